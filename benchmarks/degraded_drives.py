@@ -26,7 +26,7 @@ from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajec
 from recon.core.values.arrays import Float64, UInt8
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import ODOMETRIES, make_odometry
-from recon.run.machine import serial_algebra
+from recon.run.threads import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

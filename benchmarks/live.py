@@ -37,7 +37,8 @@ from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.trajectory import read_tum
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
-from recon.run.machine import available_cores, serial_algebra
+from recon.run.machine import available_cores
+from recon.run.threads import serial_algebra
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
 from recon.stereo.frame import FrameReconstructor
@@ -93,7 +94,8 @@ def played(
     figures = {**summary["live"], "peak_memory_mb": summary["peak_memory_mb"]}
     figures["longest_gap"] = int(np.diff(frames_of(path, source)).max(initial=0))
     if options.map:
-        return figures | {"frames": summary["frames"], "tracking": summary["frames_tracking"]}
+        states = ("frames", "frames_tracking", "frames_coasting")
+        return figures | {name: summary[name] for name in states}
     return figures | {"warnings": summary["warnings"], **errors(path, source)}
 
 

@@ -139,12 +139,13 @@ def figures_of(source: Any, map_: Map, config: ReconConfig, truth: Any) -> dict[
     figures = {
         "frames": len(drive.frames),
         "tracking": len(drive.tracked) / len(drive.frames),
+        "coasting": (len(drive.placed) - len(drive.tracked)) / len(drive.frames),
         "first_fix_frame": drive.figures()["first_fix_frame"],
         "ms_per_frame": 1e3 * drive.figures()["seconds_per_frame"]["median"],
     }
-    if truth is None or not drive.tracked:
+    if truth is None or not drive.placed:
         return figures
-    poses = truth[[frame.index for frame in drive.tracked]]
+    poses = truth[[frame.index for frame in drive.placed]]
     return figures | errors(se3.invert(poses) @ drive.trajectory.T_world_camera)
 
 
@@ -215,7 +216,16 @@ def shuffled(view: KnownView, seed: int) -> KnownView:
 
 
 def table(result: dict[str, Any]) -> str:
-    columns = ("tracking", "median_m", "p95_m", "max_m", "median_deg", "wrong", "ms_per_frame")
+    columns = (
+        "tracking",
+        "coasting",
+        "median_m",
+        "p95_m",
+        "max_m",
+        "median_deg",
+        "wrong",
+        "ms_per_frame",
+    )
     lines = ["case".ljust(18) + "".join(name.rjust(13) for name in columns)]
     for name, figures in result.items():
         if name == "growth":

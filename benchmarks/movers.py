@@ -50,7 +50,9 @@ class Traffic(SyntheticSource):
         self._pace = pace
 
     def movers(self, index: int) -> list[TriangleSoup]:
-        """Return what moves, where it is in a frame; street axes."""
+        """Return what moves, where it is in a frame, street axes; nothing beside fences."""
+        if self.world.settings.fences:
+            return []
         rng = np.random.default_rng([self.settings.seed, 5])
         step = self.settings.speed_m_per_frame
         oncoming, leading, crossing = (props.car(rng) for _ in range(3))
@@ -105,6 +107,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--json", action="store_true", help="JSON, which is printed anyway")
     parser.add_argument("--seed", type=int, default=4, help="another seed is another street")
     parser.add_argument("--pace", type=float, default=1.0, help="speed of what moves; 1 = as it is")
+    parser.add_argument(
+        "--fences", action="store_true", help="nothing moves; much can be looked through"
+    )
     parser.add_argument("--frames", type=int, default=40, help="length of the drive")
     parser.add_argument("--width", type=int, default=480, help="width of the pictures")
     return parser.parse_args(arguments)
@@ -115,6 +120,7 @@ def scene_of(options: argparse.Namespace) -> StreetScene:
         seed=options.seed,
         frames=options.frames,
         path="straight",
+        fences=options.fences,
         speed_m_per_frame=0.7,
         width_px=options.width,
         height_px=options.width * 3 // 8,
@@ -128,6 +134,7 @@ def cloud_of(mapped: MappedSequence, config: ReconConfig, *, remove: bool) -> Po
     fusion = config.fusion.model_copy(update={"remove_moving": remove})
     settings = config.model_copy(update={"fusion": fusion})
     tiles = Tiles.of_submaps(mapped.submaps, settings, mapped.T_map_world)
+    tiles.with_looks(mapped.looks)
     cloud = join_clouds(tile.cloud for tile in tiles)
     T = se3.invert(mapped.T_map_world)
     return replace(cloud, xyz=se3.apply(T, cloud.xyz), normals=None, frame="world")
@@ -148,15 +155,17 @@ class Truth:
         moving = [source.movers(index) for index in range(len(source))]
         self.standing = Surface([soup.vertices], T)
         self.thin = Surface([soup.vertices[thin]], T)
-        self.moving = Surface([soup.vertices for soups in moving for soup in soups], T)
+        soups = [soup.vertices for soups in moving for soup in soups]
+        self.moving = Surface(soups, T) if soups else None
         self.reach_m = reach_m
 
     def score(self, before: PointCloud, after: PointCloud) -> dict[str, Any]:
         """Return the shares of points that are gone."""
         left = distances(after.xyz, before.xyz) < 0.01
-        from_standing, from_moving = (
-            surface.distance(before.xyz) for surface in (self.standing, self.moving)
-        )
+        from_standing = self.standing.distance(before.xyz)
+        from_moving = np.full(len(before), np.inf)
+        if self.moving is not None:
+            from_moving = self.moving.distance(before.xyz)
         # What is near both may be of either.
         moves = (from_standing > BESIDE_M) & (from_moving <= ON_IT_M)
         stands = (from_standing <= ON_IT_M) & (from_moving > BESIDE_M)

@@ -9,6 +9,8 @@ Nothing heavy is imported before a command runs, so ``recon --help`` answers at 
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from typing import Annotated
 
@@ -92,9 +94,30 @@ def _root(
 
 
 def main() -> None:
-    """Run the program."""
+    """Run the program; a request to end it is an interruption, after which nothing half is left."""
+    _open_standard_streams()
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_DFL:  # else nohup has it ignored
+            signal.signal(number, signal.default_int_handler)
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is left in the buffer
+        if not isinstance(error, BrokenPipeError):  # as by `| head`
+            typer.echo(f"error: the output cannot be written ({error.strerror})", err=True)
+        sys.exit(1)
     except Exception as error:  # noqa: BLE001 - outside of `one_line_errors`, as while printing a table
         report_bug(error)
         sys.exit(BUG)
+
+
+def _open_standard_streams() -> None:
+    """Put the null device where a standard stream is closed: a file would take its number."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
+    sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)

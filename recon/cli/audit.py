@@ -49,9 +49,12 @@ def audit(
         from recon.cli.show.announce import announce
         from recon.commands.audit import run_audit
         from recon.commands.config import load_config
+        from recon.io.atomic import check_targets
         from recon.report.audit_table import audit_lines
         from recon.sources.registry import open_source
 
+        if mend is not None and config is not None:
+            check_targets([mend], [config])
         settings = load_config(config, [*(set_ or ()), *reading.overrides(start)])
         drive = open_source(source, reading.kind, settings.source)
         announce(drive, quiet=quiet, verbose=verbose)

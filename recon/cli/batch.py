@@ -57,12 +57,12 @@ def batch(
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:
-    """Run many commands, side by side, on this machine or a cluster.
+    r"""Run many commands, side by side, on this machine or a cluster.
 
     Each job is a process of its own with a folder of its own below --out. One
     that fails leaves the others alone; one whose worker dies goes on elsewhere.
     The folder gets summary.json, a table and a report with outliers first. The
-    exit code is 1 if any job failed. It needs: pip install 'recon[cluster]'
+    exit code is 1 if any job failed. It needs: pip install 'recon\[cluster]'
 
     Examples:
       recon batch jobs.toml --out outputs/week

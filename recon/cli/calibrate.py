@@ -79,6 +79,7 @@ def calibrate(
         from recon.commands.calibrate import run_calibrate
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
+        from recon.io.atomic import check_targets
         from recon.rig.calibrate.summary import describe_depths
 
         # kalibr's lens model has two radial terms.
@@ -86,6 +87,8 @@ def calibrate(
         chosen = [] if model is None else [f"calibration.model={model}"]
         if distance is not None:
             chosen.append(f"calibration.working_m={distance}")
+        if out is not None and shared.config is not None:
+            check_targets([out], [shared.config])
         settings = load_config(shared.config, [*fitting, *shared.changes, *chosen])
         run = run_calibrate(
             left,

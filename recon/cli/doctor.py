@@ -19,7 +19,7 @@ def doctor(
     json: opt.Json = False,
     quiet: opt.Quiet = False,
 ) -> None:
-    """Check the installation: Python, packages, system libraries, memory, folders.
+    """Check the installation: Python, packages, system libraries, kernels, memory, folders.
 
     Exits with 1 if something is missing that runs need. With --compile, the
     kernels are compiled, which the first command that needs them does otherwise.
@@ -51,7 +51,7 @@ def doctor(
 
 def _compile(*, json: bool, quiet: bool) -> None:
     with one_line_errors(quiet=quiet):
-        from recon.commands.doctor import compile_kernels
+        from recon.commands.warm_up import compile_kernels
 
         done = compile_kernels()
     if json:

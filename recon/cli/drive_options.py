@@ -34,7 +34,47 @@ StartInMap = Annotated[
 
 
 @dataclass(frozen=True)
-class SourceOptions:
+class RectifiedOptions:
+    """What is known of cameras whose images are rectified, without a calibration file."""
+
+    focal: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PX",
+            help="Focal length of images that are rectified already, without --calib.",
+            show_default="that of the calibration",
+        ),
+    ] = None
+    baseline: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M",
+            help="Distance between their cameras in metres.",
+            show_default="that of the calibration",
+        ),
+    ] = None
+    cx: Annotated[
+        float | None,
+        typer.Option(metavar="PX", help="Column of their principal points.", show_default="middle"),
+    ] = None
+    cy: Annotated[
+        float | None, typer.Option(metavar="PX", help="Row of it.", show_default="middle")
+    ] = None
+
+    @property
+    def numbers(self) -> list[str]:
+        """The settings that they stand for."""
+        given = {
+            "focal_px": self.focal,
+            "baseline_m": self.baseline,
+            "cx_px": self.cx,
+            "cy_px": self.cy,
+        }
+        return [f"source.{key}={value}" for key, value in given.items() if value is not None]
+
+
+@dataclass(frozen=True)
+class SourceOptions(RectifiedOptions):
     """How the pairs of a source are found, where its files leave that open."""
 
     kind: Annotated[
@@ -89,9 +129,8 @@ class SourceOptions:
             "stride": self.stride,
         }
         # Quoted, since a topic or folder may be named 0 or null.
-        return [
-            f"source.{key}={json.dumps(value)}" for key, value in given.items() if value is not None
-        ]
+        quoted = {key: json.dumps(value) for key, value in given.items() if value is not None}
+        return [*self.numbers, *(f"source.{key}={text}" for key, text in quoted.items())]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import resource
 import sys
 import tempfile
 import traceback
@@ -17,11 +18,13 @@ from typing import NoReturn, TextIO
 
 import typer
 
-from recon.core.errors import ReconError
+from recon.core.errors import ReconError, SettingsError
 from recon.core.kernels.cache import when_compiling
 
 INTERRUPTED = 130
 BUG = 3
+_ADDRESS_BYTES = 2_500_000_000
+"""What the libraries of a command reserve, most of it never used: 1.8 to 2.2 GB were seen."""
 
 
 @contextmanager
@@ -36,6 +39,7 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     for stream in (sys.stdout, sys.stderr):
         _escape_what_is_not_unicode(stream)
     try:
+        _check_surroundings()
         notice = _CompilingNotice(quiet)
         with _standard_output_kept_clean(quiet), when_compiling(notice.tell):
             yield
@@ -54,11 +58,36 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         _fail(f"{name}{error.strerror or error}")
+    except RuntimeError as error:
+        if not str(error).startswith("Symlink loop"):  # of Path.resolve, before Python 3.13
+            _fail_by_bug(error)
+        _fail(str(error))
     except KeyboardInterrupt as interrupt:
         typer.echo("; ".join(["interrupted", *map(str, interrupt.args)]), err=True)
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:  # noqa: BLE001 - whatever it is, it is a bug
         _fail_by_bug(error)
+
+
+def _check_surroundings() -> None:
+    """Refuse limits under which libraries would fail, or crash, while they are loaded.
+
+    Raises:
+        SettingsError: There is such a limit.
+    """
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+    if not (threads.isdecimal() and threads.isascii() and int(threads) > 0):
+        where, expected = "NUMBA_NUM_THREADS", "a positive number"
+        raise SettingsError("not a number of threads", where=where, got=threads, expected=expected)
+    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < _ADDRESS_BYTES:
+        raise SettingsError(
+            "too little address space for the libraries",
+            where="ulimit -v",
+            got=f"{limit_bytes / 1e6:.0f} MB",
+            expected=f"at least {_ADDRESS_BYTES / 1e6:.0f} MB",
+            hint="raise it, and bound memory with --memory-limit",
+        )
 
 
 def report_bug(error: BaseException) -> None:

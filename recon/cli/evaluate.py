@@ -154,7 +154,7 @@ def occupancy(
         from recon.run.summary import plain
 
         compared = run_evaluate_occupancy(run, least_frames, image=picture)
-        figures = plain(compared.metrics)
+        figures = {**plain(compared.metrics), "warnings": compared.doubts}
     if json:
         print_json(figures)
         return
@@ -164,7 +164,7 @@ def occupancy(
         if isinstance(values, dict)
         for name, value in values.items()
     }
-    print_figures(f"{run} against the true street", shown)
+    print_evaluation(f"{run} against the true street", {**shown, "warnings": compared.doubts})
 
 
 @app.command("map")
@@ -172,9 +172,12 @@ def map_(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or a PLY point cloud.")],
     reference: Annotated[Path, typer.Argument(help="Reference point cloud (PLY).")],
     reference_frame: Annotated[
-        Literal["camera", "map"],
-        typer.Option(help="Frame of REFERENCE: the first left camera, or the map."),
-    ] = "camera",
+        Literal["camera", "map"] | None,
+        typer.Option(
+            help="Frame of REFERENCE: the first left camera, or the map.",
+            show_default="camera, or the one in which --align icp finds more",
+        ),
+    ] = None,
     threshold: Annotated[
         str,
         typer.Option(

@@ -30,8 +30,9 @@ def localize(
     """Find a drive in a map that is there already: the pose of each frame.
 
     The first frames are recognised by the keyframes of the map, later ones
-    tracked against its features and surfaces. Frames are searching, tracking or
-    lost; only those that are tracked have a pose. The map is not changed.
+    tracked against its features and surfaces. Frames are searching (no pose),
+    tracking (the map confirms the pose), coasting (the pose is by odometry alone,
+    for some metres at most) or lost (no pose any more). The map is not changed.
 
     Examples:
       recon localize rides/today --map outputs/map/latest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -133,7 +134,7 @@ def _check_folders(
     remove: int | None,
 ) -> None:
     """Refuse options that say nothing together."""
-    if out is not None and resume is not None and out.resolve() != resume.resolve():
+    if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
         raise typer.BadParameter("--out and --resume name different folders")
     if into is not None and (resume is not None or out is not None):
         raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")

@@ -15,6 +15,7 @@ import typer
 
 from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json, print_run
+from recon.core import decimals
 from recon.core.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
-        return tuple(float(word) for word in text.split(","))
+        return tuple(decimals.parse_numbers(text.split(",")))
     except ValueError as error:
         raise SettingsError(
             "not numbers separated by commas", where=option, got=text, expected="0.1,0.2,0.5"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
+from recon.core.decimals import is_count
 from recon.core.errors import SettingsError
 from recon.stereo.match.foreign import name_of
 from recon.stereo.match.registry import MatchingSettings, settings_of
@@ -47,7 +48,7 @@ def capture_overrides(size: str | None, rate_hz: float | None) -> list[str]:
         SettingsError: The size is not of the form 1280x720.
     """
     width, cross, height = (size or "").partition("x")
-    if size is not None and not (cross and width.isdigit() and height.isdigit()):
+    if size is not None and not (cross and is_count(width) and is_count(height)):
         raise SettingsError("cannot read this size", got=size, expected="WIDTHxHEIGHT: 1280x720")
     given = {
         "width_px": width or None,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
+from recon.cli.drive_options import RectifiedOptions
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
 Right = Annotated[Path, typer.Argument(help="Right image.")]
@@ -30,36 +31,6 @@ def pair(
         Path | None,
         typer.Option(help=_CALIB_HELP + " Without one, the pair must be rectified already."),
     ] = None,
-    focal: Annotated[
-        float | None,
-        typer.Option(
-            min=1.0,
-            metavar="PX",
-            help="Focal length in pixels, without --calib.",
-            show_default="EXIF",
-        ),
-    ] = None,
-    baseline: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6,
-            metavar="M",
-            help="Distance between the cameras in metres, without --calib.",
-            show_default="unknown: the cloud is up to scale",
-        ),
-    ] = None,
-    cx: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PX",
-            help="Column of the principal point of both images.",
-            show_default="middle",
-        ),
-    ] = None,
-    cy: Annotated[
-        float | None,
-        typer.Option(metavar="PX", help="Row of the principal point.", show_default="middle"),
-    ] = None,
     unit_m: Annotated[
         float | None,
         typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm. [1]"),
@@ -73,6 +44,7 @@ def pair(
     matcher: opt.Matcher = None,
     ndisp: Ndisp = None,
     *,
+    known: RectifiedOptions,
     shared: opt.Shared,
 ) -> None:
     """Reconstruct one stereo pair: disparity, depth, point cloud, mesh, report.
@@ -90,14 +62,15 @@ def pair(
     with shared.one_line_errors():
         from recon.cli.overrides import pair_config
         from recon.commands.pair import run_pair
-        from recon.sources.pair_input import KnownCamera, read_pair_input, with_truth
+        from recon.sources.pair_input import read_pair_input, with_truth
 
-        settings = pair_config(shared.config, shared.changes, matcher, ndisp)
+        changes = [*shared.changes, *known.numbers]
+        settings = pair_config(shared.config, changes, matcher, ndisp)
         given = read_pair_input(
             left,
             right,
             calib,
-            known=KnownCamera(focal, baseline, cx, cy),
+            known=settings.source,
             metres_per_unit=unit_m or settings.source.metres_per_unit,
             max_megapixels=settings.readable_megapixels,
         )

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from recon.commands.config import ReconConfig
+from recon.io.atomic import check_targets
 from recon.io.files import StrPath
 from recon.report.audit_page import write_audit_page
 from recon.rig.audit.audit import Audit, audit_source, correct_calibration
@@ -37,8 +38,11 @@ def run_audit(
     Raises:
         CalibrationError: The calibration cannot rectify anything, or there are too few features to
             correct it.
-        ReconError: The calibration or the report cannot be written.
+        ReconError: The calibration or the report cannot be written, or would replace a file of the
+            recording.
     """
+    if mend is not None:
+        check_targets([Path(mend)], source.files)
     audit = audit_source(source, config, quick=quick)
     if mend is not None:
         audit = replace(audit, corrected=correct_calibration(source, config, audit, Path(mend)))

@@ -8,6 +8,8 @@ from pathlib import Path
 from recon.commands.config import ReconConfig
 from recon.core.errors import OutputError, SourceError
 from recon.core.values.board import CalibrationBoard
+from recon.io.atomic import check_targets
+from recon.io.cameras.camera_info import camera_info_paths
 from recon.report.calibration_page import write_calibration_page
 from recon.rig.calibrate.board_video import is_video, pick_views
 from recon.rig.calibrate.board_views import find_views
@@ -20,8 +22,8 @@ from recon.rig.calibrate.result import (
 )
 from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
-from recon.run.machine import serial_algebra
 from recon.run.run import Run
+from recon.run.threads import serial_algebra
 from recon.sources.image_pairs import ImagePairs, pair_images
 
 
@@ -59,6 +61,9 @@ def run_calibrate(
     _check_file(file)
     videos = _videos(left, right)
     images = ImagePairs((), by_order=False) if videos else pair_images(left, right or "")
+    inputs = videos or [path for pair in images.pairs for path in pair]
+    if file is not None:
+        check_targets(camera_info_paths(file) if form == "ros" else [file], inputs)
     with Run("calibrate", out, config, threads=threads) as run:
         if videos:
             with run.stage("pick"):
@@ -85,7 +90,7 @@ def run_calibrate(
         run.finish(
             summary,
             source=" ".join(filter(None, (left, right))),
-            inputs=videos or [path for pair in images.pairs for path in pair],
+            inputs=inputs,
             record={"board": str(seen.board)},
         )
     return result

@@ -1,27 +1,14 @@
-"""`recon doctor`: check the installation, or compile the kernels before they are needed."""
+"""`recon doctor`: check the installation.
+
+It imports no library and no kernel itself: whatever lacks is to be found, and said.
+"""
 
 from __future__ import annotations
 
-import tempfile
-import time
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
-from recon.commands.config import PAIR_DEFAULTS, load_config
-from recon.commands.demo import demo_source
-from recon.commands.map import run_map
-from recon.commands.map_options import MapOptions
-from recon.commands.occupancy import run_occupancy
-from recon.commands.pair import run_pair
-from recon.core.geometry.se3 import exp_so3, make_transform
-from recon.core.kernels.cache import when_compiling
-from recon.core.values import StereoPair
-from recon.io.occupancy.octomap import octomap_pieces
-from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.run.finished import OCTOMAP
 from recon.run.installation import (
     PACKAGES,
     SYSTEM_LIBRARIES,
@@ -37,39 +24,18 @@ from recon.run.installation import (
     check_packages,
     check_python,
     check_system_libraries,
-)
-from recon.sources.pair_input import PairInput
-from recon.stereo.frame import FrameReconstructor
-from recon.stereo.match.registry import MATCHERS
-
-_MATCHERS: Final = tuple(name for name in MATCHERS if name != "onnx")  # it needs a network
-_SMALL: Final = (
-    "street.frames=6",
-    "street.width_px=192",
-    "street.height_px=96",
-    "street.focal_px=120",
-    "submaps.length_m=2",
+    run_python,
 )
 
-
-@dataclass(frozen=True)
-class WarmUp:
-    """What was compiled.
-
-    Attributes:
-        kernels: Number of kernels that were not in the cache.
-        seconds: Time that all of it took.
-    """
-
-    kernels: int
-    seconds: float
+_ROOMS: Final = Path(__file__).parents[1]
+_COMPILE_TIMEOUT_S: Final = 600.0
 
 
 def examine(outputs: Path = Path("outputs")) -> list[Check]:
-    """Check Python, packages, system libraries, machine and folders.
+    """Check Python, packages, system libraries, machine and folders, and run some kernels.
 
     Each package is imported in a process of its own, so that a crash is reported as well; this
-    takes some seconds.
+    takes some seconds. So does each kernel: more where they are not compiled.
 
     Args:
         outputs: The folder that runs write to; it need not exist, and is not created.
@@ -82,6 +48,7 @@ def examine(outputs: Path = Path("outputs")) -> list[Check]:
         check_memory(),
         check_opencv_threads(),
         *check_numba(),
+        *check_kernels(),
         check_kiss_icp_environment(),
         check_data(),
         check_folder("results can be written", outputs, needed=True, hint="use --out"),
@@ -89,46 +56,14 @@ def examine(outputs: Path = Path("outputs")) -> list[Check]:
     ]
 
 
-def compile_kernels() -> WarmUp:
-    """Compile the kernels that pairs, drives and occupancy maps run, for all matchers of ours.
-
-    They run once on small rendered images.
-
-    The real stages run, so that a kernel that is added to one needs no mention here.
-
-    Raises:
-        OutputError: The temporary folder cannot be written.
-    """
-    begun, compiled = time.perf_counter(), set[str]()
-    with when_compiling(compiled.add), tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        config = load_config(None, _SMALL)
-        source = demo_source(config)
-        run_map(
-            source,
-            config,
-            MapOptions(audit=False, command="demo", out=folder / "drive", mesh=False),
+def check_kernels() -> Iterator[Check]:
+    """Run a kernel of each room that has some, and report what it lacks."""
+    for room in sorted(folder.parent.name for folder in _ROOMS.glob("*/kernels")):
+        sample = f"from recon.commands.kernel_samples import SAMPLES; SAMPLES[{room!r}]()"
+        ran, printed = run_python(sample, _COMPILE_TIMEOUT_S)
+        yield Check(
+            f"kernels of {room}",
+            ok=ran,
+            found="run" if ran else printed,
+            hint="" if ran else "install recon anew, with the versions of its constraints.txt",
         )
-        run_occupancy(folder / "drive", out=folder / "occupancy")
-        _read_again(folder / "drive" / OCTOMAP)
-        _move_submaps(map_sequence(source, config))
-        colour = next(iter(source))
-        grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
-        for kind, pair in {"colour": colour, "grey": grey}.items():
-            run_pair(PairInput(pair, source.calibration), out=folder / kind)
-            for matcher in _MATCHERS:
-                config = load_config(None, [f"matching.matcher={matcher}"], PAIR_DEFAULTS)
-                FrameReconstructor(source.calibration, config).reconstruct(pair)
-    return WarmUp(len(compiled), time.perf_counter() - begun)
-
-
-def _read_again(octomap: Path) -> None:
-    """Read the map as a mesh of a run does, which asks where the cameras saw free space."""
-    for _ in octomap_pieces(octomap):
-        pass
-
-
-def _move_submaps(mapped: MappedSequence) -> None:
-    """Move the submaps as closed loops do; so small a drive has none."""
-    turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
-    len(mapped.corrected(np.tile(turn, (len(mapped.submaps.entries), 1, 1))).tiles)

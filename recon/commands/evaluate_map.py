@@ -14,12 +14,14 @@ from recon.evaluation.map_comparison import (
     ReferenceFrame,
     add_within_reach,
     doubt_axes,
-    fit_cloud,
+    place_by_icp,
     place_cloud,
+    possible_frames,
     read_mapped_cloud,
 )
 from recon.io.models.ply import read_ply
 from recon.report.map_errors import write_map_errors
+from recon.run.finished import CLOUD
 from recon.run.run import Run
 from recon.run.summary import plain
 
@@ -28,7 +30,7 @@ def run_evaluate_map(
     run: Path,
     reference: Path,
     *,
-    frame: ReferenceFrame = "camera",
+    frame: ReferenceFrame | None = None,
     align_to: Path | None = None,
     icp: bool = False,
     thresholds_m: Sequence[float] = (0.2,),
@@ -44,7 +46,8 @@ def run_evaluate_map(
         run: A run's folder, or a PLY file. A PLY inside a run's folder is in that run's map axes;
             any other PLY is taken to be in the axes of the reference already.
         reference: A PLY file.
-        frame: Axes of the reference: those of the first left camera, or the map's.
+        frame: Axes of the reference: those of the first left camera, or the map's; None = those in
+            which ICP finds more, without it the camera's.
         align_to: Ground-truth poses of the run's cameras, in the axes of the reference; the run's
             path is aligned rigidly to them, and its map moves with it.
         icp: Whether the cloud is then aligned to the reference by ICP.
@@ -61,26 +64,31 @@ def run_evaluate_map(
     """
     if not thresholds_m:
         raise SettingsError("there is no threshold", where="--threshold")
-    placed, moved = place_cloud(read_mapped_cloud(run), frame, align_to)
-    truth = replace(read_ply(reference), frame=placed.cloud.frame)
+    mapped, truth = read_mapped_cloud(run), read_ply(reference)
     if icp:
-        placed, fitted = fit_cloud(placed, truth, max(thresholds_m))
-        moved |= fitted
+        reach_m, frames = max(thresholds_m), possible_frames(mapped, frame, align_to)
+        placed, moved, frame = place_by_icp(mapped, truth, frames, align_to, reach_m)
+    else:
+        frame = frame or "camera"
+        placed, moved = place_cloud(mapped, frame, align_to)
+    truth = replace(truth, frame=placed.cloud.frame)
     by_threshold = [plain(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
     beyond = add_within_reach(placed, truth, by_threshold)
     aligned = icp or align_to is not None
-    warnings = doubt_axes(placed, truth, by_threshold[0], frame, aligned=aligned)
+    doubts = doubt_axes(placed, truth, by_threshold[0], frame, aligned=aligned)
     summary = {
         **by_threshold[0],
         **moved,
         **beyond,
         "by_threshold": by_threshold,
-        "warnings": warnings,
+        "warnings": [*placed.doubts, *doubts],
     }
     if out is not None:
+        cloud = run / CLOUD if run.is_dir() else run
+        inputs = [path for path in (cloud, reference, align_to) if path is not None]
         result = MapComparison(placed.cloud, truth, tuple(thresholds_m), summary)
         with Run("evaluate map", out) as written:
             with written.report(summary):
                 write_map_errors(result, written)
-            written.finish(summary, source=str(run), inputs=[reference])
+            written.finish(summary, source=str(run), inputs=inputs)
     return summary

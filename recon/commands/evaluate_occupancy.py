@@ -11,10 +11,13 @@ from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth
 from recon.evaluation.drive_errors import LEAST_FRAMES, known_occupancy
 from recon.evaluation.occupancy import evaluate_occupancy
+from recon.export.finished_map import doubts_of
+from recon.io.atomic import check_targets
 from recon.io.images.image import write_image
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.occupancy.octomap import read_octomap
 from recon.report.colour import colour_grid_errors
+from recon.run.directory import recorded_files
 from recon.run.finished import GRID, OCTOMAP, FinishedRun, open_run
 from recon.sources.protocol import KnowsOccupancy
 
@@ -27,11 +30,13 @@ class OccupancyComparison:
         metrics: The figures.
         grid: The 2-D grid of the run.
         truth: Ground truth, in the cells of the run.
+        doubts: What is not to be trusted in the map of the run.
     """
 
     metrics: OccupancyMetrics
     grid: OccupancyGrid
     truth: OccupancyTruth
+    doubts: list[str]
 
 
 def run_evaluate_occupancy(
@@ -50,14 +55,18 @@ def run_evaluate_occupancy(
         FormatError: The folder does not contain a finished run, or a map is missing or damaged.
         EvaluationError: The run has no ground truth, or no cell was seen often enough.
         OutputError: The image cannot be written.
+        SettingsError: It would replace a file of the run.
     """
+    if image is not None:
+        check_targets([image], (folder / name for name in recorded_files(folder)))
     run, config = open_run(folder), run_settings(folder)
     source = _source_that_knows(run, config)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
     truth = known_occupancy(source, config, run.T_map_world, least_frames)
     if image is not None:
         write_image(image, colour_grid_errors(grid, truth))
-    return OccupancyComparison(evaluate_occupancy(voxels, grid, truth), grid, truth)
+    metrics = evaluate_occupancy(voxels, grid, truth)
+    return OccupancyComparison(metrics, grid, truth, doubts_of(run))
 
 
 def _source_that_knows(run: FinishedRun, config: ReconConfig) -> KnowsOccupancy:

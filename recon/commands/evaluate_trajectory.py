@@ -11,6 +11,7 @@ from recon.core.values import Trajectory
 from recon.evaluation.association import TOLERANCE_S, associate
 from recon.evaluation.interpolated_truth import interpolation_warnings
 from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
+from recon.export.finished_map import doubts_of_file
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.trajectory_page import write_trajectory_page
 from recon.run.run import Run
@@ -57,6 +58,7 @@ def run_evaluate_trajectory(
         "associated": "by time" if by_time else "in order",
         **poses,
         "warnings": [
+            *doubts_of_file(estimate),
             *_warnings(len(true), min(poses.values())),
             *interpolation_warnings(comparison.truth, comparison.segments),
         ],

@@ -22,6 +22,7 @@ from recon.rig.cameras import CameraSource
 from recon.sources.live import LiveSource
 from recon.sources.protocol import DerivedSource, StereoSource
 
+_SLOWEST: Final = 1e-3
 _FIRST: Final = 3
 """Pairs that are worked on before the first one counts: the first use of a library takes long."""
 _PACE_S: Final = 0.1
@@ -59,8 +60,9 @@ def run_live(
         ReconError: As for `run_map` and `run_localize`; the rate is not positive, or the odometry
             needs exact disparities.
     """
-    if not 0.0 < rate < float("inf"):
-        raise SettingsError("a rate is positive", where="--rate", got=f"{rate:g}")
+    if not _SLOWEST <= rate < float("inf"):
+        expected = f"{_SLOWEST:g} or more"
+        raise SettingsError("not a rate", where="--rate", got=f"{rate:g}", expected=expected)
     config, options = config or load_config(), options or MapOptions(command="live")
     _check_pose_first(config)
     _warm_up(LiveSource(_Beginning(source), stopped=stopped), config, map_path)

@@ -15,7 +15,7 @@ from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.sequence import StartPose, localize_sequence
 from recon.map.store.map import MAP_FILE, Map
 from recon.report.localize_page import write_localize_page
-from recon.run.finished import GRID, camera_height_of, refuse_as_target
+from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 
@@ -48,22 +48,24 @@ def run_localize(
         Map.open(map_path, cache_bytes=config.memory.cache_bytes) as map_,
         options.run(config) as run,
     ):
+        folder = map_path if map_path.is_dir() else None
+        inputs = [*source.files, map_path if folder is None else folder / MAP_FILE]
+        run.check_targets(inputs)
         workspace = Workspace(map_, run.watch, run.threads)
         drive = localize_sequence(source, workspace, config, start=start, progress=options.progress)
-        folder = map_path if map_path.is_dir() else None
         grid = _grid_of(folder)
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, map_run=str(map_path), **drive.figures())
         made.summary["T_map_world"] = drive.T_map_world.tolist()
-        made.summary["warnings"] = drive.warnings()
+        made.summary["warnings"] = [*map_.doubts, *drive.warnings()]
         if isinstance(source, LiveSource):
             made.summary["live"] = source.figures()
             made.summary["warnings"] += source.warnings()
         with run.stage("write"):
-            export_localized(drive, None if folder is None else camera_height_of(folder), run)
+            height_m = None if folder is None else figure_of(folder, "camera_height_m")
+            export_localized(drive, height_m, run)
         with run.report(made.summary):
             write_localize_page(made, run)
-        inputs = [*source.files, map_path if folder is None else folder / MAP_FILE]
         run.finish(made.summary, source=source.name, inputs=inputs)
     return made
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
@@ -24,7 +22,6 @@ from recon.map.store.map import MAP_FILE, Map
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
-from recon.run.finished import UNTRUSTED
 from recon.run.run import Run
 from recon.run.summary import plain
 from recon.sources.live import LiveSource
@@ -94,7 +91,6 @@ def run_map(
         record = {
             "source_description": source.description,
             "T_map_world": mapped.T_map_world.tolist(),
-            UNTRUSTED: np.flatnonzero(~mapped.trusted).tolist(),
             **pieces_of(run, map_),
         }
         run.finish(result.summary, source=source.name, inputs=source.files, record=record)

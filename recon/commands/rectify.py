@@ -15,8 +15,8 @@ from recon.rig.rectification import (
     plan_by_features,
     read_pairs,
 )
-from recon.run.machine import serial_algebra
 from recon.run.run import Run
+from recon.run.threads import serial_algebra
 from recon.sources.image_pairs import ImagePairs, pair_images
 from recon.sources.one_pair import read_pair
 
@@ -76,6 +76,7 @@ def run_rectify(
         with run.report(summary):
             write_epipolar_images(result, run)
         inputs = [file for files in images.pairs for file in files]
+        inputs += [] if calibration is None else [calibration]
         run.finish(summary, source=f"{left} {right}", inputs=inputs)
     return result
 
@@ -89,6 +90,8 @@ def _warnings(summary: dict[str, Any], images: ImagePairs) -> list[str]:
     lines = []
     if summary["up_to_scale"]:
         lines.append("without a calibration: rows correspond, but depth is up to scale, no metres")
+    if summary.get("model") == "raw":
+        lines.append("rows correspond as recorded: the images are written unchanged")
     if summary.get("row_error_px", 0.0) > _WARN_ROW_PX:
         lines.append(f"rows are {summary['row_error_px']:.2f} px apart: a matcher needs 0.5")
     if "row_error_px" not in summary:

@@ -17,6 +17,7 @@ from recon.map.drive.workspace import resuming, session_info
 from recon.map.store.map import Map
 from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.memory import memory_overrides
+from recon.run.run import Run
 from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 
@@ -55,7 +56,7 @@ def resumed(
 
 
 def begin_or_resume(
-    run: RunDirectory,
+    run: Run,
     source: StereoSource,
     config: ReconConfig,
     identity: Mapping[str, Any],
@@ -64,10 +65,12 @@ def begin_or_resume(
     """Begin the map of a run; for a resumed one, check that nothing has changed, and open it.
 
     Raises:
-        SettingsError: The run was started with other inputs or settings.
+        SettingsError: The run was started with other inputs or settings, or would replace an input.
         FormatError: The map is damaged.
         OutputError: The map cannot be written, or there is no run to resume.
     """
+    named = (arguments.get(name) for name in ("poses", "prior"))
+    run.check_targets([*source.files, *(Path(name) for name in named if name is not None)])
     path, memory = run.state(STARTED), config.memory.cache_bytes
     if run.resumes:
         refuse_others(identity, read_started(run.folder)["identity"], run.folder)
@@ -78,6 +81,7 @@ def begin_or_resume(
     start = {} if live else {"identity": dict(identity), "arguments": dict(arguments)}
     map_.begin(session_info(source, config, start))
     map_.commit()
+    run.begun = run.command != "demo"  # whose street no command line names
     return map_
 
 
@@ -97,7 +101,7 @@ def with_resume_hint(run: RunDirectory, source: StereoSource) -> Iterator[None]:
         yield
     except (*passing, KeyboardInterrupt) as error:
         hint = _way_on(run.folder, source)
-        hinted = _with_hint(error, hint) if run.resumable else None
+        hinted = _with_hint(error, hint) if run.begun else None
         if hinted is None:
             raise
         raise hinted from error

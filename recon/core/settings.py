@@ -7,10 +7,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
+from recon.core.decimals import refuse_other_numbers
 from recon.core.errors import SettingsError
 
 
@@ -31,6 +39,16 @@ class Settings(BaseModel):
             return values
         fields = cls.model_fields
         return {k: _complete(fields[k], v) if k in fields else v for k, v in values.items()}
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _check_decimals(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse what only Python takes for numbers, see `recon.core.decimals`."""
+        if _is_numeric(cls.model_fields[str(info.field_name)].annotation):
+            for part in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(part, str):
+                    refuse_other_numbers(part)
+        return value
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Show only what differs from its default."""
@@ -80,6 +98,11 @@ def _complete(field: FieldInfo, value: Any) -> Any:
         # A group may stand with other defaults than its class: keep those that are not given.
         return merge(field.default.model_dump(), value)
     return value
+
+
+def _is_numeric(annotation: Any) -> bool:
+    """Return whether a field takes a number, or several."""
+    return annotation in (int, float) or any(map(_is_numeric, get_args(annotation)))
 
 
 def can_be_none(field: FieldInfo) -> bool:

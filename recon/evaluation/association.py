@@ -41,11 +41,7 @@ def associate(
             expected=f"times within {tolerance_s:g} s of each other",
             hint="raise --tolerance, or make sure that both use the same clock",
         )
-    return _part(estimate, np.flatnonzero(mutual)), _part(truth, there[mutual])
-
-
-def _part(path: Trajectory, index: np.ndarray) -> Trajectory:
-    return Trajectory(path.T_world_camera[index], path.timestamps_s[index])
+    return estimate.select(mutual), truth.select(there[mutual])
 
 
 def _span(path: Trajectory) -> str:

@@ -129,6 +129,12 @@ def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
 
 def _check(cloud: PointCloud, reference: PointCloud, threshold_m: float) -> None:
     """Raise if the clouds cannot be compared."""
+    if not (isinstance(cloud, PointCloud) and isinstance(reference, PointCloud)):
+        raise EvaluationError(
+            "only point clouds can be compared",
+            got=f"{type(cloud).__name__} and {type(reference).__name__}",
+            expected="two PointClouds, such as of read_ply",
+        )
     for name, points in (("estimated", cloud), ("reference", reference)):
         if len(points) == 0:
             raise EvaluationError(f"the {name} cloud is empty")

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from recon.core.errors import EvaluationError, SettingsError
+from recon.core.errors import EvaluationError, RegistrationError, SettingsError
 from recon.core.geometry.alignment import fit_paths
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import angle_rad, invert
@@ -17,8 +17,10 @@ from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
 from recon.evaluation.association import TOLERANCE_S, associate
 from recon.evaluation.map import evaluate_map, register_cloud, within_reach
+from recon.export.finished_map import doubts_of
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory
+from recon.places.path_fit import drift_at_end, fit_to_path
 from recon.run.directory import RECORD
 from recon.run.finished import CLOUD, open_run
 
@@ -53,12 +55,14 @@ class MappedCloud:
         path: The path of the cameras; as read, in world axes; None = unknown.
         folder: Folder of the run; None = no run.
         T_map_world: float64 (4, 4), from world to map axes; None = no run.
+        doubts: What is not to be trusted in the map of the run.
     """
 
     cloud: PointCloud
     path: Trajectory | None = None
     folder: Path | None = None
     T_map_world: Float64 | None = None
+    doubts: Sequence[str] = ()
 
 
 def read_mapped_cloud(run: Path) -> MappedCloud:
@@ -76,7 +80,7 @@ def read_mapped_cloud(run: Path) -> MappedCloud:
     mapped = open_run(folder)
     cloud = read_ply(run / CLOUD if run.is_dir() else run)
     path = read_trajectory(mapped.path_file) if mapped.path_file.is_file() else None
-    return MappedCloud(cloud, path, folder, mapped.T_map_world)
+    return MappedCloud(cloud, path, folder, mapped.T_map_world, doubts_of(mapped))
 
 
 def place_cloud(
@@ -122,14 +126,56 @@ def place_cloud(
     return replace(mapped, cloud=cloud, path=_moved(mapped.path, T)), how
 
 
-def fit_cloud(
-    mapped: MappedCloud, reference: PointCloud, reach_m: float
-) -> tuple[MappedCloud, dict[str, Any]]:
-    """Align a map to the reference by ICP; also returns how far that moved it.
+def possible_frames(
+    mapped: MappedCloud, frame: ReferenceFrame | None, align_to: Path | None
+) -> Sequence[ReferenceFrame]:
+    """Return the axes in which a reference may be, the likelier first."""
+    if frame is not None:
+        return (frame,)
+    return ("camera",) if align_to or mapped.T_map_world is None else ("camera", "map")
+
+
+def place_by_icp(
+    mapped: MappedCloud,
+    reference: PointCloud,
+    frames: Sequence[ReferenceFrame],
+    align_to: Path | None,
+    reach_m: float,
+) -> tuple[MappedCloud, dict[str, Any], ReferenceFrame]:
+    """Bring a map into the axes of its reference (`place_cloud`), and align it there by ICP.
+
+    Args:
+        mapped: The map.
+        reference: The reference, in some axes.
+        frames: Those that are tried; the cloud is placed where most of its points have a partner.
+        align_to: Ground-truth poses of the run's cameras, see `place_cloud`.
+        reach_m: Largest distance of partners.
+
+    Returns:
+        The map, how it was aligned, and the axes.
 
     Raises:
-        EvaluationError: The two hardly overlap.
+        RegistrationError: The two overlap in none of the axes.
+        EvaluationError: As for `place_cloud`.
     """
+    found: list[tuple[MappedCloud, dict[str, Any], ReferenceFrame]] = []
+    for frame in frames:
+        placed, how = place_cloud(mapped, frame, align_to)
+        try:
+            fitted, moved = _fit_cloud(placed, reference, reach_m)
+        except RegistrationError:
+            if frame == frames[-1] and not found:
+                raise
+            continue
+        found.append((fitted, {**how, "reference_frame": frame, **moved}, frame))
+    return max(found, key=lambda each: each[1]["icp_share"])
+
+
+def _fit_cloud(
+    mapped: MappedCloud, reference: PointCloud, reach_m: float
+) -> tuple[MappedCloud, dict[str, Any]]:
+    """Align a map to the reference by ICP; also returns how far that moved it."""
+    reference = replace(reference, frame=mapped.cloud.frame)
     T, share = register_cloud(mapped.cloud, reference, reach_m)
     # Measured at the centre of the map: a rotation about a far origin would look like a shift.
     middle = np.eye(4)
@@ -198,6 +244,8 @@ def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
             got=f"{len(truth)} poses",
             expected=f"{len(path)}",
         )
+    fit = fit_to_path(path.positions_m, truth.positions_m, drift_at_end(path))
+    fit.check(poses, "are these the poses of its cameras, in metres?")
     return fit_paths(path, truth).T_to_from
 
 

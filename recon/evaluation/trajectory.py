@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -13,10 +14,13 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import Similarity, fit_points, fit_upright
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.settings import Settings
-from recon.core.values import LengthErrors, Trajectory, TrajectoryMetrics
+from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Float64, Int32
 from recon.evaluation.roll import open_roll_axis, without_roll
 from recon.evaluation.segments import Segments, choose_segments
+from recon.io.files import StrPath
+from recon.io.trajectory import read_trajectory
+from recon.places.path_fit import drift_at_end, fit_to_path
 
 MIN_PATH_M: Final = 1.0
 """On a shorter path, relative errors would be dominated by the noise of the ground truth."""
@@ -113,10 +117,36 @@ class TrajectoryRun:
 
 
 def evaluate_trajectory(
-    estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules | None = None
+    estimate: Trajectory | StrPath,
+    truth: Trajectory | SequenceTruth | StrPath,
+    rules: TrajectoryRules | None = None,
 ) -> TrajectoryMetrics:
-    """Return the errors of an estimated trajectory, see `compare_paths`."""
-    return compare_paths(estimate, truth, rules).metrics
+    """Return the errors of an estimated trajectory, see `compare_paths`.
+
+    Args:
+        estimate: The estimate, or its KITTI or TUM file.
+        truth: The true path, its file, or what a source knows of the truth.
+        rules: Alignment and segments; None = the defaults.
+
+    Raises:
+        EvaluationError: The two cannot be compared, or one is no trajectory.
+        FormatError: A file is missing or damaged.
+    """
+    return compare_paths(_path("estimate", estimate), _path("truth", truth), rules).metrics
+
+
+def _path(name: str, given: object) -> Trajectory:
+    """Return a trajectory, that of a file, or that of the truth of a source."""
+    found = given.trajectory if isinstance(given, SequenceTruth) else given
+    if isinstance(found, str | PathLike):
+        return read_trajectory(found)
+    if isinstance(found, Trajectory):
+        return found
+    raise EvaluationError(
+        f"the {name} is no trajectory",
+        got=f"{type(given).__name__} without a path" if found is None else type(given).__name__,
+        expected="a Trajectory, a KITTI or TUM file, or the truth of a source",
+    )
 
 
 def compare_paths(
@@ -139,7 +169,8 @@ def compare_paths(
 
     Raises:
         EvaluationError: The lengths differ, there are too few poses, the true path is shorter
-            than `MIN_PATH_M`, or it has no room for a requested segment.
+            than `MIN_PATH_M`, it has no room for a requested segment, or it is the estimate in
+            another unit, unless the alignment scales it.
 
     Ref:
         Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012;
@@ -247,4 +278,12 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
             "true path is too short for errors relative to its length",
             got=f"{truth.path_length_m:.2f} m",
             expected=f"{MIN_PATH_M:g} m or more",
+        )
+    drift_m = min(drift_at_end(estimate), drift_at_end(truth))
+    fit = fit_to_path(estimate.positions_m, truth.positions_m, drift_m)
+    if fit.other_unit and rules.alignment != "sim3":
+        raise EvaluationError(
+            "the true path is the estimated one in another unit",
+            got=f"{fit.scale:.4g} times as large, {fit.scaled_m:.3g} m apart if that is undone",
+            hint="both are in metres; sim3 compares an estimate whose scale is unknown",
         )

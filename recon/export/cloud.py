@@ -18,6 +18,8 @@ from recon.map.tiles import Tiles
 SAMPLE_POINTS: Final = 300_000
 """Points of the fused cloud that are kept for display."""
 _GROWTH: Final = 1.25
+_MUCH: Final = 0.02
+"""Share of the points that can be left out without a word; a busy street has less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +30,13 @@ class WrittenCloud:
         points: Number of its points.
         removed: Number of points that were left out since they moved.
         sample: Even sample of it; all points of a small one. Frame ``map``.
+        warnings: What the user should know of the points that were left out.
     """
 
     points: int
     removed: int
     sample: PointCloud
+    warnings: list[str]
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path) -> WrittenCloud:
@@ -55,7 +59,19 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path) -> WrittenCloud:
     if tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
         left_out = write_ply_tiles(removed, (cloud for cloud in moved if len(cloud)), frame="map")
-    return WrittenCloud(points, left_out, sample.cloud())
+    return WrittenCloud(points, left_out, sample.cloud(), _doubts(tiles, points, left_out))
+
+
+def _doubts(tiles: Tiles, points: int, removed: int) -> list[str]:
+    """Return a warning where much was left out, or nothing could be."""
+    if tiles.config.fusion.remove_moving and not tiles.have_looks:
+        what = "no rays were kept, so what moved stays in the cloud"
+        return [f"{what}; map with --set occupancy.keep_rays=true to leave it out"]
+    share = removed / max(points + removed, 1)
+    if share <= _MUCH:
+        return []
+    what = f"{100 * share:.1f} % of the points are taken for what moved and left out"
+    return [f"{what}: look at map/removed.ply; --set fusion.remove_moving=false keeps them"]
 
 
 class CloudSample:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +38,30 @@ Place = Callable[[Map, DriveSettings], PlacedMap]
 def place_here(map_: Map, config: DriveSettings) -> PlacedMap:
     """Cut a map into tiles in this process, without its cloud."""
     return place_map(map_, config, fuse=False)
+
+
+def doubts_of(run: FinishedRun) -> list[str]:
+    """Return lines of what is not to be trusted in the map of a run, or that it was made from.
+
+    Raises:
+        FormatError: The map is damaged.
+    """
+    if not (run.folder / MAP_FILE).is_file():
+        return list(run.doubts)
+    return doubts_of_file(run.folder / MAP_FILE)
+
+
+def doubts_of_file(file: Path) -> list[str]:
+    """Return lines of what is not to be trusted in the map of the run that a file belongs to.
+
+    Raises:
+        FormatError: The map is damaged.
+    """
+    folder = next((one for one in file.absolute().parents[:3] if (one / MAP_FILE).is_file()), None)
+    if folder is None:
+        return []
+    with closing(Map.open(folder)) as map_:
+        return map_.doubts
 
 
 def map_from_rays(run: FinishedRun, config: DriveSettings, place: Place) -> FinishedMap:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -18,7 +19,7 @@ from recon.core.values.grid import log_odds
 from recon.io.occupancy.nav2 import write_nav2
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.floor import add_floors
-from recon.map.ground.grid import flatten
+from recon.map.ground.grid import flatten, ground_depths
 from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,
@@ -33,6 +34,8 @@ from recon.map.tiles import Tiles
 
 _MOST_CELLS: Final = 1_000_000_000
 """A city of 6 by 6 km at 0.2 m; each is a byte of memory and of the file."""
+_GROUND_SHARE: Final = 0.95
+"""Share of the ground that must lie below the height band: else parts of it become obstacles."""
 _MARGIN_M: Final = 5.0
 """Least distance from the path to the edge of the grid: a footprint must fit in at the start."""
 
@@ -82,6 +85,7 @@ class _Flattening:
         self._path_m = path_m
         self._trusted = trusted
         self._resolution_m = tiles.resolution_m
+        self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> WrittenGrid:
         settings, driven = self._along_the_path()
@@ -105,7 +109,29 @@ class _Flattening:
         origin_m = (low[0] * self._resolution_m, low[1] * self._resolution_m)
         grid = OccupancyGrid(cells, self._resolution_m, origin_m)
         height_m = settings.camera_height_m
-        return WrittenGrid(grid, height_m if driven else None, _warnings(height_m, driven))
+        warnings = (*_warnings(height_m, driven), *self._band_warnings())
+        return WrittenGrid(grid, height_m if driven else None, warnings)
+
+    def _band_warnings(self) -> Iterator[str]:
+        """Yield what is wrong with a height band that is too low or too thin for the cells."""
+        settings, cell_m = self._config.grid, self._resolution_m
+        depths_m = np.concatenate(self._ground_depths)
+        if len(depths_m):
+            # What is seen as thin as can be still lies up to half a voxel off its centre.
+            thick_m = max(cell_m / 2, float(np.quantile(depths_m, _GROUND_SHARE)))
+            if settings.min_height_m < thick_m:
+                enough_m = math.ceil(20 * thick_m) / 20
+                yield (
+                    f"grid.min_height_m={settings.min_height_m:g} is too low to tell obstacles "
+                    f"from the ground, which is {thick_m:.2f} m thick in cells of {cell_m:g} m: "
+                    f"parts of it are drawn as obstacles; take {enough_m:g}, or smaller cells"
+                )
+        if settings.max_height_m - settings.min_height_m < cell_m:
+            yield (
+                f"the height band of the grid, {settings.min_height_m:g} to "
+                f"{settings.max_height_m:g} m, is thinner than a voxel of {cell_m:g} m: obstacles "
+                "fall through; widen it, or take smaller cells"
+            )
 
     def _extent(self) -> tuple[TileKey, TileKey]:
         """Return the smallest x and y of the cells, and the largest ones plus one."""
@@ -129,6 +155,7 @@ class _Flattening:
         ground = estimate_ground_surface(self._ground_points(area), path_m, settings)
         passed = {} if path is None else self._passed(key, path, ground)
         voxels = self._tiles.wide_voxels(key, passed)
+        self._ground_depths.append(ground_depths(voxels, ground, self._config.grid))
         return flatten(voxels, ground, self._config.grid) if len(voxels) else None
 
     def _ground_points(self, area: Rectangle) -> PointCloud:

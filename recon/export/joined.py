@@ -6,6 +6,8 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from recon.core.values import Trajectory, TriangleMesh
 from recon.export.products import Products
 from recon.io.trajectory import write_kitti_poses, write_tum
@@ -50,7 +52,7 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
     """Return the figures for ``summary.json``."""
     map_, made = joined.map, joined.made
     T_map_world = map_.first.T_map_world
-    linked = {session.number for session in map_.linked}
+    placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
     return {
@@ -62,7 +64,9 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
                 "name": session.info.source,
                 "frames": len(session),
                 "length_m": session.trajectory.path_length_m,
-                "linked": session.number in linked,
+                "linked": session.number in placed,
+                "frames_not_trusted": int((~session.trusted).sum()),
+                "frames_placed": int(placed.get(session.number, np.zeros(0)).sum()),
                 "positions": len(session.fixes),
             }
             for session in map_.sessions
@@ -80,13 +84,14 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
 
 
 def joined_warnings(joined: JoinedMap) -> list[str]:
-    """Return what the user should know: drives apart, doubtful lengths and positions."""
+    """Return what the user should know: drives apart; doubtful poses, lengths, and positions."""
     linked = joined.map.linked
     apart = [session for session in joined.map.sessions if session not in linked]
     names = ", ".join(f"{session.number} ({session.info.source})" for session in apart)
     what = "shares no verified place" if len(apart) == 1 else "share no verified place"
     text = f"session {names} {what} with session {linked[0].number}: kept in the map, but not in "
     return [
+        *joined.map.doubts,
         *([text + "cloud, grid, OctoMap and mesh"] if apart else ()),
         *doubts_of_lengths(joined.map),
         *doubts_of_positions(joined.map),

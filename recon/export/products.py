@@ -82,7 +82,7 @@ def write_products(mapped: Placed, run: Run, mesh: MeshSettings | None = None) -
         voxels, warnings = export_octomap(tiles, run.path("map/octomap"))
     with run.stage("grid"):
         flat = export_grid(tiles, mapped.path_m, mapped.trusted, run.path("map/grid"))
-    warnings += flat.warnings
+    warnings += [*cloud.warnings, *flat.warnings]
     surface = None
     if mesh is not None:
         run.progress.on_stage("mesh")

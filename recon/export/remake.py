@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
@@ -16,6 +17,7 @@ from recon.core.values.cloud import Frame
 from recon.export.finished_map import (
     FinishedMap,
     Place,
+    doubts_of,
     map_as_written,
     map_from_rays,
     place_here,
@@ -36,7 +38,8 @@ from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
 from recon.map.ground.axes import base_axes
 from recon.map.sessions.measured import Survey
 from recon.map.settings import DriveSettings
-from recon.run.finished import CLOUD, MAPPED_BY, UNTRUSTED, FinishedRun
+from recon.map.store.map import Map
+from recon.run.finished import CLOUD, DOUBTS, MAPPED_BY, FinishedRun
 from recon.run.run import Run
 
 PRODUCTS: Final = ("cloud", "grid", "octomap", "mesh")
@@ -93,7 +96,8 @@ def remake_map(
             voxels = "mesh" in products and wanted.mesh.free_space
             found = map_as_written(source, config, voxels=voxels)
     figures: dict[str, Any] = {"run": str(source.folder), "cloud": str(source.folder / CLOUD)}
-    warnings = list(found.warnings)
+    doubts = doubts_of(source)
+    warnings = [*doubts, *found.warnings]
     if "cloud" in products:
         copy_file(source.folder / CLOUD, run.path(CLOUD))
         figures["points"] = sum(len(tile.cloud) for tile in found.tiles)
@@ -116,7 +120,7 @@ def remake_map(
         record = {
             MAPPED_BY: source.mapped_by,
             "T_map_world": T_map_world,
-            UNTRUSTED: list(source.untrusted),
+            DOUBTS: doubts,
         }
     figures["warnings"] = warnings
     run.finish(figures, source=str(source.folder), inputs=found.files, record=record)
@@ -200,7 +204,8 @@ def _las(source: FinishedRun, wanted: Wanted, run: Run, warnings: list[str]) -> 
     """Write the cloud as LAS or LAZ; its figures."""
     T_file_map, crs, figures = np.eye(4), None, dict[str, Any]()
     if wanted.survey is not None:
-        placed = georeference(source, wanted.survey)
+        with closing(Map.open(source.folder)) as map_:
+            placed = georeference(map_, wanted.survey)
         T_file_map, crs = placed.T_survey_map, wanted.survey.crs
         figures |= placed.figures()
         warnings += placed.warnings()

@@ -8,16 +8,20 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.alignment import fit_points
-from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.models.las import check_inside
-from recon.io.trajectory import read_tum
-from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, span_m
-from recon.run.finished import FinishedRun
+from recon.map.sessions.measured import (
+    LARGEST_MISFIT,
+    Survey,
+    drift_of,
+    measure_along,
+    span_m,
+    trusted_path,
+)
+from recon.map.store.map import Map
 
 _LARGEST_STRETCH: Final = 0.05
-"""By how much the path may be too long or short; more is another unit."""
-_NAMED: Final = 3
+"""By how much the path may be too long or short before it is said."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,18 +78,21 @@ class Georeference:
         return [*lines, f"{apart}: another clock, another antenna offset, or drift"]
 
 
-def georeference(run: FinishedRun, survey: Survey) -> Georeference:
-    """Place the map of a run so that its path runs through measured positions.
+def georeference(map_: Map, survey: Survey) -> Georeference:
+    """Place a map so that the path of the drive that began it runs through measured positions.
 
-    The path is interpolated at their times. The map stays rigid, and upright where the positions
-    do not say otherwise (`fit_upright`); positions that contradict most others are left out.
+    Between frames that are trusted, the path is interpolated at their times. The map stays rigid,
+    and upright where the positions do not say otherwise (`fit_upright`); positions that contradict
+    most others are left out.
 
     Raises:
         FormatError: A file is missing or damaged.
-        EvaluationError: No position was measured during the drive, all at one place, or they lie
-            outside their coordinate system.
+        EvaluationError: No position was measured during the drive, all at one place, they lie
+            outside their coordinate system, or neither drift nor noise explains where they are.
     """
-    measured = measure_along(_path_of(run), run.T_map_world, survey)
+    session = map_.first
+    path, drift_m = trusted_path(session), drift_of(session)
+    measured = measure_along(path, session.T_map_world, survey, drift_m)
     if survey.crs is not None:
         check_inside(survey.crs, np.median(measured.position_m, axis=0), survey.positions)
     agree = measured.agree
@@ -98,11 +105,3 @@ def georeference(run: FinishedRun, survey: Survey) -> Georeference:
         len(agree) - len(ours_m),
         tuple(measured.warnings()),
     )
-
-
-def _path_of(run: FinishedRun) -> Trajectory:
-    """Return the path of the drive that began the map, without frames that are not trusted."""
-    path = read_tum(run.path_file)
-    trusted = np.ones(len(path), np.bool_)
-    trusted[[n for n in run.untrusted if n < len(path)]] = False
-    return Trajectory(path.T_world_camera[trusted], path.timestamps_s[trusted])

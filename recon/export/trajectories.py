@@ -24,7 +24,7 @@ _ENTRIES: Final = [(i, j) for i in range(6) for j in range(i, 6)]
 _COVARIANCE: Final = tuple(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in _ENTRIES)
 _UNKNOWN: Final = len(_POSE) + len(_SIGMAS) + len(_COVARIANCE)
 HEADER: Final = (
-    *("frame", "time_s", "state", "views", "inliers", "seconds"),
+    *("frame", "time_s", "state", "views", "inliers", "surfaces", "seconds"),
     *(*_POSE, *_SIGMAS, *_COVARIANCE),
 )
 
@@ -80,7 +80,8 @@ def _of_base(path: Trajectory, T_map_world: Float64, camera_height_m: float | No
 def _line(frame: LocalizedFrame) -> str:
     found = frame.located
     words = [str(frame.index), f"{frame.time_s:.9f}", found.state.value]
-    words += [str(found.views), str(found.inliers), f"{frame.seconds:.4f}"]
+    words += [str(found.views), str(found.inliers), str(int(found.surfaces))]
+    words.append(f"{frame.seconds:.4f}")
     if found.T_world_camera is None or found.covariance is None:
         return ",".join([*words, *[""] * _UNKNOWN])
     return ",".join([*words, *_numbers(found.T_world_camera, found.covariance)])

@@ -6,13 +6,14 @@ import ctypes
 import os
 import secrets
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Final
 
-from recon.core.errors import OutputError
+from recon.core.errors import OutputError, SettingsError
+from recon.io.files import special_kind
 
 _RENAME_EXCHANGE: Final = 2
 """Flag of Linux's renameat2; with absolute paths its folders do not matter."""
@@ -30,9 +31,11 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         The temporary path, which does not exist yet.
 
     Raises:
-        OutputError: The folder or file cannot be written, or the block wrote nothing.
+        OutputError: The folder or file cannot be written, ``path`` is a device, a pipe or a folder,
+            or the block wrote nothing.
     """
     target = Path(path)
+    check_targets([target])
     temporary = target.with_name(f".{secrets.token_hex(6)}-{target.name}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -44,6 +47,36 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         raise _output_error(target, error) from error
     finally:
         _remove(temporary)
+
+
+def check_targets(targets: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
+    """Refuse to write to what is no regular file, or is read by the same command.
+
+    Args:
+        targets: Files to be written, which need not exist.
+        inputs: Files that are read; links to them are the same files.
+
+    Raises:
+        OutputError: There is a device, a pipe, a socket or a folder.
+        SettingsError: There is an input.
+    """
+    read = {file for path in inputs if (file := _file_of(path)) is not None}
+    for target in targets:
+        if (kind := special_kind(target)) is not None:
+            expected = "a regular file, or none yet"
+            raise OutputError("cannot write the file", where=target, got=kind, expected=expected)
+        if read and _file_of(target) in read:
+            what, hint = "the result would replace an input", "choose another file or folder"
+            raise SettingsError(what, where=target, hint=hint)
+
+
+def _file_of(path: Path) -> tuple[int, int] | None:
+    """Return what identifies the file that a path leads to; None = it leads to none."""
+    try:
+        state = path.stat()
+    except (OSError, ValueError):
+        return None
+    return state.st_dev, state.st_ino
 
 
 def exchange(new: Path, old: Path) -> None:

@@ -173,7 +173,11 @@ def _open(address: str, headers: dict[str, str]) -> Iterator[http.client.HTTPRes
         DownloadError: It is no address, or the server refuses it.
         _BrokenOffError: The server cannot be reached, or is busy.
     """
-    if urlsplit(address).scheme not in ("http", "https"):
+    try:
+        scheme = urlsplit(address).scheme
+    except ValueError:  # such as half an IPv6 address
+        scheme = ""
+    if scheme not in ("http", "https"):
         raise DownloadError(
             "not an address that can be downloaded", where=address, expected="http or https"
         )

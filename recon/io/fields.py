@@ -7,9 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from recon.core.decimals import parse_numbers
 from recon.core.errors import FormatError
 from recon.core.values.arrays import Float64
 from recon.io.files import StrPath
+
+
+def numbers_of(value: Any) -> Float64:
+    """Return a number or text, or lists of them, as float64 of that shape.
+
+    Raises:
+        ValueError: One of them is not a number, or lists differ in length.
+    """
+    words = np.array(value, dtype=np.str_)
+    return np.array(parse_numbers(words.ravel().tolist())).reshape(words.shape)
 
 
 class Fields:
@@ -59,8 +70,7 @@ class Fields:
         value = self.get(name)
         parts = value.strip("[] ").replace(";", " ").split() if isinstance(value, str) else value
         try:
-            # Via text, as PyYAML reads 1e-05 (no dot) as text.
-            array = np.array(parts, dtype=np.str_).astype(np.float64)
+            array = numbers_of(parts)
         except (TypeError, ValueError) as error:
             raise self._wrong(name, value, "numbers") from error
         if not np.isfinite(array).all():

@@ -12,10 +12,9 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from typing import Any, Final
 
-import numpy as np
-
 from recon.core.errors import FormatError
 from recon.core.values.arrays import Float64
+from recon.io.fields import numbers_of
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.yaml_file import parse_yaml, plain_yaml
 
@@ -63,8 +62,7 @@ def _value(node: Any) -> Float64 | str | None:
     if isinstance(node, list) and any(isinstance(part, list | dict) for part in node):
         return None
     try:
-        # Via text, as YAML takes 1e-05 (no dot) for text.
-        return np.array(node, dtype=np.str_).astype(np.float64)
+        return numbers_of(node)
     except ValueError:
         return node if isinstance(node, str) else None
 

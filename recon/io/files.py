@@ -13,6 +13,7 @@ from typing import Final, ParamSpec, TypeVar, cast
 
 import numpy as np
 
+from recon.core.decimals import parse_numbers
 from recon.core.errors import FormatError, ReconError
 from recon.core.values.arrays import Float64
 
@@ -24,7 +25,9 @@ _R = TypeVar("_R")
 SMALL_FILE_BYTES: Final = 1 << 22
 _LONGEST_REASON: Final = 120
 _NO_DATA: Final = "begin lines that are no data with #"
+FOLDER: Final = "a folder"
 _KINDS: Final = (
+    (stat.S_ISDIR, FOLDER),
     (stat.S_ISFIFO, "a named pipe"),
     (stat.S_ISSOCK, "a socket"),
     (stat.S_ISCHR, "a device"),
@@ -90,13 +93,17 @@ def reader(read: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _refuse_special(path: StrPath) -> None:
+    if (kind := special_kind(path)) not in (None, FOLDER):
+        raise FormatError("not a regular file", where=path, got=kind)
+
+
+def special_kind(path: StrPath) -> str | None:
+    """Return what a path leads to, such as ``a device``; None = a regular file, or nothing."""
     try:
         mode = Path(path).stat().st_mode
     except (OSError, ValueError):  # missing, or not a path: found when it is opened
-        return
-    kind = next((name for test, name in _KINDS if test(mode)), None)
-    if kind is not None:
-        raise FormatError("not a regular file", where=path, got=kind)
+        return None
+    return next((name for test, name in _KINDS if test(mode)), None)
 
 
 @reader
@@ -174,7 +181,7 @@ def _parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[f
             "wrong number of columns", where=where, got=str(len(words)), expected=expected
         )
     try:
-        row = [float(word) for word in words]
+        row = parse_numbers(words)
     except ValueError as error:
         got = " ".join(words)[:60]
         raise FormatError("not a number", where=where, got=got, hint=_NO_DATA) from error

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from recon.core.decimals import parse_number
 from recon.core.errors import FormatError
 from recon.io.files import StrPath, read_text, reader
 
@@ -55,7 +56,7 @@ def _parse(line: str, where: str) -> CapturedFrame:
     words = [word.strip() for word in line.split(",")]
     try:
         left, right, left_s, right_s = words
-        times = float(left_s), float(right_s)
+        times = parse_number(left_s), parse_number(right_s)
     except ValueError as error:
         raise FormatError("not two images and their times", where=where, got=line[:60]) from error
     if not all(math.isfinite(time) for time in times):

@@ -119,7 +119,7 @@ def _from_kitti(
             got=f"{len(table)} poses",
             expected=f"{len(times)}",
         )
-    _check_positions(table[:, 3::4], lines, path)
+    check_positions(table[:, 3::4], lines, path)
     poses = np.zeros((len(table), 4, 4))
     poses[:, :3, :] = table.reshape(-1, 3, 4)
     poses[:, 3, 3] = 1.0
@@ -129,7 +129,7 @@ def _from_kitti(
 
 
 def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
-    _check_positions(table[:, 1:4], lines, path)
+    check_positions(table[:, 1:4], lines, path)
     norms = np.linalg.norm(table[:, 4:], axis=1)
     for norm, line in zip(norms, lines, strict=True):
         if abs(norm - 1) > _UNIT_TOLERANCE:
@@ -144,7 +144,12 @@ def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
     return Trajectory(np.stack(poses), table[:, 0].copy())
 
 
-def _check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
+def check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
+    """Refuse positions (N, 3) that are nowhere on Earth; ``lines`` are theirs in the file.
+
+    Raises:
+        FormatError: One is such.
+    """
     far_m = np.abs(xyz_m).max(axis=1)
     worst = int(np.argmax(far_m))
     if far_m[worst] > _FARTHEST_M:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import accumulate
 from typing import Any, Final
 
 import yaml
 
+from recon.core.decimals import is_count, parse_integer, parse_number
 from recon.core.errors import FormatError, OutputError
 from recon.io.atomic import write_text
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reading
@@ -17,6 +19,24 @@ from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reading
 _MOST_VALUES: Final = 1_000_000
 _DEEPEST: Final = 100
 _BRACKET: Final = re.compile(r"[\[\]{}]")
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads numbers as `parse_number` does; others of YAML 1.1 (1_0, 0x10, 1:30) stay text."""
+
+    def number(self, node: yaml.ScalarNode) -> float | str:
+        """Return a whole number, any other number, or the text as it stands."""
+        text = str(node.value)
+        plain = text.lower().replace(".inf", "inf").replace(".nan", "nan")
+        if is_count(plain.lstrip("+-")):
+            return parse_integer(plain)  # refuses thousands of digits
+        with suppress(ValueError):
+            return parse_number(plain)
+        return text
+
+
+for _kind in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.number)
 
 
 def parse_yaml(text: str, where: StrPath) -> Any:
@@ -29,7 +49,7 @@ def parse_yaml(text: str, where: StrPath) -> Any:
         if _depth(text) > _DEEPEST:
             raise FormatError("content is nested too deeply", where=where)
         try:
-            content = yaml.safe_load(text)
+            content = _Loader(text).get_single_data()
         except yaml.YAMLError as error:
             raise FormatError("not a YAML file", where=_place(where, error)) from error
         if _count(content, {}) > _MOST_VALUES:

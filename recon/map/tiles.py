@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply
@@ -24,6 +25,7 @@ from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter
 from recon.map.drive_chain import DriveChain
 from recon.map.fusion.part import KNOWABLE, FusedPart, join_fused
 from recon.map.ground.floor import find_floors
+from recon.map.occupancy.looks import Looks
 from recon.map.occupancy.moving import find_moved
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.rectangle import Rectangle
@@ -99,6 +101,7 @@ class Tiles:
         self._parts = TileParts(self.edge_m, path)
         self._chain = DriveChain(self._parts)
         self._known: tuple[str, ...] = KNOWABLE
+        self._looks: Looks | None = None
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
         self.submap_of_frame: NDArray[np.int64] = np.zeros(0, np.int64)
 
@@ -161,6 +164,20 @@ class Tiles:
         tiles = cls(config, T_map_world, halvings, path)
         cut = Cut.joined([tiles._parts.adopt(file) for file in files])
         return tiles if tiles._take(cut, drives) else None
+
+    @property
+    def have_looks(self) -> bool:
+        """Whether it is known what single frames saw, without which nothing is taken out."""
+        return self._looks is not None
+
+    def with_looks(self, looks: Looks | None) -> Self:
+        """Return the tiles, whose clouds leave out what frames show to have moved.
+
+        Args:
+            looks: What single frames saw; None = it is not known, and nothing is left out.
+        """
+        self._looks = looks
+        return self
 
     @property
     def resolution_m(self) -> float:
@@ -304,12 +321,13 @@ class Tiles:
     def _moved_rows(self, key: TileKey, drive: int, fused: FusedPart) -> Bool:
         """Return which rows of what a drive fused in a tile and its margin are of what moved."""
         fusion = self.config.fusion
-        if not fusion.remove_moving:
+        if not fusion.remove_moving or self._looks is None:
             return np.zeros(len(fused), np.bool_)
         points = apply(self._T_map_world, fused.points(fusion.voxel_m))
         counted = fused.enough(self._least_frames)
         voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
-        return find_moved(points, fused.frame_sigma_m, counted, voxels, evidence)
+        sigma_m = fused.frame_sigma_m
+        return find_moved(points, sigma_m, counted, voxels, evidence, self._looks)
 
 
 def _cloud_tree(cloud: PointCloud) -> dict[str, Any]:

@@ -38,7 +38,8 @@ class KissOdometry:
         points = select_points(frame, self._max_range_m)
         if len(points) < _MIN_POINTS:
             note = f"{len(points)} points are too few for ICP; the last motion goes on"
-            health = OdometryHealth(ok=not self._poses, icp_points=len(points), notes=(note,))
+            first = not self._poses
+            health = OdometryHealth(first, skipped=not first, icp_points=len(points), notes=(note,))
             return self._keep(self._extrapolated(), health)
         alignment = self._icp.register(points.xyz)
         health = OdometryHealth(icp_points=len(alignment.source))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Final, Literal, get_args
@@ -47,33 +47,36 @@ class FoundAxes:
 def find_axes(
     prior: Trajectory, frames: Iterable[OdometryFrame], settings: PriorSettings
 ) -> FoundAxes | None:
-    """Compare a prior in all supported axes with the visual motion of some frames.
+    """Compare a prior in the axes that it may have with the visual motion of some frames.
 
     Args:
         prior: Path of the rig by other sensors.
         frames: Frames in order; as many are read as are needed.
-        settings: The accuracy of the prior.
+        settings: The accuracy of the prior, and its axes; auto = all supported ones are tried.
 
     Returns:
         The axes; None if the cameras do not see enough motion to decide.
 
     Raises:
-        RegistrationError: The prior contradicts the visual motion in all axes.
+        RegistrationError: The prior contradicts the visual motion in these axes.
     """
-    priors = {axes: MotionPrior(prior, _in_axes(settings, axes)) for axes in get_args(Axes)}
-    off = [_distances(priors, motion) for motion in _visual_motions(priors["camera"], frames)]
+    tried: Sequence[Axes] = get_args(Axes) if settings.axes == "auto" else (settings.axes,)
+    priors = {axes: MotionPrior(prior, _in_axes(settings, axes)) for axes in tried}
+    off = [_distances(priors, motion) for motion in _visual_motions(priors[tried[0]], frames)]
     if not off:
         return None
-    sigmas = {axes: float(np.median([one[axes] for one in off])) for axes in priors}
-    best = min(priors, key=lambda axes: sigmas[axes])
+    sigmas: dict[str, float] = {
+        axes: float(np.median([one[axes] for one in off])) for axes in tried
+    }
+    best = min(tried, key=lambda axes: sigmas[axes])
     if sigmas[best] > MAX_SIGMAS:
         misfits = ", ".join(f"{axes} axes {sigmas[axes]:.1f}" for axes in priors)
         raise RegistrationError(
-            "the prior fits what the cameras see in no axes",
+            "the prior does not fit what the cameras see",
             got=f"{misfits} standard deviations off in {len(off)} motions",
             expected=f"at most {MAX_SIGMAS:g}",
-            hint="it must be the path of this rig, in metres and on its clock; name its axes with "
-            "--set odometry.prior.axes= to use it nevertheless",
+            hint="it must be the path of this rig, in metres and on its clock; see "
+            "odometry.prior.axes, and odometry.prior.sigma_m if it is no better",
         )
     return FoundAxes(best, sigmas, len(off))
 
@@ -127,10 +130,12 @@ def _visual_motions(prior: MotionPrior, frames: Iterable[OdometryFrame]) -> list
             continue
         covariance = covariance + covariance_of(seen.information)
         expected = prior.motion(start[1], time_s)
-        if expected is not None and _in_sigmas(expected, prior.settings) < _CLEAR:
-            continue
+        T = invert(start[2]) @ now[2]
         if expected is not None:
-            T = invert(start[2]) @ now[2]
+            # A prior that says too little, in kilometres, is contradicted by what is seen.
+            size = max(_in_sigmas(motion, prior.settings) for motion in (expected, T))
+            if size < _CLEAR:
+                continue
             motions.append(_VisualMotion(start[1], time_s, index - start[0], T, covariance))
         start, covariance = now, np.zeros((6, 6))
         if len(motions) == _ENOUGH:

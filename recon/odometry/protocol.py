@@ -35,6 +35,8 @@ class OdometryHealth:
     Attributes:
         ok: False where the pose is not to be trusted: it is extrapolated, or the image
             contradicts it.
+        skipped: True where later poses are measured past this one, from those before it. After
+            any other pose that is not ok, nothing says where the later ones are.
         known: True where the pose was given, not measured: nothing later bends it.
         tracks: Features followed from the last frame.
         inliers: Features that agree with the visual motion.
@@ -51,6 +53,7 @@ class OdometryHealth:
     """
 
     ok: bool = True
+    skipped: bool = False
     known: bool = False
     tracks: int = 0
     inliers: int = 0

@@ -228,7 +228,8 @@ class VisualOdometry:
         self._state = begun if sees else replace(state, motion=motion)
         why = f"{what if sees else 'nothing to follow in the image'} ({points} features)"
         if prior_motion is None or self._prior is None:
-            health = OdometryHealth(False, notes=(f"lost: {why}; the last motion goes on",))
+            notes = (f"lost: {why}; the last motion goes on",)
+            health = OdometryHealth(ok=False, skipped=not sees, notes=notes)
             return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
         sigma_m, sigma_deg = self._prior.sigmas(prior_motion)
         note = f"carried by the prior: {why}"

@@ -65,7 +65,7 @@ def write_batch_page(
             for one, cells, why in _ranked(results)
         ],
         sweep=sweep,
-        warnings=failed,
+        warnings=[*failed, *summary["warnings"]],
     )
 
 

@@ -14,10 +14,10 @@ from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive
 from recon.report.drive_figures import grid_figure, path_figure, seen_from_above
 from recon.report.page import write_page
-from recon.report.style import BAD, FAINT, WIDE_IN, styled, to_png
+from recon.report.style import BAD, FAINT, TRUTH, WIDE_IN, styled, to_png
 from recon.run.directory import RunDirectory
 
-_SHADES: Final = {State.SEARCHING: FAINT, State.LOST: BAD}
+_SHADES: Final = {State.SEARCHING: FAINT, State.COASTING: TRUTH, State.LOST: BAD}
 
 
 def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
@@ -40,11 +40,9 @@ def _path(result: LocalizeRun) -> bytes | None:
 
 @styled
 def certainty_figure(drive: LocalizedDrive) -> bytes:
-    """Return standard deviations of each pose, and what confirms it; other frames are shaded."""
+    """Return standard deviations of each pose, and what confirms it; the others are shaded."""
     known = [frame.located for frame in drive.frames]
-    sigmas_m = [
-        np.nan if x.covariance is None else np.sqrt(np.trace(x.covariance[:3, :3])) for x in known
-    ]
+    sigmas_m = [located.sigma_m for located in known]
     inliers = [float(x.inliers) if x.covariance is not None else np.nan for x in known]
     figure = Figure((WIDE_IN, 4.4))
     upper, lower = figure.subplots(2, 1, sharex=True)
@@ -61,7 +59,7 @@ def certainty_figure(drive: LocalizedDrive) -> bytes:
 
 
 def _shade(axes: Axes, states: Sequence[State]) -> None:
-    """Mark the frames without a pose."""
+    """Mark the frames whose pose nothing confirms."""
     for number, state in enumerate(states):
         if state in _SHADES:
             ends = (number - 0.5, number + 0.5)

@@ -26,7 +26,9 @@ _PAPERS_MM: Final = {
     "tabloid": (279.4, 431.8),
 }  # fmt: skip
 _AUTO: Final = ("a4", "a3", "a2", "a1", "a0")
-_CUSTOM: Final = re.compile(r"(\d+(?:\.\d*)?)\s*[x×]\s*(\d+(?:\.\d*)?)\s*mm", re.IGNORECASE)
+_CUSTOM: Final = re.compile(
+    r"(\d+(?:\.\d*)?)\s*[x×]\s*(\d+(?:\.\d*)?)\s*mm", re.IGNORECASE | re.ASCII
+)
 _KINDS: Final = (".pdf", ".png")
 _MM_PER_IN: Final = 25.4
 _POINT_MM: Final = _MM_PER_IN / 72

@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
-from recon.core.errors import SourceError
+from recon.core.decimals import is_count
+from recon.core.errors import SettingsError, SourceError
 from recon.core.values import Rig, StereoPair
 from recon.rig.capture import (
     CaptureSettings,
@@ -16,8 +17,9 @@ from recon.rig.capture import (
     open_cameras,
     warm_up,
 )
-from recon.sources.calibration import read_rig
+from recon.sources.calibration import CALIBRATE, read_rig
 from recon.sources.opencv_camera import Camera
+from recon.sources.protocol import source_text
 from recon.sources.settings import SourceSettings
 
 
@@ -47,6 +49,9 @@ class CameraSource:
         self.name = " and ".join(camera.name for camera in cameras)
         self.description = "pairs from cameras"
 
+    def __repr__(self) -> str:
+        return source_text(self)
+
     @property
     def live(self) -> bool:
         """Whether all are cameras; video files take as long as one likes."""
@@ -73,7 +78,7 @@ class CameraSource:
 
 def is_camera(name: str) -> bool:
     """Return whether a name is that of a camera, not of a recording: a number, a device, a URL."""
-    number = name.isdecimal() and not Path(name).exists()
+    number = is_count(name) and not Path(name).exists()
     return number or "://" in name or name.startswith("/dev/")
 
 
@@ -94,15 +99,23 @@ def open_camera_source(
 
     Raises:
         SourceError: A camera cannot be opened or gives no pair, or no calibration is named.
+        SettingsError: The right images are to be those of later frames.
         FormatError: The calibration is damaged.
         CalibrationError: It cannot give depth, or is of another image size.
     """
+    if source.shift_frames:
+        raise SettingsError(
+            "images of cameras are paired as they are taken",
+            where="source.shift_frames",
+            got=source.shift_frames,
+            expected=0,
+            hint="record them with recon capture, and map the recording with it",
+        )
     recording = RecordingSettings.parse({**dict(settings), "frames": source.end})
     with open_cameras(devices, settings) as cameras:
         where = " and ".join(camera.name for camera in cameras)
-        if source.calibration is None:
-            hint = "name one with --calib FILE"
-            raise SourceError("cameras need a calibration", where=where, hint=hint)
+        if not source.has_camera:
+            raise SourceError("cameras need a calibration", where=where, hint=CALIBRATE)
         warm_up(cameras, recording)
         first = next(capture_pairs(cameras, recording, stopped), None)
         if first is None:

@@ -125,8 +125,8 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
     Raises:
         CalibrationError: The features of the images fix no homographies.
     """
-    step = max(1, len(images.pairs) // _UNCALIBRATED_PAIRS)
-    some = replace(images, pairs=images.pairs[::step][:_UNCALIBRATED_PAIRS])
+    even = np.linspace(0, len(images.pairs) - 1, min(len(images.pairs), _UNCALIBRATED_PAIRS))
+    some = replace(images, pairs=tuple(images.pairs[int(at)] for at in even))
     greys = [(to_grey(pair.left), to_grey(pair.right)) for pair, _ in read_pairs(some)]
     height, width = greys[0][0].shape
     size = (width, height)
@@ -142,6 +142,8 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
         raise error.but(where=images.pairs[0][0], hint=hint) from error
 
     def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
+        if result.model == "raw":
+            return pair.left, pair.right
         left, right = (
             np.asarray(cv2.warpPerspective(image, H, size))
             for image, H in ((pair.left, result.H_left), (pair.right, result.H_right))
@@ -169,9 +171,12 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
 def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
     return {
         "method": "features",
+        "model": result.model,
         "up_to_scale": True,
         "matches": result.matches,
         "inliers": len(result.features),
+        "row_error_before_px": result.before_px,
+        "row_error_after_px": result.after_px,
         "row_error_held_out_px": plain(result.held_out_px),
         "disparity_range_px": list(result.disparity_px),
         "H_left": result.H_left.tolist(),

@@ -3,6 +3,9 @@
 Everything is written below ``<folder>/.partial`` and moved up when the run is done. A run that
 fails removes its partial files and leaves an earlier run in the same folder untouched. A run that
 was killed, interrupted or met a full disk keeps them if it can be resumed.
+
+The folder itself may be a link, such as ``outputs/map/latest``; below it no link is followed, since
+a folder that comes from elsewhere could lead anywhere.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,11 +22,14 @@ from typing import Any, ClassVar, Final
 
 from typing_extensions import Self
 
-from recon.core.errors import ClusterError, MemoryLimitError, OutputError
-from recon.io.atomic import exchange, write_text
+from recon.core.errors import ClusterError, FormatError, MemoryLimitError, OutputError
+from recon.io.atomic import check_targets, exchange, write_text
+from recon.io.files import read_text, reading
 from recon.io.lock import take_lock
 
 RECORD: Final = "run.json"
+RECORD_BYTES: Final = 1 << 26
+"""Larger than any record: it lists the files of a run."""
 STARTED: Final = "map.recon"
 """State file of a run that can be resumed: the map that it makes."""
 _PARTIAL: Final = ".partial"
@@ -53,6 +59,21 @@ def default_folder(command: str) -> Path:
     return Path("outputs") / command / stamp
 
 
+def refuse_links(folder: Path) -> None:
+    """Refuse a result folder that has links in it, which may lead to files of anybody.
+
+    Raises:
+        FormatError: It has one; it is named.
+    """
+    for place, folders, files in os.walk(folder):
+        for name in sorted((*folders, *files)):
+            path = Path(place, name)
+            if path.is_symlink():
+                hint = "remove it; what it leads to stays"
+                what = "a link in a result folder is not followed"
+                raise FormatError(what, where=path, hint=hint)
+
+
 class RunDirectory:
     """Context manager: files are written to `path` and appear in `folder` on success.
 
@@ -62,12 +83,14 @@ class RunDirectory:
         resume: Resume the unfinished run in the folder.
 
     Attributes:
+        begun: Whether there is a map from which the run can be resumed; who begins one says so.
         whole: Write beside the folder, and put the new one in its place in one step: there is
             the old run or the new one at any time, never some files of each.
 
     Raises:
         OutputError: The folder cannot be written, holds files that are not of a run, or another
             run is writing to it.
+        FormatError: It has links in it, or its record cannot be read.
     """
 
     whole: ClassVar[bool] = False
@@ -75,8 +98,10 @@ class RunDirectory:
     def __init__(self, folder: Path, *, latest: bool = False, resume: bool = False) -> None:
         self.folder = folder
         self.resumes = resume
+        self.begun = resume and (state_folder(folder) / STARTED).is_file()
         self._latest = latest
         self._made: list[Path] = []
+        self._earlier: list[Path] = []
         self._lock: int | None = None
 
     def path(self, name: str) -> Path:
@@ -105,6 +130,8 @@ class RunDirectory:
         _refuse_address(self.folder)
         if not self.resumes:
             _refuse_foreign(self.folder)
+        refuse_links(self.folder)
+        self._earlier = recorded_files(self.folder)
         self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
         try:
             self._lock = take_lock(
@@ -123,17 +150,12 @@ class RunDirectory:
         try:
             if kind is None:
                 self._publish()
-            elif not (self.resumable and (self.resumes or issubclass(kind, _PASSING))):
+            elif not (self.begun and (self.resumes or issubclass(kind, _PASSING))):
                 self._withdraw()
         except OSError as failure:
             raise _unwritable(self.folder, failure) from failure
         finally:
             self._release()
-
-    @property
-    def resumable(self) -> bool:
-        """Whether the run has begun a map."""
-        return (state_folder(self.folder) / STARTED).is_file()
 
     def _release(self) -> None:
         if self._lock is not None:
@@ -142,8 +164,10 @@ class RunDirectory:
 
     def _clear(self) -> None:
         """Remove partial files of an earlier run; a resumed run keeps its state."""
-        if self.whole:
-            shutil.rmtree(self._content, ignore_errors=True)  # of one that was killed
+        if self.whole:  # of one that was killed
+            if self._content.is_symlink():
+                self._content.unlink()
+            shutil.rmtree(self._content, ignore_errors=True)
         kept = {_LOCK, _STATE} if self.resumes else {_LOCK}
         for path in self._partial.iterdir():
             if path.name in kept:
@@ -152,6 +176,17 @@ class RunDirectory:
                 shutil.rmtree(path)
             else:
                 path.unlink()
+
+    def check_targets(self, inputs: Iterable[Path]) -> None:
+        """Refuse to replace or remove what this run has read, or what is no regular file.
+
+        Raises:
+            OutputError: One is no regular file.
+            SettingsError: One was read.
+        """
+        if not self.whole:  # else the folder is replaced, and with it the run that was read
+            changed = {*map(Path, self.files()), *self._earlier}
+            check_targets((self.folder / name for name in sorted(changed)), inputs)
 
     @property
     def _partial(self) -> Path:
@@ -176,7 +211,7 @@ class RunDirectory:
     def _move(self) -> None:
         """Move the files to their places one by one."""
         files = [Path(name) for name in self.files()]
-        for stale in set(_earlier_files(self.folder)) - set(files):
+        for stale in set(self._earlier) - set(files):
             (self.folder / stale).unlink(missing_ok=True)
         # The record goes last: a folder with a new run.json has every file it lists.
         for file in sorted(files, key=lambda f: f.name == RECORD):
@@ -189,12 +224,12 @@ class RunDirectory:
     def _swap(self) -> None:
         """Put the new folder in the place of the old one, with files in it that are of no run."""
         shutil.rmtree(self._content / _STATE, ignore_errors=True)
-        ours = {self.folder / name for name in _earlier_files(self.folder)}
+        ours = {self.folder / name for name in self._earlier}
         for path in self.folder.rglob("*"):
             target = self._content / path.relative_to(self.folder)
             if path.is_file() and path not in ours and self._partial not in path.parents:
                 target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(path, target)
+                shutil.copy2(path, target, follow_symlinks=False)
         new = self._content
         exchange(new, self.folder.resolve())
         shutil.rmtree(new, ignore_errors=True)
@@ -231,20 +266,34 @@ def _refuse_foreign(folder: Path) -> None:
         )
 
 
-def _earlier_files(folder: Path) -> list[Path]:
-    try:
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        names = [Path(name) for name in record.get("files", [])]
-    except (OSError, ValueError, AttributeError):
-        return []  # no earlier run or a broken record: no file is known to be stale
-    return [name for name in names if not name.is_absolute() and ".." not in name.parts]
+def recorded_files(folder: Path) -> list[Path]:
+    """Return the files that a folder has of a run, below it; none without a record.
+
+    Raises:
+        FormatError: Its record cannot be read.
+    """
+    path = folder / RECORD
+    if not path.is_file():
+        return []
+    with reading(path):
+        names = json.loads(read_text(path, RECORD_BYTES)).get("files", [])
+        if not isinstance(names, list) or not all(_is_name(name) for name in names):
+            raise FormatError("record of a run has no valid list of files", where=path)
+        inside = (n for n in map(Path, names) if not n.is_absolute() and ".." not in n.parts)
+        return [name for name in inside if (folder / name).is_file()]
+
+
+def _is_name(name: object) -> bool:
+    """Return whether a value can be the name of a file."""
+    return isinstance(name, str) and "\0" not in name and os.fsencode(name) != b""
 
 
 def _link_latest(folder: Path) -> None:
     link = folder.parent / "latest"
-    with suppress(OSError):  # a file system without links: the stamped folder is enough
-        link.unlink(missing_ok=True)
-        link.symlink_to(folder.name)
+    if not link.exists() or link.is_symlink():
+        with suppress(OSError):  # a file system without links: the stamped folder is enough
+            link.unlink(missing_ok=True)
+            link.symlink_to(folder.name)
 
 
 def _unwritable(folder: Path, error: OSError) -> OutputError:

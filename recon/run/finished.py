@@ -11,24 +11,23 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.decimals import is_count
 from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
 from recon.io.files import StrPath, read_text, reader, reading
-from recon.run.directory import RECORD
+from recon.run.directory import RECORD, RECORD_BYTES, refuse_links
 from recon.run.run import SUMMARY
 
-RECORD_BYTES: Final = 1 << 26
-"""Larger than any record: it lists the files of a run."""
 GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
 CLOUD: Final = "map/cloud.ply"
 PAIR_CLOUD: Final = "clouds/cloud.ply"
 MAPPED_BY: Final = "mapped_by"
 """Record key of a run made from another run: the command that mapped the drive."""
-UNTRUSTED: Final = "untrusted_frames"
-"""Record key of the numbers of frames whose pose is not to be trusted."""
+DOUBTS: Final = "doubts"
+"""Record key of a run made from another run, without a map of its own: what was doubted there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +38,13 @@ class FinishedRun:
         folder: Its folder.
         mapped_by: The command that mapped the drive, such as ``demo``.
         T_map_world: float64 (4, 4), from world to map axes.
-        untrusted: Numbers of the frames whose pose is not to be trusted.
+        doubts: What was doubted in the map that a run without one was made from.
     """
 
     folder: Path
     mapped_by: str
     T_map_world: Float64
-    untrusted: tuple[int, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "T_map_world", np.float64, (4, 4))
@@ -60,7 +59,7 @@ class FinishedRun:
 
 def _session_of(path_file: Path) -> int:
     """Return the number of the drive whose folder a file is in."""
-    return int(path_file.parent.name) if path_file.parent.name.isdecimal() else sys.maxsize
+    return int(path_file.parent.name) if is_count(path_file.parent.name) else sys.maxsize
 
 
 def open_run(folder: Path) -> FinishedRun:
@@ -77,10 +76,10 @@ def open_run(folder: Path) -> FinishedRun:
         T_map_world = np.array(record["T_map_world"], dtype=np.float64)
     check_rigid("T_map_world", T_map_world, path)
     mapped_by = record.get(MAPPED_BY, record.get("command"))
-    untrusted = record.get(UNTRUSTED, [])
-    if not isinstance(untrusted, list) or not all(type(n) is int for n in untrusted):
-        raise FormatError(f"record of the run has no valid {UNTRUSTED}", where=folder / RECORD)
-    return FinishedRun(folder, str(mapped_by), T_map_world, tuple(untrusted))
+    doubts = record.get(DOUBTS, [])
+    if not isinstance(doubts, list) or not all(isinstance(line, str) for line in doubts):
+        raise FormatError(f"record of the run has no valid {DOUBTS}", where=path)
+    return FinishedRun(folder, str(mapped_by), T_map_world, tuple(doubts))
 
 
 def is_pair_run(folder: Path) -> bool:
@@ -113,16 +112,16 @@ def camera_of_pair(folder: Path) -> RectifiedCamera:
         ) from error
 
 
-def camera_height_of(folder: Path) -> float | None:
-    """Return the height of the camera of a run above the ground, from its summary; None = unknown.
+def figure_of(folder: Path, name: str) -> float | None:
+    """Return a figure of a run, such as ``camera_height_m``, from its summary; None = unknown.
 
     Raises:
         FormatError: The folder does not contain a finished run, or its summary is damaged.
     """
-    height_m = _read_record(folder / SUMMARY).get("camera_height_m")
-    if height_m is None or (type(height_m) in (int, float) and math.isfinite(height_m)):
-        return height_m
-    raise FormatError("the summary of the run has no valid camera_height_m", where=folder / SUMMARY)
+    figure = _read_record(folder / SUMMARY).get(name)
+    if figure is None or (type(figure) in (int, float) and math.isfinite(figure)):
+        return figure
+    raise FormatError(f"the summary of the run has no valid {name}", where=folder / SUMMARY)
 
 
 def refuse_as_target(run: Path, out: StrPath | None) -> None:
@@ -141,6 +140,7 @@ def _read_record(path: Path) -> dict[str, Any]:
         raise FormatError(
             "folder does not contain a finished run", where=path.parent, expected=f"a {path.name}"
         )
+    refuse_links(path.parent)
     record = json.loads(read_text(path, RECORD_BYTES))
     if not isinstance(record, dict):
         raise FormatError("record of the run cannot be read", where=path)

@@ -23,23 +23,29 @@ from recon.run.machine import available_cores
 MIN_PYTHON: Final = (3, 10)
 MIN_MEMORY_GB: Final = 3.0
 MIN_DISK_GB: Final = 1.0
-_IMPORT_TIMEOUT_S: Final = 120.0
+_TIMEOUT_S: Final = 120.0
 
 # Package name -> module name.
 PACKAGES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "numpy": "numpy",
+        "llvmlite": "llvmlite",
         "numba": "numba",
         "opencv-python-headless": "cv2",
         "open3d": "open3d",
         "kiss-icp": "kiss_icp",
         "pymeshlab": "pymeshlab",
+        "pillow": "PIL",
+        "jinja2": "jinja2",
         "matplotlib": "matplotlib",
         "plotly": "plotly",
         "pydantic": "pydantic",
         "typer": "typer",
         "rich": "rich",
         "pyyaml": "yaml",
+        "threadpoolctl": "threadpoolctl",
+        "typing-extensions": "typing_extensions",
+        **({} if sys.version_info >= (3, 11) else {"tomli": "tomli"}),
     }
 )
 # Shared library -> Debian or Ubuntu package that provides it.
@@ -94,7 +100,7 @@ def check_package(name: str, module: str) -> Check:
         installed = version(name)
     except PackageNotFoundError:
         return Check(name, ok=False, found="not installed", hint=f"run: pip install {name}")
-    done, printed = _run_python(f"import {module}")
+    done, printed = run_python(f"import {module}")
     if done:
         return Check(name, ok=True, found=installed)
     return Check(name, ok=False, found=f"{installed}, {printed}", hint=_import_hint(name, printed))
@@ -125,7 +131,7 @@ def check_memory() -> Check:
 
 def check_opencv_threads() -> Check:
     """Ask OpenCV for its default number of threads."""
-    done, printed = _run_python("import cv2; print(cv2.getNumThreads())")
+    done, printed = run_python("import cv2; print(cv2.getNumThreads())")
     found = printed if done else "unknown"
     return Check("OpenCV threads", done, found, "" if done else "see opencv", needed=False)
 
@@ -186,31 +192,31 @@ def check_disk(folder: Path) -> Check:
     return Check("free disk space", ok, f"{free_gb:.1f} GB", hint, needed=False)
 
 
-def _check_library(library: str, package: str) -> Check:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return Check(library, ok=False, found="missing", hint=f"run: apt-get install {package}")
-    return Check(library, ok=True, found="loads")
-
-
-def _run_python(code: str) -> tuple[bool, str]:
-    """Return whether code runs in a new Python process, and the last line that it printed."""
+def run_python(code: str, timeout_s: float = _TIMEOUT_S) -> tuple[bool, str]:
+    """Run code in a new Python process: whether it ran, and the last line that it printed."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", code],
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=_IMPORT_TIMEOUT_S,
+            timeout=timeout_s,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return False, f"no answer in {_IMPORT_TIMEOUT_S:g} s"
+        return False, f"no answer in {timeout_s:g} s"
     if done.returncode < 0:
         return False, f"crashed with signal {-done.returncode}"
     lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
     return done.returncode == 0, lines[-1] if lines else ""
+
+
+def _check_library(library: str, package: str) -> Check:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return Check(library, ok=False, found="missing", hint=f"run: apt-get install {package}")
+    return Check(library, ok=True, found="loads")
 
 
 def _import_hint(name: str, printed: str) -> str:

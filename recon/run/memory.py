@@ -12,7 +12,7 @@ from recon.core.settings import Settings
 from recon.run.machine import peak_memory_mb, return_free_memory
 
 _UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
-_SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*")
+_SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", re.ASCII)
 #: Shares of the limit for an open submap, the cells of one tile, and what was read from the map.
 #: Sums grow by doubling
 #: and are copied when closed, so each briefly costs several times its size; most of the limit is

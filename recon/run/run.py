@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -16,9 +17,10 @@ from recon.io.files import StrPath
 from recon.io.yaml_file import write_yaml
 from recon.run.directory import RECORD, RunDirectory, default_folder
 from recon.run.fingerprint import fingerprint
-from recon.run.machine import peak_memory_mb, use_threads, versions
+from recon.run.machine import peak_memory_mb, versions
 from recon.run.progress import SILENT, Progress
 from recon.run.stopwatch import Stopwatch
+from recon.run.threads import use_threads
 
 CONFIG: Final = "config.yaml"
 SUMMARY: Final = "summary.json"
@@ -77,8 +79,12 @@ class Run(RunDirectory):
 
     def __enter__(self) -> Self:
         super().__enter__()
-        if self._config is not None:
-            write_yaml(self.path(CONFIG), self._config.recorded(self.command))
+        try:
+            if self._config is not None:
+                write_yaml(self.path(CONFIG), self._config.recorded(self.command))
+        except BaseException:  # such as a full disk
+            self.__exit__(*sys.exc_info())
+            raise
         return self
 
     def stage(self, name: str) -> AbstractContextManager[None]:
@@ -108,7 +114,13 @@ class Run(RunDirectory):
             source: What was processed.
             inputs: The files that were read, of which the record has a hash.
             record: What else the record has.
+
+        Raises:
+            OutputError: A file cannot be written.
+            SettingsError: The results would replace one of ``inputs``.
         """
+        inputs = tuple(inputs)
+        self.check_targets(inputs)
         summary |= {**self._cost(), "out": str(self.folder)}
         self.write_json(SUMMARY, summary)
         with self.stage("hash"):

@@ -24,26 +24,26 @@ from recon.sources.bag_topics import (
     names_rectified,
     rig_of_messages,
 )
-from recon.sources.calibration import as_rectified, read_rig
-from recon.sources.frame_list import FrameList, check_most
+from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
+from recon.sources.frame_list import check_most, pair_frames
 from recon.sources.one_pair import join_pair
 from recon.sources.protocol import Recording
 from recon.sources.rosbags import CAMERA_INFO, Bag, BagImage
 from recon.sources.settings import SourceSettings
-from recon.sources.stamps import StampPairs, check_increasing, pair_stamps
+from recon.sources.stamps import check_increasing, pair_stamps, pairs_in_time
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
 _S: Final = 1e-9
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class BagSource(Recording):
     """A drive in a bag, which does not say which poses are true; messages are read one at a time.
 
     Attributes:
         bag: The recording.
         topics: Left and right image topic.
-        pairs: Pairs of left and right messages.
+        pairs: Indices of the left and the right message of each pair.
         left_s: float64 (M,), timestamps of all left messages.
         recorded_ns: int64 (M,) and (K,), recording times of the left and right messages.
         stamped: Whether timestamps are those of the headers, not of the recording.
@@ -51,7 +51,7 @@ class BagSource(Recording):
 
     bag: Bag
     topics: tuple[str, str]
-    pairs: StampPairs
+    pairs: Sequence[tuple[int, int]]
     left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     stamped: bool = True
@@ -68,7 +68,7 @@ class BagSource(Recording):
     @property
     def stamps_s(self) -> Float64:
         """float64 (N,), times of the left images of the pairs."""
-        return self.left_s[list(self.pairs.left)]
+        return self.left_s[[left for left, _ in self.pairs]]
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Read the pairs from number ``start`` on, without reading the messages before.
@@ -81,12 +81,11 @@ class BagSource(Recording):
             return
         # One reader per camera, so that pairs with messages far apart need no buffer.
         views = zip(
-            self._images(0, self.pairs.left[start:]),
-            self._images(1, self.pairs.right[start:]),
+            *(self._images(side, [pair[side] for pair in self.pairs[start:]]) for side in (0, 1)),
             strict=True,
         )
         for index, (left, right) in enumerate(views, start=start):
-            stamp_s = float(self.left_s[self.pairs.left[index]])
+            stamp_s = float(self.left_s[self.pairs[index][0]])
             yield join_pair(left, right, stamp_s, index, f"{self.topics[0]}, pair {index}")
 
     def _images(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
@@ -122,11 +121,11 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     topics, also = choose_topics(bag, settings)
     times = bag.scan(topics)
     stamps, clock = _stamps(times, topics, path)
-    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
-    rig, texts, source = _read_rig(bag, topics, pairs, settings, path)
+    found = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
+    check_most(len(found.left), min(map(len, stamps)), path)
+    pairs, listing = pair_frames(pairs_in_time(stamps, found), settings, path)
+    rig, texts, source = _read_rig(bag, topics, pairs[0][0], settings, path)
     also += list_others(bag, topics)
-    listing = FrameList([""] * len(stamps[0]), pairs.left, pairs.alone).choose(settings, path)
-    check_most(len(pairs.left), min(map(len, stamps)), path)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
         name=path.resolve().name,
@@ -135,7 +134,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         calibration=rig,
         bag=bag,
         topics=topics,
-        pairs=StampPairs(listing.used(pairs.left), listing.used(pairs.right), pairs.alone),
+        pairs=pairs,
         listing=listing,
         left_s=stamps[0],
         recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),
@@ -203,23 +202,23 @@ def _stamps(
 def _read_rig(
     bag: Bag,
     topics: tuple[str, str],
-    pairs: StampPairs,
+    first: int,
     settings: SourceSettings,
     path: Path,
 ) -> tuple[Rig, tuple[Path, ...], str]:
     """Return the calibration, the files it was read from, and a note on its origin."""
     infos = [camera_info_topic(bag, topic) for topic in topics]
-    if settings.calibration is not None:
-        first = next(islice(bag.images(topics[0]), pairs.left[0], None))
-        image = decode_message(first, f"{path}: {topics[0]}")
+    if settings.has_camera:
+        message = next(islice(bag.images(topics[0]), first, None))
+        image = decode_message(message, f"{path}: {topics[0]}")
         rig, texts = read_rig(settings, path, (image.shape[1], image.shape[0]))
-        return rig, texts, f"calibration {settings.calibration}"
+        return rig, texts, f"calibration {settings.calibration or 'in numbers'}"
     if None in infos:
         raise SourceError(
             "recording has no calibration of both cameras",
             where=path,
             got=list_topics(bag, (CAMERA_INFO,)) or "no CameraInfo",
-            hint="name a file with --calib",
+            hint=CALIBRATE,
         )
     left, right = (bag.camera_info(topic) for topic in infos if topic is not None)
     rectified = all(map(names_rectified, topics))

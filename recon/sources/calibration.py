@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.errors import SourceError
+from recon.core.errors import CalibrationError, SettingsError, SourceError
 from recon.core.values import RectifiedCamera, Rig, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
 from recon.sources.settings import SourceSettings
@@ -22,16 +22,24 @@ _ROWS: Final = ([0, 0, 1, 1], [0, 1, 1, 2])
 _DIGITS_TOLERANCE: Final = 1e-9
 
 
+CALIBRATE: Final = (
+    "name one with --calib FILE; of rectified images --focal PX and --baseline M are enough"
+)
+"""What to do where a source lacks a calibration."""
+_WIDEST_DEG: Final = 165.0
+"""Flat images see no more: a pixel at the side would be 60 times as wide as in the middle."""
+
+
 def read_rig(
     settings: SourceSettings,
     folder: Path,
     size: tuple[int, int],
     cameras: tuple[int, int] | None = None,
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """Read the calibration named in the settings, else the one in a folder.
+    """Return the calibration that the settings name or give in numbers, else that in a folder.
 
     Args:
-        settings: May name a file.
+        settings: May name a file, or give the numbers of rectified cameras.
         folder: The folder to search otherwise.
         size: Image width and height.
         cameras: Left and right camera of a KITTI file; None = grey if it has that pair.
@@ -41,19 +49,81 @@ def read_rig(
 
     Raises:
         SourceError: No file is named and none is found.
+        SettingsError: The camera is given twice.
         FormatError: The file is damaged.
         CalibrationError: The calibration cannot give depth, or is of another image size.
     """
+    check_given_once(settings.calibration, settings)
+    if settings.numbers:
+        return camera_of_numbers(settings, size), ()
     path = find_calibration(folder) if settings.calibration is None else Path(settings.calibration)
     if path is None:
         raise SourceError(
             "calibration is missing",
             where=folder,
             expected="calib.txt, calibration.yaml, … in the folder",
-            hint="name one with --calib FILE",
+            hint=CALIBRATE,
         )
     rig = read_calibration(path, *size, metres_per_unit=settings.metres_per_unit, cameras=cameras)
     return as_rectified(rig), (path,)
+
+
+def check_given_once(calibration: object, settings: SourceSettings) -> None:
+    """Refuse a camera that is given both by a calibration file and in numbers.
+
+    Raises:
+        SettingsError: It is.
+    """
+    if calibration is not None and settings.numbers:
+        raise SettingsError(
+            "--focal, --baseline, --cx and --cy replace a calibration file",
+            where="--calib",
+            got=calibration,
+            hint="give either",
+        )
+
+
+def camera_of_numbers(
+    settings: SourceSettings, size: tuple[int, int], **instead: float
+) -> RectifiedCamera:
+    """Return the camera of rectified images of which the settings give the numbers.
+
+    Args:
+        settings: Focal length and baseline; the principal point is else the middle.
+        size: Image width and height.
+        instead: Numbers to use where the settings have none.
+
+    Raises:
+        CalibrationError: Focal length or baseline is missing, or the former is implausible.
+    """
+    numbers = {**instead, **settings.numbers}
+    focal_px, baseline_m = numbers.get("focal_px"), numbers.get("baseline_m")
+    if focal_px is None or baseline_m is None:
+        raise CalibrationError(
+            "a rectified camera needs focal length and baseline",
+            where="--focal, --baseline",
+            got=", ".join(f"{name}={value:g}" for name, value in settings.numbers.items()),
+            hint="give both, or --calib FILE",
+        )
+    cx_px = numbers.get("cx_px", (size[0] - 1) / 2)
+    camera = RectifiedCamera(
+        focal_px=focal_px,
+        cx_px=cx_px,
+        cy_px=numbers.get("cy_px", (size[1] - 1) / 2),
+        cx_right_px=cx_px,
+        baseline_m=baseline_m,
+        width_px=size[0],
+        height_px=size[1],
+    )
+    if camera.field_of_view_deg > _WIDEST_DEG:
+        raise CalibrationError(
+            "focal length is implausible",
+            where="--focal",
+            got=f"{focal_px:g} px: images of {size[0]} px see {camera.field_of_view_deg:.0f} deg",
+            expected=f"at most {_WIDEST_DEG:g} deg",
+            hint="it is in pixels, not in millimetres",
+        )
+    return camera
 
 
 def find_calibration(folder: Path) -> Path | None:

@@ -73,7 +73,7 @@ def _read_list(view: Path) -> list[tuple[float, Path]]:
 def _read_rig(
     root: Path, settings: SourceSettings, views: list[Path], size: tuple[int, int]
 ) -> tuple[Rig, tuple[Path, ...]]:
-    if settings.calibration is not None:
+    if settings.has_camera:
         return read_rig(settings, root, size)
     paths = [view / "sensor.yaml" for view in views]
     if not paths[0].is_file():

@@ -140,10 +140,9 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     how = "by name"
     if frames is None:
         frames, how = _by_index(left, right, by, folder), "by their order"
-    named, listing = pair_named(frames, folder)
-    listing = listing.choose(settings, folder)
+    pairs, listing = pair_named(frames, settings, folder)
     label = f"{views[0].name} and {views[1].name}" if views[0] != views[1] else "one folder"
-    found = _Pairing(listing.used(named), listing, None, f"{label}, paired {how}")
+    found = _Pairing(pairs, listing, None, f"{label}, paired {how}")
     return found if listed is None else _with_times(found, listed)
 
 
@@ -160,12 +159,12 @@ def _pair_as_listed(folder: Path, settings: SourceSettings) -> _Pairing:
     check_increasing(np.array([frame.left_s for frame in frames]), str(folder / FRAMES))
     pairs, listing = pair_named(
         [(existing(folder / frame.left), existing(folder / frame.right)) for frame in frames],
+        settings,
         folder,
     )
-    listing = listing.choose(settings, folder)
     stamps_s = np.array([frames[k].left_s for k in listing.kept])
     how = f"paired according to {FRAMES}"
-    return _Pairing(listing.used(pairs), listing, stamps_s, how, (folder / FRAMES,))
+    return _Pairing(pairs, listing, stamps_s, how, (folder / FRAMES,))
 
 
 def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:

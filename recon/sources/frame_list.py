@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
+from recon.core.decimals import is_count
 from recon.core.errors import SourceError
 from recon.sources.settings import SourceSettings
 
 Item = TypeVar("Item")
+Left = TypeVar("Left")
+Right = TypeVar("Right")
+
+_ONE_RATE: Final = 2 / 3
+"""Share of the frames that have both images, from which two cameras have one rate."""
 
 
 @dataclass(frozen=True)
@@ -23,17 +29,19 @@ class FrameList:
         paired: Positions of the pairs among them.
         alone: Numbers of left and right images without a partner, which are left out.
         chosen: Which of the pairs are used; None = all.
+        shift: By how many frames the right images were taken later than the left ones.
     """
 
     names: Sequence[str]
     paired: Sequence[int]
     alone: tuple[int, int] = (0, 0)
     chosen: range | None = None
+    shift: int = 0
 
     def __str__(self) -> str:
-        text = ""
+        text = f", right images {self.shift:+d} frames later" if self.shift else ""
         if any(self.alone):
-            text = f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
+            text += f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
         if self.chosen is None:
             return text
         every = f" in steps of {self.chosen.step}" if self.chosen.step > 1 else ""
@@ -86,10 +94,72 @@ class FrameList:
         if count == len(self.paired):
             return list(range(count))
         names = [self.names[k] for k in self.paired]
-        numbers = [int(name) if name.isdecimal() else count for name in names]
+        numbers = [int(name) if is_count(name) else count for name in names]
         if max(numbers) < count:
             return numbers
         return list(self.paired) if len(self.names) <= count else None
+
+
+def pair_frames(
+    frames: Sequence[tuple[Left | None, Right | None]],
+    settings: SourceSettings,
+    where: Path,
+    names: Sequence[str] | None = None,
+) -> tuple[list[tuple[Left, Right]], FrameList]:
+    """Return the pairs that are used, among frames of which an image may be missing.
+
+    Args:
+        frames: What stands for the left and for the right image of each frame, in order; None =
+            missing.
+        settings: By how many frames the right images were taken later, and the frames to use.
+        where: The source, for the error message.
+        names: Names of the frames without suffix; None = they have none.
+
+    Raises:
+        SourceError: No pair is left.
+    """
+    alone_right = sum(left is None and right is not None for left, right in frames)
+    # A listed frame without any image counts as one, on the left.
+    alone_left = sum(right is None for _, right in frames)
+    pairs, places = [], []
+    for place, (left, right) in enumerate(_shift_right(frames, settings.shift_frames, where)):
+        if left is not None and right is not None:
+            pairs.append((left, right))
+            places.append(place)
+    listing = FrameList(
+        names=[""] * len(frames) if names is None else names,
+        paired=places,
+        alone=(alone_left, alone_right),
+        shift=settings.shift_frames,
+    ).choose(settings, where)
+    return listing.used(pairs), listing
+
+
+def _shift_right(
+    frames: Sequence[tuple[Left | None, Right | None]], by: int, where: Path
+) -> Sequence[tuple[Left | None, Right | None]]:
+    """Return the frames with the right images of so many frames later.
+
+    Raises:
+        SourceError: No pair is left.
+    """
+    if not by:
+        return frames
+    whole = [k for k, (left, right) in enumerate(frames) if left is not None and right is not None]
+    # Where cameras have different rates, only the frames of the slower one count.
+    counted = whole if len(whole) < _ONE_RATE * len(frames) else range(len(frames))
+    rights: list[Right | None] = [None] * len(frames)
+    for k, later in zip(counted[max(0, -by) :], counted[max(0, by) :], strict=False):
+        rights[k] = frames[later][1]
+    shifted = [(left, right) for (left, _), right in zip(frames, rights, strict=True)]
+    if all(left is None or right is None for left, right in shifted):
+        raise SourceError(
+            "no pair is left with right images that were taken later",
+            where=where,
+            got=f"source.shift_frames={by}, {len(counted)} frames",
+            expected="fewer frames than the recording has, or 0",
+        )
+    return shifted
 
 
 def check_most(pairs: int, images: int, where: Path) -> None:

@@ -18,12 +18,12 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
-from recon.sources.frame_list import FrameList, check_most
+from recon.sources.frame_list import FrameList, check_most, pair_frames
 from recon.sources.image_names import natural_key
 from recon.sources.one_pair import join_pair
 from recon.sources.protocol import Recording
 from recon.sources.settings import SourceSettings
-from recon.sources.stamps import pair_stamps
+from recon.sources.stamps import pair_stamps, pairs_in_time
 
 IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 
@@ -46,7 +46,7 @@ class ImageFrame:
     timestamp_s: float
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class ImageSource(Recording):
     """A drive in image files, read one pair at a time.
 
@@ -125,44 +125,39 @@ def pair_listed(
     pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(where))
     # Of two cameras with different rates, the slower one decides what is missing.
     check_most(len(pairs.left), min(map(len, lists)), where)
-    partner = dict(zip(pairs.left, pairs.right, strict=True))
-    taken = set(pairs.right)
+    found = pairs_in_time(stamps, pairs)
     frames = [
-        (stamp, existing(path), existing(lists[1][partner[k]][1]) if k in partner else None)
-        for k, (stamp, path) in enumerate(lists[0])
+        (
+            None if i is None or existing(lists[0][i][1]) is None else lists[0][i],
+            None if j is None else existing(lists[1][j][1]),
+        )
+        for i, j in found
     ]
-    frames += [(stamp, None, path) for k, (stamp, path) in enumerate(lists[1]) if k not in taken]
-    frames.sort(key=lambda frame: frame[0])
-    chosen, listing = pair_named([frame[1:] for frame in frames])
-    paired = [
-        ImageFrame(left, right, frames[k][0])
-        for k, (left, right) in zip(listing.paired, chosen, strict=True)
-    ]
-    listing = listing.choose(settings, where)
-    return listing.used(paired), listing
+    names = [(lists[1][j or 0] if i is None else lists[0][i])[1].stem for i, j in found]
+    used, listing = pair_frames(frames, settings, where, names)
+    return [ImageFrame(left, right, stamp_s) for (stamp_s, left), right in used], listing
 
 
 def pair_named(
-    frames: Sequence[tuple[Path | None, Path | None]], where: Path | None = None
+    frames: Sequence[tuple[Path | None, Path | None]], settings: SourceSettings, where: Path
 ) -> tuple[list[tuple[Path, Path]], FrameList]:
-    """Return the pairs among frames of which an image may be missing.
+    """Return the pairs that are used, among frames of which an image may be missing.
 
     Args:
         frames: Left and right image of each frame in order; None = missing.
-        where: The source, for the error message; None = any number may be missing.
+        settings: The frames to use.
+        where: The source, for the error message.
 
     Raises:
-        SourceError: Most images have no partner.
+        SourceError: Most images have no partner, or no pair is left.
     """
-    pairs = [(left, right) for left, right in frames if left is not None and right is not None]
-    kept = [k for k, frame in enumerate(frames) if None not in frame]
-    # A listed frame without any image counts as one, on the left.
+    whole = sum(None not in frame for frame in frames)
     alone_right = sum(left is None and right is not None for left, right in frames)
-    alone_left = len(frames) - len(pairs) - alone_right
-    if where is not None:
-        check_most(len(pairs), len(pairs) + max(alone_left, alone_right), where)
-    names = [(left or right or Path()).stem for left, right in frames]
-    return pairs, FrameList(names, kept, (alone_left, alone_right))
+    alone = max(len(frames) - whole - alone_right, alone_right)
+    check_most(whole, whole + alone, where)
+    return pair_frames(
+        frames, settings, where, [(left or right or Path()).stem for left, right in frames]
+    )
 
 
 def existing(path: Path) -> Path | None:

@@ -25,7 +25,7 @@ from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
 from recon.io.files import StrPath
 from recon.io.trajectory import read_kitti_poses
-from recon.sources.calibration import as_rectified, read_rig
+from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.frame_list import FrameList
 from recon.sources.image_names import natural_key
 from recon.sources.images import (
@@ -65,10 +65,8 @@ def open_kitti(
     if not path.is_dir():
         raise SourceError("folder does not exist", where=path)
     pair = cameras or choose_cameras(path, "image_{}")
-    images, listing = list_pairs(*(path / f"image_{camera}" for camera in pair))
     settings = settings or SourceSettings()
-    listing = listing.choose(settings, path)
-    images = listing.used(images)
+    images, listing = _list_pairs(*(path / f"image_{camera}" for camera in pair), settings=settings)
     times, time_files = _read_times(path, listing, settings)
     rig, calibration_files = _read_rig(path, settings, pair, images[0][0])
     texts = (*calibration_files, *time_files, _find_poses(path))
@@ -113,7 +111,9 @@ def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
     )
 
 
-def list_pairs(left: Path, right: Path) -> tuple[list[tuple[Path, Path]], FrameList]:
+def _list_pairs(
+    left: Path, right: Path, *, settings: SourceSettings
+) -> tuple[list[tuple[Path, Path]], FrameList]:
     """Return the left and right image of each frame, paired by equal names.
 
     Raises:
@@ -127,7 +127,7 @@ def list_pairs(left: Path, right: Path) -> tuple[list[tuple[Path, Path]], FrameL
         (left / name if name in names[0] else None, right / name if name in names[1] else None)
         for name in sorted(names[0] | names[1], key=natural_key)
     ]
-    return pair_named(frames, left.parent)
+    return pair_named(frames, settings, left.parent)
 
 
 def _names(folder: Path) -> set[str]:
@@ -158,12 +158,10 @@ def _read_rig(
 ) -> tuple[Rig, tuple[Path, ...]]:
     """Read the calibration; its file need not contain the image size."""
     path, size = folder / "calib.txt", image_size(image, settings)
-    if settings.calibration is not None:
+    if settings.has_camera:
         return read_rig(settings, folder, size, cameras)
     if not path.exists():
-        raise SourceError(
-            "calibration is missing", where=path, hint="name a file with --calib FILE"
-        )
+        raise SourceError("calibration is missing", where=path, hint=CALIBRATE)
     return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)
 
 

@@ -15,10 +15,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+from recon.core.decimals import is_count
 from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, Rig
 from recon.io.cameras.kitti import read_kitti_rig
-from recon.sources.calibration import as_rectified, read_rig
+from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.images import ImageSource, image_size, list_images, pair_listed
 from recon.sources.kitti import choose_cameras
 from recon.sources.settings import SourceSettings
@@ -64,7 +65,7 @@ def _read_list(view: Path) -> list[tuple[float, Path]]:
     check_increasing(stamps, str(path))
     if len(stamps) == len(images):
         return list(zip(stamps.tolist(), images, strict=True))
-    if len(stamps) < len(images) or not all(image.stem.isdecimal() for image in images):
+    if len(stamps) < len(images) or not all(is_count(image.stem) for image in images):
         raise SourceError(
             "numbers of times and images differ",
             where=path,
@@ -79,7 +80,7 @@ def _read_list(view: Path) -> list[tuple[float, Path]]:
 def _read_rig(
     folder: Path, settings: SourceSettings, cameras: tuple[int, int], size: tuple[int, int]
 ) -> tuple[Rig, tuple[Path, ...]]:
-    if settings.calibration is not None:
+    if settings.has_camera:
         return read_rig(settings, folder, size, cameras)
     candidates = [place / _CALIBRATION for place in (folder, folder.resolve().parent)]
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
@@ -88,6 +89,6 @@ def _read_rig(
             "calibration is missing",
             where=folder,
             expected=f"{_CALIBRATION} in the folder of the drive or of its day",
-            hint="download the calibration of the day, or name a file with --calib",
+            hint=f"download the calibration of the day, or {CALIBRATE}",
         )
     return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)

@@ -13,14 +13,16 @@ from recon.core.values.arrays import UInt8
 from recon.io.files import StrPath
 from recon.io.images.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
 from recon.io.middlebury.scene import read_middlebury_scene
-from recon.sources.frame_list import FrameList
+from recon.sources.calibration import CALIBRATE, read_rig
+from recon.sources.frame_list import pair_frames
+from recon.sources.protocol import source_text
 from recon.sources.settings import SourceSettings
 
 LEAST_SIDE_PX: Final = 16
 """Smaller than this, an image does not hold the windows that are compared."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class OnePair:
     """One pair as a source.
 
@@ -43,6 +45,9 @@ class OnePair:
         """Name of the pair."""
         return self.pair.name
 
+    def __repr__(self) -> str:
+        return source_text(self)
+
     def __len__(self) -> int:
         return 1
 
@@ -62,16 +67,21 @@ def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
         FormatError: The folder is not a Middlebury scene, or a file in it is damaged.
         CalibrationError: No calibration is published for the scene, or it cannot give depth.
     """
-    FrameList([""], [0]).choose(settings, folder)
+    pair_frames([(0, 0)], settings, folder)
     scene = read_middlebury_scene(folder)
-    if scene.camera is None:
+    rig: Rig | None = scene.camera
+    if settings.has_camera:
+        height_px, width_px = scene.pair.left.shape[:2]
+        rig, _ = read_rig(settings, folder, (width_px, height_px))
+    if rig is None:
         raise CalibrationError(
             "no calibration is published for this scene, so there is no depth",
             where=folder,
             expected="calib.txt, or dmin.txt for scenes of 2005 and 2006",
+            hint=CALIBRATE,
         )
     files = tuple(sorted(path for path in folder.iterdir() if path.is_file()))
-    return OnePair(scene.pair, scene.camera, files, "a Middlebury scene: one rectified pair")
+    return OnePair(scene.pair, rig, files, "a Middlebury scene: one rectified pair")
 
 
 def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> StereoPair:

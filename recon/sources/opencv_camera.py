@@ -9,10 +9,13 @@ from typing import Final, Protocol
 import cv2
 import numpy as np
 
+from recon.core.decimals import is_count
 from recon.core.errors import SourceError
 from recon.core.values.arrays import UInt8
 from recon.io.images.image import silent_opencv
 
+_LONGEST_NUMBER: Final = 10
+_HEAD_BYTES: Final = 4096
 # V4L2's exposure modes: 1 = manual, 3 = automatic.
 _MANUAL: Final = 1
 
@@ -65,9 +68,11 @@ class OpenCvCamera:
         self, device: str, size: tuple[int, int] | None = None, rate_hz: float | None = None
     ) -> None:
         self.name, self.live = device, not Path(device).is_file()
-        number = int(device) if device.isdecimal() else None
+        number = int(device) if is_count(device) and len(device) < _LONGEST_NUMBER else None
         if Path(device).is_fifo() or Path(device).is_socket():  # opening one would wait for ever
             raise SourceError("not a camera and not a regular file", where=device)
+        if not self.live and _is_text(Path(device)):  # which OpenCV draws, letter by letter
+            raise SourceError("not a video", where=device, got="a text file")
         with silent_opencv():
             self._capture = cv2.VideoCapture(device if number is None else number)
         if not self._capture.isOpened():
@@ -151,3 +156,10 @@ class OpenCvCamera:
                 got=f"{given[0]}x{given[1]}",
                 expected=f"{size[0]}x{size[1]}",
             )
+
+
+def _is_text(path: Path) -> bool:
+    """Return whether a file begins with printable text, as no video does."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES).decode("latin-1")
+    return bool(head) and all(letter.isprintable() or letter.isspace() for letter in head)

@@ -8,18 +8,18 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.errors import CalibrationError, FormatError, SettingsError
-from recon.core.values import DisparityTruth, RectifiedCamera, Rig, StereoPair
+from recon.core.errors import CalibrationError, FormatError
+from recon.core.values import DisparityTruth, Rig, StereoPair
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.images.disparity_png import read_disparity
 from recon.io.images.exif import read_focal_length
 from recon.io.images.image import MAX_MEGAPIXELS
 from recon.io.middlebury.scene import stand_in_camera
+from recon.sources.calibration import camera_of_numbers, check_given_once
 from recon.sources.one_pair import read_pair
+from recon.sources.settings import SourceSettings
 
-_WIDEST_DEG: Final = 165.0
-"""Flat images see no more: a pixel at the side would be 60 times as wide as in the middle."""
 UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
 
 
@@ -44,29 +44,12 @@ class PairInput:
     up_to_scale: bool = False
 
 
-@dataclass(frozen=True)
-class KnownCamera:
-    """What is known of the camera of a rectified pair that has no calibration file.
-
-    Attributes:
-        focal_px: Focal length; None = that in the EXIF data of the left image.
-        baseline_m: Distance between the cameras; None = unknown, the cloud is up to scale.
-        cx_px: Column of the principal point of both views; None = the middle.
-        cy_px: Its row; None = the middle.
-    """
-
-    focal_px: float | None = None
-    baseline_m: float | None = None
-    cx_px: float | None = None
-    cy_px: float | None = None
-
-
 def read_pair_input(
     left: Path,
     right: Path,
     calibration: Path | None,
     *,
-    known: KnownCamera | None = None,
+    known: SourceSettings | None = None,
     metres_per_unit: float = 1.0,
     max_megapixels: float = MAX_MEGAPIXELS,
 ) -> PairInput:
@@ -76,8 +59,9 @@ def read_pair_input(
         left: Left image.
         right: Right image.
         calibration: Any file that `read_calibration` understands; None = the pair is rectified.
-        known: What is known of the camera, if depth is wanted without a calibration file; the
-            result has notes on what the rest was taken from.
+        known: Numbers of the camera, if depth is wanted without a calibration file; the focal
+            length may be that in the EXIF data of the left image, and without a baseline the cloud
+            is up to scale. The result has notes on both.
         metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
         max_megapixels: Refuse larger images, in 10⁶ pixels.
 
@@ -87,13 +71,8 @@ def read_pair_input(
         SettingsError: The camera is given twice.
         CalibrationError: The focal length is neither given nor in the image, or implausible.
     """
-    if calibration is not None and known not in (None, KnownCamera()):
-        raise SettingsError(
-            "--focal, --baseline, --cx and --cy replace a calibration file",
-            where="--calib",
-            got=calibration,
-            hint="give either",
-        )
+    if known is not None:
+        check_given_once(calibration, known)
     pair = read_pair(left, right, max_megapixels)
     height_px, width_px = pair.left.shape[:2]
     if calibration is None:
@@ -109,11 +88,11 @@ def read_pair_input(
     return PairInput(pair, rig, (left, right, calibration))
 
 
-def _with_camera(given: PairInput, known: KnownCamera) -> PairInput:
+def _with_camera(given: PairInput, known: SourceSettings) -> PairInput:
     """Return the pair with a camera from what is known of it, and from EXIF data."""
     height_px, width_px = given.pair.left.shape[:2]
-    focal_px, basis = known.focal_px, ""
-    if focal_px is None:
+    notes, instead = [], {"baseline_m": 1.0}
+    if known.focal_px is None:
         left = given.files[0]
         found = read_focal_length(left, width_px, height_px)
         if found is None:
@@ -122,31 +101,13 @@ def _with_camera(given: PairInput, known: KnownCamera) -> PairInput:
                 where=left,
                 hint="--calib FILE, or --focal PX",
             )
-        focal_px = found.focal_px
-        basis = f"focal length of {focal_px:.0f} px from EXIF ({found.basis})"
-    middle = stand_in_camera(width_px, height_px)
-    cx_px = middle.cx_px if known.cx_px is None else known.cx_px
-    camera = RectifiedCamera(
-        focal_px=focal_px,
-        cx_px=cx_px,
-        cy_px=middle.cy_px if known.cy_px is None else known.cy_px,
-        cx_right_px=cx_px,
-        baseline_m=1.0 if known.baseline_m is None else known.baseline_m,
-        width_px=width_px,
-        height_px=height_px,
-    )
-    if camera.field_of_view_deg > _WIDEST_DEG:
-        raise CalibrationError(
-            "focal length is implausible",
-            where="--focal",
-            got=f"{focal_px:g} px: images of {width_px} px see {camera.field_of_view_deg:.0f} deg",
-            expected=f"at most {_WIDEST_DEG:g} deg",
-            hint="it is in pixels, not in millimetres",
-        )
+        instead["focal_px"] = found.focal_px
+        notes.append(f"focal length of {found.focal_px:.0f} px from EXIF ({found.basis})")
+    camera = camera_of_numbers(known, (width_px, height_px), **instead)
     up_to_scale = known.baseline_m is None
-    unscaled = f"{UP_TO_SCALE}; --baseline M gives metres" if up_to_scale else ""
-    notes = tuple(note for note in (basis, unscaled) if note)
-    return replace(given, calibration=camera, notes=notes, up_to_scale=up_to_scale)
+    if up_to_scale:
+        notes.append(f"{UP_TO_SCALE}; --baseline M gives metres")
+    return replace(given, calibration=camera, notes=tuple(notes), up_to_scale=up_to_scale)
 
 
 def with_truth(given: PairInput, path: Path | None) -> PairInput:

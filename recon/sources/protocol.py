@@ -68,6 +68,11 @@ class StereoSource(Protocol):
         ...
 
 
+def source_text(source: StereoSource) -> str:
+    """Return a source in one short line, for its ``repr``."""
+    return f"{type(source).__name__}({source.name}, pairs: {len(source)}, {source.description})"
+
+
 class DerivedSource(ABC):
     """A source made of another one, with its name, calibration and files, but without its truth.
 
@@ -99,6 +104,9 @@ class DerivedSource(ABC):
     def files(self) -> Sequence[Path]:
         """Those of the source."""
         return self.source.files
+
+    def __repr__(self) -> str:
+        return source_text(self)
 
     def __iter__(self) -> Iterator[StereoPair]:
         """Yield all pairs, like ``frames()``."""
@@ -157,6 +165,10 @@ class IncompleteSource(Protocol):
         """
         ...
 
+    def shift_of(self, pairs: int) -> int:
+        """Return ``source.shift_frames`` with right images of so many pairs later than now."""
+        ...
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording(ABC):
@@ -186,6 +198,19 @@ class Recording(ABC):
     def lines(self, count: int) -> list[int] | None:
         """Return the line of each pair in a file with one line per frame; see `FrameList.lines`."""
         return self.listing.lines(count)
+
+    def shift_of(self, pairs: int) -> int:
+        """Return ``source.shift_frames`` with right images of so many pairs later than now."""
+        chosen = self.listing.chosen
+        return self.listing.shift + pairs * (1 if chosen is None else chosen.step)
+
+    @property
+    @abstractmethod
+    def files(self) -> Sequence[Path]:
+        """The files that pairs and calibration are read from."""
+
+    def __repr__(self) -> str:
+        return source_text(self)
 
     def __len__(self) -> int:
         return len(self.listing.kept)

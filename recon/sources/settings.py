@@ -26,6 +26,19 @@ class SourceSettings(Settings):
         default=None,
         description="Calibration file to use instead of that of the source. none = its own.",
     )
+    focal_px: float | None = Field(
+        default=None,
+        gt=0,
+        description="Focal length of images that are rectified already, with `source.baseline_m` "
+        "in place of a calibration file. none = that of the calibration.",
+    )
+    baseline_m: float | None = Field(
+        default=None, gt=0, description="Distance between their cameras. none = see there."
+    )
+    cx_px: float | None = Field(
+        default=None, description="Column of their principal points. none = the middle."
+    )
+    cy_px: float | None = Field(default=None, description="Row of it. none = the middle.")
     max_megapixels: float = Field(
         default=MAX_MEGAPIXELS,
         gt=0,
@@ -60,6 +73,24 @@ class SourceSettings(Settings):
     stride: int = Field(
         default=1, ge=1, description="Use every so many frames; the others are not read."
     )
+    shift_frames: int = Field(
+        default=0,
+        description="By how many frames the right camera is late: the left image of a frame is "
+        "paired with the right one of so many frames later. Times, ground truth and known poses "
+        "stay those of the left images. Negative = the left camera is late.",
+    )
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
         default="left-right", description="Arrangement of the two views in the frames of one video."
     )
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What is known of rectified cameras instead of a calibration file, by setting."""
+        names = ("focal_px", "baseline_m", "cx_px", "cy_px")
+        given = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in given.items() if value is not None}
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether the camera is known from here, not from the files of the source."""
+        return self.calibration is not None or bool(self.numbers)

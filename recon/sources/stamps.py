@@ -77,8 +77,13 @@ def _are_counters(stems: Sequence[str]) -> bool:
     return len(stems[0]) == _SECONDS_DIGITS or not steps.size or np.median(steps) < _CLOCK_STEPS
 
 
-def check_increasing(stamps_s: Float64, where: str) -> None:
+def check_increasing(stamps_s: Float64, where: str, lines: Sequence[int] | None = None) -> None:
     """Check that timestamps are strictly increasing.
+
+    Args:
+        stamps_s: float64 (N,), in the order of the frames.
+        where: Their file or folder.
+        lines: The line of each in the file; None = they are numbered.
 
     Raises:
         SourceError: They are not.
@@ -89,7 +94,7 @@ def check_increasing(stamps_s: Float64, where: str) -> None:
         still = stamps_s[at] == stamps_s[at - 1]
         raise SourceError(
             "two images have the same timestamp" if still else "timestamps are out of order",
-            where=f"{where}, image {at}",
+            where=f"{where}, image {at}" if lines is None else f"{where}:{lines[at]}",
             got=f"{stamps_s[at]:.6f} s after {stamps_s[at - 1]:.6f} s",
             hint="the images of each camera must be in the order of their exposure",
         )
@@ -142,3 +147,23 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
         )
     alone = (len(left_s) - len(chosen), len(right_s) - len(chosen))
     return StampPairs(chosen.tolist(), to_right[chosen].tolist(), alone)
+
+
+def pairs_in_time(
+    stamps_s: Sequence[Float64], pairs: StampPairs
+) -> list[tuple[int | None, int | None]]:
+    """Return all frames in order of time: indices of their left and right image, None = missing.
+
+    Args:
+        stamps_s: float64 (N,) and (M,), the two series.
+        pairs: Which of their entries are pairs.
+    """
+    partner = dict(zip(pairs.left, pairs.right, strict=True))
+    taken = set(pairs.right)
+    frames: list[tuple[float, int | None, int | None]] = [
+        (stamp_s, k, partner.get(k)) for k, stamp_s in enumerate(stamps_s[0].tolist())
+    ]
+    frames += [
+        (stamp_s, None, k) for k, stamp_s in enumerate(stamps_s[1].tolist()) if k not in taken
+    ]
+    return [frame[1:] for frame in sorted(frames, key=lambda frame: frame[0])]

@@ -15,6 +15,7 @@ from recon.core.values import (
     Trajectory,
 )
 from recon.core.values.arrays import Float64
+from recon.sources.protocol import source_text
 from recon.street.render import StreetCamera, SyntheticFrame
 from recon.street.settings import StreetSettings
 from recon.street.street import StreetWorld, build_street
@@ -36,6 +37,9 @@ class SyntheticSource:
     ) -> None:
         self.settings = StreetSettings() if settings is None else settings
         self._surface_range_m = surface_range_m
+
+    def __repr__(self) -> str:
+        return source_text(self)
 
     @property
     def name(self) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from recon.core.decimals import parse_integer, parse_number
 from recon.core.errors import FormatError, SourceError
 from recon.core.geometry.interpolation import interpolate_poses
 from recon.core.geometry.se3 import invert
@@ -15,15 +16,15 @@ from recon.core.values.arrays import Float64
 from recon.io.files import read_table, read_text, reader
 from recon.io.trajectory import read_tum
 from recon.sources.frame_list import FrameList
-from recon.sources.stamps import check_seconds
+from recon.sources.stamps import check_increasing, check_seconds
 
 
 @reader
 def read_times(path: Path, frames: int) -> Float64:
-    """Read ``times.txt``: seconds, one line per frame; lines beyond the last frame are ignored.
+    """Read ``times.txt`` of the first frames, see `read_times_of_pairs`.
 
     Returns:
-        float64 (frames,), not decreasing.
+        float64 (frames,), increasing.
 
     Raises:
         SourceError: The file is missing or too short, or its times are no seconds.
@@ -35,8 +36,10 @@ def read_times(path: Path, frames: int) -> Float64:
 def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
     """Read ``times.txt`` for the frames that are pairs; see `FrameList.lines`.
 
+    A line per frame has its time in seconds, or, as for DSO, its number, time and exposure.
+
     Returns:
-        float64, one time per pair, not decreasing.
+        float64, one time per pair, increasing.
 
     Raises:
         SourceError: The file is missing or too short, or its times are no seconds.
@@ -44,7 +47,8 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
     """
     if not path.exists():
         raise SourceError("file does not exist", where=path)
-    table, lines = read_table(path, (1,))
+    table, lines = read_table(path, (1, 3))
+    seconds = table[:, table.shape[1] // 2]
     chosen = listing.lines(len(table))
     if chosen is None:
         raise SourceError(
@@ -53,13 +57,9 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
             got=f"{len(table)} times",
             expected=f"{len(listing.names)}",
         )
-    check_seconds(table[:, 0], path)
-    times: Float64 = table[chosen, 0]
-    backwards = np.diff(times) < 0
-    if backwards.any():
-        raise FormatError(
-            "time runs backwards", where=f"{path}:{lines[chosen[int(np.argmax(backwards)) + 1]]}"
-        )
+    check_seconds(seconds, path)
+    times: Float64 = seconds[chosen]
+    check_increasing(times, str(path), [lines[k] for k in chosen])
     return times
 
 
@@ -84,8 +84,9 @@ def _parse_date(text: str, where: str) -> float:
     # Python before 3.11 parses at most six decimals.
     whole, _, fraction = text.partition(".")
     try:
+        whole.encode("ascii")
         day = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
-        return day.timestamp() + float(f"0.{fraction or 0}")
+        return day.timestamp() + parse_number(f"0.{fraction or 0}")
     except ValueError as error:
         raise FormatError(
             "not a time", where=where, got=text[:40], expected="2011-09-26 13:02:25.964389445"
@@ -118,7 +119,7 @@ def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, 
 
 def _parse_entry(words: list[str], unit_s: float, where: str) -> tuple[float, str]:
     try:
-        stamp = float(words[0]) if unit_s == 1 else int(words[0]) * unit_s
+        stamp = parse_number(words[0]) if unit_s == 1 else parse_integer(words[0]) * unit_s
     except ValueError as error:
         raise FormatError("not a timestamp", where=where, got=words[0][:40]) from error
     if len(words) < 2 or not np.isfinite(stamp):

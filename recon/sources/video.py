@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +15,7 @@ from recon.core.values import StereoPair, check_size
 from recon.core.values.arrays import UInt8
 from recon.io.images.video import VIDEOS, VideoFile, open_video
 from recon.sources.calibration import read_rig
-from recon.sources.frame_list import FrameList
+from recon.sources.frame_list import pair_frames
 from recon.sources.image_names import find_partners
 from recon.sources.protocol import Recording
 from recon.sources.settings import SourceSettings
@@ -24,17 +25,19 @@ _LONGER: Final = 0.05
 """Share of a video that may have no partner, as one camera was stopped later than the other."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class VideoSource(Recording):
     """A drive in one or two video files.
 
     Attributes:
         videos: One file with both views, or left and right.
         settings: Arrangement of the views, and the frame rate if that of the file is overridden.
+        numbers: Frame of the left and of the right view of each pair.
     """
 
     videos: tuple[VideoFile, ...]
     settings: SourceSettings
+    numbers: Sequence[tuple[int, int]]
 
     @property
     def files(self) -> Sequence[Path]:
@@ -48,9 +51,9 @@ class VideoSource(Recording):
             SourceError: The times of the two files drift apart.
             FormatError: A frame cannot be decoded, or its time does not increase.
         """
-        last_s, numbers = -np.inf, self.listing.kept[start:]
+        last_s, numbers = -np.inf, self.numbers[start:]
         views = zip(numbers, self._views(numbers), strict=True) if numbers else ()
-        for index, (number, (stamp_s, left, right)) in enumerate(views, start=start):
+        for index, ((number, _), (stamp_s, left, right)) in enumerate(views, start=start):
             for view in (left, right):
                 check_size(self.calibration, view.shape[1], view.shape[0], self.videos[0].path)
             time_s = number / self.settings.rate_hz if self.settings.rate_hz else stamp_s
@@ -63,19 +66,24 @@ class VideoSource(Recording):
             last_s = time_s
             yield StereoPair(left, right, time_s, index, f"frame {number}")
 
-    def _views(self, numbers: Sequence[int]) -> Iterator[tuple[float, UInt8, UInt8]]:
-        """Yield the views of some frames, numbered as in the files and evenly spaced."""
-        if len(self.videos) == 1:
-            for stamp_s, image in self.videos[0].pick(numbers):
+    def _views(self, numbers: Sequence[tuple[int, int]]) -> Iterator[tuple[float, UInt8, UInt8]]:
+        """Yield the views of some pairs of frames, numbered as in the files and evenly spaced."""
+        in_left, in_right = (list(side) for side in zip(*numbers, strict=True))
+        if len(self.videos) == 1 and in_left == in_right:
+            for stamp_s, image in self.videos[0].pick(in_left):
                 yield stamp_s, *split_views(image, self.settings)
             return
-        pairs = zip(*(video.pick(numbers) for video in self.videos), strict=True)
+        pairs = zip(self.videos[0].pick(in_left), self.videos[-1].pick(in_right), strict=True)
         apart_s: float | None = None
-        for number, ((left_s, left), (right_s, right)) in zip(numbers, pairs, strict=True):
+        both = len(self.videos) == 1
+        for number, ((left_s, one), (right_s, other)) in zip(in_left, pairs, strict=True):
             # Two containers may start at different times, but must then advance alike.
             apart_s = right_s - left_s if apart_s is None else apart_s
             self._check_pace(number, right_s - left_s - apart_s)
-            yield left_s, left, right
+            left, right = (
+                split_views(image, self.settings) if both else (image,) for image in (one, other)
+            )
+            yield left_s, left[0], right[-1]
 
     def _check_pace(self, index: int, drift_s: float) -> None:
         period_s = 1 / self.videos[0].rate_hz
@@ -99,9 +107,8 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
         CalibrationError: The calibration cannot give depth.
     """
     videos = open_videos(_find_videos(path, settings))
-    frames = frames_of(videos)
-    alone = (videos[0].frames - frames, videos[-1].frames - frames)
-    listing = FrameList([""] * frames, range(frames), alone).choose(settings, path)
+    frames = zip_longest(range(videos[0].frames), range(videos[-1].frames))
+    numbers, listing = pair_frames(list(frames), settings, path)
     size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
     home = path if path.is_dir() else path.resolve().parent
     rig, texts = read_rig(settings, home, size)
@@ -113,6 +120,7 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
         calibration=rig,
         videos=videos,
         settings=settings,
+        numbers=numbers,
         texts=texts,
         listing=listing,
     )

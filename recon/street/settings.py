@@ -72,6 +72,11 @@ class StreetScene(StreetSettings):
         le=1000.0,
         description="Period after which a straight street repeats itself. None = never.",
     )
+    fences: bool = Field(
+        default=False,
+        description="Fences, railings, hedges, wires and shop windows along the pavement instead "
+        "of parked cars and street furniture.",
+    )
     sway: float = Field(
         default=1.0,
         ge=0.0,

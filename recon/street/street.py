@@ -14,6 +14,7 @@ from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64, freeze
 from recon.street import props
 from recon.street.buildings import draw_plan, house
+from recon.street.fences import SECTION_M, SECTIONS
 from recon.street.materials import ROAD_HALF_M
 from recon.street.path import BEHIND_M, CentreLine, camera_poses, centre_line
 from recon.street.settings import StreetScene, StreetSettings
@@ -90,9 +91,7 @@ def build_street(settings: StreetSettings) -> StreetWorld:
     layers: list[Callable[[CentreLine, float, np.random.Generator], Iterator[TriangleSoup]]] = [
         _houses,
         _backdrop,
-        _parked_cars,
-        _trees,
-        _furniture,
+        *([_fences, _trees] if settings.fences else [_parked_cars, _trees, _furniture]),
     ]
     parts = [_ground(road)]
     for number, layer in enumerate(layers):
@@ -263,6 +262,16 @@ def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Ite
         backwards = (side > 0) != (rng.random() < 0.1)
         turn = se3.exp_so3(np.array([0.0, 0.0, jitter[2] + np.pi * backwards]))
         yield move(soup, T @ se3.make_transform(turn, np.zeros(3)))
+
+
+def _fences(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+    """Return what one looks through along the inner half of the pavement, in random order."""
+    first, end = road.span_m
+    for at in np.arange(max(first, -18.0), end, SECTION_M + 0.6):
+        section = SECTIONS[int(rng.integers(len(SECTIONS)))](rng)
+        away = np.diag([1.0, side, 1.0, 1.0])
+        T = road.place(float(at), side * (ROAD_HALF_M + 1.5), KERB_M)
+        yield move(section, T @ away)
 
 
 def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:

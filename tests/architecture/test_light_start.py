@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+from recon.run.installation import PACKAGES
+
 HEAVY = {
     "cv2", "kiss_icp", "matplotlib", "numba", "open3d", "plotly", "pymeshlab", "pyoctomap",
 }  # fmt: skip
@@ -41,3 +43,9 @@ def test_import_of_the_package_loads_no_heavy_library() -> None:
 def test_the_process_that_meshes_loads_nothing_that_it_does_not_use() -> None:
     """There is one for each tile of a surface."""
     assert loaded("import recon.export.pymeshlab").isdisjoint(HEAVY)
+
+
+def test_doctor_loads_nothing_whose_lack_it_reports() -> None:
+    shell = {"typer", "rich", "typing_extensions"}  # without these there is no command line
+    found = loaded("import recon.cli.doctor, recon.commands.doctor")
+    assert found & set(PACKAGES.values()) <= shell

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+import recon
 from recon.cli.show.tables import print_checks
-from recon.commands.doctor import examine
+from recon.commands.doctor import check_kernels, examine
 from recon.run import installation
 from recon.run.installation import Check
 
@@ -18,8 +20,21 @@ from recon.run.installation import Check
 def test_this_machine_is_examined_and_ready(tmp_path: Path) -> None:
     checks = examine(tmp_path / "outputs")
     assert [check for check in checks if check.needed and not check.ok] == []
-    assert {"Python", "numpy", "open3d", "memory", "cores"} <= {check.name for check in checks}
+    names = {check.name for check in checks}
+    assert {"Python", "numpy", "open3d", "kernels of map", "memory", "cores"} <= names
     assert not (tmp_path / "outputs").exists()
+
+
+def test_what_kernels_lack_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "llvmlite.py").write_text("raise ImportError('half of it is gone')")
+    paths = os.pathsep.join([str(tmp_path), str(Path(recon.__file__).parents[1])])
+    monkeypatch.setenv("PYTHONPATH", paths)
+    checks = list(check_kernels())
+    assert {"kernels of map", "kernels of stereo"} <= {check.name for check in checks}
+    for check in checks:
+        assert not check.ok
+        assert check.needed
+        assert check.found == "ImportError: half of it is gone"
 
 
 def test_failed_checks_say_what_to_do() -> None:
@@ -40,7 +55,7 @@ def test_a_missing_system_library_names_its_package(monkeypatch: pytest.MonkeyPa
     def fail(_: str) -> tuple[bool, str]:
         return False, "OSError: libGL.so.1: cannot open shared object file"
 
-    monkeypatch.setattr(installation, "_run_python", fail)
+    monkeypatch.setattr(installation, "run_python", fail)
     assert installation.check_package("numpy", "numpy").hint == "run: apt-get install libgl1"
 
 
@@ -53,7 +68,7 @@ def test_system_libraries_are_looked_for() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals of this kind")
 def test_a_package_that_crashes_the_process_is_reported() -> None:
-    done, told = installation._run_python("import os; os.abort()")
+    done, told = installation.run_python("import os; os.abort()")
     assert not done
     assert told.startswith("crashed with signal")
 
@@ -63,7 +78,7 @@ def test_an_import_that_never_ends_is_reported(monkeypatch: pytest.MonkeyPatch) 
         raise subprocess.TimeoutExpired("python", 1)
 
     monkeypatch.setattr(subprocess, "run", late)
-    done, told = installation._run_python("pass")
+    done, told = installation.run_python("pass")
     assert not done
     assert "no answer" in told
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.commands.evaluate_map import run_evaluate_map
-from recon.core.errors import EvaluationError, FormatError, SettingsError
+from recon.core.errors import EvaluationError, FormatError, RegistrationError, SettingsError
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import PointCloud, Trajectory
@@ -115,6 +115,34 @@ def test_icp_lays_the_cloud_onto_the_reference(drifted: Path) -> None:
     assert found["by_threshold"][1]["f_score"] > 0.99
     assert found["icp_share"] > 0.9
     assert 0.1 < found["icp_moved_m"] < 1.5
+
+
+def test_icp_finds_out_in_which_axes_the_reference_is(drifted: Path) -> None:
+    folder, reference = drifted / "drift", drifted / "reference.ply"
+    assert run_evaluate_map(folder, reference, icp=True)["reference_frame"] == "camera"
+    in_map = transform_cloud(read_ply(reference), T_MAP_WORLD, frame="map")
+    write_ply(reference, in_map)
+    found = run_evaluate_map(folder, reference, icp=True)
+    assert found["reference_frame"] == "map"
+    told = run_evaluate_map(folder, reference, icp=True, frame="map")
+    # Open3D adds up in threads, so its last digits differ from run to run.
+    for name in ("f_score", "icp_moved_m", "icp_turned_deg", "median_m"):
+        assert found[name] == pytest.approx(told[name], rel=1e-6)
+    assert found["f_score"] > 0.99
+    far = PointCloud(in_map.xyz + np.float32(1e4))
+    write_ply(reference, far)
+    with pytest.raises(RegistrationError, match="ICP found no corresponding points"):
+        run_evaluate_map(folder, reference, icp=True)
+
+
+def test_poses_in_another_unit_do_not_move_a_map(drifted: Path) -> None:
+    rows = np.loadtxt(drifted / "poses.txt")
+    rows[:, 3::4] *= 1000.0
+    np.savetxt(drifted / "poses.txt", rows)
+    with pytest.raises(EvaluationError, match="neither drift nor noise explains"):
+        run_evaluate_map(
+            drifted / "drift", drifted / "reference.ply", align_to=drifted / "poses.txt"
+        )
 
 
 def test_every_threshold_has_its_figures_and_the_first_stands_on_top(drifted: Path) -> None:

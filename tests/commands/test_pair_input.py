@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from recon.cli.drive_options import SourceOptions
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.pair import run_pair
-from recon.core.errors import CalibrationError
-from recon.core.values import RectifiedCamera
+from recon.core.errors import CalibrationError, ReconError
+from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.images.image import write_image
-from recon.sources.pair_input import KnownCamera, PairInput, read_pair_input
+from recon.sources.pair_input import PairInput, read_pair_input
+from recon.sources.registry import open_source
+from recon.sources.settings import SourceSettings
+from tests.sources.test_chosen_frames import ALL
 
 
 @pytest.fixture
@@ -27,12 +32,12 @@ def images(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "left.png", tmp_path / "right.png"
 
 
-def read(images: tuple[Path, Path], known: KnownCamera) -> PairInput:
+def read(images: tuple[Path, Path], known: SourceSettings) -> PairInput:
     return read_pair_input(*images, None, known=known)
 
 
 def test_focal_length_and_baseline_give_metres(images: tuple[Path, Path]) -> None:
-    given = read(images, KnownCamera(focal_px=300, baseline_m=0.2))
+    given = read(images, SourceSettings(focal_px=300, baseline_m=0.2))
     camera = given.calibration
     assert isinstance(camera, RectifiedCamera)
     assert (camera.focal_px, camera.baseline_m) == (300, 0.2)
@@ -41,7 +46,7 @@ def test_focal_length_and_baseline_give_metres(images: tuple[Path, Path]) -> Non
 
 
 def test_a_given_principal_point_is_that_of_both_views(images: tuple[Path, Path]) -> None:
-    known = KnownCamera(focal_px=300, baseline_m=0.2, cx_px=100, cy_px=50)
+    known = SourceSettings(focal_px=300, baseline_m=0.2, cx_px=100, cy_px=50)
     camera = read(images, known).calibration
     assert isinstance(camera, RectifiedCamera)
     assert (camera.cx_px, camera.cy_px, camera.cx_right_px) == (100, 50, 100)
@@ -50,7 +55,7 @@ def test_a_given_principal_point_is_that_of_both_views(images: tuple[Path, Path]
 def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
     images: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    given = read(images, KnownCamera(focal_px=300))
+    given = read(images, SourceSettings(focal_px=300))
     settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
     run = run_pair(given, settings, out=tmp_path / "out")
     assert run.summary["up_to_scale"] is True
@@ -60,9 +65,50 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
 
 def test_an_unknown_focal_length_is_refused(images: tuple[Path, Path]) -> None:
     with pytest.raises(CalibrationError, match=r"left\.png: focal length is unknown.*--focal PX"):
-        read(images, KnownCamera(baseline_m=0.2))
+        read(images, SourceSettings(baseline_m=0.2))
 
 
 def test_a_focal_length_in_millimetres_is_refused(images: tuple[Path, Path]) -> None:
     with pytest.raises(CalibrationError, match=r"--focal: .*4\.5 px.*see 17\d deg.*in pixels"):
-        read(images, KnownCamera(focal_px=4.5, baseline_m=0.2))
+        read(images, SourceSettings(focal_px=4.5, baseline_m=0.2))
+
+
+def test_a_drive_takes_the_same_numbers_and_a_file_is_not_needed(
+    images: tuple[Path, Path],
+) -> None:
+    folder = images[0].parent
+    with pytest.raises(ReconError, match=r"calibration is missing.*--focal PX and --baseline M"):
+        open_source(folder)
+    options = SourceOptions(focal=300, baseline=0.2, cx=100)
+    settings = load_config(None, options.overrides(None)).source
+    camera = open_source(folder, settings=settings).calibration
+    assert isinstance(camera, RectifiedCamera)
+    assert (camera.focal_px, camera.baseline_m, camera.cx_px) == (300, 0.2, 100)
+
+
+@pytest.mark.parametrize("layout", ["kitti", "kitti-raw", "euroc", "tum", "two videos", "mcap"])
+def test_numbers_take_the_place_of_the_calibration_of_every_layout(
+    tmp_path: Path, layout: str
+) -> None:
+    grey = [np.full((32, 64), 10 * k, np.uint8) for k in range(4)]
+    pairs = [StereoPair(image, image, 0.1 * k, k) for k, image in enumerate(grey)]
+    path = ALL[layout](pairs, RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32), tmp_path)
+    numbers = SourceSettings(focal_px=50, baseline_m=0.1)
+    camera = open_source(path, settings=numbers).calibration
+    assert isinstance(camera, RectifiedCamera)
+    assert (camera.focal_px, camera.baseline_m) == (50, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"focal_px": 300}, r"needs focal length and baseline \(got focal_px=300"),
+        ({"baseline_m": 0.1}, r"needs focal length and baseline"),
+        ({"focal_px": 300, "baseline_m": 0.1, "calibration": "rig.yaml"}, r"--calib: .*replace"),
+    ],
+)
+def test_half_a_camera_or_two_of_them_are_refused(
+    images: tuple[Path, Path], given: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ReconError, match=said):
+        open_source(images[0].parent, settings=SourceSettings(**given))

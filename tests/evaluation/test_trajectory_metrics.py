@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import fit_points, fit_upright
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
-from recon.core.values import Trajectory
+from recon.core.values import SequenceTruth, Trajectory
 from recon.evaluation.segments import KITTI_LENGTHS_M, choose_segments, segments_of
 from recon.evaluation.trajectory import TrajectoryRules, compare_paths, evaluate_trajectory
+from recon.io.trajectory import write_tum
 
 
 def trajectory(poses: np.ndarray) -> Trajectory:
@@ -157,6 +158,33 @@ def test_a_wrong_scale_vanishes_with_sim3_alone() -> None:
     assert found["sim3"].t_rel_percent < 1e-9
     assert found["none"].ate_m > found["se3"].ate_m > 1
     assert found["none"].t_rel_percent == pytest.approx(found["se3"].t_rel_percent)
+
+
+def test_a_path_is_taken_from_a_file_and_from_the_truth_of_a_source(tmp_path: Path) -> None:
+    path = trajectory(bend(100, 0.01))
+    found = evaluate_trajectory(path, path)
+    write_tum(tmp_path / "path.txt", path)
+    assert evaluate_trajectory(path, SequenceTruth(path)) == found
+    assert evaluate_trajectory(str(tmp_path / "path.txt"), tmp_path / "path.txt").ate_m < 1e-9
+    for nothing, got in (
+        (SequenceTruth(), "SequenceTruth without a path"),
+        (None, "NoneType without a path"),
+        (path.T_world_camera, "ndarray"),
+    ):
+        with pytest.raises(EvaluationError, match=f"truth is no trajectory .got {got}"):
+            evaluate_trajectory(path, nothing)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("unit", [1e-3, 0.3048, 1e3, 1e6])
+def test_a_truth_in_another_unit_is_refused_unless_scales_are_aligned(unit: float) -> None:
+    estimate = bend(2000, 0.01)
+    truth = estimate.copy()
+    truth[:, :3, 3] *= unit
+    pair = trajectory(estimate), trajectory(truth)
+    with pytest.raises(EvaluationError, match="in another unit"):
+        evaluate_trajectory(*pair)
+    scaled = evaluate_trajectory(*pair, TrajectoryRules(alignment="sim3"))
+    assert scaled.scale == pytest.approx(unit)
 
 
 def test_an_estimate_that_starts_elsewhere_is_right_from_its_origin() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -119,6 +120,24 @@ def test_a_map_too_large_for_an_octomap_has_all_else(
     assert "no OctoMap" in warning
     np.testing.assert_array_equal(written.grid.cells, whole.grid.cells)
     assert not [name for name in folder.files() if "octomap" in name]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (0.05, 2, r"min_height_m=0\.05 is too low .* m thick in cells of 0\.2 m"),
+        (0.3, 0.4, r"0\.3 to 0\.4 m, is thinner than a voxel of 0\.2 m"),
+        (0.3, 2, None),
+    ],
+)
+def test_a_band_that_the_ground_or_nothing_falls_into_is_warned_of(
+    mapped: MappedSequence, folder: Run, low: float, high: float, said: str | None
+) -> None:
+    config = load_config(None, [*SETTINGS, f"grid.min_height_m={low}", f"grid.max_height_m={high}"])
+    written = write_products(replace(mapped, config=config), folder)
+    warnings = [text for text in written.warnings if "height" in text]
+    assert len(warnings) == (said is not None)
+    assert said is None or re.search(said, warnings[0])
 
 
 def test_an_empty_height_band_is_reported(mapped: MappedSequence, folder: Run) -> None:

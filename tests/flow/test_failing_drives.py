@@ -7,7 +7,7 @@ rail, grey asphalt, sky. kiss-icp stands still on it and is sure of that.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.errors import CalibrationError, MappingError
+from recon.core.errors import CalibrationError, MappingError, RegistrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
 from recon.map.drive.map_run import MapRun
@@ -206,13 +206,34 @@ def test_a_prior_in_body_axes_is_recognised(seen: list[RectifiedPair], tmp_path:
     assert off_m(run, ROAD, 9) < ALLOWED_M
 
 
-def test_a_prior_said_to_be_in_the_wrong_axes_fails_with_the_reason(
-    seen: list[RectifiedPair], tmp_path: Path
+def random(positions: np.ndarray) -> np.ndarray:
+    return positions + np.random.default_rng(1).uniform(-100, 100, positions.shape)
+
+
+@pytest.mark.parametrize(
+    ("axes", "change"),
+    [
+        ("camera", lambda xyz: xyz),
+        *(
+            (axes, change)
+            for axes in ("auto", "body")
+            for change in (lambda xyz: 1e3 * xyz, lambda xyz: 1e-3 * xyz, lambda xyz: 1e6 * xyz)
+        ),
+        ("auto", random),
+        ("body", random),
+    ],
+)
+def test_a_prior_that_contradicts_the_images_is_refused(
+    seen: list[RectifiedPair], tmp_path: Path, axes: str, change: Callable[..., np.ndarray]
 ) -> None:
     write_drive(seen, tmp_path / "drive")
-    config = load_config(None, ["odometry.prior.axes=camera"])
-    options = MapOptions(audit=False, out=tmp_path / "out", mesh=False, prior=body_path(10, BODY))
-    with pytest.raises(MappingError, match=r"the map is empty .*check the prior: its axes"):
+    config = load_config(None, [f"odometry.prior.axes={axes}"])
+    path = body_path(10, BODY)
+    poses = path.T_world_camera.copy()
+    poses[:, :3, 3] = change(poses[:, :3, 3])
+    prior = replace(path, T_world_camera=poses)
+    options = MapOptions(audit=False, out=tmp_path / "out", mesh=False, prior=prior)
+    with pytest.raises(RegistrationError, match="the prior does not fit what the cameras see"):
         run_map(open_source(tmp_path / "drive"), config, options)
     assert not (tmp_path / "out").exists()
 

@@ -113,6 +113,14 @@ def test_a_camera_that_falls_silent_ends_the_drive_with_an_error() -> None:
         list(played)
 
 
+def test_rectified_cameras_need_two_numbers_and_no_file(videos: Path) -> None:
+    devices = [str(videos / "left.avi"), str(videos / "right.avi")]
+    numbers = SourceSettings(focal_px=300, baseline_m=0.2)
+    with open_camera_source(devices, CaptureSettings(), numbers) as source:
+        assert isinstance(source.calibration, RectifiedCamera)
+        assert (source.calibration.focal_px, source.calibration.baseline_m) == (300, 0.2)
+
+
 def test_the_calibration_is_that_of_the_image_size(videos: Path, tmp_path: Path) -> None:
     devices = [str(videos / "left.avi"), str(videos / "right.avi")]
     wrong = tmp_path / "calib.txt"

@@ -20,7 +20,7 @@ from recon.commands.occupancy import run_occupancy
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_tum
-from recon.map.store.map import MAP_FILE
+from recon.map.store.map import MAP_FILE, Map
 from recon.map.store.records import Store
 from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
@@ -73,8 +73,8 @@ def _summary(run: Path) -> dict[str, Any]:
 def _check_start(run: Path, least_free: float = 1.0) -> None:
     """The start and all trusted poses are free, with room for a robot around the start."""
     served, base = ServedMap(run), read_tum(run / "trajectory_map_base_tum.txt")
-    untrusted = json.loads((run / "run.json").read_text())["untrusted_frames"]
-    path = np.delete(base.positions_m[:, :2], untrusted, axis=0)
+    with Map.open(run) as map_:
+        path = base.positions_m[map_.first.trusted, :2]
     assert np.linalg.norm(path[0]) < 1e-6
     # The corners of cells that a footprint cuts are not all within it: the inner cells are free.
     assert (served.at(_disc(path[0], FOOTPRINT_M - 0.15)) == FREE).all()

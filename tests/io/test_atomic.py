@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from recon.core.errors import FormatError, OutputError
-from recon.io.atomic import atomic_path, write_bytes, write_text
+from recon.core.errors import FormatError, OutputError, SettingsError
+from recon.io.atomic import atomic_path, check_targets, write_bytes, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -70,9 +70,38 @@ def test_a_file_in_place_of_a_folder_is_one_clear_line(tmp_path: Path) -> None:
 
 def test_a_folder_in_place_of_the_file_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "a.txt").mkdir()
-    with pytest.raises(OutputError, match="Is a directory"):
+    with pytest.raises(OutputError, match="got a folder"):
         write_text(tmp_path / "a.txt", "text")
     assert names(tmp_path) == ["a.txt"]
+
+
+def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "null").symlink_to(os.devnull)
+    (tmp_path / "folder").mkdir()
+    before = {path.name: path.lstat().st_mode for path in tmp_path.iterdir()}
+    for name, kind in (("pipe", "a named pipe"), ("null", "a device"), ("folder", "a folder")):
+        with pytest.raises(OutputError, match=f"{name}: cannot write the file .got {kind}"):
+            write_text(tmp_path / name, "text")
+    assert {path.name: path.lstat().st_mode for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("link", ["same", "hard", "soft", "soft to soft", "by another way"])
+def test_an_input_is_not_written_under_any_name(tmp_path: Path, link: str) -> None:
+    source = tmp_path / "calib.txt"
+    source.write_text("precious")
+    (tmp_path / "hard").hardlink_to(source)
+    (tmp_path / "soft").symlink_to(source)
+    (tmp_path / "soft to soft").symlink_to("soft")
+    target = {"same": source, "by another way": tmp_path / ".." / tmp_path.name / "calib.txt"}
+    with pytest.raises(SettingsError, match="would replace an input"):
+        check_targets([tmp_path / "new", target.get(link, tmp_path / link)], [source])
+
+
+def test_a_new_file_and_one_that_is_not_read_may_be_written(tmp_path: Path) -> None:
+    for name in ("read", "other"):
+        (tmp_path / name).write_text("same content")
+    check_targets([tmp_path / "new", tmp_path / "other"], [tmp_path / "read", tmp_path / "gone"])
 
 
 def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:

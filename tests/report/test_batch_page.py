@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("batch") / "out"
     summary = {
         "jobs": [{}] * 12, "succeeded": 10, "failed": 1, "seconds": 60.0, "workers": 2,
-        "jobs_per_hour": 600.0,
+        "jobs_per_hour": 600.0, "warnings": ["drive0_w=9: the lens is dirty"],
     }  # fmt: skip
     (out / "drive3_w=9").mkdir(parents=True)
     (out / "drive3_w=9" / "report.html").touch()
@@ -55,6 +55,7 @@ def test_the_report_shows_outliers_first_and_links_to_the_runs(folder: Path) -> 
     assert 'href="later' not in page
     assert "trajectory.t_rel_percent 99 (usually" in page
     assert "&lt;b&gt;no images" in page
+    assert "drive0_w=9: the lens is dirty" in page
 
 
 def test_the_csv_has_every_figure_and_swept_setting(folder: Path) -> None:

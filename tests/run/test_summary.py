@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recon.odometry.health import health_warnings
+from recon.odometry.health import doubt_about, health_warnings, stretches
 from recon.odometry.protocol import OdometryHealth
 from recon.run.run import Run
 from recon.run.summary import plain
@@ -41,6 +41,26 @@ def test_a_drive_with_many_lost_frames_is_called_what_it_is_first() -> None:
     assert first.startswith("PATH AND MAP ARE NOT TO BE TRUSTED")
     assert "3 of 20 frames" in first
     assert len(others) == 1
+
+
+def test_what_follows_a_lost_pose_is_another_stretch_unless_that_was_skipped() -> None:
+    good, lost = OdometryHealth(), OdometryHealth(ok=False)
+    skipped = OdometryHealth(ok=False, skipped=True)
+    assert stretches([good, skipped, good, lost, good, good]).tolist() == [0, -1, 0, -1, 1, 1]
+    assert stretches([good, lost, skipped, good]).tolist() == [0, -1, -1, 1]
+    assert stretches([]).tolist() == []
+
+
+def test_one_line_says_what_is_doubted_of_a_drive() -> None:
+    good, lost = OdometryHealth(), OdometryHealth(ok=False)
+    skipped = OdometryHealth(ok=False, skipped=True)
+    assert doubt_about([good] * 3) == []
+    (line,) = doubt_about([*[good] * 20, skipped, *[good] * 20])
+    assert line == "1 of 41 poses are not to be trusted (frame 20): nothing of them is in the map"
+    (line,) = doubt_about([*[good] * 20, lost, *[good] * 20])
+    assert line.endswith("and what follows may be misplaced")
+    (line,) = doubt_about([good, lost, good])
+    assert line.startswith("PATH AND MAP ARE NOT TO BE TRUSTED: the poses of 1 of 3 frames")
 
 
 def test_a_healthy_drive_has_no_warning() -> None:

@@ -57,6 +57,7 @@ def test_each_kind_is_recognised_by_its_files_and_keeps_the_protocol(
         assert source.name == "folder"
         assert folder / "calib.txt" in source.files
         assert len(source) == len(list(source)) == 1
+        assert repr(source) == f"{type(source).__name__}(folder, pairs: 1, {source.description})"
 
 
 def test_a_middlebury_scene_has_its_geometry_and_no_path(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from recon.core.errors import OutputError
 from recon.sources.kitti import open_kitti
+from recon.sources.part import SourcePart
 from recon.sources.protocol import StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
@@ -30,6 +31,9 @@ def written(source, tmp_path_factory):
 
 def test_it_is_a_stereo_source(source):
     assert isinstance(source, StereoSource)
+    assert repr(source) == "SyntheticSource(synthetic street 6, pairs: 3, a rendered street)"
+    part = "SourcePart(synthetic street 6 0 to 1, pairs: 2, a rendered street)"
+    assert repr(SourcePart(source, 0, 2)) == part
     assert len(source) == 3
     assert source.calibration.width_px == 160
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recon.core.errors import FormatError, SourceError
 from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
 from recon.sources.protocol import StampedSource
@@ -55,6 +56,19 @@ def test_a_single_padded_counter_is_no_time(tmp_path: Path) -> None:
 )
 def test_integer_times_stay_times(tmp_path: Path, names: list[str], expected: list[float]) -> None:
     assert times(write_named(tmp_path, names)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_times_file_may_have_numbers_and_exposures(tmp_path: Path) -> None:
+    folder = write_named(tmp_path, [f"{k:05d}" for k in range(4)])
+    rows = [f"{k:05d} {7 + 0.25 * k:.6f} 1.5e-3\n" for k in range(4)]
+    (folder / "times.txt").write_text("".join(rows))
+    assert times(folder) == [7.0, 7.25, 7.5, 7.75]
+    (folder / "times.txt").write_text("".join([*rows[:2], rows[1], rows[3]]))
+    with pytest.raises(SourceError, match=r"times\.txt:3: two images have the same timestamp"):
+        times(folder)
+    (folder / "times.txt").write_text("1 2\n3 4\n")
+    with pytest.raises(FormatError, match="got 2, expected 1 or 3"):
+        times(folder)
 
 
 @pytest.mark.parametrize("name", ["{:010d}", "16000000{:02d}", "{}.5", "frame{}"])

@@ -11,6 +11,7 @@ from recon.core.errors import ShapeError
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int8 = NDArray[np.int8]
 UInt8 = NDArray[np.uint8]
 Int32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]

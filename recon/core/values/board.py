@@ -19,8 +19,8 @@ _FORMS: Final = (
     "(squares, such as charuco:8x6:30mm:22mm:5x5_100)"
 )
 _UNITS_M: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "": 1.0}
-_LENGTH: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m|in|)", re.IGNORECASE)
-_SIZE: Final = re.compile(r"(\d+)\s*[x×]\s*(\d+)", re.IGNORECASE)
+_LENGTH: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m|in|)", re.IGNORECASE | re.ASCII)
+_SIZE: Final = re.compile(r"(\d+)\s*[x×]\s*(\d+)", re.IGNORECASE | re.ASCII)
 _DICTIONARY: Final = re.compile(r"(?:DICT_)?(\w+)", re.IGNORECASE)
 _LARGEST_SQUARE_M: Final = 5.0
 _DEFAULT_MARKER: Final = 0.75  # of a square

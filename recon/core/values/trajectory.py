@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
 
 from recon.core.errors import ShapeError
 from recon.core.values.arrays import Float64, freeze
@@ -33,6 +36,12 @@ class Trajectory:
     def __repr__(self) -> str:
         seconds = self.timestamps_s[-1] - self.timestamps_s[0] if len(self) else 0.0
         return f"Trajectory({len(self)} poses, {self.path_length_m:.4g} m, {seconds:.4g} s)"
+
+    def select(self, frames: NDArray[Any]) -> Self:
+        """Return the poses of some frames, by numbers or bool (N,)."""
+        return replace(
+            self, T_world_camera=self.T_world_camera[frames], timestamps_s=self.timestamps_s[frames]
+        )
 
     def __len__(self) -> int:
         return len(self.T_world_camera)

@@ -15,7 +15,7 @@ from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury.calib import read_middlebury_calib
 
-_KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE)
+_KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE | re.ASCII)
 _MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)
 _OURS: Final = re.compile(rf"^format:\s*{MARK}", re.MULTILINE)
 _CAMERA_INFO: Final = re.compile(r"^projection_matrix:", re.MULTILINE)

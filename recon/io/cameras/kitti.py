@@ -28,8 +28,8 @@ from recon.io.files import StrPath, read_text, reader
 GREY_CAMERAS: Final = (0, 1)
 COLOUR_CAMERAS: Final = (2, 3)
 _FOLDER: Final = re.compile(r"image_0?([0-3])")
-_LINE: Final = re.compile(r"^P(?:_rect_0)?(\d):(.*)$", re.MULTILINE)
-_RAW_LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE)
+_LINE: Final = re.compile(r"^P(?:_rect_0)?(\d):(.*)$", re.MULTILINE | re.ASCII)
+_RAW_LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE | re.ASCII)
 
 
 @reader

@@ -23,6 +23,8 @@ _COLOURED: Final = 7
 _STEP_M: Final = 0.001
 _MARGIN_DEG: Final = 6.0
 """Systems are used as far outside their area as a zone of UTM is wide."""
+_LARGEST_STRETCH: Final = 2.0
+"""Of a metre on the ground: that of Mercator's projection at 60 degrees north."""
 _FULL_COLOUR: Final = 257
 """Colours have 16 bits: 255 becomes 65535."""
 
@@ -102,17 +104,21 @@ def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
     """Check that a position (east, north, up) lies where its coordinate system is used.
 
     Raises:
-        EvaluationError: It does not: axes swapped, another system, local coordinates or degrees.
+        EvaluationError: It does not: axes swapped, another system, local coordinates or degrees; or
+            a metre of the system is none on the ground there.
         MissingDependencyError: pyproj is not installed.
         SettingsError: There is no such coordinate system, see `check_crs`.
     """
     system = check_crs(crs)
     area = system.area_of_use
-    if area is None:
-        return
     pyproj = require("pyproj", extra=_EXTRA)
     to_degrees = pyproj.Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
-    lon, lat = to_degrees.transform(float(position_m[0]), float(position_m[1]))
+    east_m, north_m = (position_m[:2] + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])).T
+    lons, lats = to_degrees.transform(east_m, north_m)
+    lon, lat = lons[0], lats[0]
+    if area is None:
+        _check_metres(system, lons, lats, where)
+        return
     wide = area.east - area.west + (360.0 if area.east < area.west else 0.0)
     east_of_west = (lon - area.west + _MARGIN_DEG) % 360.0
     if (
@@ -127,6 +133,20 @@ def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
         expected=f"longitude {area.west:g} to {area.east:g}, latitude {area.south:g} to "
         f"{area.north:g}",
         hint="columns are time, easting, northing, height in metres; without --crs any are taken",
+    )
+
+
+def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> None:
+    """Refuse a system in which the places a metre east and north of the first are elsewhere."""
+    on_earth = bool((np.abs(lons) <= 360.0).all() and (np.abs(lats) <= 90.0).all())
+    _, _, apart_m = system.get_geod().inv(lons[[0, 0]], lats[[0, 0]], lons[1:], lats[1:])
+    if on_earth and (np.abs(np.log(apart_m)) < np.log(_LARGEST_STRETCH)).all():
+        return
+    raise EvaluationError(
+        "a metre of the coordinate system is not one on the ground where the positions are",
+        where=where,
+        got=f"longitude {lons[0]:g}, latitude {lats[0]:g} in {system.srs}",
+        expected="a projected system, such as EPSG:25832",
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.values import Frame, PointCloud
 from recon.core.values.arrays import Float32, UInt8
-from recon.io.files import StrPath, reader
+from recon.io.files import StrPath, reader, reading
 from recon.io.models.ply_tables import (
     PlyHeader,
     Table,
@@ -123,10 +123,11 @@ def read_ply_pieces(
     vertex: Table | None = None
     points, kept = 0, 0
     for header, vertex in read_table_pieces(path, "vertex", points_each):
-        piece = _shape(_vertices(vertex, path), header)
-        if sigma:
-            piece = replace(piece, sigma_m=_scalar(vertex, "sigma", np.float32))
-        piece = _finite(piece)
+        with reading(path):
+            piece = _shape(_vertices(vertex, path), header)
+            if sigma:
+                piece = replace(piece, sigma_m=_scalar(vertex, "sigma", np.float32))
+            piece = _finite(piece)
         points, kept = points + len(vertex), kept + len(piece)
         yield piece
     _vertices(vertex, path)

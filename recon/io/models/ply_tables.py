@@ -14,6 +14,7 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.decimals import parse_numbers
 from recon.core.errors import FormatError
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, reader, reading
@@ -323,7 +324,7 @@ def _read_text(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
     for _ in range(count):
         words = stream.readline().split()
         try:
-            numbers = [float(word) for word in words]
+            numbers = parse_numbers(words)
         except ValueError:
             break
         if len(numbers) != width:

@@ -17,6 +17,7 @@ from typing import IO, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.decimals import parse_integer, parse_number
 from recon.core.errors import FormatError, MappingError
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels, join_voxels
@@ -244,7 +245,7 @@ def _read_header(file: IO[bytes], path: Path) -> tuple[int, float]:
             break
         fields[name] = value
     try:
-        nodes, resolution_m = int(fields[b"size"]), float(fields[b"res"])
+        nodes, resolution_m = parse_integer(fields[b"size"]), parse_number(fields[b"res"])
     except (KeyError, ValueError) as error:
         raise FormatError("the OctoMap is truncated or damaged", where=path) from error
     if fields.get(b"id") != b"OcTree" or nodes < 0 or not 0 < resolution_m < np.inf:

@@ -52,15 +52,19 @@ def axes_of(
     reconstructor: FrameReconstructor,
     settings: PriorSettings,
 ) -> UsedPrior:
-    """Return the axes of a prior: those set, else those that explain the first motions."""
+    """Return the axes of a prior: those set, else those that explain the first motions.
+
+    Raises:
+        RegistrationError: It contradicts the first motions, or does not cover the drive.
+    """
     start = 0
     if isinstance(source, StampedSource):
         MotionPrior(prior, settings).check_covers(source.stamps_s)
         start = first_moving(prior, source.stamps_s, settings)
-    if settings.axes != "auto":
-        return UsedPrior(settings.axes, "settings")
     frames = (OdometryFrame(*reconstructor.match(pair)) for pair in source.frames(start))
     found = find_axes(prior, frames, settings)
+    if settings.axes != "auto":
+        return UsedPrior(settings.axes, "settings", {} if found is None else found.sigmas)
     if found is None:
         return UsedPrior("camera", "assumed")
     return UsedPrior(found.axes, "images", found.sigmas)

@@ -13,7 +13,7 @@ import numpy as np
 from recon.core.values import RectifiedPair
 from recon.map.drive.frame_result import FrameResult
 from recon.odometry.protocol import OdometryFrame, OdometryResult
-from recon.run.machine import work_in_background
+from recon.run.threads import work_in_background
 from recon.sources.live import LiveSource
 from recon.stereo.frame import FrameReconstructor
 

@@ -19,7 +19,8 @@ from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import SubmapBuilder
-from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
+from recon.odometry.health import stretches
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.run.lookahead import OneBehind
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
@@ -72,6 +73,8 @@ class Mapper:
         # A hole in the map is better than wrong geometry.
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
         rays = frame.rays if health.ok else None
+        if self._begins_stretch(health):
+            self.close()  # a map of several drives may have to do without what follows
         builder = self._builder_from(frame)
         work = (builder, len(self), cloud, rays, T_world_camera)
         self._behind.begin(partial(self._integrate, *work))
@@ -80,6 +83,13 @@ class Mapper:
         return FrameResult(
             len(self) - 1, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health
         )
+
+    def _begins_stretch(self, health: OdometryHealth) -> bool:
+        """Return whether nothing says where the next frame is beside those before."""
+        before = self.session.health
+        if not health.ok or not before or before[-1].ok:
+            return False
+        return bool(stretches([*before, health])[-1] > stretches(before).max())
 
     def _integrate(
         self,

@@ -124,6 +124,7 @@ def joined_drive(source: StereoSource, settings: DriveSettings, work: Workspace)
     mapped = MappedSequence(
         trajectory=session.odometry,
         health=session.health,
+        session=session,
         submaps=submaps,
         config=settings,
         T_map_world=session.T_map_world,

@@ -24,14 +24,17 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of
 from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace
+from recon.map.occupancy.looks import Looks
 from recon.map.settings import DriveSettings
+from recon.map.store.cast_submaps import looks_of
+from recon.map.store.session import Session
 from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles
 from recon.odometry.health import trusted_poses
 from recon.odometry.path_drift import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
-from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
+from recon.run.threads import serial_algebra
 from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
@@ -43,6 +46,7 @@ class MappedSequence:
     Attributes:
         trajectory: Pose of the left camera in each frame.
         health: Health of each pose.
+        session: What the map keeps of the drive.
         submaps: Fused cloud and occupancy, in submaps of consecutive frames.
         config: The configuration.
         T_map_world: float64 (4, 4).
@@ -57,6 +61,7 @@ class MappedSequence:
 
     trajectory: Trajectory
     health: tuple[OdometryHealth, ...]
+    session: Session
     submaps: Submaps
     config: DriveSettings
     T_map_world: Float64
@@ -84,7 +89,16 @@ class MappedSequence:
     @cached_property
     def tiles(self) -> Tiles:
         """Fused cloud and occupancy, tile by tile."""
-        return Tiles.of_submaps(self.submaps, self.config, self.T_map_world, self.T_corrected_world)
+        tiles = Tiles.of_submaps(
+            self.submaps, self.config, self.T_map_world, self.T_corrected_world
+        )
+        return tiles.with_looks(self.looks)
+
+    @cached_property
+    def looks(self) -> Looks | None:
+        """What each frame saw, from its rays; None where they were not kept."""
+        T_map_camera = self.T_map_world @ self.trajectory.T_world_camera
+        return looks_of([(self.session, T_map_camera, ())], self.config.occupancy)
 
     @cached_property
     def cloud(self) -> PointCloud:
@@ -190,6 +204,7 @@ def _mapped(
     mapped = MappedSequence(
         trajectory=session.odometry,
         health=session.health,
+        session=session,
         submaps=session.submaps,
         config=drive.config,
         T_map_world=session.T_map_world,

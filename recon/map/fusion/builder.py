@@ -51,8 +51,9 @@ class FusionSettings(Settings):
     )
     remove_moving: bool = Field(
         default=True,
-        description="Leave points of things that moved out of the cloud and the mesh: those in "
-        "space that rays of other frames went through. They are written to map/removed.ply.",
+        description="Leave points of things that moved out of the cloud and the mesh: what was "
+        "there as a whole at one time and gone at another, by the rays of single frames "
+        "(occupancy.keep_rays). They are written to map/removed.ply.",
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from recon.core.settings import Settings
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.grid import log_odds
-from recon.map.ground.surface import GroundSurface
+from recon.map.ground.surface import WINDOW_M, GroundSurface
 
 JOINED_CELLS: Final = 2
 """Cells that were hit, but not surely, belong to an obstacle that they hang together with over so
@@ -121,11 +121,8 @@ def flatten(
             "the height band of the grid is empty",
             got=f"{settings.min_height_m:g} to {settings.max_height_m:g} m",
         )
-    low = voxels.keys[:, :2].min(axis=0).astype(np.int64)
-    columns, rows = (voxels.keys[:, :2].max(axis=0) - low + 1).tolist()
-    cell = (voxels.keys[:, 1] - low[1]) * columns + voxels.keys[:, 0] - low[0]
-    floor = _floor(ground, low, (rows, columns), voxels.resolution_m)
-    height = (voxels.keys[:, 2] + 0.5) * voxels.resolution_m - floor[cell]
+    low, (rows, columns), cell = _columns(voxels)
+    height = _heights(voxels, ground)
 
     def any_in(which: Bool) -> Bool:
         found = np.bincount(cell[which], minlength=rows * columns) > 0
@@ -158,6 +155,22 @@ def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
     return np.asarray(cells, dtype=np.int8)
 
 
+def ground_depths(
+    voxels: OccupancyVoxels, ground: GroundSurface, settings: GridSettings
+) -> Float64:
+    """Return how far occupied voxels of the ground lie below it; float64 (N,), metres.
+
+    Nothing but ground is there, and as far as it is seen too low, it is seen too high elsewhere:
+    by its roughness, by noise, and because a voxel stands for all within it.
+    """
+    if len(voxels) == 0:
+        return np.zeros(0)
+    below = -_heights(voxels, ground)
+    full = voxels.log_odds >= log_odds(settings.occupied_probability)
+    deepest_m = WINDOW_M + voxels.resolution_m / 2
+    return np.asarray(below[full & (below >= 0) & (below <= deepest_m)])
+
+
 def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> OccupancyVoxels:
     """Return the voxels that are occupied or free by the settings; the others count as unknown.
 
@@ -169,13 +182,22 @@ def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> Occupancy
     return voxels.select(full | empty)
 
 
-def _floor(
-    ground: GroundSurface, low: NDArray[Any], shape: tuple[int, int], resolution_m: float
-) -> Float64:
-    """Return float64 (rows·columns,), height of the ground at the centre of each cell."""
+def _columns(
+    voxels: OccupancyVoxels,
+) -> tuple[NDArray[np.int64], tuple[int, int], NDArray[np.int64]]:
+    """Return the lowest column (2,), rows and columns of the grid, and the cell of each voxel."""
+    low = voxels.keys[:, :2].min(axis=0).astype(np.int64)
+    columns, rows = (voxels.keys[:, :2].max(axis=0) - low + 1).tolist()
+    return low, (rows, columns), (voxels.keys[:, :2] - low) @ np.array([1, columns])
+
+
+def _heights(voxels: OccupancyVoxels, ground: GroundSurface) -> Float64:
+    """Return float64 (N,), heights of the centres of voxels above the ground at their column."""
+    low, shape, cell = _columns(voxels)
     row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
-    xy = (np.stack([column, row], axis=1) + low + 0.5) * resolution_m
-    return ground.height_at(xy)
+    xy = (np.stack([column, row], axis=1) + low + 0.5) * voxels.resolution_m
+    floor = ground.height_at(xy)
+    return np.asarray((voxels.keys[:, 2] + 0.5) * voxels.resolution_m - floor[cell])
 
 
 def _beside(cells: Bool) -> Bool:

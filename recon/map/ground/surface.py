@@ -31,7 +31,7 @@ _NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) !
 CELL_M: Final = 1.0
 """Edge of a cell of the surface."""
 
-_WINDOW_M: Final = 0.3
+WINDOW_M: Final = 0.3
 """Points this far from the expected height may be ground: also the largest step from one cell to
 the next."""
 
@@ -241,7 +241,7 @@ class _Field:
         """Give the cells of a ring the height of their points, or carry the expected one."""
         slot = np.searchsorted(cells, self._cell[points])
         z = self._z[points]
-        height, window = expected, _WINDOW_M
+        height, window = expected, WINDOW_M
         for width in (window, window / 2):
             near = np.abs(z - height[slot]) <= width
             number = np.bincount(slot[near], minlength=len(cells))

@@ -47,42 +47,79 @@ def crossed_cells(
     """
     table = make_table(len(keys))
     enter_keys(table, keys)
+    spreads = np.zeros((len(cells), 3, 3))
+    _measure_spreads(cells, table, sums, spreads)
+    # Not in a kernel: numba takes linear algebra from scipy, which nothing else here needs.
+    normals = np.ascontiguousarray(np.linalg.eigh(spreads)[1][:, :, 0])
     crossed = np.zeros(len(cells), np.bool_)
-    _crossed_cells(cells, table, sums, crossed)
+    _test_cells(cells, table, sums, normals, crossed)
     return crossed
 
 
 @kernel
-def _crossed_cells(
+def _measure_spreads(
     cells: NDArray[np.int32],
     table: NDArray[np.int64],
     sums: NDArray[np.float32],
-    crossed: NDArray[np.bool_],
+    spreads: NDArray[np.float64],
 ) -> None:
-    """The loop of `crossed_cells`."""
+    """Write the covariance (N, 3, 3) of the points around each cell; 0 where they are too few."""
     points, weights = np.empty((AROUND, 3)), np.empty(AROUND)
     for n in range(len(cells)):
-        i, j, k = np.int64(cells[n, 0]), np.int64(cells[n, 1]), np.int64(cells[n, 2])
-        found, own = 0, False
-        for step in range(AROUND):
-            di, dj, dk = step // 9 - 1, step // 3 % 3 - 1, step % 3 - 1
-            row = find(table, pack_key(i + di, j + dj, k + dk))
-            if row == EMPTY:
-                continue
-            own = own or (di == 0 and dj == 0 and dk == 0)
-            weight = np.float64(sums[row, 0])
-            weights[found] = weight
-            points[found, 0] = di + sums[row, 1] / weight
-            points[found, 1] = dj + sums[row, 2] / weight
-            points[found, 2] = dk + sums[row, 3] / weight
-            found += 1
-        crossed[n] = own if found < LEAST else _crosses(points[:found], weights[:found])
+        found, _ = _gather(cells[n], table, sums, points, weights)
+        if found >= LEAST:
+            _add_spread(points[:found], weights[:found], spreads[n])
 
 
 @kernel
-def _crosses(points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
+def _test_cells(
+    cells: NDArray[np.int32],
+    table: NDArray[np.int64],
+    sums: NDArray[np.float32],
+    normals: NDArray[np.float64],
+    crossed: NDArray[np.bool_],
+) -> None:
+    """Test whether the plane with the normal (N, 3) of each cell crosses it."""
+    points, weights = np.empty((AROUND, 3)), np.empty(AROUND)
+    for n in range(len(cells)):
+        found, own = _gather(cells[n], table, sums, points, weights)
+        if found < LEAST:
+            crossed[n] = own
+        else:
+            crossed[n] = _crosses(points[:found], weights[:found], normals[n])
+
+
+@kernel
+def _gather(
+    cell: NDArray[np.int32],
+    table: NDArray[np.int64],
+    sums: NDArray[np.float32],
+    points: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> tuple[int, bool]:
+    """Write the points in and around a cell; their number, and whether one is in the cell."""
+    i, j, k = np.int64(cell[0]), np.int64(cell[1]), np.int64(cell[2])
+    found, own = 0, False
+    for step in range(AROUND):
+        di, dj, dk = step // 9 - 1, step // 3 % 3 - 1, step % 3 - 1
+        row = find(table, pack_key(i + di, j + dj, k + dk))
+        if row == EMPTY:
+            continue
+        own = own or (di == 0 and dj == 0 and dk == 0)
+        weight = np.float64(sums[row, 0])
+        weights[found] = weight
+        points[found, 0] = di + sums[row, 1] / weight
+        points[found, 1] = dj + sums[row, 2] / weight
+        points[found, 2] = dk + sums[row, 3] / weight
+        found += 1
+    return found, own
+
+
+@kernel
+def _crosses(
+    points: NDArray[np.float64], weights: NDArray[np.float64], normal: NDArray[np.float64]
+) -> bool:
     """Whether the plane through points around a cell's centre crosses the cell."""
-    normal = _normal(points, weights)
     total, distance = 0.0, 0.0
     for n in range(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -95,10 +132,12 @@ def _crosses(points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
 
 
 @kernel
-def _normal(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """float64 (3,), the direction in which weighted points spread least."""
+def _add_spread(
+    points: NDArray[np.float64], weights: NDArray[np.float64], spread: NDArray[np.float64]
+) -> None:
+    """Add up the covariance of weighted points."""
     total = weights.sum()
-    mean, spread = np.zeros(3), np.zeros((3, 3))
+    mean = np.zeros(3)
     for n in range(len(points)):
         for a in range(3):
             mean[a] += weights[n] / total * points[n, a]
@@ -107,4 +146,3 @@ def _normal(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArra
             for b in range(3):
                 product = (points[n, a] - mean[a]) * (points[n, b] - mean[b])
                 spread[a, b] += weights[n] / total * product
-    return np.linalg.eigh(spread)[1][:, 0]

@@ -11,6 +11,12 @@ from recon.core.geometry.se3 import adjoint, as_step, as_transform, invert, orth
 from recon.core.values.arrays import Float64
 from recon.places.drift import drift_over
 
+MAX_SIGMA_M: Final = 0.15
+"""Poses less certain than this are not given out: an error of 0.5 m is then beyond three sigmas."""
+
+MAX_SIGMA_DEG: Final = 1.0
+"""The same of the rotation."""
+
 _MAX_CHI2: Final = 22.5
 """Chi-square, with six degrees of freedom, above which a correction contradicts: 0.1 % of right
 ones are beyond."""
@@ -48,6 +54,11 @@ class Belief:
     def sigma_deg(self) -> float:
         """Standard deviation of the rotation about its worst axis."""
         return float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1])))
+
+    @property
+    def certain(self) -> bool:
+        """Whether the pose is certain enough to be given out."""
+        return self.sigma_m <= MAX_SIGMA_M and self.sigma_deg <= MAX_SIGMA_DEG
 
     def moved(self, T_before_now: Float64, covariance: Float64, path_m: float) -> Belief:
         """Return the belief after a motion.

@@ -1,7 +1,11 @@
-"""Whether a correction by ICP is worth applying: it fits better, is likely, and knows more."""
+"""Whether a correction by ICP is worth applying: it fits better, is likely, and knows more.
+
+And whether the surfaces could have refused it: in a street they fit as well half a metre on.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,6 +29,9 @@ prior."""
 _ICP_INDEPENDENCE: Final = 0.05
 """Share of the points whose errors count as independent."""
 
+_MIN_CONTRAST: Final = 2.0 * math.log(1000.0)
+"""Chi-square by which any pose that is wrong must fit worse: it is a thousand times less likely."""
+
 _ICP_FLOOR_M: Final = 0.02
 """Standard deviation of ICP's translation that more points do not improve."""
 
@@ -41,11 +48,13 @@ class Correction:
             of the prior; without the bias that all corrections share.
         before: The frame against the map, at the prior.
         after: The same at ICP's pose.
+        contrast: By how much the poses around ICP's fit worse, see `contrast`.
     """
 
     step: Float64
     before: Fit
     after: Fit
+    contrast: float
 
 
 def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
@@ -58,6 +67,8 @@ def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
     before, after, step = correction.before, correction.after, correction.step
     # A residual that is not known compares as False.
     if not after.residual_m <= (1.0 - _MIN_RESIDUAL_GAIN) * before.residual_m:
+        return False
+    if _ICP_INDEPENDENCE * correction.contrast < _MIN_CONTRAST:
         return False
     both = prior_covariance + icp_covariance(after)
     likely = distance_in_sigmas(step, both) <= MAX_SIGMAS

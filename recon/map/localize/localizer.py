@@ -1,9 +1,12 @@
-"""Localisation frame by frame: search until a place is recognised, then track against the map."""
+"""Localisation frame by frame: search until a place is recognised, then track against the map.
+
+Where the map confirms nothing, odometry goes on alone until its drift makes the pose uncertain.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
 
@@ -11,7 +14,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Bool, Float64
-from recon.map.localize.belief import Belief
+from recon.map.localize.belief import MAX_SIGMA_M, Belief
 from recon.map.localize.search import Search
 from recon.map.localize.surroundings import Surroundings
 from recon.odometry.covariance import covariance_of, step_covariance
@@ -29,13 +32,7 @@ _VIEWS: Final = 2
 _SURFACES_EVERY: Final = 3
 """Frames between two corrections by surfaces, where features confirm the pose."""
 
-_MAX_SIGMA_M: Final = 0.15
-"""Poses less certain than this are not given out: an error of 0.5 m is then beyond three sigmas."""
-
-_MAX_SIGMA_DEG: Final = 1.0
-"""The same of the rotation."""
-
-_SURE_SIGMA_M: Final = 0.5 * _MAX_SIGMA_M
+_SURE_SIGMA_M: Final = 0.5 * MAX_SIGMA_M
 """Poses that are more certain than this need not be compared with the map if time is short."""
 
 _LOST_SIGMA_M: Final = 0.05
@@ -50,12 +47,14 @@ class State(str, Enum):
 
     Attributes:
         SEARCHING: Nothing; no place has been recognised for certain.
-        TRACKING: Its pose.
+        TRACKING: Its pose; views or surfaces of the map confirm it.
+        COASTING: Its pose by odometry alone since the last one that was confirmed.
         LOST: Nothing any more; the pose of the frame before was the last one.
     """
 
     SEARCHING = "searching"
     TRACKING = "tracking"
+    COASTING = "coasting"
     LOST = "lost"
 
 
@@ -65,13 +64,14 @@ class Located:
 
     Attributes:
         state: What is known.
-        T_world_camera: float64 (4, 4), in the world of the map; None unless it is tracked.
+        T_world_camera: float64 (4, 4), in the world of the map; None unless it is tracked or
+            coasting.
         covariance: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
-            in camera axes; None unless it is tracked.
+            in camera axes; None where there is no pose. While coasting it grows with the way.
         views: Views of the map that confirm the pose.
         inliers: Features that agree with them.
-        surfaces: Whether the surfaces of the map corrected the pose.
-        note: Why nothing is known.
+        surfaces: Whether the surfaces of the map confirm and corrected the pose.
+        note: Why nothing is known, or confirmed.
     """
 
     state: State
@@ -111,7 +111,8 @@ class Localizer:
     """Finds the frames of a drive in a map, which it does not change.
 
     Visual odometry predicts each pose; features of the nearest views of the map, and its surfaces,
-    correct it, by their covariances. A pose is given out only while it is certain. Where frames are
+    correct it, by their covariances. A pose is given out only while it is certain; where nothing
+    corrects it, that is as far as odometry drifts by so much, some metres. Where frames are
     matched roughly, since time is short, one view corrects them; surfaces do only if none is found.
 
     Args:
@@ -154,12 +155,12 @@ class Localizer:
             return self._result(_Confirmed(self._belief, refused="no time to look at the map"))
         focal_px = self._known.focal_px
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity, focal_px=focal_px)
-        if self._belief is None:
-            self._belief = self._first_fix(keyframe, frame)
-        if self._belief is None:
+        if self._belief is not None:
+            return self._result(self._confirm(self._belief, keyframe, frame))
+        if (fix := self._first_fix(keyframe, frame)) is None:
             return Located(State.SEARCHING, note="no place is recognised for certain")
-        confirmed = self._confirm(self._belief, keyframe, frame)
-        return self._result(confirmed)
+        confirmed = self._confirm(Belief(*self._measured(fix)), keyframe, frame)
+        return self._result(replace(confirmed, loops=confirmed.loops or (fix,)))
 
     def _advance(self, visual: VisualEstimate) -> None:
         """Move on by the motion since the last frame."""
@@ -177,15 +178,15 @@ class Localizer:
             self._belief = self._belief.moved(T_before_now, covariance, step_m)
         self._T_odometry, self._path_m = T_now, self._path_m + step_m
 
-    def _first_fix(self, keyframe: Keyframe, frame: OdometryFrame) -> Belief | None:
+    def _first_fix(self, keyframe: Keyframe, frame: OdometryFrame) -> Loop | None:
+        """Return the best of the loops that are believed; None = no place is recognised."""
         camera = frame.pair.camera
         loops = self._search.add(keyframe, camera, self._T_odometry, self._path_m, self._among)
         if not loops:
             return None
         self._search.forget()
         self._among = None
-        best = max(loops, key=lambda loop: loop.inliers)
-        return Belief(*self._measured(best))
+        return max(loops, key=lambda loop: loop.inliers)
 
     def _measured(self, loop: Loop) -> tuple[Float64, Float64]:
         """Return the pose by a loop from a view of the map, and its covariance."""
@@ -221,17 +222,18 @@ class Localizer:
 
     def _result(self, confirmed: _Confirmed) -> Located:
         """Return the result of a frame; a belief that is not certain is given up."""
-        belief = confirmed.belief
-        if belief.sigma_m > _MAX_SIGMA_M or belief.sigma_deg > _MAX_SIGMA_DEG:
+        belief, seen = confirmed.belief, bool(confirmed.loops) or confirmed.surfaces
+        why = "" if seen else confirmed.refused or "no view of the map is near"
+        if not belief.certain:
             self._belief = None
-            why = confirmed.refused or "no view of the map is near"
-            return Located(State.LOST, note=why)
+            return Located(State.LOST, note=why or "what confirms the pose is too uncertain")
         self._belief = belief
         return Located(
-            State.TRACKING,
+            State.TRACKING if seen else State.COASTING,
             belief.T_world_camera,
             belief.covariance,
             len(confirmed.loops),
             sum(loop.inliers for loop in confirmed.loops),
             confirmed.surfaces,
+            why,
         )

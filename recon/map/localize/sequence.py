@@ -20,8 +20,8 @@ from recon.map.store.map import Map
 from recon.map.store.map_views import known_places
 from recon.odometry.protocol import OdometryFrame
 from recon.run.lookahead import look_ahead
-from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
+from recon.run.threads import serial_algebra
 from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor
@@ -74,8 +74,8 @@ class LocalizedFrame:
 
     @property
     def ok(self) -> bool:
-        """Whether its pose is known."""
-        return self.located.state is State.TRACKING
+        """Whether its pose is known, be it by odometry alone for some metres."""
+        return self.located.T_world_camera is not None
 
     @property
     def event(self) -> dict[str, Any]:
@@ -89,6 +89,8 @@ class LocalizedFrame:
             "position_m": None if T is None else T[:3, 3].round(6).tolist(),
             "views": self.located.views,
             "inliers": self.located.inliers,
+            "surfaces": self.located.surfaces,
+            "sigma_m": None if T is None else round(self.located.sigma_m, 6),
             "note": self.located.note,
         }
 
@@ -96,7 +98,7 @@ class LocalizedFrame:
     def state(self) -> str:
         """The frame for people."""
         found = self.located
-        if found.T_world_camera is None:
+        if found.state is not State.TRACKING:
             return f"{found.state.value}: {found.note}"
         return f"{found.state.value}, {found.inliers} inliers in {found.views} views"
 
@@ -117,16 +119,21 @@ class LocalizedDrive:
 
     @property
     def tracked(self) -> list[LocalizedFrame]:
-        """The frames whose pose is known."""
+        """The frames whose pose the map confirms."""
+        return [frame for frame in self.frames if frame.located.state is State.TRACKING]
+
+    @property
+    def placed(self) -> list[LocalizedFrame]:
+        """The frames whose pose is known: tracked, or coasting."""
         return [frame for frame in self.frames if frame.ok]
 
     @property
     def trajectory(self) -> Trajectory:
-        """Their poses, in the world of the map; perhaps none."""
+        """The poses of the frames that are placed, in the world of the map; perhaps none."""
         poses = [
-            f.located.T_world_camera for f in self.tracked if f.located.T_world_camera is not None
+            f.located.T_world_camera for f in self.placed if f.located.T_world_camera is not None
         ]
-        times_s = np.array([frame.time_s for frame in self.tracked])
+        times_s = np.array([frame.time_s for frame in self.placed])
         return Trajectory(np.array(poses).reshape(-1, 4, 4), times_s)
 
     def figures(self) -> dict[str, Any]:
@@ -150,13 +157,19 @@ class LocalizedDrive:
     def warnings(self) -> list[str]:
         """Return what the user should know."""
         states = [frame.located.state for frame in self.frames]
-        lost = states.count(State.LOST)
+        lost, coasting = states.count(State.LOST), states.count(State.COASTING)
         if not self.tracked:
             return ["the drive was not found in the map: no frame has a pose"]
-        if lost:
-            times = "once" if lost == 1 else f"{lost} times"
-            return [f"the drive was lost {times}; frames without a pose are not in the trajectory"]
-        return []
+        times = "once" if lost == 1 else f"{lost} times"
+        of = f"{coasting} of {len(states)} poses are by odometry alone"
+        return [
+            *([f"{of}: nothing in the map confirms them (coasting)"] if coasting else ()),
+            *(
+                [f"the drive was lost {times}; frames without a pose are not in the trajectory"]
+                if lost
+                else ()
+            ),
+        ]
 
 
 def open_localizer(

@@ -22,6 +22,9 @@ Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
 NOISE_M = 0.02
 """Standard deviation that is added to that of every surface."""
 
+FAR_CHI2 = 9.0
+"""Points three standard deviations from the surface of their cell count like those without one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
@@ -90,6 +93,15 @@ def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
     J = step_jacobian(near)
     total = np.einsum("nki,nkl,nlj->ij", J, information, J, optimize=True)
     return Fit(overlap, residual_m, total)
+
+
+def misfit(xyz: Float64, surfaces: Surfaces) -> float:
+    """Return how badly points (N, 3) fit: squared distances in standard deviations, summed up."""
+    cell, hit = _look_up(xyz, surfaces)
+    off, information = xyz[hit] - surfaces.means[cell[hit]], surfaces.information[cell[hit]]
+    square = np.einsum("ni,nij,nj->n", off, information, off, optimize=True)
+    square[~information.any(axis=(1, 2))] = FAR_CHI2
+    return float(np.minimum(square, FAR_CHI2).sum()) + FAR_CHI2 * float((~hit).sum())
 
 
 def _thin_information(covariance: Float64, edge_m: float) -> Float64:

@@ -11,14 +11,21 @@ import numpy as np
 from recon.core.geometry.se3 import adjoint, apply, as_step, as_transform, invert
 from recon.core.values.arrays import Float64
 from recon.io.files import reading
-from recon.map.localize.belief import Belief
+from recon.map.localize.belief import MAX_SIGMA_DEG, MAX_SIGMA_M, Belief
 from recon.map.localize.gate import Correction, icp_covariance, is_worthwhile
-from recon.map.localize.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces
+from recon.map.localize.surfaces import (
+    Fit,
+    Surfaces,
+    describe_surfaces,
+    fit_surfaces,
+    misfit,
+)
 from recon.map.store.map import Map
 from recon.map.store.session import Session
 from recon.odometry.icp_points import select_points
 from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
 from recon.odometry.protocol import OdometryFrame
+from recon.places.drift import SIGMAS
 
 _VOXEL_M: Final = 0.3
 """Edge of a voxel of the map of ICP."""
@@ -38,6 +45,9 @@ _MIN_POINTS: Final = 300
 _OFFSET_FRAMES: Final = 30
 """Corrections of poses that features confirm are averaged over as many frames and subtracted: their
 mean is the bias of stereo depth, not an error of the pose."""
+
+_ASIDE: Final = SIGMAS * np.repeat([MAX_SIGMA_M, np.deg2rad(MAX_SIGMA_DEG)], 3)
+"""Steps along and about each axis to poses that no pose given out may be mistaken for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +130,7 @@ class Surroundings:
             step=as_step(invert(T_prior) @ T_icp),
             before=_fit(alignment.source, T_prior, self._surfaces),
             after=_fit(alignment.source, T_icp, self._surfaces),
+            contrast=contrast(alignment.source, T_icp, self._surfaces),
         )
 
     def _learn(self, step: Float64) -> None:
@@ -140,14 +151,28 @@ class Surroundings:
         self._surfaces = describe_surfaces(xyz, _SURFACE_M)
 
 
+def contrast(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> float:
+    """Return by how much poses around another one fit worse, in chi-square; of the best of them.
+
+    Surfaces that fit half a metre away, too, say nothing of a pose, however well they fit there.
+    """
+    steps = np.concatenate([np.diag(_ASIDE), np.diag(-_ASIDE)])
+    around = [T_world_camera @ as_transform(step) for step in steps]
+    here, *aside = (misfit(apply(T, xyz_camera), surfaces) for T in (T_world_camera, *around))
+    return min(aside) - here
+
+
 def _parts(map_: Map, session: Session) -> Iterator[_Part]:
-    """Yield the submaps of a drive."""
+    """Yield the submaps of a drive whose frames have a place in the map."""
+    apart = session.trusted & ~map_.placed[session.number]
     corrections, T_map_session = session.corrections(), map_.T_world_session(session)
     cameras_m = apply(T_map_session, session.trajectory.positions_m)
     for entry in session.submaps.entries:
+        frames = slice(entry.first_frame, entry.first_frame + entry.frames)
+        if apart[frames].any():
+            continue
         T = T_map_session if corrections is None else T_map_session @ corrections[entry.index]
-        seen_from = cameras_m[entry.first_frame : entry.first_frame + entry.frames]
-        yield _Part(session, entry.index, T, seen_from)
+        yield _Part(session, entry.index, T, cameras_m[frames])
 
 
 def _distance_m(positions_m: Float64, place_m: Float64) -> float:

@@ -38,7 +38,7 @@ MAX_PROBABILITY: Final = 0.97
 FREE_MARGIN_SIGMAS: Final = 2.0
 """Free space ends this many standard deviations before the point."""
 
-_SPREAD_SIGMAS: Final = 1.0
+SPREAD_SIGMAS: Final = 1.0
 """Voxels within this many standard deviations of the point share its hit."""
 
 _MIN_POINTS: Final = 2
@@ -113,10 +113,9 @@ class OccupancyBuilder:
         """
         check_camera_cloud(cloud)
         _check_pose(T_world_camera, self._settings.resolution_m)
-        rays = self._rays(cloud, self._T_map_world @ T_world_camera)
-        s = self._settings
-        self._evidence = raycast.cast_rays(self._evidence, rays, _SPREAD_SIGMAS)
-        if s.thin_surfaces:
+        rays = frame_rays(cloud, self._T_map_world @ T_world_camera, self._settings)
+        self._evidence = raycast.cast_rays(self._evidence, rays, SPREAD_SIGMAS)
+        if self._settings.thin_surfaces:
             self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
         low, high = log_odds(MIN_PROBABILITY), log_odds(MAX_PROBABILITY)
         self._map = clamped.add_evidence(self._map, self._evidence, low, high)
@@ -148,28 +147,28 @@ class OccupancyBuilder:
         points = int(self._points.used[0]) * sum(a[:1].nbytes for a in self._points[1:-1])
         return int(self._map.used[0]) * self._map.cells[:1].nbytes + points
 
-    def _rays(self, cloud: PointCloud, T_map_camera: Float64) -> raycast.Rays:
-        """Return one ray per voxel in which enough points end; lengths in voxels."""
-        s = self._settings
-        T = T_map_camera.copy()
-        T[:3] /= s.resolution_m
-        ends, values = raycast.measure_points(
-            cloud.xyz,
-            *sigma_and_confidence(cloud),
-            T,
-            s.max_range_m / s.resolution_m,
-            FREE_MARGIN_SIGMAS,
-        )
-        means, values = _reduce(ends, values, cloud.count, _MIN_POINTS)
-        sigma, free, confidence, hit = np.ascontiguousarray(values.T)
-        return raycast.Rays(
-            origin=T[:3, 3].copy(),
-            ends=means,
-            free=free.astype(np.float64),
-            sigma=sigma.astype(np.float64),
-            hit=np.float32(log_odds(_HIT_PROBABILITY)) * confidence * hit,
-            miss=np.float32(log_odds(_MISS_PROBABILITY)) * confidence,
-        )
+
+def frame_rays(cloud: PointCloud, T_map_camera: Float64, s: OccupancySettings) -> raycast.Rays:
+    """Return one ray per voxel in which enough points of a frame end; lengths in voxels."""
+    T = T_map_camera.copy()
+    T[:3] /= s.resolution_m
+    ends, values = raycast.measure_points(
+        cloud.xyz,
+        *sigma_and_confidence(cloud),
+        T,
+        s.max_range_m / s.resolution_m,
+        FREE_MARGIN_SIGMAS,
+    )
+    means, values = _reduce(ends, values, cloud.count, _MIN_POINTS)
+    sigma, free, confidence, hit = np.ascontiguousarray(values.T)
+    return raycast.Rays(
+        origin=T[:3, 3].copy(),
+        ends=means,
+        free=free.astype(np.float64),
+        sigma=sigma.astype(np.float64),
+        hit=np.float32(log_odds(_HIT_PROBABILITY)) * confidence * hit,
+        miss=np.float32(log_odds(_MISS_PROBABILITY)) * confidence,
+    )
 
 
 def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:

@@ -1,8 +1,8 @@
-"""What moved: points of the fused cloud that rays of other frames went through.
+"""What moved: points of the fused cloud that were there at one time only.
 
-All that a drive saw in a voxel adds up: hits of a thing that was there, and rays that passed before
-and after. Rays of a frame end two standard deviations before what they hit, so what is far or
-uncertain frees nothing near itself. A voxel that a frame hit is not freed by that frame.
+First what may have moved is found. All that a drive saw in a voxel adds up: hits, and rays that
+passed before and after. Rays of a frame end two standard deviations before what they hit, so what
+is far or uncertain frees nothing near itself. A voxel that a frame hit is not freed by that frame.
 
 One voxel alone tells little. Someone who walks is hit in it nearly as often as it is seen through,
 and the surface of a wall lies partly in voxels that rays pass. So evidence is averaged over the
@@ -16,6 +16,9 @@ the others, and less is known of them than of what stands, which was seen again 
 a whole piece of surface was free, what moved grows into voxels that are not surely occupied, if
 half of those beside them at the same height have moved. That is one of two along an upright
 surface; at a straight edge on the ground it is three of eight, and nothing grows.
+
+Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noise are looked
+through as well, but no frame sees a whole piece of them gone. They are contradicted, and stay.
 
 A point that its frames could not place in a voxel stays if something occupied is in its reach.
 """
@@ -33,7 +36,9 @@ from recon.core.keys import are_among, find_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.core.values.grid import log_odds
+from recon.map.occupancy.bodies import came_or_went
 from recon.map.occupancy.builder import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
+from recon.map.occupancy.looks import Looks
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))
@@ -73,6 +78,7 @@ def find_moved(
     counted: Bool,
     voxels: OccupancyVoxels,
     evidence: CellEvidence,
+    looks: Looks,
 ) -> Bool:
     """Return bool (N,), the points of a drive that something left which has moved.
 
@@ -82,11 +88,17 @@ def find_moved(
         counted: bool (N,), which of them enough frames saw; the voxels of others tell nothing.
         voxels: What all drives observed, map axes.
         evidence: The `cell_evidence` of the same drive.
+        looks: What single frames of all drives saw.
     """
     places = points / voxels.resolution_m
     packed = pack_keys(np.floor(places).astype(np.int64))
-    moved = _mostly_free(packed, counted, voxels, evidence)
     placed = sigma_m <= _PLACED * voxels.resolution_m
+    keys, home = np.unique(packed, return_inverse=True)
+    moved = _mostly_free(keys, _among(home, counted), voxels, evidence)
+    if moved.any():
+        free = keys[moved]
+        moved[moved] = came_or_went(free, _among(home, counted & placed)[moved], looks.at(free))
+    moved = moved[home]
     occupied = pack_keys(voxels.keys[voxels.log_odds > 0])
     occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed])])
     unsure = np.flatnonzero(moved & ~placed)
@@ -95,11 +107,17 @@ def find_moved(
     return moved
 
 
+def _among(home: NDArray[np.int64], points: Bool) -> Bool:
+    """Return bool (cells,), which cells have one of the points; ``home`` is the cell of each."""
+    found = np.zeros(int(home.max(initial=-1)) + 1, np.bool_)
+    found[home[points]] = True
+    return found
+
+
 def _mostly_free(
-    packed: NDArray[np.int64], counted: Bool, voxels: OccupancyVoxels, evidence: CellEvidence
+    keys: NDArray[np.int64], tells: Bool, voxels: OccupancyVoxels, evidence: CellEvidence
 ) -> Bool:
-    """Return bool (N,), whether the voxels around points, in which there are points, are free."""
-    keys, home = np.unique(packed, return_inverse=True)
+    """Return bool (N,), sorted cells with points around which most of those that tell are free."""
     place, known = find_keys(keys, evidence[0])
     seen = np.full(len(keys), _MOST)
     seen[known] = evidence[1][place[known]]
@@ -107,10 +125,8 @@ def _mostly_free(
     # What was there when the drive ended, and is free in the end, another drive looked through:
     # a later one; or an earlier one, where this one hit it hardly more often than by chance.
     seen[free_in_the_end & (seen > _FREE)] = -_MOST
-    tells = np.zeros(len(keys), np.bool_)
-    tells[home[counted]] = True
     mean = _mean_around(keys, keys[tells], seen[tells])
-    return _grown(keys, mean <= 0, mean <= _UNSURE)[home]
+    return _grown(keys, mean <= 0, mean <= _UNSURE)
 
 
 def _grown(keys: NDArray[np.int64], sure: Bool, unsure: Bool) -> Bool:

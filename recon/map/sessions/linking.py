@@ -13,7 +13,7 @@ from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.map_views import MapViews
 from recon.map.store.session import Session
-from recon.odometry.health import trusted_poses
+from recon.odometry.health import stretches
 from recon.places.agree import agreeing_loops
 from recon.places.drift import path_lengths
 from recon.places.known_places import KnownPlaces, KnownView
@@ -53,18 +53,19 @@ def path_up_to(session: Session) -> Float64:
     """
     if all(record.known for record in session.health):
         return np.zeros(len(session))
-    return path_lengths(session.odometry.T_world_camera, trusted_poses(session.health))
+    return path_lengths(session.odometry.T_world_camera, session.trusted)
 
 
 def _between(map_: Map, group: Sequence[int], new: Session) -> list[Link]:
     """Return the links from drives that share axes to a new one."""
     links, theirs, own = [], set(), set()
     for number in group:
-        shared = shared_frames(map_.session(number), new).tolist()
-        if shared:
-            links.append(
-                Link((number, new.number), link_by_frame(map_.session(number), *shared[-1]))
-            )
+        other = map_.session(number)
+        shared = shared_frames(other, new).tolist()
+        ones, news = stretches(other.health), stretches(new.health)
+        # One for each two stretches: nothing else may say where those behind a lost pose are.
+        last = {(int(ones[first]), int(news[last])): (first, last) for first, last in shared}
+        links += [Link((number, new.number), link_by_frame(other, *pair)) for pair in last.values()]
         theirs |= {(number, first) for first, _ in shared}
         own |= {last for _, last in shared}
     views = MapViews(map_, group)

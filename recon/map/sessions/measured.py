@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,20 +10,25 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.errors import EvaluationError
+from recon.core.errors import EvaluationError, FormatError, SettingsError
 from recon.core.geometry.alignment import find_agreeing, fit_upright
 from recon.core.geometry.interpolation import interpolate_poses, nearest_sorted
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.files import read_table, reader
+from recon.io.trajectory import check_positions
 from recon.map.store.map import Map
 from recon.map.store.session import Session
-from recon.odometry.health import trusted_poses
+from recon.odometry.path_drift import expected_drift
+from recon.places.drift import SIGMAS
 from recon.places.fixes import Fixes
+from recon.places.path_fit import RECEIVER_M, drift_at_end, fit_to_path
 
 LARGEST_MISFIT: Final = 0.01
 """Misfit, as a share of the extent of the path, that drift may explain."""
+_LONGEST_ARM_M: Final = 100.0
+"""The axes of a vehicle are known to a degree or so: an antenna farther away is off by metres."""
 _LEAST_SPAN_M: Final = 1.0
 """Positions closer together than this say nothing of the direction of the map."""
 _LONGEST_GAP_S: Final = 1.0
@@ -44,19 +50,33 @@ class Survey:
 
     Attributes:
         positions: File with rows of time in seconds, easting, northing and height in metres (or a
-            TUM file), on the clock of the images.
+            TUM file), on the clock of the images. One or three more columns are standard
+            deviations in metres, of each coordinate or all.
         antenna_m: Where what they are the positions of (antenna, prism) is, from the left camera:
             metres forward, left and up.
         crs: Name of the coordinate system, such as ``EPSG:25832``; None = not stated.
+
+    Raises:
+        SettingsError: No vehicle has an antenna so far from its camera.
     """
 
     positions: Path
     antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     crs: str | None = None
 
+    def __post_init__(self) -> None:
+        if not math.hypot(*self.antenna_m) <= _LONGEST_ARM_M:
+            raise SettingsError(
+                "the antenna is not on the vehicle of the camera",
+                where="--antenna",
+                got=f"{math.hypot(*self.antenna_m):.4g} m away",
+                expected=f"at most {_LONGEST_ARM_M:g} m",
+                hint="it is metres forward, left and up from the left camera",
+            )
+
     @cached_property
     def rows(self) -> Float64:
-        """float64 (N, 4), time, easting, northing and height, in the order of time.
+        """float64 (N, 5), time, easting, northing, height, sigma (or NaN), in the order of time.
 
         Raises:
             FormatError: The file is missing or damaged.
@@ -73,12 +93,14 @@ class Measured:
         position_m: float64 (N, 3), in the coordinates of the survey.
         ours_m: float64 (N, 3), by the path, in map axes.
         agree: bool (N,), False for positions that contradict most others.
+        stated_m: Standard deviation of a coordinate by the file; None = it does not say.
     """
 
     times_s: Float64
     position_m: Float64
     ours_m: Float64
     agree: Bool
+    stated_m: float | None = None
 
     @cached_property
     def T_survey_map(self) -> Float64:
@@ -92,13 +114,39 @@ class Measured:
 
     @property
     def sigma_m(self) -> float:
-        """Standard deviation of a coordinate, by how evenly the positions differ from the path.
+        """Standard deviation of a coordinate, as the path is bent by it.
 
-        What many in a row are off by, or by more and more, cannot be told from drift of the path.
+        What many in a row are off by, or by more and more, cannot be told from drift of the path:
+        that is for the file to say.
         """
+        return max(_LEAST_SIGMA_M, self.uneven_m, self.stated_m or 0.0)
+
+    @property
+    def uneven_m(self) -> float:
+        """Standard deviation of a coordinate, by how evenly the positions differ from the path."""
         bends_m = np.abs(np.diff(self.misfit_m[self.agree], n=2, axis=0))
         bend_m = float(np.median(bends_m)) if len(bends_m) else 0.0
-        return max(_LEAST_SIGMA_M, float(_SIGMA_OF_BEND * bend_m))
+        return float(_SIGMA_OF_BEND * bend_m)
+
+    def check(self, drift_m: float, where: Path) -> None:
+        """Refuse positions that neither the drift of the path nor their noise explains.
+
+        Raises:
+            EvaluationError: They are such.
+        """
+        swapped = "; ".join(self._swapped())
+        hint = swapped or "have they its clock, metres, and the offset of the antenna?"
+        sigma_m = RECEIVER_M if self.stated_m is None else self.stated_m
+        ours_m, position_m = self.ours_m[self.agree], self.position_m[self.agree]
+        fit_to_path(ours_m, position_m, drift_m, sigma_m).check(where, hint)
+        if self.uneven_m > SIGMAS * sigma_m:
+            raise EvaluationError(
+                "positions jump from one to the next",
+                where=where,
+                got=f"a standard deviation of {self.uneven_m:.3g} m",
+                expected=f"{sigma_m:g} m, as "
+                + ("of a receiver" if self.stated_m is None else "the file states"),
+            )
 
     def warnings(self) -> list[str]:
         """Return lines of positions that are left out, and of columns that seem swapped."""
@@ -135,17 +183,21 @@ def _off_m(ours_m: Float64, there_m: Float64) -> Float64:
     return np.asarray(apply(fit_upright(ours_m, there_m).T_to_from, ours_m) - there_m)
 
 
-def measure_along(path: Trajectory, T_map_world: Float64, survey: Survey) -> Measured:
+def measure_along(
+    path: Trajectory, T_map_world: Float64, survey: Survey, drift_m: float
+) -> Measured:
     """Return the positions that were measured during a drive, and where its path has them.
 
     Args:
         path: The path, interpolated at their times.
         T_map_world: float64 (4, 4), from its world to map axes.
         survey: What was measured.
+        drift_m: By how much the path may be off at its end, standard deviation.
 
     Raises:
         FormatError: The file is missing or damaged.
-        EvaluationError: No position was measured during the drive, or all at one place.
+        EvaluationError: No position was measured during the drive, all are at one place, or
+            neither drift nor noise explains where they are.
     """
     rows = survey.rows
     here = rows[_during(path, rows[:, 0])]
@@ -157,18 +209,22 @@ def measure_along(path: Trajectory, T_map_world: Float64, survey: Survey) -> Mea
             expected=f"times within {path.timestamps_s[0]:.3f} to {path.timestamps_s[-1]:.3f} s",
             hint="both need one clock",
         )
-    if span_m(here[:, 1:]) < _LEAST_SPAN_M:
+    position_m, sigma_m = here[:, 1:4], here[:, 4]
+    if span_m(position_m[:, :2]) < _LEAST_SPAN_M:
         raise EvaluationError(
             "the positions do not say how the map is turned",
             where=survey.positions,
-            got=f"{len(here)} positions within {span_m(here[:, 1:]):.2f} m",
+            got=f"{len(here)} positions within {span_m(position_m[:, :2]):.2f} m",
             expected=f"{_LEAST_SPAN_M:g} m or more",
             hint="eastings and northings are in metres, not degrees",
         )
     antenna_m = _in_camera(survey, T_map_world)
     ours_m = _placed(T_map_world @ interpolate_poses(path, here[:, 0]), antenna_m)
-    agree = find_agreeing(ours_m, here[:, 1:], LARGEST_MISFIT * span_m(ours_m))
-    return Measured(here[:, 0], here[:, 1:], ours_m, agree)
+    agree = find_agreeing(ours_m, position_m, LARGEST_MISFIT * span_m(ours_m))
+    stated_m = None if np.isnan(sigma_m).any() else float(np.sqrt(np.mean(sigma_m[agree] ** 2)))
+    measured = Measured(here[:, 0], position_m, ours_m, agree, stated_m)
+    measured.check(drift_m, survey.positions)
+    return measured
 
 
 def hold(map_: Map, survey: Survey) -> list[str]:
@@ -185,14 +241,15 @@ def hold(map_: Map, survey: Survey) -> list[str]:
 
     Raises:
         FormatError: The file is missing or damaged.
-        EvaluationError: No position was measured during any drive, or all of one at one place.
+        EvaluationError: No position was measured during any drive, all of one are at one place, or
+            neither drift nor noise explains where they are.
         OutputError: The map cannot be written.
     """
     times_s, lines = survey.rows[:, 0], list[str]()
-    sessions = [each for each in map_.sessions if _during(_trusted(each), times_s).any()]
+    sessions = [each for each in map_.sessions if _during(trusted_path(each), times_s).any()]
     for session in sessions or map_.sessions[:1]:  # of none, the first says why
-        path = _trusted(session)
-        measured = measure_along(path, session.T_map_world, survey)
+        path, drift_m = trusted_path(session), drift_of(session)
+        measured = measure_along(path, session.T_map_world, survey, drift_m)
         session.set_fixes(_fixes(session, path, measured, survey))
         lines += measured.warnings()
     return lines
@@ -250,10 +307,17 @@ def _in_camera(survey: Survey, T_map_world: Float64) -> Float64:
     return np.asarray(R_map_camera.T @ R_map_vehicle @ np.asarray(survey.antenna_m))
 
 
-def _trusted(session: Session) -> Trajectory:
+def trusted_path(session: Session) -> Trajectory:
     """Return the path of a drive without frames that are not trusted."""
-    path, good = session.trajectory, trusted_poses(session.health)
-    return Trajectory(path.T_world_camera[good], path.timestamps_s[good])
+    return session.trajectory.select(session.trusted)
+
+
+def drift_of(session: Session) -> float:
+    """Return by how much the path of a drive may be off at its end, standard deviation."""
+    path = session.odometry
+    stated = expected_drift(path, session.health, session.camera)
+    percent = None if stated is None else stated.percent
+    return drift_at_end(path, session.trusted, percent)
 
 
 def span_m(positions: Float64) -> float:
@@ -263,9 +327,16 @@ def span_m(positions: Float64) -> float:
 
 @reader
 def _read_positions(file: Path) -> Float64:
-    """Return time, east, north and up (N, 4), in the order of time."""
-    table, _ = read_table(file, (4, 8))
-    return np.asarray(table[np.argsort(table[:, 0], kind="stable"), :4])
+    """Return time, east, north, up and sigma (N, 5), in the order of time."""
+    table, lines = read_table(file, (4, 5, 7, 8))
+    check_positions(table[:, 1:4], lines, file)
+    sigma_m = np.full(len(table), np.nan)
+    if table.shape[1] in (5, 7):
+        sigma_m = np.sqrt(np.mean(table[:, 4:] ** 2, axis=1))
+        if not (table[:, 4:] > 0.0).all():
+            raise FormatError("a standard deviation is not above 0", where=file)
+    rows = np.column_stack([table[:, :4], sigma_m])
+    return np.asarray(rows[np.argsort(rows[:, 0], kind="stable")])
 
 
 def _during(path: Trajectory, times_s: Float64) -> Bool:

@@ -9,16 +9,16 @@ import numpy as np
 
 from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
+from recon.map.occupancy.looks import Looks
 from recon.map.sessions.shared_frames import seen_before
 from recon.map.settings import DriveSettings
-from recon.map.store.cast_submaps import CastSubmaps, check_rays
+from recon.map.store.cast_submaps import CastSubmaps, check_rays, looks_of
 from recon.map.store.map import Map
 from recon.map.store.records import Store
 from recon.map.store.session import Session
 from recon.map.store.submaps import Submaps
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
-from recon.odometry.health import trusted_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class PlacedMap:
     Attributes:
         tiles: What they observed.
         path_m: float64 (N, 3), positions of the camera, map axes; a row of NaN between two drives.
-        trusted: bool (N,), which of them are to be trusted.
+        trusted: bool (N,), which of them are to be trusted, and have a place in the map.
     """
 
     tiles: Tiles
@@ -67,14 +67,15 @@ def place_map(map_: Map, settings: DriveSettings, *, fuse: bool = True) -> Place
     tiles = Tiles.of_submaps(
         made, settings, map_.first.T_map_world, placed.corrections, drives=placed.drives, fuse=fuse
     )
-    return with_path(map_, tiles)
+    return with_path(map_, tiles.with_looks(_looks(map_, settings)))
 
 
 class PlacedSubmaps:
     """The submaps of all linked drives of a map, one drive after the other, where they lie.
 
     Those of a single drive are in its world by odometry, to be corrected; those of several are in
-    the world of the first: sums are moved, rays cast where they were seen.
+    the world of the first: sums are moved, rays cast where they were seen. Frames without a place
+    in the map give none, and their submaps, in which frames cannot be told apart, no sums.
 
     Args:
         map_: The map.
@@ -94,6 +95,7 @@ class PlacedSubmaps:
         for session in sessions:
             check_rays(session, settings)
         self._settings = settings
+        self._apart = [_without_place(map_, session) for session in sessions]
         self.drives = [len(session.submaps) for session in sessions]
         alone = len(sessions) == 1
         self.corrections = sessions[0].corrections() if alone else None
@@ -116,6 +118,9 @@ class PlacedSubmaps:
         own = number - sum(self.drives[:drive])
         cast, T = self._parts[drive]
         submap = cast[own]
+        frames = range(submap.first_frame, submap.first_frame + submap.frames)
+        if not self._apart[drive].isdisjoint(frames):
+            return replace(submap, fused=submap.fused.select(np.zeros(0, np.intp)))
         if T is None or np.array_equal(T[own], np.eye(4)):
             return submap
         return replace(submap, fused=submap.fused.moved(T[own], self._settings.fusion.voxel_m))
@@ -125,7 +130,8 @@ def with_path(map_: Map, tiles: Tiles) -> PlacedMap:
     """Return the tiles of a map with the paths of its linked drives."""
     sessions = map_.linked
     paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
-    good = [trusted_poses(session.health) for session in sessions]
+    placed = map_.placed
+    good = [placed[session.number] for session in sessions]
     return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
 
 
@@ -145,9 +151,30 @@ def _beside(map_: Map, session: Session, settings: DriveSettings) -> tuple[CastS
     poses = T_world_session @ session.trajectory.T_world_camera
     T = np.repeat(T_world_session[None], len(session.submaps), axis=0)
     moves = T if corrections is None else T @ corrections
-    # What an earlier drive has seen in the same images is no evidence of its own.
-    without = seen_before(map_, session)
+    without = _no_evidence(map_, session)
     return CastSubmaps(session, settings, map_.first.T_map_world, poses, without), moves
+
+
+def _looks(map_: Map, settings: DriveSettings) -> Looks | None:
+    """Return what single frames of the linked drives saw, where they lie in the map."""
+    return looks_of(
+        (
+            (s, s.T_map_world @ s.trajectory.T_world_camera, _no_evidence(map_, s))
+            for s in map_.linked
+        ),
+        settings.occupancy,
+    )
+
+
+def _no_evidence(map_: Map, session: Session) -> frozenset[int]:
+    """Return the frames without a place, and those whose images an earlier drive has, too."""
+    return frozenset(seen_before(map_, session) | _without_place(map_, session))
+
+
+def _without_place(map_: Map, session: Session) -> frozenset[int]:
+    """Return the frames of a drive that saw something, but have no place in the map."""
+    frames = np.flatnonzero(session.trusted & ~map_.placed[session.number])
+    return frozenset(frames.tolist())
 
 
 def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:

@@ -39,11 +39,16 @@ def link_by_frame(one: Session, first: int, last: int) -> Loop:
 
 
 def seen_before(map_: Map, session: Session) -> frozenset[int]:
-    """Return the frames of a drive that an earlier one linked with it has: no evidence of its own.
+    """Return the frames of a drive that an earlier one has in the map: no evidence of its own.
 
     Raises:
         FormatError: The map is damaged.
     """
     linked = map_.linked
-    earlier = linked[: linked.index(session)]
-    return frozenset(last for one in earlier for last in shared_frames(one, session)[:, 1].tolist())
+    earlier, placed = linked[: linked.index(session)], map_.placed
+    return frozenset(
+        last
+        for one in earlier
+        for first, last in shared_frames(one, session).tolist()
+        if placed[one.number][first]
+    )

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from recon.core.errors import FormatError, SettingsError
+from recon.core.values import RayCloud
 from recon.core.values.arrays import Float64
-from recon.map.occupancy.builder import OccupancyBuilder
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
+from recon.map.occupancy.looks import Looks
 from recon.map.settings import DriveSettings
 from recon.map.store.records import Store
 from recon.map.store.session import Session
@@ -57,6 +61,34 @@ class CastSubmaps:
             if frame not in self.without:
                 builder.integrate(session.rays(frame)[0].cloud(), poses[frame])
         return replace(kept, occupancy=builder.take())
+
+
+def looks_of(
+    drives: Iterable[tuple[Session, Float64, Collection[int]]], settings: OccupancySettings
+) -> Looks | None:
+    """Return what single frames of drives saw, from the rays that their sessions kept.
+
+    Args:
+        drives: Each session, its ``T_map_camera`` float64 (N, 4, 4), and the frames to leave out.
+        settings: How rays become occupancy.
+
+    Returns:
+        The looks; None where a drive kept no rays.
+    """
+    found: list[tuple[Session, int]] = []
+    poses = []
+    for session, T_map_camera, without in drives:
+        if session.ray_frames != len(session):
+            return None
+        frames = [frame for frame in range(len(session)) if frame not in without]
+        found += [(session, frame) for frame in frames]
+        poses.append(T_map_camera[frames])
+
+    def read(number: int) -> RayCloud:
+        session, frame = found[number]
+        return session.rays(frame)[0]
+
+    return Looks(settings, np.concatenate(poses), read)
 
 
 def with_occupancy(session: Session, settings: DriveSettings, *, threads: int = 1) -> Submaps:

@@ -11,11 +11,13 @@ from typing_extensions import Self
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
 from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.io.files import StrPath, reading
 from recon.map.store.links import LINKS, Link
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
+from recon.map.store.trust import doubts_of_drives, placed_frames
+from recon.run.directory import refuse_links
 
 if TYPE_CHECKING:
     from recon.map.localize.localizer import Located
@@ -66,6 +68,8 @@ class Map:
         if path.is_dir() and not file.is_file():
             expected = f"a {MAP_FILE}, as recon map, live and merge keep it"
             raise FormatError("folder has no map", where=path, expected=expected)
+        if path.is_dir():
+            refuse_links(path)
         store = Store.open(file, read_only=read_only, cache_bytes=cache_bytes)
         try:
             return cls(store)
@@ -140,6 +144,26 @@ class Map:
         if not (linked := self.linked):
             raise FormatError("the map has no drive", where=self.store.name)
         return linked[0]
+
+    @property
+    def placed(self) -> dict[int, Bool]:
+        """Which frames of each linked drive, by its number, have a place in the map; bool (N,).
+
+        Only these are in its products, and to be recognised.
+
+        Raises:
+            FormatError: The map is damaged.
+        """
+        return placed_frames(self.linked, self.links)
+
+    @property
+    def doubts(self) -> list[str]:
+        """Lines of what is not to be trusted in the linked drives; whoever uses the map says so.
+
+        Raises:
+            FormatError: The map is damaged.
+        """
+        return doubts_of_drives(self.linked, self.placed)
 
     def set_links(self, links: Sequence[Link], linked: Collection[int]) -> None:
         """Keep the links, and the numbers of the drives that share the axes of the map.

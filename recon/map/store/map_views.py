@@ -34,7 +34,8 @@ class MapViews(Sequence[KnownView]):
 
     Args:
         map_: The map.
-        sessions: Numbers of the drives to take; None = those that share the axes of the map.
+        sessions: Numbers of the drives to take; None = those that share the axes of the map, as
+            far as they have a place in it.
 
     Raises:
         FormatError: The map is damaged.
@@ -46,8 +47,11 @@ class MapViews(Sequence[KnownView]):
         self._poses: dict[int, Float64] = {}
         self._cameras: dict[int, RectifiedCamera] = {}
         taken = map_.linked if sessions is None else map(map_.session, sorted(sessions))
+        placed = map_.placed if sessions is None else None
         for session in taken:
             frames = session.keyframes.frames
+            if placed is not None:
+                frames = [frame for frame in frames if placed[session.number][frame]]
             if frames:
                 T_world_session = map_.T_world_session(session)
                 self._poses[session.number] = T_world_session @ session.trajectory.T_world_camera

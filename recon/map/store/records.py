@@ -14,6 +14,7 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.core.errors import FormatError
+from recon.io.atomic import check_targets
 from recon.io.files import reading
 from recon.map.store.arrays import Bytes, from_bytes, to_bytes
 from recon.map.store.cache import Cache
@@ -63,6 +64,7 @@ class Store:
         Raises:
             OutputError: The file cannot be written.
         """
+        check_targets([path])
         with writing(path):
             for stale in (path, *beside(path)):
                 stale.unlink(missing_ok=True)
@@ -233,9 +235,11 @@ class Store:
         """
         for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
             with self._lock, self._reading():
-                text, content, _ = self._row(kind, _name(key))
+                text, content, checksum = self._row(kind, _name(key))
                 whole = content.read(content.left)
                 content.close()
+                if content.checksum != checksum:
+                    raise FormatError("a record of the map is damaged", got=f"{kind} {_name(key)}")
             other._insert(kind, _name(new), text, [whole])
 
     def commit(self) -> None:

@@ -11,13 +11,14 @@ import numpy as np
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.io.files import reading
 from recon.map.store.frames import FRAMES, frames_in, frames_record
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.rays import RAYS, rays_in, rays_record
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
+from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
 from recon.places.fixes import NO_FIXES, Fixes
@@ -134,6 +135,11 @@ class Session:
     def health(self) -> tuple[OdometryHealth, ...]:
         """How far each pose can be trusted."""
         return tuple(self._health)
+
+    @property
+    def trusted(self) -> Bool:
+        """bool (N,), which poses are to be trusted."""
+        return trusted_poses(self._health)
 
     @property
     def T_map_world(self) -> Float64:

@@ -109,7 +109,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     findings = [
         *find_image_faults(sample, config.matching.matcher),
         *find_series_faults(sample, gaps),
-        *find_geometry_faults(geometry),
+        *find_geometry_faults(geometry, source),
         *_turn_faults(source.calibration, motion, camera),
         *find_range_faults(geometry, reach_px, camera),
         *find_calibration_faults(sample, source.calibration, camera, settings.baseline_m),

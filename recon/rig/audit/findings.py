@@ -14,6 +14,7 @@ from recon.rig.audit.measures import Gaps
 from recon.rig.audit.right_turn import RightTurn
 from recon.rig.audit.sample import BLANK_DN, Sample
 from recon.rig.audit.seen_motion import turn_figures
+from recon.sources.protocol import IncompleteSource, StereoSource
 from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]
@@ -168,7 +169,7 @@ def find_series_faults(sample: Sample, gaps: Gaps) -> Iterator[Finding]:
         )
 
 
-def find_geometry_faults(geometry: Geometry) -> Iterator[Finding]:
+def find_geometry_faults(geometry: Geometry, source: StereoSource) -> Iterator[Finding]:
     """Yield problems of the geometry: swapped cameras, delays, row errors."""
     swapped, lag, skew = geometry.swapped_share, geometry.lag, geometry.skew
     if swapped >= _SWAPPED_SHARE:
@@ -183,8 +184,8 @@ def find_geometry_faults(geometry: Geometry) -> Iterator[Finding]:
         yield Finding(
             "lag",
             True,
-            f"the {late} camera is {abs(lag)} frames late; shift its sequence, or pair the images "
-            "by timestamp",
+            f"the {late} camera is {abs(lag)} frame{'s' * (abs(lag) > 1)} late; "
+            + _in_step(source, lag),
         )
     elif skew is not None and abs(skew[0]) > max(_SKEW_FRAMES, 4 * skew[1]):
         yield Finding(
@@ -194,6 +195,13 @@ def find_geometry_faults(geometry: Geometry) -> Iterator[Finding]:
             "both cameras together, or drive slowly",
         )
     yield from _find_row_faults(geometry)
+
+
+def _in_step(source: StereoSource, lag: int) -> str:
+    """Return how the images of two cameras come to belong together."""
+    if not isinstance(source, IncompleteSource):
+        return "pair the images by timestamp"
+    return f"--set source.shift_frames={source.shift_of(lag)} pairs the images that belong together"
 
 
 def _find_row_faults(geometry: Geometry) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -58,10 +59,10 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
     features = pool_features(sample.features)
     matched = len(features)
     alignment = _align(features, camera)
-    skew = _time_skew(sample, camera, alignment)
-    lag = _best_lag(sample, skew)
+    skew = _time_skew(sample.features, sample.flows, camera, alignment)
+    lag = _best_lag(sample, skew, camera)
     if lag:
-        features, skew = pool_features(sample.lagged[lag]), None
+        features, skew = pool_features(found for found, _ in sample.lagged[lag]), None
         alignment = _align(features, camera)
     swapped = inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share
     disparity = _disparities(features, alignment, camera)
@@ -89,16 +90,22 @@ def _disparities(
     return shift[np.abs(rows) < max(1.0, 3 * alignment.residual_px)].astype(np.float64)
 
 
-def _best_lag(sample: Sample, skew: tuple[float, float] | None) -> int:
+def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: RectifiedCamera) -> int:
     """Return the lag that fits best, if it fits clearly better than none.
 
-    A delay of half a frame fits both neighbours badly and is reported as skew, not as lag.
+    A delay of half a frame fits both neighbours badly and is reported as skew, not as lag: what
+    moves tells the two apart, where it is seen at that lag.
     """
     if not sample.by_lag:
         return 0
     # Lags were tried on different numbers of pairs.
     fit = {lag: n / len(sample.lagged[lag]) for lag, n in sample.by_lag.items()}
     best = max(fit, key=lambda lag: (fit[lag], -abs(lag)))
+    if abs(best) == 1:
+        found, flows = zip(*sample.lagged[best], strict=True)
+        left = _time_skew(found, flows, camera, _align(pool_features(found), camera))
+        if left is not None:
+            return best if abs(left[0]) < 1 - _LARGEST_SKEW else 0
     between = skew is not None and 4 * skew[1] < abs(skew[0]) < _LARGEST_SKEW
     if abs(best) == 1 and between:
         return 0
@@ -106,16 +113,19 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None) -> int:
 
 
 def _time_skew(
-    sample: Sample, camera: RectifiedCamera, alignment: RowAlignment | None
+    pairs: Sequence[PairFeatures],
+    flows: Sequence[Float64],
+    camera: RectifiedCamera,
+    alignment: RowAlignment | None,
 ) -> tuple[float, float] | None:
-    """Return the skew in frames with its standard error, from all pairs."""
+    """Return the skew in frames with its standard error, from features of pairs and their flow."""
     if alignment is None:
         return None
-    errors, flows = [np.zeros(0)], [np.zeros(0)]
-    for features, flow in zip(sample.features, sample.flows, strict=True):
+    errors, moving = [np.zeros(0)], [np.zeros(0)]
+    for features, flow in zip(pairs, flows, strict=True):
         rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
         # The skew is at most half a frame, so a larger row error means a wrong match.
         known = np.isfinite(flow) & (np.abs(rows) < 1.5 + 0.5 * np.abs(flow))
         errors.append(rows[known])
-        flows.append(flow[known])
-    return measure_time_skew(np.concatenate(errors), np.concatenate(flows))
+        moving.append(flow[known])
+    return measure_time_skew(np.concatenate(errors), np.concatenate(moving))

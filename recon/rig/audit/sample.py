@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.core.errors import ReconError
 from recon.core.values import RectifiedPair
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float32, Float64
 from recon.rig.audit.measures import (
     RepeatCounter,
     measure_gain,
@@ -96,7 +96,7 @@ class Sample:
         features: Matched features of each pair.
         by_lag: Number of features that agree on one rotation, summed over pairs; the key is how
             many frames after the left image the right image is taken from.
-        lagged: Matched features of the pairs at each lag.
+        lagged: Matched features of the pairs at each lag, and their `flows`.
         speeds_m_per_s: Speed of the rig at each pair where it could be measured.
         flows: float64 (N,) per pair, rows by which each feature moves to the next frame; NaN if
             unknown.
@@ -112,7 +112,7 @@ class Sample:
     gains: list[Float64] = field(default_factory=list)
     features: list[PairFeatures] = field(default_factory=list)
     by_lag: dict[int, int] = field(default_factory=dict)
-    lagged: dict[int, list[PairFeatures]] = field(default_factory=dict)
+    lagged: dict[int, list[tuple[PairFeatures, Float64]]] = field(default_factory=dict)
     speeds_m_per_s: list[float] = field(default_factory=list)
     flows: list[Float64] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
@@ -226,7 +226,7 @@ class _Sampler:
         sample.gains.append(gains)
         if centre in self._with_lag:
             self._compare_lags(centre, features)
-        self._follow(centre, features)
+        self._measure_motion(centre, features)
 
     def _note(
         self, pair: RectifiedPair, sharpness: tuple[float, float], features: PairFeatures
@@ -248,19 +248,27 @@ class _Sampler:
                 found = match_features(pair.left, right, self._features)
             agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
             sample.by_lag[lag] = sample.by_lag.get(lag, 0) + agreeing
-            sample.lagged.setdefault(lag, []).append(found)
+            flow, _ = self._follow(centre, found)
+            sample.lagged.setdefault(lag, []).append((found, flow))
 
-    def _follow(self, centre: int, features: PairFeatures) -> None:
+    def _measure_motion(self, centre: int, features: PairFeatures) -> None:
         """Measure speed and row flow against the left image of the next frame."""
-        flow = np.full(len(features), np.nan)
-        later = self._recent.get(centre + 1)
+        flow, there = self._follow(centre, features)
+        self.sample.flows.append(flow)
+        found, later = np.isfinite(flow), self._recent.get(centre + 1)
         if later is not None:
             pair = self._recent[centre]
-            there, found = track(pair.left, later.left, features.left_uv)
-            flow[found] = there[found, 1] - features.left_uv[found, 1]
             seen = (features.left_uv[found], features.right_uv[found], there[found])
             moved_m = measure_speed(*seen, pair.camera)
             step_s = later.timestamp_s - pair.timestamp_s
             if moved_m is not None and step_s > 0:
                 self.sample.speeds_m_per_s.append(moved_m / step_s)
-        self.sample.flows.append(flow)
+
+    def _follow(self, centre: int, features: PairFeatures) -> tuple[Float64, Float32]:
+        """Return rows by which features move to the next frame, NaN = unknown, and their places."""
+        flow, there = np.full(len(features), np.nan), features.left_uv
+        later = self._recent.get(centre + 1)
+        if later is not None and len(features):
+            there, found = track(self._recent[centre].left, later.left, features.left_uv)
+            flow[found] = there[found, 1] - features.left_uv[found, 1]
+        return flow, there

@@ -29,7 +29,7 @@ from recon.odometry.window import TrackWindow
 from recon.rig.audit.rig_fit import StereoTracks
 from recon.rig.audit.right_turn import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.rig.audit.sample import plan_stretches
-from recon.run.machine import serial_algebra
+from recon.run.threads import serial_algebra
 from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns

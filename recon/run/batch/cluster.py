@@ -273,7 +273,8 @@ def join_cluster(address: str) -> Iterator[Cluster]:
     try:
         where = {"scheduler_file" if Path(address).is_file() else "address": address}
         client = distributed.Client(**where, timeout=_REACH_S)
-    except (OSError, TimeoutError, ValueError) as error:
+    except (OSError, TimeoutError, ValueError, TypeError, RuntimeError, ImportError) as error:
+        # The last three: a protocol without its certificates, or without its library.
         raise SettingsError(
             "the scheduler cannot be reached", where=address, got=error, expected="tcp://host:8786"
         ) from error

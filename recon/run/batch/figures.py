@@ -21,8 +21,12 @@ _LEAST_JOBS: Final = 4
 _SIGMAS: Final = 1.4826
 #: Smallest spread, as a share of the median: figures that are all equal have none.
 _LEAST_SPREAD: Final = 0.01
-#: Figures whose differences say nothing of a result.
-_NOT_COMPARED: Final = ("stages.", "seconds", "T_map_world", "peak_memory_mb")
+_UNUSUAL: Final = 3.5
+"""Standard deviations from which a figure is unusual: 0.05 % of normal ones are."""
+#: Last parts of the names of what is compared: drift and trust. Drives differ in all else.
+_COMPARED: Final = (
+    "t_rel_percent", "ate_m", "expected_drift_percent", "frames_not_trusted", "valid_percent",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,8 @@ class JobResult:
         worker: Where that ran.
         figures: Numbers of its summary by dotted name; none if it failed.
         warnings: Warnings of its summary.
-        unusual: How far its most unusual figure is from the others', in standard deviations.
+        unusual: How far its most unusual figure is from the others', in standard deviations; 0 =
+            none is unusual.
         remark: That figure with its usual value; "" = there is none.
     """
 
@@ -129,9 +134,9 @@ def _remarks(group: Sequence[JobResult]) -> dict[str, tuple[float, str]]:
     usual = {
         name: _usual([one.figures[name] for one in done])
         for name in sorted(shared)
-        if len(done) >= _LEAST_JOBS and not name.startswith(_NOT_COMPARED)
+        if len(done) >= _LEAST_JOBS and name.rpartition(".")[2] in _COMPARED
     }
-    return {
+    most = {
         one.job.name: max(
             (abs(one.figures[name] - median) / spread, _remark(name, one.figures[name], median))
             for name, (median, spread) in usual.items()
@@ -139,6 +144,7 @@ def _remarks(group: Sequence[JobResult]) -> dict[str, tuple[float, str]]:
         for one in done
         if usual
     }
+    return {name: found for name, found in most.items() if found[0] >= _UNUSUAL}
 
 
 def _usual(values: Sequence[float]) -> tuple[float, float]:

@@ -36,6 +36,11 @@ from recon.io.yaml_file import read_yaml
 
 SUFFIXES: Final = (".toml", ".yaml", ".yml")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.=+-]{0,119}")
+_FILES: Final = frozenset(
+    ("jobs.json", "run.json", "summary.json", "config.yaml", "report.html", "table.csv",
+     "table.md", "sweep.png")
+)  # fmt: skip
+"""What a batch writes beside the folders of its jobs."""
 _MOST_JOBS: Final = 1_000_000
 _KEYS: Final = ("job", "sweep")
 
@@ -162,6 +167,10 @@ def check_names(entries: Sequence[Entry], where: str) -> None:
                 where=where,
                 got=repr(entry.name),
                 expected=expected,
+            )
+        if entry.name.lower() in _FILES:
+            raise SettingsError(
+                "name of a job is that of a file of the batch", where=where, got=entry.name
             )
         # On some file systems, capital and small letters are the same.
         if entry.name.lower() in seen:

@@ -13,14 +13,17 @@ from recon.io.atomic import write_text
 from recon.io.files import read_text, reading
 from recon.io.middlebury.layout import find_image, find_layout
 from recon.run.batch.job import Job
-from recon.run.batch.job_file import Entry
+from recon.run.batch.job_file import Entry, check_names
 from recon.run.memory import parse_size_mb
 
 PLAN: Final = "jobs.json"
 """The jobs of a batch, in its folder from the first moment."""
 _PLAN_BYTES: Final = 1 << 30
-#: A job writes into its own folder, and says what the batch reads.
-_NOT_OPTIONS: Final = ("--out", "-o", "--resume", "--json", "--latex", "--quiet", "-q", "--help")
+#: A job writes into its own folder alone, and says what the batch reads.
+_NOT_OPTIONS: Final = (
+    "--out", "-o", "--resume", "--json", "--latex", "--quiet", "-q", "--help", "--", "--into",
+    "--remove", "--mend", "--picture",
+)  # fmt: skip
 _WITHOUT_SOURCE: Final = ("demo",)
 
 
@@ -85,13 +88,19 @@ def read_plan(folder: Path) -> list[Job]:
 
     Raises:
         FormatError: The folder is not one of a batch, or its jobs cannot be read.
+        SettingsError: A job would write outside of the folder.
     """
     path = folder / PLAN
     if not path.is_file():
         raise FormatError("folder holds no batch", where=folder, expected=f"a {PLAN}")
     with reading(path):
         listed = json.loads(read_text(path, _PLAN_BYTES))
-        return [Job(**{**job, "words": tuple(job["words"])}) for job in listed]
+        jobs = [Job(**{**job, "words": tuple(job["words"])}) for job in listed]
+        # A batch from elsewhere must not write elsewhere.
+        check_names([Entry(job.name, job.command) for job in jobs], str(path))
+        for job in jobs:
+            _options(job.words, f"{path}: job {job.name}")
+    return jobs
 
 
 def _job(entry: Entry, program: Program, limits: Limits, folder: Path) -> Job:
@@ -107,6 +116,10 @@ def _job(entry: Entry, program: Program, limits: Limits, folder: Path) -> Job:
     words += _given(takes, "--threads", entry.threads) + _given(
         takes, "--memory-limit", entry.memory
     )
+    for word in entry.options:
+        if word.partition("=")[0] == "--set" or word[:2] == "-s":
+            hint = "settings have a place of their own: the key set of a job, or recon batch --set"
+            raise SettingsError("a setting among the options", where=where, got=word, hint=hint)
     words += _options(entry.options, where)
     try:
         program.check(words)
@@ -146,7 +159,7 @@ def _given(takes: frozenset[str], option: str, value: object) -> list[str]:
 
 def _options(options: Sequence[str], where: str) -> Sequence[str]:
     for word in options:
-        if word.partition("=")[0] in _NOT_OPTIONS or (word[:2] == "-o" and word[:3] != "--o"):
+        if word.partition("=")[0] in _NOT_OPTIONS or word[:2] in ("-o", "-q"):
             raise SettingsError("a job cannot have this option", where=where, got=word)
     return options
 

@@ -188,7 +188,7 @@ class _Teller:
 
     def error(self) -> str:
         """Return the error in one line; "" = nothing was said."""
-        lines = [line for line in self._lines if line]
+        lines = [line for line in self._lines if any(map(str.isalnum, line))]  # no frame of a box
         told = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
         return (told or lines or [""])[-1][:_LONGEST]
 

@@ -8,7 +8,7 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
 from recon.map.ground import grid as grid_file
-from recon.map.ground.grid import GridSettings, drop_undecided, flatten
+from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
 from recon.map.ground.surface import GroundSurface
 
 SLOPE = 0.1
@@ -187,3 +187,11 @@ def test_impossible_requests_are_refused() -> None:
         _flatten(_voxels((np.zeros((0, 3)), 0.0)), _ground())
     with pytest.raises(MappingError, match="band of the grid is empty"):
         _flatten(_slanted_scene(), _ground(), min_height_m=2.0, max_height_m=1.0)
+
+
+def test_the_ground_is_as_thick_as_what_is_seen_below_it_but_not_as_deep_as_a_hole() -> None:
+    road = _box((0, -2, -1.6), (4, 2, -1.4)), 2.0
+    low, hole = ((_box((0, -2, z), (4, 0, z + 0.2)), 2.0) for z in (-1.8, -2.4))
+    unsure = _box((0, -2, -2.0), (4, 2, -1.8)), 0.05
+    depths_m = ground_depths(_voxels(road, low, hole, unsure), _ground(), GridSettings())
+    np.testing.assert_allclose(depths_m, np.full(200, 0.1), atol=1e-6)

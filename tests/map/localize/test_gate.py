@@ -5,6 +5,7 @@ import pytest
 
 from recon.map.localize.gate import Correction, is_worthwhile
 from recon.map.localize.surfaces import Fit, describe_surfaces, fit_surfaces
+from recon.map.localize.surroundings import contrast
 from recon.odometry.covariance import step_covariance
 
 UNSURE = step_covariance(0.3, 1.0)
@@ -25,9 +26,13 @@ def corridor(ends: bool) -> np.ndarray:
 def corrected(xyz: np.ndarray, step: np.ndarray) -> Correction:
     """ICP would move a frame by ``step``, and would fit the map better there."""
     surfaces = describe_surfaces(xyz, 1.0)
-    fit = fit_surfaces(xyz[::7], surfaces)
+    # Not to where an open corridor ends: there the map does.
+    along_m = np.abs(xyz[:, 2])
+    seen = xyz[(along_m < 11.0) | (along_m > 12.0)][::7]
+    fit = fit_surfaces(seen, surfaces)
     before = Fit(fit.overlap, 0.2, fit.information)
-    return Correction(step, before, Fit(fit.overlap, 0.1, fit.information))
+    beside = contrast(seen, np.eye(4), surfaces)
+    return Correction(step, before, Fit(fit.overlap, 0.1, fit.information), beside)
 
 
 def test_walls_tell_where_a_camera_is_that_hardly_knows() -> None:
@@ -41,6 +46,13 @@ def test_a_corridor_tells_nothing_along_itself() -> None:
     step = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     assert not is_worthwhile(corrected(corridor(ends=False), step), along)
     assert is_worthwhile(corrected(corridor(ends=True), step), along)
+
+
+def test_surfaces_that_could_not_have_refused_a_pose_do_not_confirm_it() -> None:
+    """A corridor that goes on fits as well half a metre on, whatever it says of the sides."""
+    aside = np.array([0.1, 0.05, 0.0, 0.0, 0.0, 0.0])
+    assert is_worthwhile(corrected(corridor(ends=True), aside), UNSURE)
+    assert not is_worthwhile(corrected(corridor(ends=False), aside), UNSURE)
 
 
 def test_a_sure_prior_stays() -> None:
@@ -69,6 +81,6 @@ def test_a_correction_must_fit_better(
 ) -> None:
     information = np.eye(6) * 1e5
     correction = Correction(
-        np.full(6, 0.01), Fit(overlap, before, information), Fit(overlap, after, information)
+        np.full(6, 0.01), Fit(overlap, before, information), Fit(overlap, after, information), 1e4
     )
     assert is_worthwhile(correction, UNSURE) is worth

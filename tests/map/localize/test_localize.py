@@ -61,9 +61,9 @@ def _localized(source: Film, map_: Map, start: StartPose | None = None) -> Local
 
 
 def _errors(drive: LocalizedDrive, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the tracked frames: metres and degrees."""
-    tracked = [frame.index for frame in drive.tracked]
-    off = se3.invert(truth[tracked]) @ drive.trajectory.T_world_camera
+    """Errors of the frames that have a pose: metres and degrees."""
+    placed = [frame.index for frame in drive.placed]
+    off = se3.invert(truth[placed]) @ drive.trajectory.T_world_camera
     return np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(se3.angle_rad(off))
 
 
@@ -107,15 +107,17 @@ def test_another_light_makes_no_difference(street, street_map, truth, change):
     assert error_m.max() < 0.3
 
 
-def test_in_a_hurry_frames_are_tracked_by_odometry_alone(street, street_map, truth):
+def test_in_a_hurry_frames_coast_by_odometry_alone(street, street_map, truth):
     localizer = open_localizer(street_map, SETTINGS)
     reconstructor = FrameReconstructor(street.calibration, SETTINGS)
     frames = [OdometryFrame(*reconstructor.match(pair)) for pair in street.taken(slice(1, 8))]
 
     found = [localizer.add(frame, hurried=lambda n=n: n >= 3) for n, frame in enumerate(frames)]
 
-    assert [place.state for place in found[2:]] == [State.TRACKING] * 5
-    by_odometry = [place for place in found[3:] if not place.views]
+    by_odometry = [place for place in found[2:] if place.state is State.COASTING]
+    assert [place.views > 0 for place in found[2:]] == [
+        place.state is State.TRACKING for place in found[2:]
+    ]
     assert len(by_odometry) >= 2
     for place in by_odometry:
         sigma_m = np.sqrt(np.linalg.eigvalsh(place.covariance[:3, :3])[-1])
@@ -172,7 +174,32 @@ def test_a_drive_that_leaves_the_map_is_lost_and_then_searched():
     lost = states.index(State.LOST)
     assert set(states[lost + 1 :]) == {State.SEARCHING}
     assert _errors(drive, whole.trajectory.T_world_camera)[0].max() < 0.5
-    assert "lost once" in drive.warnings()[0]
+    assert "lost once" in drive.warnings()[-1]
+
+
+def test_after_a_jump_to_a_place_that_is_not_in_the_map_the_drive_coasts_and_is_lost():
+    """Two streets cut together, driven slowly: odometry hardly notices, the map knows nothing."""
+    scene = STREET.model_copy(update={"frames": 6, "speed_m_per_frame": 0.19})
+    here, elsewhere = film(scene), film(scene.model_copy(update={"seed": 2, "frames": 7}))
+    made = Map.temporary()
+    map_sequence(here, SETTINGS, known_poses=here.trajectory, workspace=Workspace(made))
+    poses = np.concatenate([film.trajectory.T_world_camera for film in (here, elsewhere)])
+    jumping = Film([*here.pairs, *elsewhere.pairs], here.calibration, poses)
+
+    drive = _localized(jumping, made)
+
+    before, after = drive.frames[len(here) - 1], drive.frames[len(here) :]
+    assert before.located.state is State.TRACKING
+    found = [frame.located for frame in after]
+    assert not any(one.state is State.TRACKING for one in found)
+    lost = [one.state for one in found].index(State.LOST)
+    assert lost >= 2
+    assert {one.state for one in found[:lost]} == {State.COASTING}
+    sigmas_m = [one.sigma_m for one in (before.located, *found[:lost])]
+    assert (np.diff(sigmas_m) > 0).all()
+    assert all("coasting" in frame.state for frame in after[:lost])
+    assert drive.figures()["frames_coasting"] == lost == len(drive.placed) - len(drive.tracked)
+    assert any("by odometry alone" in line for line in drive.warnings())
 
 
 def test_a_blinded_camera_is_lost_and_found_again(street, street_map, truth):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from recon.commands.config import load_config
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import make_transform
 from recon.core.kernels.voxels import pack_keys
-from recon.core.values import OccupancyVoxels, PointCloud, join_clouds
+from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, join_clouds
 from recon.core.values.arrays import Bool
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.occupancy.looks import Looks
 from recon.map.occupancy.moving import find_moved
 from recon.map.occupancy.rays import thin_rays
 from recon.map.submaps import Submap, SubmapBuilder
@@ -52,8 +54,17 @@ def _look(boxes: Sequence[Box], z_m: float, seed: int) -> PointCloud:
     return cloud.select(depth < 60.0)
 
 
-def _drive(scenes: Sequence[Sequence[Box]], step_m: float = 0.5, aside: float = 0.0) -> Submap:
+class Drive(NamedTuple):
+    """A drive of one submap, where its frames were taken, and their rays."""
+
+    submap: Submap
+    poses: list[np.ndarray]
+    rays: list[RayCloud]
+
+
+def _drive(scenes: Sequence[Sequence[Box]], step_m: float = 0.5, aside: float = 0.0) -> Drive:
     """A drive through a scene that changes from frame to frame."""
+    poses, kept = [], []
     builder = SubmapBuilder(CONFIG.submaps, CONFIG.fusion, CONFIG.occupancy, T_MAP_WORLD)
     for frame, boxes in enumerate(scenes):
         T = make_transform(np.eye(3), np.array([aside, 0.0, step_m * frame]))
@@ -62,14 +73,27 @@ def _drive(scenes: Sequence[Sequence[Box]], step_m: float = 0.5, aside: float = 
         rays = thin_rays(cloud, CONFIG.occupancy)
         near = cloud.select(cloud.xyz[:, 2] < RANGE_M)
         builder.integrate(transform_cloud(near, T, frame="world"), rays.cloud(), T)
-    return builder.close()
+        poses.append(T)
+        kept.append(rays)
+    return Drive(builder.close(), poses, kept)
 
 
-def _cloud(*drives: Submap, remove: bool = True) -> PointCloud:
+def _looks(drives: Sequence[Drive]) -> Looks:
+    poses = np.stack([pose for drive in drives for pose in drive.poses])
+    rays = [cloud for drive in drives for cloud in drive.rays]
+    return Looks(CONFIG.occupancy, T_MAP_WORLD @ poses, rays.__getitem__)
+
+
+def _tiles(*drives: Drive, remove: bool = True) -> Tiles:
     fusion = CONFIG.fusion.model_copy(update={"remove_moving": remove})
     config = CONFIG.model_copy(update={"fusion": fusion})
-    tiles = Tiles.of_submaps(drives, config, T_MAP_WORLD, drives=[1] * len(drives))
-    return join_clouds(tile.cloud for tile in tiles)
+    submaps = [drive.submap for drive in drives]
+    tiles = Tiles.of_submaps(submaps, config, T_MAP_WORLD, drives=[1] * len(drives))
+    return tiles.with_looks(_looks(drives))
+
+
+def _cloud(*drives: Drive, remove: bool = True) -> PointCloud:
+    return join_clouds(tile.cloud for tile in _tiles(*drives, remove=remove))
 
 
 def _near(cloud: PointCloud, boxes: Sequence[Box], margin_m: float = 0.25) -> Bool:
@@ -84,7 +108,7 @@ def _near(cloud: PointCloud, boxes: Sequence[Box], margin_m: float = 0.25) -> Bo
     return found
 
 
-def _left(of: Sequence[Box], *drives: Submap) -> float:
+def _left(of: Sequence[Box], *drives: Drive) -> float:
     """Share of the points near boxes that are still there."""
     before, after = (_cloud(*drives, remove=on) for on in (False, True))
     assert _near(before, of).sum() > 100
@@ -111,6 +135,14 @@ def test_what_moved_is_gone(scenes: list[list[Box]]) -> None:
     assert _left(trail, _drive(scenes)) <= 0.05
 
 
+class Came:
+    """Frames in which some cells were hit, all at once, after they were looked through."""
+
+    def at(self, keys: np.ndarray) -> Iterable[np.ndarray]:
+        """Two frames of each."""
+        return (np.full(len(keys), sign, np.int8) for sign in (-1, -1, 1, 1))
+
+
 def test_what_moved_grows_along_an_upright_surface_but_not_over_the_ground() -> None:
     # A wall over the line y = 0 and the ground beside it: free, unsure, surely occupied along x.
     wall = np.stack(np.meshgrid(np.arange(14), [0], np.arange(1, 7)), -1).reshape(-1, 3)
@@ -126,6 +158,7 @@ def test_what_moved_grows_along_an_upright_surface_but_not_over_the_ground() -> 
         np.ones(len(cells), np.bool_),
         OccupancyVoxels(cells, seen, 0.2),
         (keys[order], seen[order]),
+        Came(),
     )
     upright = np.arange(len(cells)) < len(wall)
     # What counts is the mean over a cell and those that touch it: 5 is free, 8 stands.
@@ -158,6 +191,7 @@ def test_what_a_later_drive_looked_through_outweighs_what_stood_beside_it() -> N
         np.ones(len(cells), np.bool_),
         OccupancyVoxels(cells.astype(np.int32), in_the_end, 0.2),
         stood,
+        Came(),
     )
     # Columns 0 to 6 are free in the end; 7, between a free one and one that stands, goes with them.
     assert set(cells[moved, 0].tolist()) == set(range(8))
@@ -175,8 +209,30 @@ def test_a_roof_just_below_the_camera_keeps_most_of_its_points() -> None:
 
 
 def test_what_was_removed_is_kept_aside() -> None:
-    tiles = Tiles.of_submaps([_drive(CROSSING)], CONFIG, T_MAP_WORLD)
+    tiles = _tiles(_drive(CROSSING))
     removed = join_clouds(tile.removed for tile in tiles)
     trail = [box for boxes in CROSSING for box in boxes]
     assert _near(removed, trail).mean() > 0.9
     assert removed.sigma_m is not None
+
+
+def _fence(frame: int) -> list[Box]:
+    """A fence 12 m long, and a wall behind it; a frame sees every third board or another."""
+    boards = [((x, 0.0, 12.0), (0.2, 1.2, 0.05)) for x in np.arange(-6.0, 6.0, 0.2)]
+    seen = np.random.default_rng(frame).random(len(boards)) < 0.35
+    return [board for board, on in zip(boards, seen, strict=True) if on]
+
+
+def test_a_fence_that_is_looked_through_as_often_as_it_is_hit_stays() -> None:
+    scenes = [_fence(frame) for frame in range(FRAMES)]
+    drive = _drive(scenes, step_m=0.2)
+    whole: list[Box] = [((0.0, 0.3, 12.0), (12.0, 0.9, 0.1))]
+    before = _near(_cloud(drive, remove=False), whole, 0.1).sum()
+    assert before > 300
+    # It is free for most rays: the sums of hits and rays alone would take it out.
+    points = _cloud(drive, remove=False)
+    in_the_end = drive.submap.occupancy.voxels(CONFIG.occupancy.resolution_m)
+    free = np.sort(pack_keys(in_the_end.keys[in_the_end.log_odds <= 0]))
+    cells = np.floor(points.xyz[_near(points, whole, 0.1)] / CONFIG.occupancy.resolution_m)
+    assert np.isin(pack_keys(cells.astype(np.int64)), free).mean() > 0.25
+    assert _near(_cloud(drive), whole, 0.1).sum() >= 0.99 * before

@@ -121,7 +121,7 @@ def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma(
     # Measured 0.99, 0.98 and 0.79: what erodes a wall is to take noisy points for exact.
     assert kept() > 0.97
     monkeypatch.setattr(occupancy, "FREE_MARGIN_SIGMAS", 0.0)
-    monkeypatch.setattr(occupancy, "_SPREAD_SIGMAS", 0.0)
+    monkeypatch.setattr(occupancy, "SPREAD_SIGMAS", 0.0)
     assert kept() < 0.9
 
 

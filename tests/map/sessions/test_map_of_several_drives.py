@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
 from recon.odometry.protocol import OdometryHealth
+from recon.places.fixes import Fixes
 from recon.places.loop import Loop
 
 CONFIG = load_config(None, ["submaps.length_m=8", "fusion.min_count=1"])
@@ -60,23 +62,28 @@ def _drive(
     drift: float = 0.0,
     first: int = 0,
     noise: int = 0,
+    health: Mapping[int, OdometryHealth] | None = None,
 ) -> Session:
     """Map a drive whose own world begins with its first camera; ``drift`` stretches its path.
 
+    ``health`` of some frames is not good; where a stretch ends, a submap does.
     Drives of one ``seed`` without other ``noise`` have the same images, from frame ``first`` on.
     """
     session = map_.begin(SessionInfo(name, "of a test", len(true), CONFIG.model_dump(mode="json")))
     session.set_axes(T_MAP_WORLD, CAMERA)
     builder = SubmapBuilder(CONFIG.submaps, CONFIG.fusion, CONFIG.occupancy, T_MAP_WORLD)
+    records = [(health or {}).get(frame, OdometryHealth()) for frame in range(len(true))]
     for frame, T_true in enumerate(true):
         T = invert(true[0]) @ T_true
         T[:3, 3] *= 1 + drift
         cloud = _wall(T_true, 1000 * seed + first + frame + 500 * noise)
+        if not records[frame].ok:
+            cloud = cloud.select(np.zeros(0, np.intp))
         rays = thin_rays(cloud, CONFIG.occupancy)
         builder.integrate(transform_cloud(cloud, T, frame="world"), rays.cloud(), T)
-        session.add_frame(T, 0.1 * (first + frame) + seed, OdometryHealth())
+        session.add_frame(T, 0.1 * (first + frame) + seed, records[frame])
         session.add_rays(frame, rays, ray_grain(CONFIG.occupancy))
-        if builder.full or frame == len(true) - 1:
+        if builder.full or frame == len(true) - 1 or not records[frame].ok:
             session.submaps.add(builder.close())
     return session
 
@@ -254,6 +261,82 @@ def test_what_only_one_that_is_taken_out_held_is_apart() -> None:
     copy_sessions(map_, left, without=[1])
     join_sessions(left, left.links)
     assert [session.number for session in left.linked] == [0]
+
+
+LOST = OdometryHealth(ok=False)
+SKIPPED = OdometryHealth(ok=False, skipped=True)
+AT = 9
+
+
+def _torn(health: OdometryHealth, last: int = FRAMES) -> tuple[Map, list[Link]]:
+    """A map whose second drive has a bad pose at frame 9, and its links up to a frame."""
+    map_ = _map(1)
+    _drive(map_, TRUE[1], 1, health={AT: health})
+    return map_, [link for link in _links(0, 1, TRUE[:2]) if link.loop.last < last]
+
+
+def test_what_follows_a_lost_pose_stays_out_of_a_map_of_several_drives() -> None:
+    map_, links = _torn(LOST, last=AT)
+    join_sessions(map_, links)
+
+    placed = map_.placed
+    assert placed[0].all()
+    assert np.flatnonzero(placed[1]).tolist() == list(range(AT))
+    made = place_map(map_, CONFIG)
+    cloud = join_clouds(tile.cloud for tile in made.tiles)
+    assert cloud.xyz[:, 0].max() < TRUE[1][AT, 2, 3] + 8.0  # what frame 8 sees ends there
+    assert np.abs(-cloud.xyz[:, 1] - WALL_M).max() < 0.1
+    voxels = join_voxels((tile.voxels for tile in made.tiles), made.tiles.resolution_m)
+    assert (voxels.keys[:, 0] * voxels.resolution_m).max() < TRUE[1][AT, 2, 3] + 8.0
+    assert not made.trusted[FRAMES + 1 + AT :].any()
+    not_trusted, left_out = map_.doubts
+    assert not_trusted.startswith("session 1 (wall): 1 of 20 poses are not to be trusted (frame 9)")
+    assert left_out.startswith("session 1 (wall): frames 10-19 follow a lost pose")
+
+
+@pytest.mark.parametrize(("health", "last"), [(LOST, FRAMES), (SKIPPED, AT)])
+def test_what_is_seen_again_or_measured_past_a_bad_pose_is_in_the_map(
+    health: OdometryHealth, last: int
+) -> None:
+    map_, links = _torn(health, last)
+    join_sessions(map_, links)
+    assert np.flatnonzero(~map_.placed[1]).tolist() == [AT]
+    assert len(map_.doubts) == 1
+
+
+def test_loops_and_measured_positions_hold_what_follows_a_lost_pose() -> None:
+    map_, links = _torn(LOST, last=AT)
+    join_sessions(map_, links)
+    other = map_.session(1)
+    loop = asdict(Loop(3, 15, np.eye(4), np.eye(6), 50, 0.9))
+    other.set_loops({**other.loops, "closed": [loop]})
+    assert map_.placed[1][AT + 1 :].all()
+    other.set_loops({**other.loops, "closed": []})
+    assert not map_.placed[1][AT + 1 :].any()
+    for session, frames in ((map_.session(0), [0, 19]), (other, [12, 17])):
+        session.set_fixes(
+            Fixes(np.array(frames, np.int32), np.zeros((2, 3)), np.zeros((2, 3)), 0.1)
+        )
+    assert map_.placed[1][AT + 1 :].all()
+
+
+def test_a_map_of_one_drive_keeps_what_follows_a_lost_pose_and_says_so() -> None:
+    map_ = Map.temporary()
+    session = _drive(map_, TRUE[0], 0, health={AT: LOST})
+    map_.commit()
+    assert np.flatnonzero(~map_.placed[0]).tolist() == [AT]
+    np.testing.assert_array_equal(map_.placed[0], session.trusted)
+    (line,) = map_.doubts
+    assert line.startswith("1 of 20 poses are not to be trusted (frame 9)")
+
+
+def test_a_first_frame_that_sees_nothing_is_not_where_the_map_begins() -> None:
+    map_ = Map.temporary()
+    _drive(map_, TRUE[0], 0, health={1: LOST})
+    _drive(map_, TRUE[1], 1)
+    join_sessions(map_, _links(0, 1, TRUE[:2]))
+    assert np.flatnonzero(~map_.placed[0]).tolist() == [0, 1]
+    assert map_.placed[1].all()
 
 
 @pytest.mark.parametrize("setting", ["fusion.voxel_m=0.2", "occupancy.resolution_m=0.05"])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.core.errors import EvaluationError, RegistrationError
+from recon.core.errors import EvaluationError, ReconError, RegistrationError
 from recon.core.geometry.interpolation import interpolate_poses
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
@@ -101,6 +101,38 @@ def winding(folder: Path, off_m: float, every_s: float, numbers: tuple[int, ...]
     rows[1:, 1:3] += off_m * np.sin(3.0 * rows[1:, 0])[:, None]
     np.savetxt(folder / "gnss.txt", rows, fmt="%.4f")
     return folder / "gnss.txt"
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e-3, 1e6])
+def test_positions_in_another_unit_leave_the_map_as_it_is(tmp_path: Path, scale: float) -> None:
+    map_ = drives()
+    rows = np.loadtxt(positions(tmp_path, every_s=0.05))
+    rows[:, 1:] = scale * (rows[:, 1:] - rows[1, 1:])
+    np.savetxt(tmp_path / "gnss.txt", rows, fmt="%.9f")
+    with pytest.raises(ReconError, match=r"gnss\.txt"):
+        hold(map_, Survey(tmp_path / "gnss.txt", ANTENNA))
+    assert not len(map_.first.fixes)
+
+
+def test_a_few_jumps_are_left_out(tmp_path: Path) -> None:
+    map_ = drives()
+    rows = np.loadtxt(positions(tmp_path, every_s=0.05))
+    rows[[4, 17], 1:3] += 800.0
+    np.savetxt(tmp_path / "gnss.txt", rows, fmt="%.4f")
+    (line,) = hold(map_, Survey(tmp_path / "gnss.txt", ANTENNA))
+    assert "2 of 38 positions contradict the others" in line
+    join_new(map_, [])
+    assert _off_m(map_, 0) < 0.03
+
+
+def test_positions_count_as_much_as_the_file_says(tmp_path: Path) -> None:
+    rows = np.loadtxt(positions(tmp_path))
+    np.savetxt(tmp_path / "gnss.txt", np.column_stack([rows, np.full(len(rows), 5.0)]), fmt="%.4f")
+    map_ = drives()
+    hold(map_, Survey(tmp_path / "gnss.txt", ANTENNA))
+    join_new(map_, [])
+    assert map_.first.fixes.sigma_m == pytest.approx(5.0)
+    assert _off_m(map_, 0) > 0.1
 
 
 def test_positions_far_from_the_path_are_warned_of(tmp_path: Path) -> None:

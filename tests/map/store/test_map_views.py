@@ -7,12 +7,14 @@ import pytest
 
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera
+from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.map_views import MapViews
 from recon.map.store.session import SessionInfo
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
+from recon.places.loop import Loop
 
 CAMERAS = [RectifiedCamera(100.0 + n, 9.0, 5.0, 9.5, 0.5, 20, 12) for n in range(3)]
 T_MAP_WORLD = [
@@ -43,7 +45,8 @@ def map_() -> Map:
             session.add_frame(_pose(frame), 0.1 * frame, OdometryHealth())
         for frame in KEYFRAMES if n < 2 else ():
             session.keyframes.put(StoredKeyframe(_keyframe(frame), _pose(frame), 1.5 * frame))
-    made.set_links([], [0, 1, 2])
+    loop = Loop(0, 0, np.eye(4), np.eye(6), 50, 0.9)
+    made.set_links([Link((0, n), loop) for n in (1, 2)], [0, 1, 2])
     return made
 
 
@@ -75,3 +78,20 @@ def test_some_drives_may_be_left_out(map_):
     assert [view.session for view in MapViews(map_, [1])] == [1, 1, 1]
     map_.set_links([], [1])
     assert [view.session for view in MapViews(map_)] == [1, 1, 1]
+
+
+def test_what_follows_a_lost_pose_is_not_to_be_recognised_among_several_drives():
+    map_ = Map.temporary()
+    for n in range(2):
+        session = map_.begin(SessionInfo())
+        session.set_axes(T_MAP_WORLD[n], CAMERAS[n])
+        for frame in range(FRAMES):
+            session.add_frame(_pose(frame), 0.1 * frame, OdometryHealth(ok=(n, frame) != (1, 3)))
+        for frame in KEYFRAMES:
+            session.keyframes.put(StoredKeyframe(_keyframe(frame), _pose(frame), 1.5 * frame))
+    map_.set_links([Link((0, 1), Loop(0, 0, np.eye(4), np.eye(6), 50, 0.9))], [0, 1])
+
+    seen = [(view.session, view.keyframe.frame) for view in MapViews(map_)]
+
+    assert seen == [(0, 0), (0, 2), (0, 5), (1, 0), (1, 2)]
+    assert [view.keyframe.frame for view in MapViews(map_, [1])] == [0, 2, 5]

@@ -170,7 +170,7 @@ def image_of(seed: int, size: tuple[int, int]) -> np.ndarray:
     return np.clip(128 + 30 * total, 0, 255).astype(np.uint8)
 
 
-def planes_pair(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def planes_pair(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A rectified pair: three upright planes at different depths; and its disparity."""
     width, height = size
     disparity = np.zeros((height, width))
@@ -178,7 +178,7 @@ def planes_pair(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarr
         rows = slice(n * height // 3, (n + 1) * height // 3)
         disparity[rows] = np.linspace(*values, width)[None]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    right = image_of(0, (width + 80, height))[:, 40:-40]
+    right = image_of(seed, (width + 80, height))[:, 40:-40]
     at = (u - disparity).astype(np.float32)
     return cv2.remap(right, at, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), right, disparity
 
@@ -215,6 +215,42 @@ def test_a_pair_under_known_homographies_comes_back_onto_rows(warp: str) -> None
     found = rectify_images([seen], count=1500)
     rows = true_rows(found, A, B, disparity)
     assert np.abs(rows).mean() < 0.3
+
+
+def pitched_folder(pitch_deg: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    """Eight pairs of a rig whose right camera is pitched, and the homography of that pitch."""
+    size, K = (400, 300), np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
+    B = K @ exp_so3(np.array([np.deg2rad(pitch_deg), 0, 0])) @ np.linalg.inv(K)
+    pairs = [planes_pair(size, seed)[:2] for seed in range(8)]
+    if pitch_deg:
+        pairs = [(left, cv2.warpPerspective(right, B, size)) for left, right in pairs]
+    return pairs, B
+
+
+@pytest.mark.parametrize("first", ["like the others", "blank", "misleading"])
+def test_a_pitched_right_camera_is_turned_back_and_nothing_else(first: str) -> None:
+    pairs, B = pitched_folder(0.44)
+    if first == "blank":
+        pairs[0] = (np.full_like(pairs[0][0], 90),) * 2
+    if first == "misleading":  # what moves across the view, as a car that is all that has texture
+        oblique = np.array([[1.0, 0, -20], [0, 1, 12], [0, 0, 1]])
+        pairs[0] = (pairs[0][0], cv2.warpPerspective(pairs[0][0], oblique, (400, 300)))
+    found = rectify_images(pairs, count=600)
+    assert found.model == "rotation"
+    assert found.before_px == pytest.approx(3.1, abs=0.4)
+    _, _, disparity = planes_pair((400, 300))
+    assert np.abs(true_rows(found, np.eye(3), B, disparity)).max() < 0.3
+    for H in (found.H_left, found.H_right):
+        across = np.diff(map_pixels(H, np.array([[0.0, 150], [399, 150]])), axis=0)[0]
+        assert abs(np.degrees(np.arctan2(across[1], across[0]))) < 0.1
+
+
+def test_pairs_on_equal_rows_stay_as_they_are() -> None:
+    found = rectify_images(pitched_folder(0.0)[0], count=600)
+    assert found.model == "raw"
+    assert np.array_equal(found.H_left, np.eye(3))
+    assert np.array_equal(found.H_right, np.eye(3))
+    assert found.after_px == found.before_px
 
 
 def test_matches_of_images_made_alike_are_places_in_those_recorded() -> None:

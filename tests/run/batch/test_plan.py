@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from recon.cli import app
 from recon.cli.program import known_program
 from recon.commands.piece import piece_job
 from recon.core.errors import ReconError, SettingsError
 from recon.map.drive.pieces import Piece
-from recon.run.batch.job_file import Entry
+from recon.run.batch.job_file import Entry, check_names
 from recon.run.batch.plan import Limits, plan_jobs, read_plan, write_plan
 from recon.run.directory import STARTED, state_folder
 from tests.docs.blocks import ROOT
@@ -110,6 +113,23 @@ def test_a_damaged_plan_is_one_line(tmp_path: Path, content: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"name": "../outside"}, "not a name of a folder"),
+        ({"name": "/outside"}, "not a name of a folder"),
+        ({"words": ["map", "drive", "--out", "/outside"]}, "cannot have this option"),
+    ],
+)
+def test_a_plan_from_elsewhere_that_writes_outside_is_refused(
+    tmp_path: Path, changes: dict[str, object], words: str
+) -> None:
+    (job,) = plan_jobs([DRIVE], PROGRAM, Limits(), ROOT)
+    (tmp_path / "jobs.json").write_text(json.dumps([{**job.plain(), **changes}]))
+    with pytest.raises(SettingsError, match=words):
+        read_plan(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
         ({"command": "mapp"}, "job a: unknown command .*got mapp"),
         ({"command": "batch"}, "unknown command"),
         ({"source": ()}, "job a: job has no source"),
@@ -138,3 +158,30 @@ def test_every_command_of_a_batch_is_one_of_the_program_or_to_come() -> None:
     assert {"map", "pair", "evaluate trajectory", "evaluate middlebury"} <= set(PROGRAM.commands)
     assert "batch" not in PROGRAM.commands
     assert os.sep not in "".join(PROGRAM.commands)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--",), ("--into", "run"), ("--mend", "/abs.yaml"), ("--picture=/abs.png",), ("-q",)],
+)
+def test_a_job_writes_into_its_own_folder_alone(options: tuple[str, ...]) -> None:
+    with pytest.raises(SettingsError, match="a job cannot have this option"):
+        planned(replace(DRIVE, options=options))
+
+
+@pytest.mark.parametrize("options", [("--set", "a=b"), ("--set=a=b",), ("-sa=b",), ("-s", "a=b")])
+def test_settings_among_the_options_are_refused(options: tuple[str, ...]) -> None:
+    with pytest.raises(SettingsError, match="a setting among the options"):
+        planned(replace(DRIVE, options=options))
+
+
+@pytest.mark.parametrize("name", ["jobs.json", "Summary.JSON", "report.html", "table.csv"])
+def test_a_job_is_not_named_like_a_file_of_the_batch(name: str) -> None:
+    with pytest.raises(SettingsError, match="that of a file of the batch"):
+        check_names([replace(DRIVE, name=name)], "jobs.toml")
+
+
+def test_no_help_loses_words_in_brackets_to_the_markup() -> None:
+    texts = [each.callback.__doc__ or "" for each in app.registered_commands if each.callback]
+    assert "recon\\[cluster]" in "".join(texts)
+    assert [text for text in texts if re.search(r"(?<!\\)\[[a-z]+\]", text)] == []

@@ -1,0 +1,163 @@
+"""Which pieces of surface came or went as one body, by what each frame saw of them.
+
+Two things are hit in some frames and looked through in others: what moved, and what stands but is
+seen badly or through its gaps, such as fences, hedges, glass and the edges of things. What moved
+was there as a whole at one time, and its whole place was free at another: in one frame its cells
+agree. Of a fence one frame hits some cells and looks through others.
+
+So pairs of cells that touch are counted, frame by frame: those that a frame saw differently, and
+those that it would have if each cell had been hit at random, as often as it was. The ratio is 0
+where all is hit or looked through at once and 1 where cells have nothing in common (the join count
+of spatial statistics). A piece moved if the ratio is small, over all pairs and over those that lie
+one above the other: things that move are upright, and what is entered by one edge first agrees
+from top to bottom.
+
+Ref: P. A. P. Moran, "The interpretation of statistical maps", J. R. Statist. Soc. B 10, 1948.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import product
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.voxels import pack_keys
+from recon.core.keys import find_keys
+from recon.core.values.arrays import Bool, Float64, Int8
+
+_DISAGREEMENT: Final = 0.4
+"""Largest disagreement within a body, root mean square of that of all and of upright pairs.
+
+Rendered and real cars and walkers have 0.05 to 0.36; picket fences, hedges, roof edges and crowns
+of trees 0.43 to 0.7, noise 1.
+"""
+_GAP_CELLS: Final = 2
+"""Pieces about which too little is known belong to a body that is no farther away."""
+_GAPS: Final = 3
+"""How many such gaps are crossed, one after the other."""
+_LEAST_LOOKS: Final = 2
+"""Frames that must have looked through a cell without neighbours to compare it with."""
+_HALF: Final = np.array([s for s in product((-1, 0, 1), repeat=3) if s > (0, 0, 0)])
+"""Steps to one of each two opposite neighbours."""
+
+
+class _Seen(NamedTuple):
+    """What all frames saw.
+
+    Attributes:
+        hit: int64 (N,), frames that hit each cell.
+        through: int64 (N,), frames that looked through it.
+        runs: int64 (N,), how often hits began.
+        both: int64 (P,), frames that saw both cells of a pair.
+        differed: int64 (P,), those that hit one and looked through the other.
+    """
+
+    hit: NDArray[np.int64]
+    through: NDArray[np.int64]
+    runs: NDArray[np.int64]
+    both: NDArray[np.int64]
+    differed: NDArray[np.int64]
+
+
+def came_or_went(keys: NDArray[np.int64], placed: Bool, looks: Iterable[Int8]) -> Bool:
+    """Return bool (N,), the cells of pieces of surface that were there at one time only.
+
+    Args:
+        keys: int64 (N,), packed cells with points that were seen through as often as hit, sorted.
+        placed: bool (N,), cells with points that their frames could place in one cell, which are
+            the better evidence.
+        looks: What each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
+    """
+    pairs, upright = _pairs(keys)
+    seen = _count(len(keys), pairs, looks)
+    piece = _pieces(len(keys), pairs)
+    ratio = _disagreement(seen, pairs, upright, placed, piece)[piece]
+    known = np.isfinite(ratio)
+    body = known & (ratio <= _DISAGREEMENT)
+    for _ in range(_GAPS):
+        body |= ~known & _near(keys, body)
+    # A few cells alone: hit in one run of frames, and looked through before or after.
+    alone = (seen.runs == 1) & (seen.through >= _LEAST_LOOKS)
+    return np.asarray(body | (~known & alone))
+
+
+def _pairs(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], Bool]:
+    """Return int64 (P, 2), rows of cells that touch; and which pairs lie one above the other."""
+    origin, found, upright = pack_keys(np.zeros((1, 3), np.int64)), [], []
+    for step, stride in zip(_HALF, pack_keys(_HALF) - origin, strict=True):
+        place, known = find_keys(keys + stride, keys)
+        rows = np.flatnonzero(known)
+        found.append(np.stack([rows, place[rows]], axis=1))
+        upright.append(np.full(len(rows), not step[:2].any()))
+    return np.concatenate(found), np.concatenate(upright)
+
+
+def _count(cells: int, pairs: NDArray[np.int64], looks: Iterable[Int8]) -> _Seen:
+    """Count what frames saw in cells and pairs."""
+    hit, through, runs = (np.zeros(cells, np.int64) for _ in range(3))
+    both, differed = np.zeros((2, len(pairs)), np.int64)
+    before = np.zeros(cells, np.int8)
+    for look in looks:
+        hit += look > 0
+        through += look < 0
+        runs += (look > 0) & (before <= 0)
+        before = np.where(look != 0, look, before)
+        together = look[pairs[:, 0]] * look[pairs[:, 1]]
+        both += together != 0
+        differed += together < 0
+    return _Seen(hit, through, runs, both, differed)
+
+
+def _disagreement(
+    seen: _Seen,
+    pairs: NDArray[np.int64],
+    upright: Bool,
+    placed: Bool,
+    piece: NDArray[np.int64],
+) -> Float64:
+    """Return float64, the disagreement in each piece; NaN where too little is known.
+
+    Cells whose points were not placed count where a piece has no others.
+    """
+    rate = seen.hit / np.maximum(seen.hit + seen.through, 1)
+    one, other = rate[pairs].T
+    by_chance = seen.both * (one * (1 - other) + other * (1 - one))
+    home, pieces = piece[pairs[:, 0]], int(piece.max(initial=-1)) + 1
+
+    def ratio(which: Bool) -> Float64:
+        differed = np.bincount(home[which], seen.differed[which], pieces)
+        expected = np.bincount(home[which], by_chance[which], pieces)
+        out = np.full(pieces, np.nan)
+        np.divide(differed, expected, out=out, where=np.asarray(expected > 0))
+        return out
+
+    def of(which: Bool) -> Float64:
+        return np.asarray(np.hypot(ratio(which), ratio(which & upright)) / np.sqrt(2.0))
+
+    surely, at_all = of(np.asarray(placed[pairs].all(axis=1))), of(np.ones(len(pairs), np.bool_))
+    return np.where(np.isfinite(surely), surely, at_all)
+
+
+def _pieces(cells: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return int64 (N,), number of the piece of each cell: cells that touch are of one."""
+    label = np.arange(cells)
+    while True:
+        least = label.copy()
+        for one, other in (pairs.T, pairs.T[::-1]):
+            np.minimum.at(least, one, label[other])
+        least = least[least]
+        if np.array_equal(least, label):
+            return np.unique(label, return_inverse=True)[1]
+        label = least
+
+
+def _near(keys: NDArray[np.int64], body: Bool) -> Bool:
+    """Return bool (N,), cells with one of a body within the gap."""
+    steps = np.array(list(product(range(-_GAP_CELLS, _GAP_CELLS + 1), repeat=3)))
+    near, among = np.zeros(len(keys), np.bool_), keys[body]
+    for stride in pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64)):
+        near |= find_keys(keys + stride, among)[1]
+    return near
