@@ -52,8 +52,19 @@ def test_no_more_items_are_begun_than_can_be_held() -> None:
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """SIGINT raises `KeyboardInterrupt`, also where a shell in whose background we run hides it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """The first SIGINT raises `KeyboardInterrupt`, also in a background job of a shell.
+
+    Later ones do nothing, so that one which comes just before a wait, and so does not end it,
+    can be sent again.
+    """
+    interrupted = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        if not interrupted.is_set():
+            interrupted.set()
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
     yield
     signal.signal(signal.SIGINT, before)
 
@@ -73,8 +84,10 @@ def test_nothing_is_begun_after_an_interruption(monkeypatch: pytest.MonkeyPatch)
     def work(item: int) -> None:
         begun.append(item)
         next_drawn.wait(30)
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        dropped.wait(30)
+        for _ in range(600):
+            if dropped.wait(0.05):
+                return
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         list(side_by_side(work, items(), threads=1))
