@@ -138,7 +138,7 @@ def record(kind: str, change: Callable[[dict[str, Any]], None] | None) -> Alter:
     def alter(path: Path) -> None:
         with Store.open(path) as store:
             first = store.keys(kind)[0]
-            content = store.read(kind, first)
+            content = store.read(kind, first, most_bytes=1 << 30)
             if change is None:
                 store.delete(kind, first)
             else:

@@ -6,7 +6,7 @@ import json
 import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,8 @@ _TREE: Final = "tree"
 _KINDS: Final = "biuf"
 _NARROW: Final = 16
 """Arrays with at most this many columns are compressed column by column."""
-_MOST_INFLATED: Final = 1040
-"""Deflate makes nothing more than 1032 times smaller."""
+_INFLATED_PER_CHARACTER: Final = 32
+"""Bytes of packed arrays for each character of the JSON, which names each frame and link."""
 
 
 def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Bytes]]:
@@ -61,21 +61,23 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Byte
     return json.dumps(plain(tree)), content
 
 
-def from_bytes(text: str, read: Callable[[int], bytearray]) -> dict[str, Any]:
+def from_bytes(text: str, read: Callable[[int], bytearray], most: int) -> dict[str, Any]:
     """Return the tree of `to_bytes`. Tuples are lists now.
 
     Args:
         text: The JSON.
         read: Gives the next bytes, as many as it is asked for. Each array takes over its own, so
             that a tree takes no more memory than its arrays.
+        most: Bytes that its compressed arrays may take together, beside what the length of the
+            JSON explains.
 
     Raises:
         FormatError: The bytes are no such arrays; other exceptions where the text is no tree.
     """
-    position = 0
+    position, left = 0, most + _INFLATED_PER_CHARACTER * len(text)
 
     def restored(value: Any) -> Any:
-        nonlocal position
+        nonlocal position, left
         if isinstance(value, list):
             return [restored(item) for item in value]
         if not isinstance(value, dict):
@@ -85,13 +87,37 @@ def from_bytes(text: str, read: Callable[[int], bytearray]) -> dict[str, Any]:
             if begin != position:
                 raise FormatError("the arrays of a record of the map are not in order")
             position = end
-            return _unpack(head, read(end - begin))
+            claim = _Claim(np.dtype(head[0]), *head[1:])
+            left -= claim.nbytes if claim.codec == _ZLIB else 0
+            if left < 0:
+                raise FormatError("a record of the map claims more than it can hold")
+            return _unpack(claim, read(end - begin))
         return {name: restored(item) for name, item in value[_TREE].items()}
 
     tree = restored(json.loads(text))
     if not isinstance(tree, dict):
         raise FormatError("a record of the map is no tree")
     return tree
+
+
+class _Claim(NamedTuple):
+    """What a record says of an array, before anything is made of it."""
+
+    dtype: np.dtype[Any]
+    shape: list[int]
+    layout: str
+    codec: str
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the array.
+
+        Raises:
+            FormatError: There is no such array.
+        """
+        if self.dtype.kind not in _KINDS or min(self.shape, default=0) < 0:
+            raise FormatError("an array of the map has an impossible type or shape")
+        return math.prod(self.shape) * self.dtype.itemsize
 
 
 def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | memoryview]:
@@ -113,23 +139,18 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | me
     return [little.dtype.str, list(array.shape), layout, codec], content
 
 
-def _unpack(head: Sequence[Any], packed: bytearray) -> NDArray[Any]:
+def _unpack(claim: _Claim, packed: bytearray) -> NDArray[Any]:
     """Return the array of these bytes, which it takes over where they are not compressed.
 
     Raises:
         FormatError: They are no such array.
     """
-    dtype, shape, layout, codec = np.dtype(head[0]), *head[1:]
-    if dtype.kind not in _KINDS or min(shape, default=0) < 0:
-        raise FormatError("an array of the map has an impossible type or shape")
+    dtype, shape, layout, codec = claim
     axes = shape[::-1] if layout == "F" else shape
-    wanted = math.prod(shape) * dtype.itemsize
     content: bytes | bytearray = packed  # compiled kernels take only arrays that can be written
     if codec == _ZLIB:
-        if wanted > _MOST_INFLATED * (len(packed) + 1):
-            raise FormatError("an array of the map is truncated")
-        content = zlib.decompressobj().decompress(packed, wanted + 1)
-    if len(content) != wanted:
+        content = zlib.decompressobj().decompress(packed, claim.nbytes + 1)
+    if len(content) != claim.nbytes:
         raise FormatError("an array of the map is truncated")
     numbers: NDArray[Any] = np.frombuffer(content, np.uint8)
     if codec == _ZLIB:

@@ -13,6 +13,8 @@ from recon.places.keyframe import Keyframe
 from recon.places.loop import Loop
 
 KEYFRAME: Final = "keyframe"
+_MOST_BYTES: Final = 1 << 24
+"""Hundreds of features, and every 64th disparity: of 100 megapixels 6 MB."""
 
 
 class Keyframes:
@@ -67,7 +69,9 @@ class Keyframes:
 
     def _read(self, frame: int) -> StoredKeyframe:
         with reading(self._store.name):
-            content: dict[str, Any] = self._store.read(KEYFRAME, (self._session, frame))
+            content: dict[str, Any] = self._store.read(
+                KEYFRAME, (self._session, frame), most_bytes=_MOST_BYTES
+            )
             return StoredKeyframe(
                 Keyframe(**content["keyframe"]),
                 content["T_world_camera"],

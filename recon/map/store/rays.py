@@ -15,6 +15,8 @@ from recon.core.values.arrays import frozen_array
 from recon.map.store.frames import FARTHEST_M
 
 RAYS: Final = "rays"
+RAY_BYTES: Final = 10
+"""Of one ray in a record; a frame has at most one for each pixel."""
 
 
 def rays_record(rays: RayCloud, grain: RayGrain) -> dict[str, Any]:

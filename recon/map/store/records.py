@@ -33,6 +33,9 @@ from recon.map.store.database import (
 
 Key = int | tuple[int, ...]
 CACHE_BYTES: Final = 100_000_000
+_SMALL_BYTES: Final = 1 << 24
+_MOST_GROWTH: Final = 16
+"""What was measured becomes two to three times smaller; small records may shrink further."""
 
 
 class Store:
@@ -129,22 +132,31 @@ class Store:
     def get(self, kind: str, key: Key) -> dict[str, Any]:
         """Return a record, which others may hold as well: copy it before changing it.
 
+        It has no large compressed arrays: see `read`.
+
         Raises:
             FormatError: It is missing or damaged.
         """
         return self.cache.get((kind, key), lambda: self.read(kind, key))
 
-    def read(self, kind: str, key: Key) -> dict[str, Any]:
+    def read(self, kind: str, key: Key, *, most_bytes: int = 0) -> dict[str, Any]:
         """Return a record read from the file, past the cache; for those that are read once.
 
+        Args:
+            kind: Its kind.
+            key: Its number, or several.
+            most_bytes: What its compressed arrays can take together, as far as the rest of the
+                map says. A small file can claim very large ones.
+
         Raises:
-            FormatError: It is missing or damaged.
+            FormatError: It is missing or damaged, or claims more than it can hold.
         """
         name = _name(key)
         with self._lock, self._reading():
             text, content, checksum = self._row(kind, name)
             try:
-                return from_bytes(text, content.read)
+                most = min(most_bytes, max(_SMALL_BYTES, _MOST_GROWTH * content.left))
+                return from_bytes(text, content.read, most)
             finally:
                 content.close()
                 if content.checksum != checksum:

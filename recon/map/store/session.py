@@ -15,7 +15,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.io.files import reading
 from recon.map.store.frames import FRAMES, frames_in, frames_record
 from recon.map.store.keyframes import Keyframes
-from recon.map.store.rays import RAYS, rays_in, rays_record
+from recon.map.store.rays import RAY_BYTES, RAYS, rays_in, rays_record
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.odometry.health import trusted_poses
@@ -219,7 +219,9 @@ class Session:
             FormatError: They are missing or damaged.
         """
         with reading(self._store.name):
-            return rays_in(self._store.read(RAYS, (self.number, frame)))
+            camera = self.camera
+            most_bytes = RAY_BYTES * camera.width_px * camera.height_px
+            return rays_in(self._store.read(RAYS, (self.number, frame), most_bytes=most_bytes))
 
     def same_rays(self, frame: int, other: Session, other_frame: int) -> bool:
         """Return whether this drive and another of the map kept the same rays, and any at all.

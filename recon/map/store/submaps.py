@@ -13,6 +13,9 @@ from recon.map.submaps import Submap
 
 SUBMAP: Final = "submap"
 ENTRY: Final = "submap_entry"
+_VOXEL_BYTES: Final = 60
+_CELL_BYTES: Final = 54
+"""Most of one cell: its values, its surface point, and a block of its own."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ class SubmapEntry:
     frames: int
     voxels: int
     cells: int
+
+    @property
+    def nbytes(self) -> int:
+        """Most bytes that the arrays of the submap take."""
+        return _VOXEL_BYTES * self.voxels + _CELL_BYTES * self.cells
 
     @property
     def middle(self) -> int:
@@ -100,7 +108,9 @@ class Submaps:
             FormatError: It is missing or damaged.
         """
         with reading(self.store.name):
-            return Submap.from_tree(self.store.read(SUBMAP, (self._session, index)))
+            most_bytes = self._entries[index].nbytes
+            record = self.store.read(SUBMAP, (self._session, index), most_bytes=most_bytes)
+            return Submap.from_tree(record)
 
     def __iter__(self) -> Iterator[Submap]:
         """Return the submaps in order, read one at a time."""
