@@ -6,7 +6,6 @@ The list is ``datasets.toml`` beside this file; its first lines explain it.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,42 +15,39 @@ from pydantic import Field
 
 from recon.core.errors import SettingsError
 from recon.core.settings import Settings
-from recon.io.archives import Choice
-from recon.io.download import Promise
 from recon.io.toml_file import read_toml
 
 _LIST: Final = Path(__file__).with_suffix(".toml")
 
 
-class _Facts(Settings):
+class Facts(Settings):
+    """What is known of a file beforehand; the digest begins with its kind, such as ``md5:``."""
+
     bytes: int | None = None
     digest: str | None = None
     id: str = ""
 
 
-class _Archive(Settings):
+class Archive(Facts):
+    """One archive of a data set: its address, its name here, and what of it is unpacked."""
+
     path: str
     file: str = ""
     below: str = ""
     without: tuple[str, ...] = ()
     zips: bool = False
 
+    def of_part(self, part: str, base: str, files: dict[str, Facts]) -> Archive:
+        """Return the archive of one part, with its whole address and what is known of it."""
+        file = (self.file or self.path.rpartition("/")[2]).format(part=part)
+        facts = files.get(file, Facts())
+        path = base + self.path.format(part=part, id=facts.id)
+        below = self.below.format(part=part)
+        return self.model_copy(update={**dict(facts), "path": path, "file": file, "below": below})
+
 
 class Dataset(Settings):
-    """One entry of the list.
-
-    Attributes:
-        name: Its name, and that of its folder.
-        about: What it shows.
-        page: Where its owners describe it.
-        licence: Its terms.
-        cite: What to cite.
-        layout: Its files, below the folder that `recon datasets fetch` writes.
-        use: A command that reads it.
-        unchecked: Why there is no hash to compare with; "" = there is one.
-        digest_beside: Kind of the hash that is in a file beside each archive; "" = there is none.
-        parts: What can be fetched by itself; none = only the whole.
-    """
+    """One entry of the list; ``digest_beside`` is the kind of the hash beside each archive."""
 
     name: str
     about: str
@@ -63,48 +59,23 @@ class Dataset(Settings):
     unchecked: str = ""
     digest_beside: str = ""
     base: str
-    parts: tuple[str, ...] = ()
-    archives: tuple[_Archive, ...]
-    files: dict[str, _Facts] = Field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Download:
-    """One archive of a part.
-
-    Attributes:
-        address: Where its owners offer it.
-        file: Name of the file, here and on a mirror.
-        promise: What is known of it beforehand.
-        choice: What of it is unpacked.
-        digest_beside: Suffix and kind of a file with its hash; "" = there is none.
-    """
-
-    address: str
-    file: str
-    promise: Promise
-    choice: Choice
-    digest_beside: str = ""
+    parts: tuple[str, ...] = ("",)
+    archives: tuple[Archive, ...]
+    files: dict[str, Facts] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Part:
-    """What is fetched at once, into one folder.
-
-    Attributes:
-        dataset: The data set.
-        name: Its name, such as ``kitti-raw/2011_09_26_drive_0013``.
-        downloads: Its archives, in the order in which they are unpacked.
-    """
+    """What is fetched at once, into one folder: ``kitti-raw/2011_09_26_drive_0013``."""
 
     dataset: Dataset
     name: str
-    downloads: tuple[Download, ...]
+    archives: tuple[Archive, ...]
 
     @property
     def size(self) -> int | None:
         """Bytes to download; None = not known beforehand."""
-        sizes = [one.promise.size for one in self.downloads]
+        sizes = [one.bytes for one in self.archives]
         return None if None in sizes else sum(size or 0 for size in sizes)
 
 
@@ -115,11 +86,16 @@ def datasets() -> dict[str, Dataset]:
     return {one.name: one for one in entries}
 
 
-def parts_of(dataset: Dataset) -> Iterator[Part]:
-    """Yield the parts of a data set, in the order of the list; at least one."""
-    for part in dataset.parts or ("",):
-        name = f"{dataset.name}/{part}" if part else dataset.name
-        yield Part(dataset, name, tuple(_download(dataset, one, part) for one in dataset.archives))
+def parts_of(dataset: Dataset) -> list[Part]:
+    """Return the parts of a data set, in the order of the list; at least one."""
+    return [
+        Part(
+            dataset,
+            f"{dataset.name}/{part}".rstrip("/"),
+            tuple(one.of_part(part, dataset.base, dataset.files) for one in dataset.archives),
+        )
+        for part in dataset.parts
+    ]
 
 
 def find_parts(name: str) -> list[Part]:
@@ -129,28 +105,13 @@ def find_parts(name: str) -> list[Part]:
         SettingsError: There is no such data set or part.
     """
     whole = name.rstrip("/").partition("/")[0]
-    known = list(datasets()) if whole not in datasets() else []
-    parts = [] if known else list(parts_of(datasets()[whole]))
+    every = [part for one in datasets().values() for part in parts_of(one)]
+    parts = [part for part in every if part.dataset.name == whole]
     found = [part for part in parts if name.rstrip("/") in (whole, part.name)]
-    if found:
-        return found
-    near = difflib.get_close_matches(name, known or [part.name for part in parts], n=3)
-    raise SettingsError(
-        "unknown data set" if known else f"{whole} has no such part",
-        got=name,
-        expected=", ".join(near or known) or None,
-        hint=f"`recon datasets list{'' if known else ' ' + whole}` lists them",
-    )
-
-
-def _download(dataset: Dataset, archive: _Archive, part: str) -> Download:
-    name = (archive.file or archive.path.rpartition("/")[2]).format(part=part)
-    facts = dataset.files.get(name, _Facts())
-    choice = Choice(archive.below.format(part=part), archive.without, archive.zips)
-    return Download(
-        dataset.base + archive.path.format(part=part, id=facts.id),
-        name,
-        Promise(facts.bytes, facts.digest),
-        choice,
-        dataset.digest_beside,
-    )
+    if not found:
+        names = [part.name for part in parts] or list(datasets())
+        near = difflib.get_close_matches(name, names, n=3) or ([] if parts else names)
+        hint = f"`recon datasets list{' ' + whole if parts else ''}` lists them"
+        expected = ", ".join(near) or None
+        raise SettingsError("unknown data set or part", got=name, expected=expected, hint=hint)
+    return found

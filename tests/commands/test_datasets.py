@@ -12,12 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from recon.commands.datasets import run_fetch, run_list, run_verify
+from recon.commands.datasets import RECORD, run_fetch, run_list, run_verify
 from recon.core.errors import DownloadError, FormatError, OutputError, SettingsError
 from recon.core.values import RectifiedCamera
 from recon.io import download
 from recon.sources.datasets import datasets, find_parts, parts_of
-from recon.sources.fetching import RECORD
 from recon.sources.registry import open_source, recognise_source
 from tests.flow.test_paper import write_scene
 from tests.hostile.refusals import assert_refused, run
@@ -33,18 +32,18 @@ def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(download, "_PAUSE_S", 0.0)
 
 
-@pytest.fixture
-def mirror() -> Iterator[Mirror]:
-    with serving(Mirror()) as served:
-        yield served
-
-
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The files of a scene, by name."""
+def scene(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The archive of a scene."""
     folder = tmp_path_factory.mktemp("scene") / "Pipes"
     write_scene(folder, slanted_pair(CAMERA, 1.5, (0.1, -0.1), seed=1))
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    return zipped({f"Pipes-perfect/{path.name}": path.read_bytes() for path in folder.iterdir()})
+
+
+@pytest.fixture
+def mirror(scene: bytes) -> Iterator[Mirror]:
+    with serving(Mirror({"/Pipes-perfect.zip": scene})) as served:
+        yield served
 
 
 def zipped(files: Mapping[str, bytes]) -> bytes:
@@ -65,35 +64,35 @@ def tarred(files: Mapping[str, bytes]) -> bytes:
     return out.getvalue()
 
 
-def offer_scene(mirror: Mirror, scene: Mapping[str, bytes]) -> None:
-    files = {f"Pipes-perfect/{name}": content for name, content in scene.items()}
-    mirror.files["/Pipes-perfect.zip"] = zipfile_content = zipped(files)
-    assert len(zipfile_content) > 1000
-
-
 def test_every_address_is_that_of_a_file_and_says_how_it_is_checked() -> None:
     parts = [part for dataset in datasets().values() for part in parts_of(dataset)]
     assert len({part.name for part in parts}) == len(parts) > 100
     for part in parts:
-        for one in part.downloads:
-            assert one.address.startswith("https://")
-            assert "{" not in one.address
-            assert "//" not in one.address.removeprefix("https://")
-            hashed = one.promise.digest or one.digest_beside
+        for one in part.archives:
+            assert one.path.startswith("https://")
+            assert "{" not in one.path
+            assert "//" not in one.path.removeprefix("https://")
+            hashed = one.digest or part.dataset.digest_beside
             assert bool(hashed) != bool(part.dataset.unchecked)
-
-
-def test_every_fact_of_a_file_is_of_a_file_that_is_fetched() -> None:
     for dataset in datasets().values():
-        files = {one.file for part in parts_of(dataset) for one in part.downloads}
+        files = {one.file for part in parts_of(dataset) for one in part.archives}
         assert set(dataset.files) <= files
 
 
-def test_the_list_says_what_is_there(
-    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path
-) -> None:
-    offer_scene(mirror, scene)
-    run_fetch([SCENE], tmp_path, address=mirror.address)
+def test_a_scene_arrives_once_as_recon_reads_it(mirror: Mirror, tmp_path: Path) -> None:
+    mirror.break_after = 1000
+    (found,) = run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"]
+    assert found["fetched"]
+    assert recognise_source(found["out"]) == "middlebury"
+    assert len(open_source(found["out"])) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["middlebury-2014"]
+    asked = len(mirror.asked)
+    assert run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"] == [
+        {**found, "fetched": False}
+    ]
+    assert len(mirror.asked) == asked
+    del found["fetched"]
+    assert run_verify(["middlebury-2014"], tmp_path)["datasets"] == [found]
     listed = {one["name"]: one for one in run_list(folder=tmp_path)["datasets"]}
     assert set(listed) == set(datasets())
     assert (listed["middlebury-2014"]["fetched"], listed["middlebury-2014"]["parts"]) == (1, 23)
@@ -102,34 +101,10 @@ def test_the_list_says_what_is_there(
     assert [name for name, fetched in parts.items() if fetched] == [SCENE]
 
 
-def test_a_scene_arrives_as_recon_reads_it(
-    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path
-) -> None:
-    offer_scene(mirror, scene)
-    mirror.break_after = 1000
-    (found,) = run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"]
-    assert found["files"] == len(scene)
-    assert recognise_source(found["out"]) == "middlebury"
-    assert len(open_source(found["out"])) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["middlebury-2014"]
-    assert run_verify([SCENE], tmp_path)["datasets"][0]["files"] == len(scene)
-
-
-def test_what_is_there_is_not_fetched_again(
-    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path
-) -> None:
-    offer_scene(mirror, scene)
-    assert run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"][0]["fetched"]
-    asked = len(mirror.asked)
-    assert not run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"][0]["fetched"]
-    assert len(mirror.asked) == asked
-
-
 @pytest.mark.parametrize("damage", ["changed", "missing"])
 def test_verification_names_the_file_that_is_not_what_was_unpacked(
-    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path, damage: str
+    mirror: Mirror, tmp_path: Path, damage: str
 ) -> None:
-    offer_scene(mirror, scene)
     run_fetch([SCENE], tmp_path, address=mirror.address)
     image = tmp_path / SCENE / "im1.png"
     if damage == "missing":
@@ -140,13 +115,11 @@ def test_verification_names_the_file_that_is_not_what_was_unpacked(
         run_verify([SCENE], tmp_path)
 
 
-def test_the_archives_of_a_part_come_together(mirror: Mirror, tmp_path: Path) -> None:
-    day, drive = "2011_09_28", "2011_09_28_drive_0001"
-    calib, images = b"calib", b"image"
-    mirror.files = {
-        f"/{day}_calib.zip": zipped({f"{day}/calib_cam_to_cam.txt": calib}),
-        f"/{drive}_sync.zip": zipped({f"{day}/{drive}_sync/image_00/data/0000000000.png": images}),
-    }
+def test_a_part_of_which_one_archive_is_not_that_of_the_list_does_not_appear(
+    mirror: Mirror, tmp_path: Path
+) -> None:
+    drive = "2011_09_28_drive_0001"
+    mirror.files["/2011_09_28_calib.zip"] = zipped({"2011_09_28/calib_cam_to_cam.txt": b"calib"})
     with pytest.raises(DownloadError, match="another file than the list"):
         run_fetch([f"kitti-raw/{drive}"], tmp_path, address=mirror.address)
     assert not (tmp_path / "kitti-raw").exists()
@@ -174,6 +147,9 @@ def test_a_hash_beside_the_archive_is_compared(mirror: Mirror, tmp_path: Path) -
     mirror.files[f"/{name}.tar"] = content
     mirror.files[f"/{name}.tar.md5"] = b"0123456789abcdef0123456789abcdef  x\n"
     with pytest.raises(DownloadError, match="not what was promised"):
+        run_fetch(["tum-vi/room1"], tmp_path, address=mirror.address)
+    mirror.files[f"/{name}.tar.md5"] = b"<!DOCTYPE html>"
+    with pytest.raises(DownloadError, match="no hash"):
         run_fetch(["tum-vi/room1"], tmp_path, address=mirror.address)
     digest = hashlib.md5(content).hexdigest()  # noqa: S324
     mirror.files[f"/{name}.tar.md5"] = f"{digest} *{name}.tar\n".encode()
@@ -205,8 +181,7 @@ def test_unknown_names_are_one_line(tmp_path: Path, name: str) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_the_commands_print_json(mirror: Mirror, scene: dict[str, bytes], tmp_path: Path) -> None:
-    offer_scene(mirror, scene)
+def test_the_commands_print_json(mirror: Mirror, tmp_path: Path) -> None:
     where = ("--folder", tmp_path, "--json")
     for words in (("list",), ("fetch", SCENE, "--address", mirror.address), ("verify", SCENE)):
         ended = run("datasets", *words, *where)
