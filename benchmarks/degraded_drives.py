@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,7 @@ from recon.commands.config import load_config
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
-from recon.odometry.protocol import OdometryFrame
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
 from recon.run.threads import serial_algebra
 from recon.sources.registry import open_source
@@ -145,11 +145,10 @@ class Kept:
         return iter(self.pairs[start:])
 
 
-def run(altered: Altered) -> dict[str, dict[str, Any]]:
+def run(altered: Altered, odometries: Mapping[str, Odometry]) -> dict[str, dict[str, Any]]:
     """Errors of each odometry on the same frames."""
     reconstructor = FrameReconstructor(altered.calibration, load_config(None, []), threads=1)
-    odometries = {name: make_odometry(name) for name in ODOMETRIES}
-    results: dict[str, list[Any]] = {name: [] for name in ODOMETRIES}
+    results: dict[str, list[OdometryResult]] = {name: [] for name in odometries}
     with serial_algebra():
         for pair in altered.frames():
             frame = OdometryFrame(*reconstructor.match(pair))
@@ -176,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         cases = degradations(alterations(open_source(options.drive))["as it is"])
     result = {}
     for name in options.only or cases:
-        result[name] = run(cases[name])
+        result[name] = run(cases[name], {each: make_odometry(each) for each in ODOMETRIES})
         if not options.json:
             print(line(name, result[name]), flush=True)
     if options.json:
