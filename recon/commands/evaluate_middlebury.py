@@ -5,22 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain
 from pathlib import Path
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import SettingsError
-from recon.evaluation.middlebury.bench import Bench
-from recon.evaluation.middlebury.results import find_results
-from recon.evaluation.middlebury.scenes import check_folder, find_scenes, read_scored_scene
-from recon.evaluation.middlebury.score import Figures
-from recon.evaluation.middlebury.summary import (
-    SceneDone,
-    SceneFigures,
-    check_names,
-    result_figures,
-    summarise_scenes,
+from recon.evaluation.middlebury.bench import Bench, check_names, read_result
+from recon.evaluation.middlebury.scenes import (
+    check_folder,
+    find_results,
+    find_scenes,
+    read_scored_scene,
 )
+from recon.evaluation.middlebury.score import Figures
+from recon.evaluation.middlebury.summary import SceneDone, SceneFigures, summarise_scenes
 from recon.io.files import StrPath
 from recon.io.images.pfm import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
@@ -91,12 +88,14 @@ def run_middlebury(
             if scene is None:
                 return None
             figures = {}
-            read = (one for other in others if (one := other.read(scene)) is not None)
-            for one in chain(bench.results(scene), read):
-                if one.file is None:
-                    write_pfm(run.path(f"disparity/{one.matcher}/{name}.pfm"), one.values)
+            for one in bench.results(scene):
+                write_pfm(run.path(f"disparity/{one.matcher}/{name}.pfm"), one.values)
                 draw_result(one, run)
-                figures[one.matcher] = result_figures(one)
+                figures[one.matcher] = one.figures
+            for other in others:
+                if (given := read_result(other, scene)) is not None:
+                    draw_result(given, run)
+                    figures[other.name] = given.figures
             return figures
 
         progress.on_start(str(folder), len(paths), "scenes")

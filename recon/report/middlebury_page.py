@@ -10,7 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from recon.core.values.arrays import UInt8
 from recon.evaluation.middlebury.bench import SceneResult
+from recon.evaluation.middlebury.score import error_map
 from recon.io.atomic import write_text
 from recon.io.images.image import write_image
 from recon.report.colour import colour_disparity, colour_error, value_range
@@ -38,15 +40,14 @@ def draw_result(result: SceneResult, run: RunDirectory) -> None:
     Raises:
         OutputError: A file cannot be written.
     """
-    scale = round(4 * result.values.shape[1] / result.scene.truth.values.shape[1]) / 4
-    low, high = value_range(result.scene.truth.values)
-    images = {
-        "disparity": colour_disparity(result.values, low * scale, high * scale),
-        "error": colour_error(result.error_px(), ERROR_LIMIT_PX),
-    }
-    for name, image in images.items():
-        path = run.path(f"pictures/{result.matcher}/{result.scene.name}_{name}.png")
-        write_image(path, image)
+    scene, values = result.scene, result.values
+    scale = round(4 * values.shape[1] / scene.truth.values.shape[1]) / 4
+    low, high = value_range(scene.truth.values)
+    stem = f"pictures/{result.matcher}/{scene.name}"
+    disparity = colour_disparity(values, low * scale, high * scale)
+    write_image(run.path(f"{stem}_disparity.png"), disparity)
+    error = colour_error(error_map(scene, values), ERROR_LIMIT_PX)
+    write_image(run.path(f"{stem}_error.png"), error)
 
 
 def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None:
@@ -85,7 +86,7 @@ def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
     upper.plot((0, 1), (0, 1), color=FAINT, linestyle="--", linewidth=1, label="calibrated")
     for n, (name, curves) in enumerate(matchers.items()):
         bins, colour = curves["reliability"], f"C{n}"
-        confidence, right, share = (_floats(bins[key]) for key in ("confidence", "right", "share"))
+        confidence, right, share = _floats(bins, "confidence", "right", "share")
         shown = share >= _LEAST_SHARE
         label = f"{name}: ECE {curves['ece']:.3f}"
         upper.plot(confidence[shown], right[shown], "o-", color=colour, markersize=4, label=label)
@@ -105,7 +106,7 @@ def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
     axes = figure.subplots()
     for n, (name, curves) in enumerate(matchers.items()):
         steps, colour = curves["sparsification"], f"C{n}"
-        removed, wrong, best = (100 * _floats(steps[key]) for key in ("removed", "wrong", "best"))
+        removed, wrong, best = 100 * _floats(steps, "removed", "wrong", "best")
         axes.plot(removed, wrong, color=colour, label=f"{name}: AUSE {curves['ause']:.3f}")
         axes.plot(removed, best, color=colour, linewidth=1.0, linestyle=":")
     axes.plot([], [], color=FAINT, linestyle=":", label="if the wrong ones went first")
@@ -117,38 +118,27 @@ def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
     return to_png(figure)
 
 
-def _floats(values: Any) -> Any:
-    """Return float64 array, with NaN for None."""
-    return np.array(values, dtype=np.float64)
+def _floats(curves: Curves, *names: str) -> Any:
+    """Return float64 (names, N), with NaN for None."""
+    return np.array([curves[name] for name in names], dtype=np.float64)
 
 
 def _scene(scene: str, summary: Mapping[str, Any], run: RunDirectory) -> dict[str, Any]:
-    """Return what the page shows of a scene: one row of images per matcher."""
+    """Return what the page shows of a scene: disparity and error of each matcher, row by row."""
     names = [name for name, found in summary["matchers"].items() if scene in found["scenes"]]
+    rows = [np.hstack(_small_images(run, f"pictures/{name}/{scene}")) for name in names]
     buffer = io.BytesIO()
-    rows = [_both_images(run, name, scene) for name in names]
-    _joined(rows, down=True).save(buffer, "PNG")
+    Image.fromarray(np.vstack(rows)[:-_GAP_PX, :-_GAP_PX]).save(buffer, "PNG")
     return {"name": scene, "matchers": names, "png": buffer.getvalue()}
 
 
-def _both_images(run: RunDirectory, matcher: str, scene: str) -> Image.Image:
-    """Return disparity and error side by side."""
-    stem = f"pictures/{matcher}/{scene}"
-    found = Image.open(run.path(f"{stem}_disparity.png"))
+def _small_images(run: RunDirectory, stem: str) -> list[UInt8]:
+    """Return disparity and error in one size, with a white strip to the right and below."""
     # The error has the size of the ground truth, which is that of no or every matcher's result.
-    error = Image.open(run.path(f"{stem}_error.png"))
-    width = min(_WIDTH_PX, error.width)
-    size = (width, max(1, round(error.height * width / error.width)))
-    nearest = Image.Resampling.NEAREST
-    return _joined([found.resize(size, nearest), error.resize(size, nearest)], down=False)
-
-
-def _joined(images: list[Image.Image], *, down: bool) -> Image.Image:
-    """Return images of one size below or beside each other, with white gaps."""
-    width, height = images[0].size
-    step = (0, height + _GAP_PX) if down else (width + _GAP_PX, 0)
-    last = len(images) - 1
-    whole = Image.new("RGB", (width + last * step[0], height + last * step[1]), "white")
-    for n, image in enumerate(images):
-        whole.paste(image, (n * step[0], n * step[1]))
-    return whole
+    images = [Image.open(run.path(f"{stem}_{name}.png")) for name in ("disparity", "error")]
+    width, height = images[1].size
+    shown = min(_WIDTH_PX, width)
+    size = (shown, max(1, round(height * shown / width)))
+    small = [np.asarray(image.resize(size, Image.Resampling.NEAREST)) for image in images]
+    strips = ((0, _GAP_PX), (0, _GAP_PX), (0, 0))
+    return [np.pad(image, strips, constant_values=255) for image in small]

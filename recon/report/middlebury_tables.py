@@ -2,42 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any, Final
 
 from recon.report.table import NOT_KNOWN, Row, Table, csv_text, number
 
 Figures = Mapping[str, Any]
+Path = tuple[str, ...]
 
-WEIGHTED: Final = "weighted"
 _LIMITS: Final = ("0.5", "1", "2", "4")
 _LENGTHS: Final = ("avgerr", "rms", "a50", "a90", "a95", "a99")
 _DEPTHS: Final = ("mean_m", "median_m", "rms_m", "median_percent", "over_5_percent", "infinite")
-_HEAD: Final = ("matcher", *(f"bad{t}" for t in _LIMITS), "invalid", *_LENGTHS)
 _CONFIDENCE: Final = ("ece", "ause", "within_1_sigma", "within_2_sigma")
 _KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("all", "sparse"))
+_OF_EACH_SCENE: Final = {
+    "bad 1 of each scene, nonocc, dense": ("nonocc", "dense", "bad", "1"),
+    "bad 2 of each scene, nonocc, dense": ("nonocc", "dense", "bad", "2"),
+    "avgerr (px) of each scene, nonocc, dense": ("nonocc", "dense", "avgerr"),
+}
 
 
 def middlebury_tables(summary: Figures) -> list[Table]:
     """Return all tables: weighted means of each mask and filling, then figures of each scene."""
-    matchers, mean = summary["matchers"], _mean_title(summary)
-    tables = [
-        _weighted_table(f"{mean}, {mask}, {holes}", matchers, mask, holes) for mask, holes in _KINDS
-    ]
-    for limit in _LIMITS[1:3]:
-        title = f"bad {limit} of each scene, nonocc, dense"
-        tables.append(_scene_table(title, matchers, partial(_bad, limit)))
-    title = "avgerr (px) of each scene, nonocc, dense"
-    tables.append(_scene_table(title, matchers, lambda one: one["nonocc"]["dense"]["avgerr"]))
-    if any(found["weighted"].get("confidence") for found in matchers.values()):
+    matchers = summary["matchers"]
+    averaged, scenes = len(summary["mean_over"]), len(scene_names(matchers))
+    mean = "Weighted mean" + (f" of {averaged} of {scenes} scenes" if averaged < scenes else "")
+    tables = [_weighted_table(f"{mean}, {', '.join(kind)}", matchers, kind) for kind in _KINDS]
+    tables += [_scene_table(title, matchers, path) for title, path in _OF_EACH_SCENE.items()]
+    if any(_at(found, ("weighted", "confidence")) for found in matchers.values()):
         tables.append(_confidence_table(f"Confidence, {mean.lower()}, all, sparse", matchers))
         tables += [
-            _scene_table(f"{name} of each scene", matchers, partial(_rated, name), 3)
-            for name in _CONFIDENCE[:2]
+            _scene_table(f"{name} of each scene", matchers, ("confidence", name), digits=3)
+            for name in ("ece", "ause")
         ]
     title = "seconds of each scene, matching alone"
-    return [*tables, _scene_table(title, matchers, lambda one: one["seconds"], 3)]
+    return [*tables, _scene_table(title, matchers, ("seconds",), digits=3)]
 
 
 def scene_names(matchers: Figures) -> list[str]:
@@ -51,73 +50,61 @@ def csv_table(summary: Figures) -> str:
     Figures of the confidence are in the rows they refer to: all pixels that have a value.
     """
     depths = [f"depth_{name}" for name in _DEPTHS]
-    names = [*_HEAD[1:], *depths, *_CONFIDENCE]
-    rows = [[_HEAD[0], "scene", "mask", "holes", *names, "seconds"]]
+    named = [*_columns("", ""), *depths, *_CONFIDENCE]
+    rows = [["matcher", "scene", "mask", "holes", *named, "seconds"]]
     for matcher, found in summary["matchers"].items():
-        for scene, figures in [*found["scenes"].items(), (WEIGHTED, found["weighted"])]:
-            for mask, holes in _KINDS:
-                cells = _all_cells(figures, mask, holes)
-                rows.append([matcher, scene, mask, holes, *cells, figures["seconds"]])
+        for scene, figures in [*found["scenes"].items(), ("weighted", found["weighted"])]:
+            for kind in _KINDS:
+                rated = "confidence" if kind == _KINDS[-1] else ""
+                paths = [
+                    *_columns(*kind).values(),
+                    *((*kind, "depth", name) for name in _DEPTHS),
+                    *((rated, name) for name in _CONFIDENCE),
+                ]
+                cells = [_at(figures, path) for path in paths]
+                texts = ["" if cell is None else f"{cell:.6g}" for cell in cells]
+                rows.append([matcher, scene, *kind, *texts, figures["seconds"]])
     return csv_text(rows)
 
 
-def _mean_title(summary: Figures) -> str:
-    averaged, scenes = len(summary["mean_over"]), len(scene_names(summary["matchers"]))
-    return "Weighted mean" + (f" of {averaged} of {scenes} scenes" if averaged < scenes else "")
+def _columns(mask: str, holes: str) -> dict[str, Path]:
+    """Return where each column is found; the invalid share is that of the unfilled map."""
+    bad = {f"bad{limit}": (mask, holes, "bad", limit) for limit in _LIMITS}
+    lengths = {name: (mask, holes, name) for name in _LENGTHS}
+    return {**bad, "invalid": (mask, "invalid"), **lengths}
 
 
-def _weighted_table(title: str, matchers: Figures, mask: str, holes: str) -> Table:
+def _at(figures: Figures, path: Path) -> Any:
+    """Return a figure by its keys; None where there is none."""
+    found: Any = figures
+    for key in path:
+        found = (found or {}).get(key)
+    return found
+
+
+def _weighted_table(title: str, matchers: Figures, kind: tuple[str, str]) -> Table:
+    columns = _columns(*kind)
     rows: list[Row] = []
     for name, found in matchers.items():
         figures = found["weighted"]
-        depth = figures[mask][holes].get("depth", {}).get("median_percent")
-        cells = [number(cell) for cell in _cells(figures, mask, holes)]
-        shown = NOT_KNOWN if depth is None else f"{number(depth)} %"
+        depth = number(_at(figures, (*kind, "depth", "median_percent")))
+        shown = depth if depth == NOT_KNOWN else f"{depth} %"
+        cells = [number(_at(figures, path)) for path in columns.values()]
         rows.append((name, *cells, shown, number(figures["seconds"], 3)))
-    return Table(title, (*_HEAD, "depth error", "seconds"), rows, best="columns")
+    return Table(title, ("matcher", *columns, "depth error", "seconds"), rows, best="columns")
 
 
 def _confidence_table(title: str, matchers: Figures) -> Table:
-    rows = [
-        (name, *(number(_rated(one, found["weighted"]), 3) for one in _CONFIDENCE))
-        for name, found in matchers.items()
-    ]
+    paths = [("weighted", "confidence", name) for name in _CONFIDENCE]
+    rows = [(m, *(number(_at(one, path), 3) for path in paths)) for m, one in matchers.items()]
     # The shares within sigma are best near those of a normal distribution, not at 0.
     return Table(title, ("matcher", *_CONFIDENCE), rows)
 
 
-def _scene_table(
-    title: str, matchers: Figures, pick: Callable[[Figures], float | None], digits: int = 2
-) -> Table:
+def _scene_table(title: str, matchers: Figures, path: Path, digits: int = 2) -> Table:
     """Return one row per scene, one column per matcher."""
-    rows: list[Row] = []
-    for scene in scene_names(matchers):
-        ones = (found["scenes"].get(scene) for found in matchers.values())
-        rows.append((scene, *(number(None if one is None else pick(one), digits) for one in ones)))
-    head = ("scene", *matchers)
-    return Table(title, head, rows, best="rows")
-
-
-def _bad(limit: str, figures: Figures) -> float | None:
-    share: float | None = figures["nonocc"]["dense"]["bad"][limit]
-    return share
-
-
-def _rated(name: str, figures: Figures) -> float | None:
-    """Return a figure of the confidence; None if the matcher has no confidence."""
-    return (figures.get("confidence") or {}).get(name)
-
-
-def _cells(figures: Figures, mask: str, holes: str) -> list[Any]:
-    """Return cells in the order of the header; the invalid share is that of the unfilled map."""
-    one = figures[mask][holes]
-    bad = [one["bad"][limit] for limit in _LIMITS]
-    return [*bad, figures[mask]["invalid"], *(one[name] for name in _LENGTHS)]
-
-
-def _all_cells(figures: Figures, mask: str, holes: str) -> list[str]:
-    depth = figures[mask][holes].get("depth", {})
-    counted = (mask, holes) == _KINDS[-1]
-    rated = [_rated(name, figures) if counted else None for name in _CONFIDENCE]
-    cells = [*_cells(figures, mask, holes), *(depth.get(name) for name in _DEPTHS), *rated]
-    return ["" if cell is None else f"{cell:.6g}" for cell in cells]
+    rows = [
+        (scene, *(number(_at(one, ("scenes", scene, *path)), digits) for one in matchers.values()))
+        for scene in scene_names(matchers)
+    ]
+    return Table(title, ("scene", *matchers), rows, best="rows")

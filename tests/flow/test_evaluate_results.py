@@ -110,10 +110,11 @@ def test_missing_scenes_are_named_and_left_out_of_all_means(
     assert list(found["matchers"]["mine"]["scenes"]) == ["Piano", "Teddy", "Vintage"]
 
 
-def test_folders_of_one_name_are_distinguished(scenes: Path, results: Path, tmp_path: Path) -> None:
+def test_folders_of_one_name_are_distinguished(scenes: Path, tmp_path: Path) -> None:
+    both: list[str | Path] = []
     for method in ("a", "b"):
         write_pfm(tmp_path / method / "maps" / "Teddy.pfm", truth(scenes))
-    both = ("--results", tmp_path / "a" / "maps", "--results", tmp_path / "b" / "maps")
+        both += ["--results", tmp_path / method / "maps"]
     done = evaluate(scenes, "--matcher", "none", *both, "--out", tmp_path / "run", "--json")
     assert list(json.loads(done.stdout)["matchers"]) == ["a/maps", "b/maps"]
 
@@ -142,25 +143,18 @@ def test_latex_is_printed_alone(scenes: Path, results: Path, tmp_path: Path) -> 
 def broken(scenes: Path, folder: Path, kind: str) -> tuple[str | Path, ...]:
     """Arguments that cannot be evaluated."""
     given = folder / "given"
-    write_pfm(given / "Teddy.pfm", truth(scenes))
-    if kind == "size":
-        write_pfm(given / "Teddy.pfm", np.ones((7, WIDTH), np.float32))
+    file = given / ("Teddy/disp0.pfm" if kind in {"several", "time"} else "Teddy.pfm")
+    write_pfm(file, np.ones((7, WIDTH), np.float32) if kind == "size" else truth(scenes))
     if kind == "several":
-        (given / "Teddy.pfm").unlink()
-        for name in ("disp0A", "disp0B"):
-            write_pfm(given / "Teddy" / f"{name}.pfm", truth(scenes))
+        write_pfm(file.with_name("disp0B.pfm"), truth(scenes))
     if kind == "time":
-        (given / "Teddy.pfm").rename(folder / "disp0.pfm")
-        (given / "Teddy").mkdir()
-        (folder / "disp0.pfm").rename(given / "Teddy" / "disp0.pfm")
-        (given / "Teddy" / "time.txt").write_text("fast")
+        file.with_name("time.txt").write_text("fast")
     if kind == "colour":
-        (given / "Teddy.pfm").write_bytes(b"PF\n1 1\n-1\n" + bytes(12))
-    if kind == "twice":
-        return ("--results", given, "--results", given)
+        file.write_bytes(b"PF\n1 1\n-1\n" + bytes(12))
     if kind == "nothing":
-        return ("--matcher", "none")
-    return ("--results", folder / "nowhere" if kind == "nowhere" else given)
+        return ()
+    named = ("--results", folder / "nowhere" if kind == "nowhere" else given)
+    return 2 * named if kind == "twice" else named
 
 
 @pytest.mark.parametrize(
@@ -168,7 +162,7 @@ def broken(scenes: Path, folder: Path, kind: str) -> tuple[str | Path, ...]:
     [
         ("nowhere", "nowhere: folder does not exist"),
         ("size", "Teddy.pfm: result and truth differ in size"),
-        ("several", "Teddy: folder has several results for one scene (got disp0A.pfm, disp0B.pfm)"),
+        ("several", "Teddy: folder has several results for one scene (got disp0.pfm, disp0B.pfm)"),
         ("time", "time.txt:1: not a number"),
         ("colour", "Teddy.pfm: PFM file is in colour"),
         ("twice", "given twice"),

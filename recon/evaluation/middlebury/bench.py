@@ -1,30 +1,30 @@
-"""Matching and scoring one scene with several matchers."""
+"""One scene matched by several matchers, or matched by other programs, and scored."""
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
-import numpy as np
-
+from recon.core.errors import SettingsError
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float32
-from recon.evaluation.middlebury.confidence import confidence_figures
-from recon.evaluation.middlebury.rules import values_compared
-from recon.evaluation.middlebury.scenes import ScoredScene
-from recon.evaluation.middlebury.score import Figures, dense_map, score_result
+from recon.evaluation.middlebury.rules import scene_weight
+from recon.evaluation.middlebury.scenes import ResultFolder, ScoredScene, read_seconds
+from recon.evaluation.middlebury.score import Figures, confidence_figures, score_result
 from recon.io.files import naming
+from recon.io.images.pfm import read_pfm
 from recon.stereo.match.foreign import name_of
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.registry import make_matcher, searched_ndisp
+from recon.stereo.match.registry import check_matcher, make_matcher, searched_ndisp
 from recon.stereo.rectify.rectifier import Rectifier
 from recon.stereo.settings import StereoSettings
 
 _WARM_UP_ROWS: Final = 64
+_FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,25 +35,13 @@ class SceneResult:
         scene: The scene.
         matcher: Name of the matcher or of the folder of results.
         values: float32 (h, w), its disparity in pixels of its own size; NaN = none.
-        figures: As `score_result` gives them; ``ndisp``, the number of disparities searched, None
-            of a matcher that is not ours; and ``confidence`` as `confidence_figures` gives it,
-            None of a matcher with the same confidence everywhere.
-        seconds: Time of matching alone; None = not known.
-        file: The file that the result was read from; None = it was made here.
+        figures: An entry of ``scenes`` in ``summary.json``.
     """
 
     scene: ScoredScene
     matcher: str
     values: Float32
     figures: Figures
-    seconds: float | None
-    file: Path | None = None
-
-    def error_px(self) -> Float32:
-        """Return float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
-        truth, rules = self.scene.truth.values, self.scene.rules
-        error = values_compared(dense_map(self.values), truth.shape, rules) - truth
-        return np.asarray(np.abs(error) * np.float32(rules.full_size_factor), dtype=np.float32)
 
 
 class Bench:
@@ -66,8 +54,7 @@ class Bench:
         matchers: The matchers, by name or as objects.
         config: Their settings, and the conversion of images to grey.
         threads: Threads of each matcher.
-        auto_range: Whether the disparity range is estimated from each pair, as if unknown,
-            instead of taken from the scene.
+        auto_range: Whether the disparity range is estimated from each pair, as if unknown.
     """
 
     def __init__(
@@ -97,11 +84,10 @@ class Bench:
                 start = time.perf_counter()
                 disparity = matcher.match(pair)
                 seconds = time.perf_counter() - start
-                figures = score_result(scene, disparity.values)
-                figures["ndisp"] = searched_ndisp(given, self._config.matching, pair)
                 rated = confidence_figures(disparity, scene.truth) if _rates(disparity) else None
-                figures["confidence"] = rated
-                yield SceneResult(scene, name_of(given), disparity.values, figures, seconds)
+                ndisp = searched_ndisp(given, self._config.matching, pair)
+                figures = _figures(scene, disparity.values, ndisp, rated, round(seconds, 4))
+                yield SceneResult(scene, name_of(given), disparity.values, figures)
 
     def _matchers(self, pair: RectifiedPair) -> list[Matcher]:
         made: list[Matcher] | None = getattr(self._own, "matchers", None)
@@ -113,6 +99,60 @@ class Bench:
         return made
 
 
+def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
+    """Read and score what another program found for a scene; None if there is nothing.
+
+    Raises:
+        FormatError: A file is damaged.
+        EvaluationError: The size of the result does not fit that of the truth.
+    """
+    file = given.files.get(scene.name)
+    if file is None:
+        return None
+    values = read_pfm(file)
+    with naming(file):
+        figures = _figures(scene, values, None, None, read_seconds(file))
+    return SceneResult(scene, given.name, values, figures)
+
+
+def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
+    """Return the names of the matchers, which are also those of their folders.
+
+    Raises:
+        SettingsError: A matcher is unknown or named twice, or has no name for a folder.
+    """
+    for matcher in matchers:
+        check_matcher(matcher)
+    names = [name_of(matcher) for matcher in matchers]
+    if len(set(names)) < len(names):
+        objects = any(not isinstance(one, str) for one in matchers)
+        hint = "give each object an attribute `name`" if objects else None
+        raise SettingsError("a matcher is named twice", got=", ".join(names), hint=hint)
+    for name in names:
+        if not _FOLDER_NAME.fullmatch(name):
+            raise SettingsError("the matcher's name cannot name a folder", got=repr(name))
+    return names
+
+
+def _figures(
+    scene: ScoredScene,
+    values: Float32,
+    ndisp: int | None,
+    confidence: Figures | None,
+    seconds: float | None,
+) -> Figures:
+    return {
+        **score_result(scene, values),
+        "ndisp": ndisp,
+        "confidence": confidence,
+        "seconds": seconds,
+        "width_px": scene.camera.width_px,
+        "height_px": scene.camera.height_px,
+        "full_size_factor": scene.rules.full_size_factor,
+        "weight": scene_weight(scene.name),
+    }
+
+
 def _rates(disparity: Disparity) -> bool:
     """Return whether the matcher gives each match a confidence of its own."""
     sure = disparity.confidence[disparity.valid]
@@ -122,8 +162,5 @@ def _rates(disparity: Disparity) -> bool:
 def _upper_rows(pair: RectifiedPair) -> RectifiedPair:
     """Return the top rows of a pair, for a quick warm-up on images of the same kind."""
     rows = min(_WARM_UP_ROWS, pair.camera.height_px)
-    return RectifiedPair(
-        left=np.ascontiguousarray(pair.left[:rows]),
-        right=np.ascontiguousarray(pair.right[:rows]),
-        camera=replace(pair.camera, height_px=rows),
-    )
+    camera = replace(pair.camera, height_px=rows)
+    return RectifiedPair(left=pair.left[:rows], right=pair.right[:rows], camera=camera)

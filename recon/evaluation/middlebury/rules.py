@@ -18,8 +18,7 @@ from recon.core.values import Disparity, DisparityMetrics, DisparityTruth
 from recon.core.values.arrays import Float32
 from recon.evaluation.disparity import evaluate_disparity, truth_of, values_of
 
-HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
-"""Scenes with half weight in the table's mean: variants, or hard for a single reason."""
+_HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
 
 
 @dataclass(frozen=True)
@@ -35,74 +34,6 @@ class MiddleburyRules:
     full_size_factor: float = 1.0
     largest_px: float | None = None
     isint: bool = False
-
-
-def scene_weight(name: str) -> float:
-    """Return the weight of a scene in the table's mean: 8, or 4 for the scenes of `HALF_WEIGHT`.
-
-    Args:
-        name: Name of the scene's folder, or a path that ends in it.
-    """
-    scene = name.rpartition("/")[2].removesuffix("-perfect").removesuffix("-imperfect")
-    return 4.0 if scene in HALF_WEIGHT else 8.0
-
-
-def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
-    """Resample a result to the size of the truth, with values in pixels of that size.
-
-    Pixels are repeated or skipped, never interpolated.
-
-    Args:
-        values: float32 (h, w), pixels of its own size; NaN = none.
-        shape: (H, W) of the truth.
-
-    Returns:
-        float32 (H, W).
-
-    Raises:
-        EvaluationError: Neither size is 1, 2 or 4 times the other, up to rounding.
-    """
-    step = _step(values.shape, shape)
-    return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)
-
-
-def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple[Disparity, float]:
-    """Resample all arrays of a result as `at_truth_size` does.
-
-    Args:
-        estimate: The result.
-        shape: (H, W) of the truth.
-
-    Returns:
-        The result at that size, and the number of its original pixels per pixel of the truth.
-
-    Raises:
-        EvaluationError: The sizes do not fit.
-    """
-    step = _step(estimate.values.shape, shape)
-    sized = Disparity(
-        values=at_truth_size(estimate.values, shape),
-        confidence=_taken(estimate.confidence, shape, step),
-        sigma_px=at_truth_size(estimate.sigma_px, shape),
-        reason=_taken(estimate.reason, shape, step),
-    )
-    return sized, step
-
-
-def values_compared(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
-    """Return a result as it is compared: at the size of the truth, clipped, rounded.
-
-    Args:
-        values: float32 (h, w), pixels; NaN = none.
-        shape: (H, W) of the truth.
-        rules: Rules of the scene.
-
-    Raises:
-        EvaluationError: The sizes do not fit.
-    """
-    sized = np.clip(at_truth_size(values, shape), np.float32(0), rules.largest_px)
-    # The SDK rounds halves up, as C does; numpy rounds them to even.
-    return np.asarray(np.floor(sized + np.float32(0.5)) if rules.isint else sized, np.float32)
 
 
 def evaluate_middlebury(
@@ -131,15 +62,49 @@ def evaluate_middlebury(
     return evaluate_disparity(compared, known, occluded=occluded, scale=rules.full_size_factor)
 
 
-def weighted_mean(figures: Mapping[str, float]) -> float:
-    """Return the mean over scenes, weighted as in the table; NaN if any value is NaN.
+def values_compared(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
+    """Return a result as it is compared: at the size (H, W) of the truth, clipped, rounded."""
+    sized = np.clip(at_truth_size(values, shape), np.float32(0), rules.largest_px)
+    # The SDK rounds halves up, as C does; numpy rounds them to even.
+    return np.asarray(np.floor(sized + np.float32(0.5)) if rules.isint else sized, np.float32)
+
+
+def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
+    """Return float32 (H, W), a result at the size of the truth, in pixels of that size.
+
+    Pixels are repeated or skipped, never interpolated.
 
     Raises:
-        EvaluationError: There is no scene.
+        EvaluationError: Neither size is 1, 2 or 4 times the other, up to rounding.
     """
-    if not figures:
-        raise EvaluationError("there is no scene to take a mean over")
-    weights = np.array([scene_weight(name) for name in figures])
+    step = _step(values.shape, shape)
+    return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)
+
+
+def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple[Disparity, float]:
+    """Return a result as `at_truth_size` does, and its original pixels per pixel of the truth."""
+    step = _step(estimate.values.shape, shape)
+    sized = Disparity(
+        values=at_truth_size(estimate.values, shape),
+        confidence=_taken(estimate.confidence, shape, step),
+        sigma_px=at_truth_size(estimate.sigma_px, shape),
+        reason=_taken(estimate.reason, shape, step),
+    )
+    return sized, step
+
+
+def scene_weight(name: str) -> float:
+    """Return what a scene counts for in the table's mean: 4 if it is a variant or hard, else 8.
+
+    ``name`` is that of its folder, or a path that ends in it.
+    """
+    scene = name.rpartition("/")[2].removesuffix("-perfect").removesuffix("-imperfect")
+    return 4.0 if scene in _HALF_WEIGHT else 8.0
+
+
+def weighted_mean(figures: Mapping[str, float]) -> float:
+    """Return the mean over scenes, weighted as in the table; NaN if any value is NaN."""
+    weights = [scene_weight(name) for name in figures]
     return float(np.average(np.array(list(figures.values()), dtype=np.float64), weights=weights))
 
 

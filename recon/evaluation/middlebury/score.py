@@ -1,4 +1,4 @@
-"""The figures of one result and of all scenes together, as ``summary.json`` holds them."""
+"""The figures of one result, as ``summary.json`` holds them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.interpolation import nearest_sorted
-from recon.core.values import DisparityMetrics
+from recon.core.values import Disparity, DisparityMetrics, DisparityTruth
 from recon.core.values.arrays import Bool, Float32, Int32, frozen_array
+from recon.evaluation.confidence import (
+    measure_reliability,
+    measure_sparsification,
+    share_within_sigma,
+)
 from recon.evaluation.disparity import evaluate_depth
-from recon.evaluation.middlebury.rules import evaluate_middlebury, values_compared, weighted_mean
+from recon.evaluation.middlebury.rules import (
+    estimate_at_truth_size,
+    evaluate_middlebury,
+    values_compared,
+)
 from recon.evaluation.middlebury.scenes import ScoredScene
 
 MASKS: Final = {"nonocc": False, "all": True}
@@ -20,23 +29,12 @@ MASKS: Final = {"nonocc": False, "all": True}
 
 Figures = dict[str, Any]
 
-
-def dense_map(values: Float32) -> Float32:
-    """Return a map without holes: float32 (H, W).
-
-    Holes that cannot be filled get disparity 0, which is wrong nearly everywhere, so that no
-    matcher gains by leaving pixels out.
-    """
-    filled = fill_holes(values)
-    return np.where(np.isfinite(filled), filled, np.float32(0))
+_RIGHT_PX: Final = 1.0  # largest error of a correct pixel, in pixels of the result
+_KEPT: Final = 5  # every fifth point of a sparsification curve: 20 of 100
 
 
 def score_result(scene: ScoredScene, values: Float32) -> Figures:
-    """Return the figures of a result, by mask.
-
-    Args:
-        scene: The scene.
-        values: float32 (h, w), pixels; NaN = none.
+    """Return the figures of a result, float32 (h, w) in pixels, by mask.
 
     Raises:
         EvaluationError: The size of the result does not match the ground truth.
@@ -45,15 +43,18 @@ def score_result(scene: ScoredScene, values: Float32) -> Figures:
     return {mask: _of_mask(scene, maps, occluded=occluded) for mask, occluded in MASKS.items()}
 
 
-def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
-    """Return the mean of each figure over scenes, with the benchmark's weights.
-
-    Args:
-        scenes: Nested figures by scene name. A figure that any scene lacks is left out.
-    """
-    first, *others = scenes.values()
-    shared = [key for key in first if all(key in other for other in others)]
-    return {key: _weighted({name: one[key] for name, one in scenes.items()}) for key in shared}
+def _of_mask(scene: ScoredScene, maps: Mapping[str, Float32], *, occluded: bool) -> Figures:
+    figures: Figures = {}
+    for name, values in maps.items():
+        metrics = evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded)
+        figures[name] = named_figures(metrics)
+        if scene.truth_camera is not None:
+            compared = values_compared(values, scene.truth.values.shape, scene.rules)
+            depth = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
+            figures[name]["depth"] = asdict(depth)
+        # The sparse map comes last: its holes are what the matcher did not find.
+        figures["invalid"] = metrics.invalid
+    return figures
 
 
 def named_figures(metrics: DisparityMetrics) -> Figures:
@@ -66,29 +67,70 @@ def named_figures(metrics: DisparityMetrics) -> Figures:
     }
 
 
-def _weighted(values: Mapping[str, Any]) -> Any:
-    if isinstance(next(iter(values.values())), dict):
-        return weighted_figures(values)
-    return weighted_mean(values)
+def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | None:
+    """Return how well the confidence and the standard deviation of a result predict its errors.
+
+    Counts all pixels with a value and known ground truth, occluded ones included.
+
+    Args:
+        estimate: The result.
+        truth: Ground truth at the same size, or at 2, 4, 1/2 or 1/4 times it.
+
+    Returns:
+        The figures, or None if no pixel can be compared.
+
+    Raises:
+        EvaluationError: The sizes do not match.
+    """
+    sized, step = estimate_at_truth_size(estimate, truth.values.shape)
+    if not (sized.valid & np.isfinite(truth.values)).any():
+        return None
+    shares = {f"within_{n}_sigma": share_within_sigma(sized, truth, n) for n in (1, 2)}
+    return {**curve_figures(sized, truth, _RIGHT_PX / step), **shares}
 
 
-def _of_mask(scene: ScoredScene, maps: Mapping[str, Float32], *, occluded: bool) -> Figures:
-    figures: Figures = {}
-    for name, values in maps.items():
-        metrics = evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded)
-        figures[name] = named_figures(metrics) | _depth(scene, values, occluded=occluded)
-        # The sparse map comes last: its holes are what the matcher did not find.
-        figures["invalid"] = metrics.invalid
-    return figures
+def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
+    """Return the same for the confidence alone, of maps of equal size.
+
+    Raises:
+        EvaluationError: The sizes differ, or no pixel can be compared.
+    """
+    bins = measure_reliability(estimate, truth, limit_px)
+    steps = measure_sparsification(estimate, truth, limit_px)
+    return {
+        "ece": bins.calibration_error,
+        "ause": steps.ause,
+        "reliability": {
+            "confidence": rounded(bins.confidence),
+            "right": rounded(bins.right),
+            "share": rounded(bins.pixels / bins.pixels.sum()),
+        },
+        "sparsification": {
+            name: rounded(getattr(steps, name)[::_KEPT]) for name in ("removed", "wrong", "best")
+        },
+    }
 
 
-def _depth(scene: ScoredScene, values: Float32, *, occluded: bool) -> Figures:
-    """Return errors in metres, where the scene has a calibration."""
-    if scene.truth_camera is None:
-        return {}
-    compared = values_compared(values, scene.truth.values.shape, scene.rules)
-    metrics = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
-    return {"depth": asdict(metrics)}
+def rounded(values: Any) -> list[float | None]:
+    """Return values for JSON: six decimals, None for NaN (an empty bin)."""
+    return [None if np.isnan(value) else round(float(value), 6) for value in values]
+
+
+def error_map(scene: ScoredScene, values: Float32) -> Float32:
+    """Return float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
+    truth, rules = scene.truth.values, scene.rules
+    error = values_compared(dense_map(values), truth.shape, rules) - truth
+    return np.asarray(np.abs(error) * np.float32(rules.full_size_factor), dtype=np.float32)
+
+
+def dense_map(values: Float32) -> Float32:
+    """Return a map without holes: float32 (H, W).
+
+    Holes that cannot be filled get disparity 0, which is wrong nearly everywhere, so that no
+    matcher gains by leaving pixels out.
+    """
+    filled = fill_holes(values)
+    return np.where(np.isfinite(filled), filled, np.float32(0))
 
 
 def fill_holes(values: Float32) -> Float32:
@@ -98,11 +140,7 @@ def fill_holes(values: Float32) -> Float32:
     the nearest values to the left and to the right on its row, or the only one. A row without any
     value is copied from the nearest row with some, the upper one of two. Known values stay.
 
-    Args:
-        values: float32 (H, W), pixels; NaN = none.
-
-    Returns:
-        float32 (H, W); all NaN where ``values`` are, else without NaN.
+    Takes and returns float32 (H, W), in pixels; NaN = none.
 
     Raises:
         ShapeError: The array has another dtype or shape.

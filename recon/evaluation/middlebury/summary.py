@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from recon.core.errors import SettingsError, SourceError
-from recon.evaluation.middlebury.bench import SceneResult
-from recon.evaluation.middlebury.confidence import weighted_confidence
-from recon.evaluation.middlebury.results import ResultFolder
+import numpy as np
+
+from recon.core.errors import SourceError
+from recon.core.values.arrays import Float64
 from recon.evaluation.middlebury.rules import scene_weight, weighted_mean
-from recon.evaluation.middlebury.score import MASKS, Figures, weighted_figures
+from recon.evaluation.middlebury.scenes import ResultFolder
+from recon.evaluation.middlebury.score import MASKS, Figures, rounded
 from recon.run.summary import plain
-from recon.stereo.match.foreign import name_of
-from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.registry import check_matcher
-
-_FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")
-_NAMING: Final = "give each object an attribute `name`"
 
 SceneFigures = dict[str, Figures]
 """Figures of one scene, by matcher."""
@@ -30,10 +24,7 @@ SceneFigures = dict[str, Figures]
 class SceneDone:
     """A scene that is matched and scored: a `Step` of the progress of a run.
 
-    Attributes:
-        name: Its name.
-        figures: Its figures by matcher; None = it has no ground truth.
-        seconds: Time since the previous scene was done.
+    Without ground truth it has no figures; ``seconds`` are since the scene before.
     """
 
     name: str
@@ -53,37 +44,6 @@ class SceneDone:
         return self.name if self.figures is not None else f"{self.name}: no truth"
 
 
-def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
-    """Return the names of the matchers, which are also those of their folders.
-
-    Raises:
-        SettingsError: A matcher is unknown or named twice, or has no name for a folder.
-    """
-    for matcher in matchers:
-        check_matcher(matcher)
-    names = [name_of(matcher) for matcher in matchers]
-    if len(set(names)) < len(names):
-        hint = None if all(isinstance(one, str) for one in matchers) else _NAMING
-        raise SettingsError("a matcher is named twice", got=", ".join(names), hint=hint)
-    for name in names:
-        if not _FOLDER_NAME.fullmatch(name):
-            raise SettingsError("the matcher's name cannot name a folder", got=repr(name))
-    return names
-
-
-def result_figures(result: SceneResult) -> Figures:
-    """Return the figures of one result, with its time and what its scene counts for in means."""
-    scene, seconds = result.scene, result.seconds
-    return {
-        **result.figures,
-        "seconds": None if seconds is None else round(seconds, 4),
-        "width_px": scene.camera.width_px,
-        "height_px": scene.camera.height_px,
-        "full_size_factor": scene.rules.full_size_factor,
-        "weight": scene_weight(scene.name),
-    }
-
-
 def summarise_scenes(
     found: Mapping[str, SceneFigures | None],
     names: Sequence[str],
@@ -92,10 +52,12 @@ def summarise_scenes(
 ) -> Figures:
     """Return the content of ``summary.json``: the figures of each matcher, and its means.
 
+    Means are over the scenes for which all have a result, so that they can be compared.
+
     Args:
         found: Figures of each scene; None without ground truth.
         names: Names of the matchers and of the folders of results.
-        results: The folders of results.
+        results: Folders of results of other programs.
         folder: The folder of the scenes.
 
     Raises:
@@ -103,28 +65,6 @@ def summarise_scenes(
     """
     skipped = [name for name, figures in found.items() if figures is None]
     scenes = {name: figures for name, figures in found.items() if figures is not None}
-    common = _common(scenes, names, folder, skipped)
-    summary = {
-        "matchers": {name: _of_matcher(scenes, name, common) for name in names},
-        "folder": str(folder),
-        "results": {result.name: str(result.folder) for result in results},
-        "mean_over": common,
-        "skipped": skipped,
-        "warnings": [
-            *(f"{name}: no truth, skipped" for name in skipped),
-            *_missing(scenes, results, common),
-        ],
-    }
-    return dict(plain(summary))
-
-
-def _common(
-    scenes: Mapping[str, SceneFigures],
-    names: Sequence[str],
-    folder: Path,
-    skipped: Sequence[str],
-) -> list[str]:
-    """Return the scenes for which all have a result, so that means can be compared."""
     if not scenes:
         raise SourceError(
             "no scene has ground truth to compare with",
@@ -137,7 +77,16 @@ def _common(
         raise SourceError(
             "there is no scene that all have a result for", where=folder, got=", ".join(names)
         )
-    return common
+    without = [f"{name}: no truth, skipped" for name in skipped]
+    summary = {
+        "matchers": {name: _of_matcher(scenes, name, common) for name in names},
+        "folder": str(folder),
+        "results": {result.name: str(result.folder) for result in results},
+        "mean_over": common,
+        "skipped": skipped,
+        "warnings": [*without, *_missing(scenes, results, common)],
+    }
+    return dict(plain(summary))
 
 
 def _missing(
@@ -156,13 +105,55 @@ def _missing(
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:
     """Return the entry of one matcher in ``summary.json``."""
     own = {name: figures[matcher] for name, figures in scenes.items() if matcher in figures}
-    meant = {name: own[name] for name in common}
-    masked = {name: {mask: figures[mask] for mask in MASKS} for name, figures in meant.items()}
-    rated = {name: figures["confidence"] for name, figures in meant.items()}
-    seconds = {name: figures["seconds"] for name, figures in meant.items()}
+    counted = {name: own[name] for name in common}
+    masks = {name: {mask: one[mask] for mask in MASKS} for name, one in counted.items()}
+    seconds = {name: one["seconds"] for name, one in counted.items()}
+    confidence = {name: one["confidence"] for name, one in counted.items()}
     weighted = {
-        **weighted_figures(masked),
-        "confidence": weighted_confidence(rated),
-        "seconds": None if None in seconds.values() else weighted_mean(seconds),
+        **weighted_figures(masks),
+        "confidence": weighted_confidence(confidence),
+        "seconds": None if None in seconds.values() else weighted_figures(seconds),
     }
     return {"scenes": own, "weighted": weighted}
+
+
+def weighted_figures(scenes: Mapping[str, Any]) -> Any:
+    """Return the mean of nested figures and curves over scenes, with the benchmark's weights.
+
+    A figure that any scene lacks is left out.
+    """
+    first = next(iter(scenes.values()))
+    if isinstance(first, Mapping):
+        shared = (key for key in first if all(key in one for one in scenes.values()))
+        by_key = {key: {name: one[key] for name, one in scenes.items()} for key in shared}
+        return {key: weighted_figures(each) for key, each in by_key.items()}
+    if isinstance(first, list):
+        return rounded(np.average(list(scenes.values()), axis=0, weights=_weights(scenes)))
+    return weighted_mean(scenes)
+
+
+def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
+    """Return the mean over the scenes that have figures, with the benchmark's weights."""
+    found = {name: one for name, one in scenes.items() if one is not None}
+    if not found:
+        return None
+    bins = {name: one["reliability"] for name, one in found.items()}
+    rest = {name: {**one, "reliability": {}} for name, one in found.items()}
+    return {**weighted_figures(rest), "reliability": _pooled(bins)}
+
+
+def _pooled(scenes: Mapping[str, Figures]) -> Figures:
+    """Pool the bins of confidence with the share of each scene scaled to its weight."""
+    weights, bins = _weights(scenes), scenes.values()
+    share = np.array([one["share"] for one in bins]) * (weights / weights.sum())[:, None]
+    total = share.sum(axis=0)
+    pooled: Figures = {}
+    for name in ("confidence", "right"):
+        values = np.array([one[name] for one in bins], dtype=np.float64)
+        with np.errstate(invalid="ignore"):
+            pooled[name] = rounded(np.sum(share * np.nan_to_num(values), axis=0) / total)
+    return {**pooled, "share": rounded(total)}
+
+
+def _weights(scenes: Iterable[str]) -> Float64:
+    return np.array([scene_weight(name) for name in scenes])

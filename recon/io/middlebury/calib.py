@@ -27,10 +27,9 @@ class MiddleburyCalib:
 
     Attributes:
         camera: The rectified camera, in metres.
-        isint: True if the ground truth is in whole pixels, so that results are rounded before
-            comparison.
-        doffs_px: ``doffs`` as in the file; that of the camera is the difference of its rounded
-            principal points. None = not in the file.
+        isint: True if the truth is in whole pixels, so that results are rounded as well.
+        doffs_px: As in the file; that of the camera is the difference of its rounded principal
+            points. None = not in the file.
     """
 
     camera: RectifiedCamera
@@ -62,16 +61,10 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
 def nominal_camera_2005(
     width_px: int, height_px: int, dmin_px: float, factor: float
 ) -> RectifiedCamera:
-    """Return the camera of a 2005 or 2006 scene, from the nominal values that are published.
+    """Return the nominal camera of a 2005 or 2006 scene, of that many full-size pixels per pixel.
 
-    The images are cropped so that disparities are too small by ``dmin``. The principal point is
-    unknown and assumed at the image centre.
-
-    Args:
-        width_px: Image width.
-        height_px: Image height.
-        dmin_px: Content of ``dmin.txt``, in full-size pixels.
-        factor: Full-size pixels per pixel: 1, 2 or 3.
+    The images are cropped so that disparities are too small by ``dmin`` full-size pixels. The
+    principal point is unknown and assumed at the image centre.
     """
     cx_px = (width_px - 1) / 2
     return RectifiedCamera(

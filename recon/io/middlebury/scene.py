@@ -15,20 +15,15 @@ from recon.io.files import StrPath, read_table, reader
 from recon.io.images.disparity_png import read_disparity_png
 from recon.io.images.image import read_grey_levels, read_image
 from recon.io.images.pfm import read_pfm
-from recon.io.middlebury.calib import (
-    MiddleburyCalib,
-    nominal_camera_2005,
-    read_middlebury_calib,
-)
+from recon.io.middlebury.calib import MiddleburyCalib, nominal_camera_2005, read_middlebury_calib
 from recon.io.middlebury.layout import (
     Generation,
     Layout,
+    Units,
     find_image,
     find_layout,
-    full_size_factor,
-    generation_of,
-    levels_per_pixel,
     scene_root,
+    units_of,
 )
 
 _MASKS: Final = ("mask0nocc.png", "mask_nocc_derived.png", "v2eval/nonocc.png", "nonocc.png")
@@ -49,8 +44,8 @@ class MiddleburyScene:
         truth: True disparity of the left image, or None if the folder has none.
         ndisp: Number of disparities to search, or None if it is not published.
         isint: True if results are rounded to whole pixels before comparison.
-        full_size_factor: Full-size pixels per pixel of these images: the error thresholds of the
-            benchmark are in full-size pixels.
+        full_size_factor: Full-size pixels, in which the benchmark counts, per pixel of these
+            images.
     """
 
     name: str
@@ -65,7 +60,7 @@ class MiddleburyScene:
 
 @reader
 def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
-    """Read one scene; `middlebury_layout` lists the supported layouts.
+    """Read one scene of any year.
 
     Raises:
         FormatError: The folder is not a Middlebury scene, or a file in it is missing, damaged or
@@ -82,27 +77,24 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
         )
     pair = _read_pair(path, layout)
     height_px, width_px = pair.left.shape[:2]
-    factor = full_size_factor(layout, width_px, height_px, path)
-    root = scene_root(path)
-    calib = _read_calib(root, generation_of(layout, width_px), pair.left, factor)
-    scale = levels_per_pixel(layout, width_px, height_px)
+    units, root = units_of(layout, width_px, height_px, path), scene_root(path)
+    calib = _read_calib(root, units, pair.left)
     return MiddleburyScene(
         name=path.name,
-        generation=generation_of(layout, width_px),
+        generation=units.generation,
         pair=pair,
         camera=calib.camera if calib else None,
-        truth=read_middlebury_truth(root, layout, scale, (height_px, width_px)),
+        truth=_read_truth(root, layout, units.levels, (height_px, width_px)),
         ndisp=calib.camera.ndisp if calib else _read_ndisp(path),
         isint=calib.isint if calib else False,
-        full_size_factor=factor,
+        full_size_factor=units.factor,
     )
 
 
 def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
-    """Return a placeholder camera for uncalibrated images: valid for matching, not for depth.
+    """Return a camera for uncalibrated images: its width as focal length, a baseline of 1.
 
-    The focal length is set to the image width and the baseline to 1, so depth has an unknown
-    scale.
+    It is valid for matching; depth has an unknown scale.
     """
     cx_px = (width_px - 1) / 2
     return RectifiedCamera(
@@ -135,14 +127,12 @@ def _read_image(path: Path, stem: str) -> UInt8:
     return read_image(file)
 
 
-def _read_calib(
-    path: Path, generation: Generation, left: UInt8, factor: float
-) -> MiddleburyCalib | None:
+def _read_calib(path: Path, units: Units, left: UInt8) -> MiddleburyCalib | None:
     height_px, width_px = left.shape[:2]
-    if generation == "2005" and (path / "dmin.txt").is_file():
-        table, _ = read_table(path / "dmin.txt", (1,))
-        return MiddleburyCalib(nominal_camera_2005(width_px, height_px, float(table[0, 0]), factor))
-    if generation != "2014" or not (path / "calib.txt").is_file():
+    if units.generation == "2005" and (path / "dmin.txt").is_file():
+        dmin_px = float(read_table(path / "dmin.txt", (1,))[0][0, 0])
+        return MiddleburyCalib(nominal_camera_2005(width_px, height_px, dmin_px, units.factor))
+    if units.generation != "2014" or not (path / "calib.txt").is_file():
         return None
     calib = read_middlebury_calib(path / "calib.txt")
     check_size(calib.camera, width_px, height_px, path / "calib.txt")
@@ -152,55 +142,35 @@ def _read_calib(
 def _read_ndisp(path: Path) -> int | None:
     """Read ``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
     info = path / "v2eval" / "info.txt"
-    if not info.is_file():
-        return None
-    table, _ = read_table(info, (1, 2))
-    return int(table.ravel()[-1]) + 1
+    return int(read_table(info, (1, 2))[0].ravel()[-1]) + 1 if info.is_file() else None
 
 
-def read_middlebury_truth(
-    folder: Path, layout: Layout, scale: float | None, shape: tuple[int, int]
+def _read_truth(
+    folder: Path, layout: Layout, levels: float | None, shape: tuple[int, int]
 ) -> DisparityTruth | None:
-    """Read the ground truth of the left image.
+    """Read the truth of the left image, and which pixels both cameras see.
 
-    Pixels count as visible to both cameras according to a mask file; without one, where the left
-    and right true disparities agree within a pixel; without a right one, everywhere.
-
-    Args:
-        folder: Folder of the scene.
-        layout: Its file names.
-        scale: Grey levels per pixel of disparity; None = PFM.
-        shape: (H, W) of the images.
-
-    Returns:
-        The ground truth, or None if the folder has none.
-
-    Raises:
-        FormatError: A file is damaged or of another size.
+    That is what a mask says; without one, where the true disparities of both images agree; without
+    a right one, everywhere.
     """
-    values = _read_disparity(folder, layout.truth_left, scale, shape)
+    values = _read_disparity(folder, layout.truth_left, levels, shape)
     if values is None:
         return None
-    known = np.isfinite(values)
-    mask = _read_mask(folder, shape)
-    if mask is not None:
-        return DisparityTruth(values, known & mask)
-    right = _read_disparity(folder, layout.truth_right, scale, shape)
-    if right is None:
-        return DisparityTruth(values, known)
-    return DisparityTruth(values, known & cross_check(values, right, _TOLERANCE_PX))
+    seen = _read_mask(folder, shape)
+    if seen is None:
+        right = _read_disparity(folder, layout.truth_right, levels, shape)
+        everywhere = np.ones(shape, bool)
+        seen = everywhere if right is None else cross_check(values, right, _TOLERANCE_PX)
+    return DisparityTruth(values, np.isfinite(values) & seen)
 
 
 def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
-    """Return where the left and the right disparity describe the same point.
+    """Return bool (H, W), where the left and the right disparity describe the same point.
 
     Args:
         left: float32 (H, W), disparity of the left image; NaN = unknown.
         right: float32 (H, W), disparity of the right image, also ``x_left - x_right``.
         tolerance_px: Largest difference.
-
-    Returns:
-        bool (H, W) in the left image.
     """
     height, width = left.shape
     columns = np.rint(np.arange(width) - np.nan_to_num(left, nan=2.0 * width)).astype(np.int64)
@@ -210,12 +180,12 @@ def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
 
 
 def _read_disparity(
-    folder: Path, stem: str, scale: float | None, shape: tuple[int, int]
+    folder: Path, stem: str, levels: float | None, shape: tuple[int, int]
 ) -> Float32 | None:
-    path = folder / f"{stem}.pfm" if scale is None else find_image(folder, stem)
+    path = folder / f"{stem}.pfm" if levels is None else find_image(folder, stem)
     if path is None or not path.is_file():
         return None
-    values = read_pfm(path) if scale is None else read_disparity_png(path, scale=scale)
+    values = read_pfm(path) if levels is None else read_disparity_png(path, scale=levels)
     _check_shape(path, values.shape, shape)
     return values
 

@@ -15,34 +15,20 @@ from recon.evaluation.middlebury.score import fill_holes
 N = float("nan")
 
 
-def grid(*rows: list[float]) -> np.ndarray:
-    return np.array(rows, dtype=np.float32)
-
-
-def test_the_smaller_of_both_neighbours_fills_a_hole() -> None:
-    assert fill_holes(grid([9, N, N, 4, N, 7])).tolist() == [[9, 4, 4, 4, 4, 7]]
-
-
-def test_at_the_border_the_one_neighbour_fills() -> None:
-    assert fill_holes(grid([N, N, 3, N])).tolist() == [[3, 3, 3, 3]]
-
-
 def test_a_row_without_values_is_filled_from_the_nearest_row_the_upper_one_first() -> None:
-    filled = fill_holes(grid([N, N], [1, N], [N, N], [N, 2], [N, N], [N, N]))
+    rows = [[N, N], [1, N], [N, N], [N, 2], [N, N], [N, N]]
+    filled = fill_holes(np.array(rows, np.float32))
     assert filled[:, 0].tolist() == [1, 1, 1, 2, 2, 2]
 
 
-def test_a_map_without_values_stays_without() -> None:
-    assert np.isnan(fill_holes(grid([N, N], [N, N]))).all()
-
-
-def test_another_dtype_is_refused() -> None:
+def test_a_map_without_values_stays_without_and_another_dtype_is_refused() -> None:
+    assert np.isnan(fill_holes(np.full((2, 2), N, np.float32))).all()
     with pytest.raises(ShapeError, match="values"):
         fill_holes(np.zeros((2, 2)))
 
 
 def plainly_filled(row: list[float]) -> list[float]:
-    """The rule for one row, pixel by pixel."""
+    """The rule for one row, pixel by pixel: the smaller of both neighbours, or the only one."""
     out = []
     for x, value in enumerate(row):
         left = next((v for v in row[:x][::-1] if not math.isnan(v)), None)
