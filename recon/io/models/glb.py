@@ -19,12 +19,10 @@ from recon.core.values.cloud import Frame
 from recon.io.atomic import write_bytes
 from recon.io.files import StrPath
 
-_FLOAT, _UINT, _USHORT = 5126, 5125, 5123
+_COMPONENTS: Final = {"float32": 5126, "uint32": 5125, "uint16": 5123}
+_KINDS: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _VERTICES, _INDICES = 34962, 34963
-_MATERIAL: Final = {
-    "doubleSided": True,
-    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-}
+_MATTE: Final = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
 #: Colours taken from images already include the lighting.
 _UNLIT: Final = "KHR_materials_unlit"
 
@@ -40,17 +38,34 @@ def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> 
     Raises:
         OutputError: The file cannot be written.
     """
-    attributes: dict[str, tuple[NDArray[Any], int]] = {"POSITION": (mesh.vertices, _FLOAT)}
+    vertices: dict[str, NDArray[Any]] = {"POSITION": mesh.vertices}
     if mesh.normals is not None:
-        attributes["NORMAL"] = (mesh.normals, _FLOAT)
+        vertices["NORMAL"] = mesh.normals
     if mesh.rgb is not None:
-        attributes["COLOR_0"] = (_linear(mesh.rgb), _USHORT)
-    document, binary = _document(mesh, attributes)
-    if frame is not None:
-        # Column by column, in metres.
-        document["nodes"][0]["matrix"] = T_YUP_FRAME[frame].T.ravel().tolist()
+        vertices["COLOR_0"] = _linear(mesh.rgb)
+    arrays = [*vertices.values(), mesh.faces.astype(np.uint32).reshape(-1, 1)]
+    views, accessors = _described(arrays)
+    # glTF requires the bounding box of the positions.
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
+    attributes = {name: number for number, name in enumerate(vertices)}
+    primitive = {"attributes": attributes, "indices": len(vertices), "material": 0}
+    unlit: dict[str, Any] = {"extensions": {_UNLIT: {}}} if mesh.rgb is not None else {}
+    # Column by column, in metres.
+    turn = {} if frame is None else {"matrix": T_YUP_FRAME[frame].T.ravel().tolist()}
+    document = {
+        "asset": {"version": "2.0", "generator": "recon"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0} | turn],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": _MATTE} | unlit],
+        "buffers": [{"byteLength": sum(values.nbytes for values in arrays)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    } | ({"extensionsUsed": [_UNLIT]} if unlit else {})
     head = _chunk(b"JSON", json.dumps(document).encode(), b" ")
-    body = _chunk(b"BIN\0", binary, b"\0")
+    body = _chunk(b"BIN\0", b"".join(values.tobytes() for values in arrays), b"\0")
     length = 12 + len(head) + len(body)
     write_bytes(path, struct.pack("<4sII", b"glTF", 2, length) + head + body)
 
@@ -66,61 +81,23 @@ def _linear(rgb: UInt8) -> NDArray[np.uint16]:
     """Return uint16 (V, 4): linear red, green, blue and full opacity (IEC 61966-2-1)."""
     share = rgb / 255
     curve = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    opaque = np.ones((len(rgb), 1))
-    whole = np.rint(np.concatenate([curve, opaque], axis=1) * 65535)
-    return np.asarray(whole, dtype=np.uint16)
+    return np.asarray(np.rint(np.insert(curve, 3, 1.0, axis=1) * 65535), dtype=np.uint16)
 
 
-def _document(
-    mesh: TriangleMesh, attributes: dict[str, tuple[NDArray[Any], int]]
-) -> tuple[dict[str, Any], bytes]:
-    """Return the JSON part, and the arrays it describes as one block of bytes."""
-    arrays = [*attributes.values(), (mesh.faces.astype(np.uint32).reshape(-1, 1), _UINT)]
+def _described(arrays: list[NDArray[Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return views and accessors: where each array lies in the block of bytes, and its form."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     offset = 0
-    for values, component in arrays:
-        target = _INDICES if component == _UINT else _VERTICES
-        views.append(
-            {"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": target}
-        )
-        accessors.append(_accessor(values, component, len(accessors)))
-        offset += values.nbytes
-    # glTF requires the bounding box of the positions.
-    accessors[0] |= {
-        "min": mesh.vertices.min(axis=0).tolist(),
-        "max": mesh.vertices.max(axis=0).tolist(),
-    }
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(attributes)},
-        "indices": len(attributes),
-        "material": 0,
-    }
-    coloured = mesh.rgb is not None
-    document = {
-        "asset": {"version": "2.0", "generator": "recon"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [_MATERIAL | ({"extensions": {_UNLIT: {}}} if coloured else {})],
-        "buffers": [{"byteLength": offset}],
-        "bufferViews": views,
-        "accessors": accessors,
-    } | ({"extensionsUsed": [_UNLIT]} if coloured else {})
-    return document, b"".join(np.ascontiguousarray(values).tobytes() for values, _ in arrays)
-
-
-def _accessor(values: NDArray[Any], component: int, view: int) -> dict[str, Any]:
-    """Return the description of one array."""
-    kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
-    return {
-        "bufferView": view,
-        "componentType": component,
-        "count": len(values),
-        "type": kind,
-        "normalized": component == _USHORT,
-    }
+    for view, values in enumerate(arrays):
+        size, kind = values.nbytes, values.dtype.name
+        target = _INDICES if kind == "uint32" else _VERTICES
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, "target": target})
+        shape = {"bufferView": view, "componentType": _COMPONENTS[kind], "count": len(values)}
+        form = {"type": _KINDS[values.shape[1]], "normalized": kind == "uint16"}
+        accessors.append(shape | form)
+        offset += size
+    return views, accessors
 
 
 def _chunk(kind: bytes, content: bytes, filler: bytes) -> bytes:
