@@ -13,7 +13,7 @@ WORKERS ?= 2
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope --no-loadscope-reorder
 
-.PHONY: help setup demo test interpreted test-all fuzz check lint bench format clean
+.PHONY: help setup demo test interpreted test-all fuzz check lint bench results format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -56,6 +56,9 @@ lint: $(READY) ## style, formatting, types and import contracts
 
 bench: $(COMPILED) ## speed of the matchers beside OpenCV's, as JSON
 	@$(BIN)/python benchmarks/matching.py --json
+
+results: $(COMPILED) ## measure the tables of the pages, or some: ONLY="movers kitti"; hours in all
+	@$(BIN)/python benchmarks/results.py $(if $(ONLY),--only $(ONLY))
 
 format: $(READY) ## put the code into the project's style
 	$(BIN)/ruff check --fix

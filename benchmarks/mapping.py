@@ -58,8 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "octomap": pyoctomap.__version__,
         "rays": options.rays,
         "rounds": options.rounds,
-        "ray_casting": ray_casting(options.rays, options.rounds),
-        "drive": None if options.drive is None else budget(options.drive, options.set),
+        "ray_casting": [] if options.no_rays else ray_casting(options.rays, options.rounds),
+        "drive": None
+        if options.no_drive or options.drive is None
+        else budget(options.drive, options.set),
     }
     print(json.dumps(result, indent=2) if options.json else table(result))
 
@@ -72,6 +74,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--drive", type=Path, default=real_drive(), help="source; RECON_DATA's kitti_raw_0013"
     )
+    parser.add_argument("--no-rays", action="store_true", help="only map the drive")
+    parser.add_argument("--no-drive", action="store_true", help="only cast rays")
     parser.add_argument("--set", action="append", default=[], help="a setting of recon map")
     return parser.parse_args(arguments)
 
@@ -232,7 +236,7 @@ def table(result: dict[str, Any]) -> str:
 
 def budget_table(drive: dict[str, Any] | None) -> list[str]:
     if drive is None:
-        return ["no drive: give --drive, or name the data in RECON_DATA"]
+        return ["no drive is mapped: --drive, or RECON_DATA, names one"]
     stages = ", ".join(f"{name} {ms:g}" for name, ms in drive["stages_ms"].items())
     after = ", ".join(f"{name} {s:g}" for name, s in drive["after_s"].items())
     return [

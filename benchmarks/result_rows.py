@@ -1,0 +1,255 @@
+"""The rows of each table of results, made of what its commands print.
+
+Each function takes the printed JSON by the names of the commands, and gives the cells by label and
+heading; headings without a cell stay empty.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+Found = dict[str, Any]
+Rows = dict[str, dict[str, Any]]
+
+
+def drift(found: Found) -> Rows:
+    """Both odometries on both drives; of kiss-icp the median over ranges."""
+    rows: Rows = {}
+    for drive in [name.removesuffix(" visual") for name in found if name.endswith(" visual")]:
+        one, many = found[f"{drive} visual"], found[f"{drive} kiss"]["spread"]
+        path = one["trajectory"]
+        rows[f"{drive}, `visual`"] = {
+            "t_rel": path["t_rel_percent"],
+            "r_rel": path["r_rel_deg_per_100m"],
+            "ATE": 100 * path["ate_m"],
+            "not trusted": one["frames_not_trusted"],
+        }
+        t_rel = many["t_rel_percent"]
+        rows[f"{drive}, `kiss`"] = {
+            "t_rel": t_rel["median"],
+            "least to most": f"{t_rel['least']:.2f} to {t_rel['most']:.2f} %",
+            "r_rel": many["r_rel_deg_per_100m"]["median"],
+            "ATE": 100 * many["ate_m"]["median"],
+            "not trusted": round(many["untrusted"]["median"]),
+        }
+    return rows
+
+
+def lidar(found: Found) -> Rows:
+    names = {
+        "precision": "precision",
+        "recall": "recall",
+        "F": "f_score",
+        "precision in reach": "precision_in_reach",
+        "F in reach": "f_score_in_reach",
+    }
+    return {
+        label: {heading: one[key] for heading, key in names.items()} for label, one in found.items()
+    }
+
+
+def lenses(found: Found) -> Rows:
+    """Drift, and F of the map beside the drive that it was measured for."""
+    rows: Rows = {}
+    for label, one in found.items():
+        path = one.get("trajectory")
+        if path is None:
+            rows[label.removesuffix(", F")]["F, own path"] = one["f_score"]
+            continue
+        rows[label] = {
+            "t_rel": path["t_rel_percent"],
+            "r_rel": path["r_rel_deg_per_100m"],
+            "length": one["path_length_m"] / path["path_length_m"],
+        }
+    return rows
+
+
+def altered(found: Found) -> Rows:
+    rows: Rows = {}
+    for drive, cases in found.items():
+        for case, one in cases.items():
+            row = rows.setdefault(case, {})
+            row[f"{drive} t_rel"], row[f"{drive} length"] = one["t_rel_percent"], one["scale"]
+    return rows
+
+
+def degraded(found: Found) -> Rows:
+    return {
+        case: {
+            f"`{odometry}` {heading}": one[key]
+            for odometry, one in both.items()
+            for heading, key in (("t_rel", "t_rel_percent"), ("not trusted", "untrusted"))
+        }
+        for case, both in found["street"].items()
+    }
+
+
+def intervals(found: Found) -> Rows:
+    one = found["streets"]
+    return {
+        "rendered streets": {
+            "drives": one["drives_that_count"],
+            "segments within their 95 % interval": 100 * one["covered"],
+            "error over stated deviation, rms": one["rms_sigmas"],
+        }
+    }
+
+
+def occupancy(found: Found) -> Rows:
+    return {f"street {seed}": one for seed, one in found["streets"]["streets"].items()}
+
+
+def middlebury(found: Found) -> Rows:
+    rows: Rows = {}
+    for size, columns in found.items():
+        for name, one in columns["matchers"].items():
+            dense = one["weighted"]["nonocc"]["dense"]
+            bad = {f"bad {limit}": dense["bad"][limit] for limit in ("1", "2", "4")}
+            rows[f"`{name}`{size}"] = {**bad, "mean error": dense["avgerr"]}
+    return rows
+
+
+def loops(found: Found) -> Rows:
+    rows: Rows = {}
+    for block, both in found.items():
+        for drive, added in (("block", ""), ("drift", ", 1 % and 1°/100 m added")):
+            row = {"loops": both[drive]["loops"]["closed"]}
+            for when in ("before", "after"):
+                one = both[drive][when]
+                row |= {
+                    f"end {when}": one["end_error_m"],
+                    f"ATE {when}": one["aligned_rms_error_m"],
+                    f"F {when}": one["cloud"][0]["f_score"],
+                }
+            rows[f"{block}{added}"] = row
+    return rows
+
+
+def localized(found: Found) -> Rows:
+    return {
+        case: {
+            "tracked": 100 * one["tracking"] if "tracking" in one else None,
+            "median": 100 * one["median_m"] if "median_m" in one else None,
+            "95 %": 100 * one["p95_m"] if "p95_m" in one else None,
+            "largest": 100 * one["max_m"] if "max_m" in one else None,
+            "angle": one.get("median_deg"),
+            "off by 0.5 m": one.get("wrong"),
+        }
+        for case, one in found["drive"].items()
+        if case != "growth"
+    }
+
+
+def second_day(found: Found) -> Rows:
+    return {
+        f"{how}: {cloud}": {
+            "precision": one["precision"],
+            "recall": one["recall"],
+            "F": one["f_score"],
+            "points on cars that left": one["points_of_cars_that_left"],
+        }
+        for how, both in found.items()
+        for cloud, one in both["second"]["clouds"].items()
+    }
+
+
+def halves(found: Found) -> Rows:
+    one = found["halves"]["halves"]
+    return {
+        "kitti_raw_0013": {
+            "t_rel, one run": one["t_rel_percent"]["one run"],
+            "merged": one["t_rel_percent"]["merged"],
+            "paths apart": 1000 * one["path_apart_m"],
+            "cells that differ": 100 * one["grid"]["differ"],
+            "free against occupied": 100 * one["grid"]["free_against_occupied"],
+        }
+    }
+
+
+def movers(found: Found) -> Rows:
+    return {
+        street + ("" if whose == "recon" else ", DUFOMap"): {
+            "moving points": one["moving_points"],
+            "of them gone": percent(one["moving_gone"]),
+            "of static ones lost": percent(one["static_lost"]),
+            "of posts and lamps": percent(one["thin_lost"]),
+        }
+        for street, both in found.items()
+        for whose, one in both.items()
+        if whose in ("recon", "dufomap")
+    }
+
+
+def percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
+
+
+def matching(found: Found) -> Rows:
+    rows: Rows = {}
+    for threads, one in found.items():
+        for size in one["sizes"]:
+            label = f"{size['height']}×{size['width']}, {size['ndisp']} disparities, {threads}"
+            rows[label] = dict(size["ratios"])
+    return rows
+
+
+def mapping(found: Found) -> Rows:
+    names = {
+        "frames per second": "fps",
+        "whole run": "whole_run_s",
+        "processor": "processor_s",
+        "memory": "peak_memory_mb",
+    }
+    return {
+        drive: {heading: one["drive"][key] for heading, key in names.items()}
+        for drive, one in found.items()
+    }
+
+
+def rays(found: Found) -> Rows:
+    return {
+        f"{row['scene']}, {row['resolution_m']:g} m": {
+            "times as fast": row["octomap / recon"],
+            "same occupied cells": 100 * row["agreement"]["occupied"],
+            "same free cells": 100 * row["agreement"]["free"],
+        }
+        for row in found["rays"]["ray_casting"]
+    }
+
+
+def live(found: Found) -> Rows:
+    one = found["drive"]
+    return {
+        f"{float(rate) * 10:g} Hz": {
+            "p50": played["latency_ms"]["p50"],
+            "p95": played["latency_ms"]["p95"],
+            "largest": played["latency_ms"]["max"],
+            "dropped": played["frames_dropped"],
+            "tracked, not matched": played["frames_not_matched"],
+            "t_rel": played["t_rel_percent"],
+            "memory": played["peak_memory_mb"],
+        }
+        for rate, played in one["rates"].items()
+    }
+
+
+def memory(found: Found) -> Rows:
+    one = found["street"]
+    rows = {
+        f"{row['frames']} frames": {
+            "recon map": row["peak_mb"],
+            **{f"recon {name}": again["peak_mb"] for name, again in row["again"].items()},
+        }
+        for row in one["drives"]
+    }
+    return {"libraries": {"recon map": one["libraries"]["peak_mb"]}, **rows}
+
+
+def scheduler(found: Found) -> Rows:
+    return {
+        f"{row['workers']} workers, {row['jobs']} jobs": {
+            "ms per job": row["scheduler_ms_per_job"],
+            "jobs per second at most": row["jobs_per_second_at_most"],
+        }
+        for row in found["sleeping"]["rows"]
+    }

@@ -1,0 +1,261 @@
+"""The tables of README and docs/results.md: their commands, and which figures they show.
+
+In a command, ``$RECON_DATA`` is the folder of real data and ``$OUT`` a temporary one that the
+commands of a table share; the last command of a line prints JSON.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import result_rows as rows_of
+from result_rows import Rows
+
+DRIVES: Final = {
+    "kitti_raw_0013": "$RECON_DATA/driven/kitti_raw_0013",
+    "sequence 06": "$RECON_DATA/driven/kitti_06_51",
+}
+D13, D06 = DRIVES.values()
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table.
+
+    Attributes:
+        commands: Shell lines, by name.
+        columns: Format of the cells, by heading.
+        rows: Makes the cells of the printed JSON of all commands, by label and heading.
+        timed: Whether it depends on what else the machine does.
+    """
+
+    commands: dict[str, str]
+    columns: dict[str, str]
+    rows: Callable[[dict[str, Any]], Rows]
+    timed: bool = False
+
+    def lacking(self) -> str:
+        """What is needed and not there; empty if nothing is."""
+        words = " ".join(self.commands.values()).split()
+        data = [word for word in words if word.startswith("$RECON_DATA")]
+        if data and not os.environ.get("RECON_DATA"):
+            return "RECON_DATA is not set"
+        missing = [word for word in data if not Path(os.path.expandvars(word)).exists()]
+        return f"there is no {missing[0]}" if missing else ""
+
+
+def map_drive(drive: str, name: str, *options: str) -> str:
+    return " ".join(
+        ["recon map", drive, *options, "--no-mesh --json --quiet --out", f"$OUT/{name}"]
+    )
+
+
+def against_lidar(name: str, *options: str) -> str:
+    words = ["recon evaluate map", f"$OUT/{name}", f"{D13}/lidar_map.ply --threshold 0.2 --json"]
+    return " ".join([*words, *options])
+
+
+PERCENT: Final = "{:.2f} %"
+SHARE: Final = "{:.3f}"
+CM: Final = "{:.1f} cm"
+MB: Final = "{:.0f} MB"
+MIDDLEBURY: Final = "recon evaluate middlebury $RECON_DATA/middlebury/MiddEval3/trainingQ --json"
+MENDED: Final = {"kitti_raw_0013": (D13, "13"), "sequence 06": (D06, "06")}
+
+TABLES: Final[dict[str, Table]] = {
+    "kitti-drift": Table(
+        {f"{name} visual": map_drive(drive, name[-2:]) for name, drive in DRIVES.items()}
+        | {
+            f"{name} kiss": f"python benchmarks/kiss_spread.py {drive} --json"
+            for name, drive in DRIVES.items()
+        },
+        {"t_rel": PERCENT, "least to most": "{}", "r_rel": "{:.2f} °/100 m", "ATE": CM}
+        | {"not trusted": "{}"},
+        rows_of.drift,
+    ),
+    "kitti-lidar": Table(
+        {
+            "known poses": f"{map_drive(D13, 'known', f'--poses {D13}/poses.txt')} && "
+            + against_lidar("known"),
+            "own path, `--align-to`": f"{map_drive(D13, 'own')} && "
+            + against_lidar("own", f"--align-to {D13}/poses.txt"),
+            "own path, `--align icp`": against_lidar(
+                "own", f"--align-to {D13}/poses.txt --align icp"
+            ),
+        },
+        dict.fromkeys(("precision", "recall", "F", "precision in reach", "F in reach"), SHARE),
+        rows_of.lidar,
+    ),
+    "kitti-lenses": Table(
+        {
+            f"{name}, {how}": mend + map_drive(drive, f"{key}{how[:2]}", options)
+            for name, (drive, key) in MENDED.items()
+            for how, mend, options in (
+                ("as it comes", "", ""),
+                (
+                    "mended",
+                    f"recon audit {drive} --mend $OUT/{key}.yaml --json && ",
+                    f"--calib $OUT/{key}.yaml",
+                ),
+            )
+        }
+        | {
+            f"kitti_raw_0013, {how}, F": against_lidar(
+                f"13{how[:2]}", f"--align-to {D13}/poses.txt"
+            )
+            for how in ("as it comes", "mended")
+        },
+        {"t_rel": PERCENT, "r_rel": "{:.2f} °/100 m", "length": SHARE, "F, own path": SHARE},
+        rows_of.lenses,
+    ),
+    "kitti-altered": Table(
+        {
+            name: f"python benchmarks/altered_drives.py {drive} --json"
+            for name, drive in DRIVES.items()
+        },
+        {
+            f"{name} {what}": form
+            for name in DRIVES
+            for what, form in (("t_rel", PERCENT), ("length", SHARE))
+        },
+        rows_of.altered,
+    ),
+    "kitti-localize": Table(
+        {"drive": f"python benchmarks/localize.py {D13} --elsewhere {D06} --json"},
+        {"tracked": "{:.1f} %", "median": CM, "95 %": CM, "largest": CM, "angle": "{:.2f}°"}
+        | {"off by 0.5 m": "{}"},
+        rows_of.localized,
+    ),
+    "kitti-halves": Table(
+        {"halves": f"python benchmarks/merge.py --parts halves --drive {D13} --json"},
+        {"t_rel, one run": "{:.3f} %", "merged": "{:.3f} %", "paths apart": "{:.0f} mm"}
+        | {"cells that differ": PERCENT, "free against occupied": PERCENT},
+        rows_of.halves,
+    ),
+    "kitti-speed": Table(
+        {
+            name: f"python benchmarks/mapping.py --json --no-rays --drive {drive}"
+            for name, drive in DRIVES.items()
+        },
+        {"frames per second": "{:.1f}", "whole run": "{:.0f} s", "processor": "{:.0f} s"}
+        | {"memory": MB},
+        rows_of.mapping,
+        timed=True,
+    ),
+    "kitti-live": Table(
+        {"drive": f"python benchmarks/live.py {D13} --rates 1 2 --only-live --json"},
+        {"p50": "{:.0f} ms", "p95": "{:.0f} ms", "largest": "{:.0f} ms", "dropped": "{}"}
+        | {"tracked, not matched": "{}", "t_rel": PERCENT, "memory": MB},
+        rows_of.live,
+        timed=True,
+    ),
+    "middlebury": Table(
+        {
+            "": f"{MIDDLEBURY} --matcher sad,sgm,opencv-bm,opencv-sgbm --out $OUT/plain",
+            ", padded": f"{MIDDLEBURY} --matcher opencv-bm,opencv-sgbm "
+            "--set matching.opencv.pad=true --out $OUT/padded",
+        },
+        {"bad 1": "{:.1f} %", "bad 2": "{:.1f} %", "bad 4": "{:.1f} %", "mean error": "{:.1f} px"},
+        rows_of.middlebury,
+    ),
+    "movers": Table(
+        {
+            "seed 4": "python benchmarks/movers.py --seed 4",
+            "seed 7": "python benchmarks/movers.py --seed 7",
+            "seed 7, slower": "python benchmarks/movers.py --seed 7 --pace 0.6",
+            "seed 11, faster": "python benchmarks/movers.py --seed 11 --pace 1.6",
+            "fences alone, seed 4": "python benchmarks/movers.py --seed 4 --fences",
+        },
+        {"moving points": "{}", "of them gone": "{:.1f} %", "of static ones lost": PERCENT}
+        | {"of posts and lamps": "{:.1f} %"},
+        rows_of.movers,
+    ),
+    "second-day": Table(
+        {
+            "2 m aside": "python benchmarks/merge.py --parts second",
+            "opposite lane, positions of 2 cm": "python benchmarks/merge.py --parts second "
+            "--lane opposite --measured 0.02",
+        },
+        {"precision": SHARE, "recall": SHARE, "F": SHARE, "points on cars that left": "{}"},
+        rows_of.second_day,
+    ),
+    "occupancy": Table(
+        {"streets": "python benchmarks/occupancy.py --json"},
+        dict.fromkeys(
+            (
+                *("voxels.precision", "voxels.recall", "voxels_exact.precision"),
+                *("voxels_exact.recall", "grid.iou_occupied", "grid_exact.iou_occupied"),
+                *("grid_exact.iou_free", "grid.occupied_called_free"),
+            ),
+            SHARE,
+        ),
+        rows_of.occupancy,
+    ),
+    "loops": Table(
+        {
+            "block 1": "python benchmarks/loops.py --json",
+            "block 2": "python benchmarks/loops.py --json --seed 2",
+        },
+        {"loops": "{}"}
+        | {
+            f"{what} {when}": SHARE if what == "F" else "{:.2f} m"
+            for what in ("end", "ATE", "F")
+            for when in ("before", "after")
+        },
+        rows_of.loops,
+    ),
+    "degraded": Table(
+        {"street": "python benchmarks/degraded_drives.py --json"},
+        {
+            f"`{odometry}` {what}": form
+            for odometry in ("visual", "kiss")
+            for what, form in (("t_rel", PERCENT), ("not trusted", "{}"))
+        },
+        rows_of.degraded,
+    ),
+    "drift-intervals": Table(
+        {"streets": "python benchmarks/drift_intervals.py --drives 40 --json"},
+        {"drives": "{}", "segments within their 95 % interval": "{:.1f} %"}
+        | {"error over stated deviation, rms": "{:.2f}"},
+        rows_of.intervals,
+    ),
+    "matching": Table(
+        {
+            f"{n} thread{'s'[: n - 1]}": f"python benchmarks/matching.py --json --threads {n}"
+            for n in (1, 2)
+        },
+        dict.fromkeys(
+            (
+                *("opencv-bm / sad", "opencv-bm / sad-upright"),
+                *("opencv-sgbm-hh / sgm", "opencv-sgbm-3way / sgm"),
+            ),
+            "{:.2f}",
+        ),
+        rows_of.matching,
+        timed=True,
+    ),
+    "rays": Table(
+        {"rays": "python benchmarks/mapping.py --json --no-drive"},
+        {"times as fast": "{:.1f}", "same occupied cells": PERCENT, "same free cells": PERCENT},
+        rows_of.rays,
+        timed=True,
+    ),
+    "memory": Table(
+        {
+            "street": "python benchmarks/memory.py --json --frames 1000 --frames 4000 "
+            "--again merge --again localize"
+        },
+        {"recon map": MB, "recon merge": MB, "recon localize": MB},
+        rows_of.memory,
+    ),
+    "scheduler": Table(
+        {"sleeping": "python benchmarks/fleet.py scheduler --workers 10 100 --jobs 1000 2000"},
+        {"ms per job": "{:.1f}", "jobs per second at most": "{}"},
+        rows_of.scheduler,
+        timed=True,
+    ),
+}
