@@ -42,5 +42,5 @@ def paper(
 
         overrides = [*shared.changes, *(["paper.as_printed=true"] if as_printed else ())]
         settings = load_config(shared.config, overrides, PAIR_DEFAULTS)
-        run = run_paper(scenes, settings, out=out, threads=shared.threads)
-    shared.show(run.summary if shared.json else {**headline(run.summary), **run.summary})
+        summary = run_paper(scenes, settings, out=out, threads=shared.threads)
+    shared.show(summary if shared.json else {**headline(summary), **summary})

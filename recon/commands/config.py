@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from recon.core.errors import FormatError, SettingsError
 from recon.core.settings import Settings, merge
-from recon.evaluation.paper.settings import PaperConfig
+from recon.evaluation.paper import PaperConfig
 from recon.export.mesh.poisson import MeshSettings
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
 from recon.io.yaml_file import parse_yaml

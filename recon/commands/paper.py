@@ -6,13 +6,21 @@ from pathlib import Path
 from typing import Any
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
-from recon.evaluation.paper.result import (
-    PaperRun,
-    paper_figures,
-    run_experiment,
-    write_experiments,
+from recon.evaluation.paper import (
+    CORRECTED,
+    TITLES,
+    Experiment,
+    MethodResult,
+    apply_method,
+    read_experiments,
+    table_1_row,
+    try_patches,
 )
-from recon.evaluation.paper.scenes import default_scenes_folder, read_experiments
+from recon.io.images.image import write_image
+from recon.io.images.pfm import write_pfm
+from recon.io.models.mlp import write_mlp
+from recon.io.models.ply import write_ply
+from recon.report.colour import colour_disparity
 from recon.report.paper_page import write_paper_page
 from recon.run.run import Run
 
@@ -23,7 +31,7 @@ def run_paper(
     *,
     out: Path | None = None,
     threads: int | None = None,
-) -> PaperRun:
+) -> dict[str, Any]:
     """Repeat experiments 2 to 4 of the seed paper: what `recon paper` does.
 
     Each method is applied to each scene, alone and with all patch sizes, and compared with the
@@ -36,39 +44,74 @@ def run_paper(
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
 
+    Returns:
+        The figures of ``summary.json``.
+
     Raises:
         ReconError: A scene is missing or damaged, or the folder cannot be written; nothing is left
             behind.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
-    folder = folder or default_scenes_folder()
     experiments = read_experiments(folder)
+    methods = tuple(TITLES) if config.paper.as_printed else (CORRECTED,)
+    source = experiments[0].files[0].parents[1]
     with Run("paper", out, config, threads=threads) as run:
-        results = tuple(run_experiment(one, config, run.threads, run.watch) for one in experiments)
-        with run.stage("write"):
-            write_experiments(results, run)
-        warnings = tuple(
-            f"{one.scene} has no true disparity: nothing is compared with the truth"
-            for one in experiments
-            if one.truth is None
-        )
-        summary = {**paper_figures(results, config), "warnings": list(warnings)}
-        result = PaperRun(folder, config, results, summary, warnings)
+        figures, done = {}, []
+        for one in experiments:
+            with run.stage("methods"):
+                results = [apply_method(name, one, config, run.threads) for name in methods]
+            with run.stage("patches"):
+                tried = {name: try_patches(name, one, config, run.threads) for name in methods}
+            with run.stage("write"):
+                _write_experiment(one, results, run)
+            done.append((one, results))
+            figures[str(one.number)] = {
+                "scene": one.scene,
+                "width_px": one.camera.width_px,
+                "height_px": one.camera.height_px,
+                "methods": {result.method: result.figures for result in results},
+                "patches": tried,
+            }
+        summary: dict[str, Any] = {
+            "as_printed": config.paper.as_printed,
+            "table_1": [table_1_row(one) for one in experiments],
+            "experiments": figures,
+            "warnings": [
+                f"{one.scene} has no true disparity: nothing is compared with the truth"
+                for one in experiments
+                if one.truth is None
+            ],
+        }
         with run.report(summary):
-            write_paper_page(result, run)
-        inputs = [path for one in experiments for path in one.files]
-        run.finish(summary, source=str(folder), inputs=inputs)
-    return result
+            write_paper_page(source, done, summary, run)
+        run.finish(
+            summary, source=str(source), inputs=[f for one in experiments for f in one.files]
+        )
+    return summary
+
+
+def _write_experiment(one: Experiment, results: list[MethodResult], run: Run) -> None:
+    """Write disparity, depth and cloud of each method, and a MeshLab project."""
+    experiment = f"experiment_{one.number}_{one.scene}"
+    for result in results:
+        folder = f"{experiment}/{result.method}"
+        write_pfm(run.path(f"{folder}/disparity.pfm"), result.disparity.values)
+        colours = colour_disparity(result.disparity.values)
+        write_image(run.path(f"{folder}/disparity_colour.png"), colours)
+        write_pfm(run.path(f"{folder}/depth.pfm"), result.depth_m)
+        write_ply(run.path(f"{folder}/cloud.ply"), result.cloud)
+        write_ply(run.path(f"{folder}/cloud_ascii.ply"), result.cloud, ascii=True)
+    layers = {each.method: run.path(f"{experiment}/{each.method}/cloud.ply") for each in results}
+    write_mlp(run.path(f"{experiment}/clouds.mlp"), layers, "camera")
 
 
 def headline(summary: dict[str, Any]) -> dict[str, str]:
     """Return one line for each experiment and method, for the command's table."""
-    lines = {}
-    for number, experiment in summary["experiments"].items():
-        for method, figures in experiment["methods"].items():
-            name = f"{number} {experiment['scene']}, {method}"
-            lines[name] = _headline(figures)
-    return lines
+    return {
+        f"{number} {experiment['scene']}, {method}": _headline(figures)
+        for number, experiment in summary["experiments"].items()
+        for method, figures in experiment["methods"].items()
+    }
 
 
 def _headline(figures: dict[str, Any]) -> str:

@@ -4,5 +4,5 @@
 - `segments.py`: where drift is measured; `association.py`: which poses belong together;
 - `drive_errors.py`: a mapped drive beside the truth of its source; `map_comparison.py`: a map
   beside a cloud;
-- `middlebury/bench.py`: the benchmark; `paper/methods.py`: the seed paper's experiments.
+- `middlebury/bench.py`: the benchmark; `paper.py`: the seed paper's experiments.
 """

@@ -1,6 +1,8 @@
-"""Block matching as printed: what it finds, and what its missing absolute value does."""
+"""The geometry that Table 1 describes, and block matching as printed."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,11 +10,62 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from recon.core.errors import MatchingError
-from recon.core.values import Reason, RectifiedCamera, RectifiedPair
+from recon.core.errors import CalibrationError, MatchingError, SettingsError
+from recon.core.geometry.projection import depth_from_disparity
+from recon.core.values import DisparityTruth, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
-from recon.evaluation.paper.printed import match_as_printed
+from recon.evaluation.paper import (
+    EXPERIMENTS,
+    PaperSettings,
+    PrintedMatcher,
+    camera_of_table_1,
+    compare_depth,
+    read_experiments,
+    table_1_row,
+)
 from tests.scenery.planes import fronto_parallel_pair
+
+CAMERA = RectifiedCamera(935.0, 148.0, 138.0, 198.0, 0.16, 347, 277, 64)
+"""That of ArtL at quarter size."""
+
+
+def test_doffs_of_zero_is_no_focal_length() -> None:
+    camera = RectifiedCamera(935.0, 148.0, 138.0, 148.0, 0.16, 347, 277)
+    with pytest.raises(CalibrationError, match="doffs"):
+        camera_of_table_1(camera)
+
+
+def test_true_depths_have_no_error_and_those_of_table_1_a_large_one() -> None:
+    values = np.linspace(16, 58, 200, dtype=np.float32).reshape(10, 20)
+    truth = DisparityTruth(values, np.isfinite(values))
+    believed_m = depth_from_disparity(values, camera_of_table_1(CAMERA))
+    assert np.allclose(believed_m, 50 * 0.16 / values, rtol=1e-6)
+    right = compare_depth(depth_from_disparity(values, CAMERA), truth, CAMERA) or {}
+    wrong = compare_depth(believed_m, truth, CAMERA) or {}
+    assert right["median_error_percent"] == 0
+    assert right["median_ratio"] == 1
+    # Z'/Z = doffs·(d + doffs) / (f·d): 0.22 at d = 16, 0.10 at d = 58.
+    assert 0.10 < wrong["median_ratio"] < 0.22
+    assert wrong["pixels"] == 200
+    assert compare_depth(np.full((10, 20), np.nan, np.float32), truth, CAMERA) is None
+
+
+@pytest.mark.parametrize("values", [{"patch_px": 4}, {"patches_px": [3, 6]}, {"patches_px": []}])
+def test_even_patches_and_none_are_refused(values: dict[str, object]) -> None:
+    with pytest.raises(SettingsError, match="patch"):
+        PaperSettings.parse(values)
+
+
+@pytest.mark.real
+def test_the_real_scenes_have_the_numbers_that_identify_table_1(recon_data: Path) -> None:
+    rows = [
+        table_1_row(one) for one in read_experiments(recon_data / "middlebury/MiddEval3/trainingQ")
+    ]
+    assert {row["experiment"]: row["scene"] for row in rows} == EXPERIMENTS
+    # Ref: doffs, baseline, ndisp as the paper's Table 1 prints them.
+    printed = [(50.0, 160.0, 64), (201.044, 380.135, 160), (19.331, 236.922, 75)]
+    assert [tuple(row["printed"].values()) for row in rows] == printed
+    assert [row["corrected"]["focal_px"] for row in rows] == [935.0, 1823.297, 989.886]
 
 
 def camera_for(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
@@ -25,23 +78,18 @@ def match(
 ) -> Float32:
     height, width = left.shape
     pair = RectifiedPair(left, right, camera_for(width, height, ndisp))
-    return match_as_printed(pair, patch_px, signed=signed).values
+    return PrintedMatcher(patch_px, signed).match(pair).values
 
 
-def test_absolute_differences_find_a_wall_to_the_whole_pixel() -> None:
+def test_only_absolute_differences_find_a_wall_to_the_whole_pixel() -> None:
     # 60 px · 0.5 m / 5 m = 6 px exactly.
     scene = fronto_parallel_pair(camera_for(64, 40, 16), 5.0)
-    found = match_as_printed(scene.pair, 7, signed=False)
+    found = PrintedMatcher(7, signed=False).match(scene.pair)
     seen = found.valid.copy()
     seen[:, : 6 + 3] = False  # there the right image does not show the patch
     assert np.mean(found.values[seen] == 6) > 0.99
-    assert np.all(found.values[found.valid] == np.rint(found.values[found.valid]))
-
-
-def test_signed_differences_do_not_find_the_wall() -> None:
-    scene = fronto_parallel_pair(camera_for(64, 40, 16), 5.0)
-    found = match_as_printed(scene.pair, 7, signed=True)
-    assert np.mean(found.values[:, 9:-3] == 6) < 0.3
+    signed = PrintedMatcher(7, signed=True).match(scene.pair)
+    assert np.mean(signed.values[:, 9:-3] == 6) < 0.3
 
 
 def test_the_least_signed_sum_is_the_brightest_patch_of_the_right_image() -> None:
@@ -55,18 +103,11 @@ def test_the_least_signed_sum_is_the_brightest_patch_of_the_right_image() -> Non
 def test_only_pixels_whose_patch_leaves_the_image_have_no_value() -> None:
     left = np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8)
     pair = RectifiedPair(left, left, camera_for(30, 20))
-    found = match_as_printed(pair, 5, signed=True)
+    found = PrintedMatcher(5, signed=True).match(pair)
     expected = np.zeros(left.shape, dtype=bool)
     expected[2:-2, 2:-2] = True
     assert np.array_equal(found.valid, expected)
     assert np.all(found.reason[~expected] == Reason.BORDER)
-
-
-@pytest.mark.parametrize("level", [0, 255])
-def test_an_image_without_texture_gives_disparity_zero(level: int) -> None:
-    flat = np.full((12, 15), level, dtype=np.uint8)
-    values = match(flat, flat, patch_px=3, signed=False)
-    assert np.all(values[1:-1, 1:-1] == 0)
 
 
 def test_a_patch_larger_than_the_image_is_refused() -> None:

@@ -1,0 +1,353 @@
+"""The seed paper's experiments 2 to 4, as printed and corrected, on three Middlebury scenes."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from recon.core.errors import CalibrationError, MatchingError, SourceError
+from recon.core.geometry.projection import depth_from_disparity
+from recon.core.settings import Settings
+from recon.core.values import (
+    Disparity,
+    DisparityTruth,
+    PointCloud,
+    Reason,
+    RectifiedCamera,
+    RectifiedPair,
+    StereoPair,
+)
+from recon.core.values.arrays import Float32, Int32
+from recon.evaluation.disparity import evaluate_disparity
+from recon.io.middlebury.calib import read_middlebury_calib
+from recon.io.middlebury.scene import read_middlebury_scene
+from recon.run.summary import plain
+from recon.stereo.cloud.back_project import CloudSettings, back_project
+from recon.stereo.frame import FrameReconstructor
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.sad import SadMatcher, SadSettings
+from recon.stereo.match.search import usual_ndisp
+from recon.stereo.rectify.grey import to_grey
+from recon.stereo.rectify.rectifier import Rectifier
+from recon.stereo.settings import StereoSettings
+
+EXPERIMENTS: Final[Mapping[int, str]] = MappingProxyType({2: "ArtL", 3: "Jadeplant", 4: "Pipes"})
+"""Scene of each experiment, identified by Table 1: docs/paper.md."""
+CORRECTED: Final = "corrected"
+ABSOLUTE: Final = "absolute"
+AS_PRINTED: Final = "as_printed"
+TITLES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        CORRECTED: "corrected",
+        ABSOLUTE: "as printed, but absolute differences",
+        AS_PRINTED: "as printed",
+    }
+)
+BAD_PX: Final = 1.0
+"""Disparity error above which a pixel counts as wrong."""
+_SCENES: Final = Path("middlebury", "MiddEval3", "trainingQ")
+_WHERE: Final = "name the folder MiddEval3/trainingQ of the Middlebury benchmark"
+# A value rounded to whole pixels is off by up to half a pixel, each amount as likely.
+_SIGMA_PX: Final = 1 / math.sqrt(12)
+# Keeps every point of the printed method, regardless of range and uncertainty.
+_EVERY_POINT: Final = CloudSettings(min_range_m=0.0, max_range_m=None, max_relative_sigma=None)
+
+
+class PaperSettings(Settings):
+    """How the seed paper's experiments are repeated."""
+
+    as_printed: bool = Field(
+        default=False, description="Run the method as printed as well as the corrected one."
+    )
+    patch_px: int = Field(
+        default=11,
+        ge=3,
+        le=61,
+        description="Patch size of the printed method, odd. The paper does not give one: try "
+        "others.",
+    )
+    patches_px: tuple[int, ...] = Field(
+        default=tuple(range(3, 22, 2)),
+        min_length=1,
+        description="Patch sizes, and window sizes of the matcher `sad`, to compare; odd.",
+    )
+
+    @field_validator("patch_px", "patches_px")
+    @classmethod
+    def _are_odd(cls, value: int | tuple[int, ...]) -> int | tuple[int, ...]:
+        patches = (value,) if isinstance(value, int) else value
+        if any(patch % 2 == 0 or not 1 <= patch <= 61 for patch in patches):
+            raise ValueError("a patch is an odd number from 1 to 61")
+        return value
+
+
+class PaperConfig(StereoSettings):
+    """Settings of `recon paper`, which corrects the printed method with ours."""
+
+    paper: PaperSettings = PaperSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """Input of one experiment: its scene, the truth of which may be missing, and its files."""
+
+    number: int
+    scene: str
+    pair: StereoPair
+    camera: RectifiedCamera
+    truth: DisparityTruth | None
+    files: tuple[Path, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """Result of one method on one experiment.
+
+    Attributes:
+        method: A key of `TITLES`.
+        pair: The grey images, with the camera that the method assumes.
+        disparity: The disparity map.
+        depth_m: float32 (H, W), metres; NaN = unknown.
+        cloud: The points in camera axes.
+        figures: Shares, and errors of disparity and depth; None without ground truth.
+    """
+
+    method: str
+    pair: RectifiedPair
+    disparity: Disparity
+    depth_m: Float32
+    cloud: PointCloud
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class PrintedMatcher:
+    """Block matching as the paper prints it: whole disparities, no check, plain numpy.
+
+    A pixel has no value only where no patch lies within both images. Every other pixel keeps
+    its minimum, however doubtful: confidence 1 says that nothing was asked, not that it is right.
+
+    Attributes:
+        patch_px: Edge of the patch; odd.
+        signed: Whether to sum the differences with their signs, as Eq. 9-10 are printed; else
+            their absolute values, which is what SAD means.
+
+    Ref: Eq. 9-10 of the seed paper, see docs/paper.md.
+    """
+
+    patch_px: int
+    signed: bool
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Return the disparities with the smallest sum, as far as the camera says or a tenth."""
+        shape, size = pair.left.shape, self.patch_px
+        if size > min(shape):
+            what, expected = "patch is larger than the image", f"at most {min(shape)} px"
+            raise MatchingError(what, got=f"{size} px", expected=expected)
+        values = np.full(shape, np.nan, dtype=np.float32)
+        inside = self._smallest_sums(pair)
+        values[size // 2 :, size // 2 :][: inside.shape[0], : inside.shape[1]] = inside
+        known = np.isfinite(values)
+        return Disparity(
+            values=values,
+            confidence=known.astype(np.float32),
+            sigma_px=np.where(known, np.float32(_SIGMA_PX), np.float32(np.nan)),
+            reason=np.where(known, np.uint8(Reason.VALID), np.uint8(Reason.BORDER)),
+        )
+
+    def _smallest_sums(self, pair: RectifiedPair) -> Float32:
+        """Return float32, the disparity of each pixel whose patch lies within the left image."""
+        left, right = pair.left.astype(np.int32), pair.right.astype(np.int32)
+        size = (left.shape[0] - self.patch_px + 1, left.shape[1] - self.patch_px + 1)
+        least, best = np.full(size, np.iinfo(np.int64).max), np.zeros(size, dtype=np.float32)
+        for d in range(min(pair.camera.ndisp or usual_ndisp(pair.camera.width_px), size[1])):
+            difference = left[:, d:] - right[:, : right.shape[1] - d]
+            sums = _patch_sums(difference if self.signed else np.abs(difference), self.patch_px)
+            # Strictly less: of equal sums the smallest disparity wins.
+            better = sums < least[:, d:]
+            least[:, d:][better] = sums[better]
+            best[:, d:][better] = d
+        return best
+
+
+def _patch_sums(compared: Int32, n: int) -> NDArray[Any]:
+    """Return int64 (H - n + 1, W - n + 1), sums over all patches by an integral image."""
+    table = np.pad(compared.astype(np.int64), ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    return np.asarray(table[n:, n:] - table[:-n, n:] - table[n:, :-n] + table[:-n, :-n])
+
+
+def read_experiments(folder: Path | None = None) -> list[Experiment]:
+    """Read the three scenes; None = those of MiddEval3 in the folder that ``RECON_DATA`` names.
+
+    Raises:
+        SourceError: A scene is missing, or no folder is named.
+        FormatError: A file of a scene is damaged.
+        CalibrationError: A scene's geometry cannot give depth.
+    """
+    if folder is None:
+        if not os.environ.get("RECON_DATA"):
+            what = "no folder of scenes is given, and RECON_DATA is not set"
+            expected = f"a folder with {', '.join(EXPERIMENTS.values())}"
+            raise SourceError(what, expected=expected, hint=_WHERE)
+        folder = Path(os.environ["RECON_DATA"]) / _SCENES
+    missing = [scene for scene in EXPERIMENTS.values() if not (folder / scene).is_dir()]
+    if missing:
+        got = f"no folder {', '.join(missing)}"
+        raise SourceError("scenes of the paper are missing", where=folder, got=got, hint=_WHERE)
+    return [_read_experiment(number, folder / scene) for number, scene in EXPERIMENTS.items()]
+
+
+def _read_experiment(number: int, folder: Path) -> Experiment:
+    scene, calib = read_middlebury_scene(folder), read_middlebury_calib(folder / "calib.txt")
+    # The file rounds doffs and the principal points independently; doffs defines depth.
+    doffs_px = calib.camera.doffs_px if calib.doffs_px is None else calib.doffs_px
+    camera = replace(calib.camera, cx_right_px=calib.camera.cx_px + doffs_px)
+    files = tuple(sorted(path for path in folder.iterdir() if path.is_file()))
+    return Experiment(number, scene.name, scene.pair, camera, scene.truth, files)
+
+
+def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
+    """Return the camera of Table 1: ``doffs`` taken as the focal length, and no offset added to d.
+
+    Raises:
+        CalibrationError: ``doffs`` is not positive, so it cannot be used as a focal length.
+    """
+    if camera.doffs_px <= 0:
+        what, got = "doffs cannot be used as a focal length", f"{camera.doffs_px:g} px"
+        raise CalibrationError(what, got=got, expected="> 0 px")
+    return replace(camera, focal_px=camera.doffs_px, cx_right_px=camera.cx_px)
+
+
+def table_1_row(experiment: Experiment) -> dict[str, Any]:
+    """Return a row of Table 1 as printed and corrected, and the error that it makes by itself."""
+    camera, truth, error = experiment.camera, experiment.truth, None
+    if truth is not None and camera.doffs_px > 0:
+        depth_m = depth_from_disparity(truth.values, camera_of_table_1(camera))
+        error = (compare_depth(depth_m, truth, camera) or {}).get("median_error_percent")
+    both = {"baseline_mm": round(1000 * camera.baseline_m, 6), "ndisp": camera.ndisp}
+    doffs_px = round(camera.doffs_px, 6)
+    return {
+        "experiment": experiment.number,
+        "scene": experiment.scene,
+        "printed": {"focal_length": doffs_px, **both},
+        "corrected": {"focal_px": camera.focal_px, "doffs_px": doffs_px, **both},
+        "depth_error_of_printed_percent": error,
+    }
+
+
+def apply_method(
+    method: str, experiment: Experiment, config: PaperConfig, threads: int | None = None
+) -> MethodResult:
+    """Reconstruct one experiment by one method.
+
+    Args:
+        method: ``corrected`` is our matcher with the scene's calibration. ``absolute`` and
+            ``as_printed`` find integer disparities in Eq. 6 grey images, without and with the
+            misprint of Eq. 9-10, and both use Table 1's focal length as printed.
+        experiment: The scene.
+        config: Settings of the stages, and of the experiments.
+        threads: Threads for our matcher; None = all cores.
+    """
+    if method == CORRECTED:
+        rebuilt = FrameReconstructor(experiment.camera, config, threads=threads)
+        frame = rebuilt.reconstruct(experiment.pair)
+        return _result(method, experiment, frame.pair, frame.disparity, frame.cloud)
+    pair = _printed_pair(experiment)
+    disparity = PrintedMatcher(config.paper.patch_px, method == AS_PRINTED).match(pair)
+    pair = replace(pair, camera=camera_of_table_1(pair.camera))
+    cloud = back_project(disparity, pair, _EVERY_POINT, normals=False)
+    return _result(method, experiment, pair, disparity, cloud)
+
+
+def try_patches(
+    method: str, experiment: Experiment, config: PaperConfig, threads: int | None = None
+) -> list[dict[str, Any]]:
+    """Run a method with each patch size in the settings; ``corrected`` uses the matcher `sad`."""
+    if method == CORRECTED:
+        pair = Rectifier(experiment.camera, config.rectification).rectify(experiment.pair)
+    else:
+        pair = _printed_pair(experiment)
+    figures = []
+    for patch_px in config.paper.patches_px:
+        if patch_px <= min(pair.left.shape):
+            matcher: Matcher = PrintedMatcher(patch_px, method == AS_PRINTED)
+            if method == CORRECTED:
+                own = {**config.matching.sad.model_dump(), "window_px": patch_px}
+                matcher = SadMatcher(SadSettings.parse(own), threads)
+            figures.append(_patch_figures(patch_px, matcher.match(pair), experiment.truth))
+    return figures
+
+
+def compare_depth(
+    depth_m: Float32, truth: DisparityTruth, camera: RectifiedCamera
+) -> dict[str, float] | None:
+    """Compare depths with the truth at pixels seen by both cameras; None = no pixel has both.
+
+    Args:
+        depth_m: float32 (H, W), metres; NaN = unknown.
+        truth: True disparity.
+        camera: The true geometry.
+
+    Returns:
+        Medians: of the depth, of the true depth of these pixels, of the absolute error in per cent
+        of it, and of estimated ÷ true depth; the number of pixels.
+    """
+    true_m = depth_from_disparity(truth.values, camera)
+    both = np.isfinite(depth_m) & np.isfinite(true_m) & truth.nonocc
+    if not both.any():
+        return None
+    found, true = depth_m[both].astype(np.float64), true_m[both].astype(np.float64)
+    return {
+        "median_m": float(np.median(found)),
+        "true_median_m": float(np.median(true)),
+        "median_error_percent": 100 * float(np.median(np.abs(found - true) / true)),
+        "median_ratio": float(np.median(found / true)),
+        "pixels": int(both.sum()),
+    }
+
+
+def _result(
+    method: str,
+    experiment: Experiment,
+    pair: RectifiedPair,
+    disparity: Disparity,
+    cloud: PointCloud,
+) -> MethodResult:
+    depth_m, truth = depth_from_disparity(disparity.values, pair.camera), experiment.truth
+    known_m = depth_m[np.isfinite(depth_m)]
+    figures = {
+        "valid_percent": 100.0 * float(disparity.valid.mean()),
+        "points": len(cloud),
+        "depth_median_m": float(np.median(known_m)) if len(known_m) else None,
+        "disparity": None if truth is None else plain(evaluate_disparity(disparity, truth)),
+        "depth": None if truth is None else compare_depth(depth_m, truth, experiment.camera),
+    }
+    return MethodResult(method, pair, disparity, depth_m, cloud, figures)
+
+
+def _printed_pair(experiment: Experiment) -> RectifiedPair:
+    """Return the images converted to grey by Eq. 6."""
+    pair, rectifier = experiment.pair, Rectifier(experiment.camera)
+    left, right = (to_grey(image, "paper") for image in rectifier.warp(pair))
+    return replace(rectifier.rectify(pair), left=left, right=right)
+
+
+def _patch_figures(patch_px: int, found: Disparity, truth: DisparityTruth | None) -> dict[str, Any]:
+    """Return the shares of pixels with a value, wrong and right, and the mean error in pixels."""
+    bad = right = error = None
+    if truth is not None:
+        metrics = evaluate_disparity(found, truth, (BAD_PX,))
+        bad, error = metrics.bad[BAD_PX], metrics.avgerr_px
+        right = 100 - bad - metrics.invalid
+    figures = {"patch_px": patch_px, "valid_percent": 100 * float(found.valid.mean())}
+    errors = {"bad_percent": bad, "right_percent": right, "avgerr_px": error}
+    return dict(plain({**figures, **errors}))
