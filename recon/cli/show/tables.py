@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from recon.commands.settings_list import SettingEntry, SettingGroup
-    from recon.run.installation import Check
+    from recon.commands.doctor import Check
+    from recon.commands.settings import SettingEntry, SettingGroup
 
 
 def print_json(content: Mapping[str, Any]) -> None:
