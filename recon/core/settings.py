@@ -29,7 +29,9 @@ class Settings(BaseModel):
     with its bounds. Equal settings give equal results: environment variables have no effect.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
     @model_validator(mode="before")
     @classmethod

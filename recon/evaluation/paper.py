@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +75,7 @@ class PaperSettings(Settings):
         description="Patch size of the printed method, odd. The paper does not give one: try "
         "others.",
     )
-    patches_px: tuple[int, ...] = Field(
+    patches_px: tuple[Annotated[int, Field(ge=1, le=61)], ...] = Field(
         default=tuple(range(3, 22, 2)),
         min_length=1,
         description="Patch sizes, and window sizes of the matcher `sad`, to compare; odd.",

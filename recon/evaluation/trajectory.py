@@ -34,7 +34,7 @@ class TrajectoryRules(Settings):
         description="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
         "rigid with scale (sim3), or rigid where z is up in both (upright).",
     )
-    lengths_m: tuple[Annotated[float, Field(gt=0)], ...] | None = Field(
+    lengths_m: tuple[Annotated[float, Field(ge=1e-6, le=1e9)], ...] | None = Field(
         default=None,
         min_length=1,
         description="Lengths of the segments in metres; null = chosen by the length of the path.",
@@ -42,10 +42,13 @@ class TrajectoryRules(Settings):
     step_frames: int | None = Field(
         default=None,
         ge=1,
+        le=1_000_000_000,
         description="Frames between the starts of segments; null = chosen by the length of the "
         "path.",
     )
-    rpe_frames: int = Field(default=1, ge=1, description="Frame distance of the RPE.")
+    rpe_frames: int = Field(
+        default=1, ge=1, le=1_000_000_000, description="Frame distance of the RPE."
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ class SubmapSettings(Settings):
 
     length_m: float = Field(
         25.0,
-        gt=0.0,
+        ge=0.1,
         le=10_000.0,
         description="Path after which a new submap begins. Shorter ones bend better with closed "
         "loops and take less memory.",

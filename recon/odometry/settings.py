@@ -20,21 +20,29 @@ class PriorSettings(Settings):
     )
     max_gap_s: float = Field(
         1.0,
-        gt=0.0,
+        ge=1e-6,
+        le=1e6,
         description="Poses farther apart in time are not interpolated. Raise it for a slow "
         "receiver.",
     )
     sigma_m: float = Field(
         0.03,
-        gt=0.0,
+        ge=1e-6,
+        le=1e6,
         description="Standard deviation of its motion from frame to frame. State here what your "
         "sensor is worth: the cameras are believed where it is worse.",
     )
     sigma_share: float = Field(
-        0.03, ge=0.0, description="Share of the motion's length that is added to `sigma_m`."
+        0.03,
+        ge=0.0,
+        le=1000.0,
+        description="Share of the motion's length that is added to `sigma_m`.",
     )
     sigma_deg: float = Field(
-        0.5, gt=0.0, description="Standard deviation of its rotation from frame to frame."
+        0.5,
+        ge=1e-6,
+        le=360.0,
+        description="Standard deviation of its rotation from frame to frame.",
     )
 
 
@@ -56,7 +64,8 @@ class OdometrySettings(Settings):
     )
     max_range_m: float = Field(
         30.0,
-        gt=0.0,
+        ge=0.1,
+        le=10_000.0,
         description="Points farther than this are not registered by kiss-icp (`kiss`, and "
         "`recon localize`). Raise it with a wide baseline in open country.",
     )

@@ -34,13 +34,19 @@ class CaptureSettings(Settings):
     """Settings of a recording."""
 
     width_px: int | None = Field(
-        default=None, ge=16, description="Requested frame width. none = the driver's default."
+        default=None,
+        ge=16,
+        le=100_000,
+        description="Requested frame width. none = the driver's default.",
     )
     height_px: int | None = Field(
-        default=None, ge=16, description="Requested frame height; with width_px."
+        default=None, ge=16, le=100_000, description="Requested frame height; with width_px."
     )
     rate_hz: float | None = Field(
-        default=None, gt=0, description="Requested frame rate. none = the driver's default."
+        default=None,
+        ge=1e-3,
+        le=1e6,
+        description="Requested frame rate. none = the driver's default.",
     )
     lock_exposure: bool = Field(
         default=True,
@@ -58,10 +64,17 @@ class CaptureSettings(Settings):
 class RecordingSettings(CaptureSettings):
     """The settings of one recording, and when it ends."""
 
-    frames: int | None = Field(default=None, ge=1, description="Stop after this many pairs.")
-    seconds: float | None = Field(default=None, gt=0, description="Stop after this many seconds.")
+    frames: int | None = Field(
+        default=None, ge=1, le=1_000_000_000, description="Stop after this many pairs."
+    )
+    seconds: float | None = Field(
+        default=None, ge=1e-3, le=1e9, description="Stop after this many seconds."
+    )
     preview_every: int | None = Field(
-        default=None, ge=1, description="Update preview.jpg every N pairs. None = no preview."
+        default=None,
+        ge=1,
+        le=1_000_000_000,
+        description="Update preview.jpg every N pairs. None = no preview.",
     )
 
 

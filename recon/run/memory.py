@@ -28,7 +28,8 @@ class MemorySettings(Settings):
 
     limit_mb: float | None = Field(
         None,
-        gt=0.0,
+        ge=1.0,
+        le=1e9,
         description="Largest resident memory of the process, in 10⁶ bytes; none = no limit. "
         "Submaps and tiles are made smaller to meet it, so results may differ by rounding.",
     )

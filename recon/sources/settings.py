@@ -28,26 +28,37 @@ class SourceSettings(Settings):
     )
     focal_px: float | None = Field(
         default=None,
-        gt=0,
+        ge=1.0,
+        le=1e6,
         description="Focal length of images that are rectified already, with `source.baseline_m` "
         "in place of a calibration file. none = that of the calibration.",
     )
     baseline_m: float | None = Field(
-        default=None, gt=0, description="Distance between their cameras. none = see there."
+        default=None,
+        ge=1e-6,
+        le=1e6,
+        description="Distance between their cameras. none = see there.",
     )
     cx_px: float | None = Field(
-        default=None, description="Column of their principal points. none = the middle."
+        default=None,
+        ge=-1e6,
+        le=1e6,
+        description="Column of their principal points. none = the middle.",
     )
-    cy_px: float | None = Field(default=None, description="Row of it. none = the middle.")
+    cy_px: float | None = Field(
+        default=None, ge=-1e6, le=1e6, description="Row of it. none = the middle."
+    )
     max_megapixels: float = Field(
         default=MAX_MEGAPIXELS,
-        gt=0,
+        ge=1e-4,
+        le=10_000.0,
         description="Largest image that is read, in 10⁶ pixels; larger ones are refused before "
         "they are decoded.",
     )
     metres_per_unit: float = Field(
         default=1.0,
-        gt=0,
+        ge=1e-6,
+        le=1e6,
         description="Unit of the translation in an OpenCV calibration file: 0.001 for mm.",
     )
     pair_by: Literal["auto", "stamp", "name", "index"] = Field(
@@ -57,24 +68,39 @@ class SourceSettings(Settings):
     )
     tolerance_s: float = Field(
         default=0.01,
-        gt=0,
+        ge=1e-9,
+        le=1e6,
         description="Largest difference between the timestamps of a pair.",
     )
     rate_hz: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-3,
+        le=1e6,
         description="Frame rate of a KITTI drive, plain folders or videos, in place of their "
         "times. none = their times, or 10 Hz for plain folders without times.",
     )
-    start: int = Field(default=0, ge=0, description="First frame used; earlier ones are not read.")
+    start: int = Field(
+        default=0,
+        ge=0,
+        le=1_000_000_000,
+        description="First frame used; earlier ones are not read.",
+    )
     end: int | None = Field(
-        default=None, ge=1, description="Frame at which to stop, itself not used. none = the last."
+        default=None,
+        ge=1,
+        le=1_000_000_000,
+        description="Frame at which to stop, itself not used. none = the last.",
     )
     stride: int = Field(
-        default=1, ge=1, description="Use every so many frames; the others are not read."
+        default=1,
+        ge=1,
+        le=1_000_000_000,
+        description="Use every so many frames; the others are not read.",
     )
     shift_frames: int = Field(
         default=0,
+        ge=-1_000_000_000,
+        le=1_000_000_000,
         description="By how many frames the right camera is late: the left image of a frame is "
         "paired with the right one of so many frames later. Times, ground truth and known poses "
         "stay those of the left images. Negative = the left camera is late.",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
@@ -13,6 +13,7 @@ CORNER_M: Final = 16.0
 """Radius of the corners of a block."""
 
 _LEAST_SIDE_M: Final = 2 * CORNER_M + 28.0  # two rows of houses, back to back
+_SideM = Annotated[float, Field(ge=_LEAST_SIDE_M, le=2000.0)]
 
 
 class StreetSettings(Settings):
@@ -42,9 +43,9 @@ class StreetSettings(Settings):
         default=640, ge=16, le=8192, description="Image width. Take that of your rig to try it."
     )
     height_px: int = Field(default=240, ge=16, le=8192, description="Image height.")
-    focal_px: float = Field(default=360.0, gt=0.0, description="Focal length.")
+    focal_px: float = Field(default=360.0, ge=1.0, le=100_000.0, description="Focal length.")
     baseline_m: float = Field(
-        default=0.54, gt=0.0, le=5.0, description="Distance between the cameras."
+        default=0.54, ge=0.001, le=5.0, description="Distance between the cameras."
     )
     camera_height_m: float = Field(
         default=1.65, ge=0.3, le=4.0, description="Height of the cameras above the road."
@@ -61,9 +62,9 @@ class StreetScene(StreetSettings):
         default=1.0, ge=0.0, le=5.0, description="Distance driven between two frames."
     )
     frame_rate_hz: float = Field(
-        default=10.0, gt=0.0, description="Frame rate; affects only the timestamps."
+        default=10.0, ge=1e-3, le=1e6, description="Frame rate; affects only the timestamps."
     )
-    block_m: tuple[float, float] = Field(
+    block_m: tuple[_SideM, _SideM] = Field(
         default=(100.0, 70.0), description="Side lengths of the block for path = block."
     )
     repeat_m: float | None = Field(
@@ -122,8 +123,6 @@ class StreetScene(StreetSettings):
 
     @model_validator(mode="after")
     def _check_shape(self) -> Self:
-        if min(self.block_m) < _LEAST_SIDE_M or max(self.block_m) > 2000.0:
-            raise ValueError(f"block_m: each side must be {_LEAST_SIDE_M:g} to 2000 m")
         if self.repeat_m is not None and self.path != "straight":
             raise ValueError("repeat_m: only a straight street can repeat itself")
         return self

@@ -25,9 +25,6 @@ def refused(path: Path | None, overrides: list[str], *words: str) -> None:
 @pytest.mark.parametrize("number", sorted(set(NUMBERS) - {"minus 1e300", "null"}))
 @pytest.mark.parametrize("setting", ["matching.sad.window_px", "source.tolerance_s", "matching"])
 def test_a_hostile_value_of_a_setting_is_refused(setting: str, number: str) -> None:
-    valid = {"1e300", "1e400", "1e-300", "400 digits", "inf", "sexagesimal"}
-    if setting == "source.tolerance_s" and number in valid:
-        pytest.skip("a valid tolerance")
     refused(None, [f"{setting}={NUMBERS[number]}"])
 
 

@@ -15,7 +15,7 @@ from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32
 from recon.export.mesh.cut import Plane, cut_mesh
-from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
+from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.seams import close_seam, open_edges
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
@@ -32,8 +32,6 @@ SAMPLE_FACES: Final = 2_000_000
 _MOST_AT_ONCE: Final = 4
 _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
 """The four sides of a piece: (axis, 1 for the far side)."""
-_OVERLAP_M: Final = 3.0
-"""Margin around a piece whose points its surface is fitted to as well."""
 _SEAM_M: Final = 0.15
 """Widest gap that is closed where two pieces meet."""
 _BULGE_M: Final = 2.0
@@ -182,7 +180,7 @@ class _Mesher:
 
     def _cut(self, key: PieceKey) -> TriangleMesh:
         """Return the surface of a piece with its margin, cut at the sides of the piece."""
-        wide = self._bounds(key).wider(_OVERLAP_M)
+        wide = self._bounds(key).wider(OVERLAP_M)
         cloud = self.tiles.cloud_in(wide)
         wrong = None
         if self.settings.free_space:

@@ -19,6 +19,9 @@ from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
 from recon.stereo.cloud import open3d_clouds
 
+OVERLAP_M: Final = 3.0
+"""Margin around a tile whose points its surface is fitted to as well. A tile is at least as wide as
+both margins together: in narrower ones every point would be meshed more than four times."""
 _MIN_POINTS = 50
 MIN_DEPTH = 4
 _FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of their median
@@ -48,7 +51,7 @@ class MeshSettings(Settings):
     )
     cell_spacings: float = Field(
         default=1.5,
-        gt=0,
+        ge=0.1,
         le=20,
         description="Widest octree cell, in point spacings; noise in smaller ones becomes ripples. "
         "Raise it for a smoother surface.",
@@ -62,6 +65,7 @@ class MeshSettings(Settings):
     point_weight: float = Field(
         default=4.0,
         ge=0,
+        le=1000.0,
         description="Weight of the points against their normals. Lower is smoother.",
     )
     trim_density_quantile: float = Field(
@@ -72,24 +76,28 @@ class MeshSettings(Settings):
     )
     max_distance_spacings: float | None = Field(
         default=2.0,
-        gt=0,
+        ge=0.01,
+        le=1e6,
         description="Farthest a vertex may lie from the points, in local point spacings; "
         "none = keep all. Lower it to keep holes open.",
     )
     min_component_faces: int = Field(
         default=100,
         ge=1,
+        le=1_000_000_000,
         description="Connected pieces with fewer faces are dropped. Raise it against crumbs.",
     )
     target_faces: int | None = Field(
         default=None,
         ge=4,
+        le=1_000_000_000,
         description="Simplify to about so many faces; none = do not. For viewers and other "
         "programs with a limit.",
     )
     tile_m: float = Field(
         default=50.0,
-        gt=0,
+        ge=2 * OVERLAP_M,
+        le=10_000.0,
         description="Edge of the tiles in which the map of a drive is meshed. Smaller ones take "
         "less memory.",
     )

@@ -30,7 +30,7 @@ class FusionSettings(Settings):
 
     voxel_m: float = Field(
         0.1,
-        gt=0.0,
+        ge=0.001,
         le=10.0,
         description="Edge of a voxel. Half of it takes about four times the memory; scale it with "
         "the scene.",
@@ -44,7 +44,7 @@ class FusionSettings(Settings):
     )
     max_depth_error_m: float | None = Field(
         0.25,
-        gt=0.0,
+        ge=1e-6,
         le=100.0,
         description="Points are fused up to the depth at which a matching error of 0.3 px makes "
         "this error; none = all. Raise it to map farther and less precisely.",

@@ -34,14 +34,14 @@ class GridSettings(Settings):
     )
     max_height_m: float = Field(
         2.0,
-        gt=0.0,
+        ge=0.01,
         le=100.0,
         description="Upper end of the band: what is higher is passed under. The height of the "
         "vehicle.",
     )
     free_height_m: float = Field(
         0.8,
-        gt=0.0,
+        ge=0.01,
         le=100.0,
         description="Free voxels below this height make a cell free; higher ones may be seen "
         "over an obstacle that hides what is behind it. About half the height of the camera.",
@@ -62,6 +62,7 @@ class GridSettings(Settings):
     min_blob_cells: int = Field(
         3,
         ge=1,
+        le=100_000_000,
         description="Connected blocked cells fewer than this are taken for noise. 1 keeps thin "
         "posts.",
     )

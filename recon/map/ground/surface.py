@@ -50,14 +50,14 @@ class GroundSettings(Settings):
 
     reach_m: float = Field(
         25.0,
-        gt=0.0,
+        ge=0.1,
         le=500.0,
         description="How far from the path the surface grows, and with it the grid. Raise it with "
         "occupancy.max_range_m.",
     )
     camera_height_m: float | None = Field(
         None,
-        gt=0.0,
+        ge=0.01,
         le=100.0,
         description="Height of the camera above ground; none = measured. Set it where the ground "
         "near the path is not seen.",

@@ -50,14 +50,14 @@ class OccupancySettings(Settings):
 
     resolution_m: float = Field(
         0.2,
-        gt=0.0,
+        ge=0.001,
         le=10.0,
         description="Edge of a voxel, and of a cell of the grid. Half of it takes about six times "
         "the memory.",
     )
     max_range_m: float = Field(
         25.0,
-        gt=0.0,
+        ge=0.1,
         le=1000.0,
         description="Points farther away hit nothing. Less for short baselines, more for long "
         "ones.",

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import Field
 
 from recon.core.settings import Settings
 from recon.stereo.settings import StereoSettings
+
+Metres = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class AuditSettings(Settings):
@@ -19,10 +23,11 @@ class AuditSettings(Settings):
     frames: int = Field(
         default=300,
         ge=2,
+        le=1_000_000,
         description="Frames to read in all; on longer drives, in several runs. More finds what is "
         "rare.",
     )
-    baseline_m: tuple[float, float] = Field(
+    baseline_m: tuple[Metres, Metres] = Field(
         default=(0.01, 2.0),
         description="Smallest and largest plausible baseline, in metres. Widen it for an unusual "
         "rig.",

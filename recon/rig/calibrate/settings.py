@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -28,15 +28,17 @@ class CalibrationSettings(Settings):
     bootstrap: int = Field(
         default=500,
         ge=50,
+        le=100_000,
         description="Number of bootstrap resamples, of which the intervals come. Fewer are faster.",
     )
-    depths_m: tuple[float, ...] = Field(
+    depths_m: tuple[Annotated[float, Field(ge=1e-3, le=1e6)], ...] = Field(
         default=(2.0, 5.0, 10.0, 20.0),
         description="Depths at which the depth error is predicted, in metres.",
     )
     working_m: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-3,
+        le=1e6,
         description="Distance for which the verdict is made, in metres; none = where the expected "
         "error of matching is 2 % of the distance.",
     )

@@ -26,17 +26,22 @@ class CloudSettings(Settings):
         "to see what the matcher found.",
     )
     min_range_m: float = Field(
-        default=0.1, ge=0, description="Nearest depth kept. Set it to hide a bonnet or gripper."
+        default=0.1,
+        ge=0,
+        le=1e6,
+        description="Nearest depth kept. Set it to hide a bonnet or gripper.",
     )
     max_range_m: float | None = Field(
         default=30.0,
-        gt=0,
+        ge=1e-6,
+        le=1e6,
         description="Farthest depth kept; none = no limit. The error of a depth grows with its "
         "square.",
     )
     max_relative_sigma: float | None = Field(
         default=0.1,
-        gt=0,
+        ge=1e-6,
+        le=1e6,
         description="Largest standard deviation of a depth kept, as a share of it; none = no "
         "limit. Smaller for fewer, more certain points.",
     )

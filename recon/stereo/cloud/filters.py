@@ -26,20 +26,22 @@ class FilterSettings(Settings):
 
     voxel_m: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-6,
+        le=1e6,
         description="Edge of the voxels that points are averaged in. Set it for fewer points.",
     )
     statistical_neighbours: int | None = Field(
         default=None,
         ge=1,
-        le=1000,
+        le=100,
         description="Neighbours of the statistical outlier filter, which drops points that are "
         "farther from them than most. Several times as slow as the others; for one pair, or a "
         "map with noise in the air.",
     )
     radius_m: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-6,
+        le=1e6,
         description="Points with fewer than two others within this radius are dropped. About "
         "three voxels; larger drops larger islands.",
     )

@@ -77,12 +77,11 @@ def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
     Returns:
         bool (N,), True = keep.
     """
-    if len(xyz) == 0:
-        return np.ones(0, dtype=bool)
-    with _quiet():
-        # Open3D counts the point itself, but requires more neighbours than the given number.
-        _, index = _legacy(xyz).remove_radius_outlier(neighbours, radius_m)
-    return _mask(index, len(xyz))
+    if len(xyz) <= neighbours:
+        return np.zeros(len(xyz), dtype=bool)
+    # Open3D's own filter finds all points within the radius: of a wide one it never ends.
+    _, distances_m = nearest(xyz, xyz, neighbours + 1)  # the first is the point itself
+    return np.asarray(distances_m[:, -1] < radius_m)
 
 
 def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:

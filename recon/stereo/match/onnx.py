@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import cv2
 import numpy as np
@@ -34,23 +34,32 @@ class OnnxSettings(Settings):
     width_px: int | None = Field(
         default=None,
         ge=1,
+        le=10_000,
         description="Width at which the network matches; images are resized. none = its own, or "
         "that of the images, widened to a multiple of 32. Smaller is faster.",
     )
     height_px: int | None = Field(
-        default=None, ge=1, description="Height at which it matches; with width_px or not at all."
+        default=None,
+        ge=1,
+        le=10_000,
+        description="Height at which it matches; with width_px or not at all.",
     )
-    mean: tuple[float, ...] = Field(
+    mean: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
         default=(0.0,), description="Taken from grey levels in [0, 1]; one number, or per channel."
     )
-    std: tuple[float, ...] = Field(
+    std: tuple[Annotated[float, Field(ge=1e-6, le=1e6)], ...] = Field(
         default=(1.0,),
         description="Divides what is left; one number, or per channel. 1/255 makes "
         "levels in [0, 255].",
     )
-    output: int = Field(default=-1, description="Which output is the disparity; -1 = the last.")
+    output: int = Field(
+        default=-1, ge=-1000, le=1000, description="Which output is the disparity; -1 = the last."
+    )
     output_scale: float = Field(
-        default=1.0, description="Pixels per unit of the output; -1 where it is a flow to the left."
+        default=1.0,
+        ge=-1e6,
+        le=1e6,
+        description="Pixels per unit of the output; -1 where it is a flow to the left.",
     )
 
     @model_validator(mode="after")
@@ -59,8 +68,6 @@ class OnnxSettings(Settings):
             raise ValueError("width_px and height_px are given together or not at all")
         if any(len(numbers) not in {1, 3} for numbers in (self.mean, self.std)):
             raise ValueError("mean and std have one number, or one for each of three channels")
-        if not all(number > 0 for number in self.std):
-            raise ValueError("std must be above 0")
         return self
 
 

@@ -106,6 +106,7 @@ class MeasuredSettings(SearchSettings):
     speckle_size_px: int = Field(
         default=50,
         ge=0,
+        le=100_000_000,
         description="Regions of fewer pixels are removed; 0 = keep all. Grows with the square of "
         "the image width.",
     )

@@ -68,7 +68,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, list[T
 
 def overlap_less(patch: pytest.MonkeyPatch) -> None:
     """Let tiles overlap in the proportion of the pieces of 8 m, which are small."""
-    patch.setattr("recon.export.mesh.pieces._OVERLAP_M", 1.5)
+    patch.setattr("recon.export.mesh.pieces.OVERLAP_M", 1.5)
 
 
 def filled() -> Tiles:
