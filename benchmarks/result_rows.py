@@ -109,6 +109,19 @@ def middlebury(found: Found) -> Rows:
     return rows
 
 
+def confidence(found: Found) -> Rows:
+    return {
+        f"{folder}, `{name}`": {
+            "calibration error": one["weighted"]["confidence"]["ece"],
+            "AUSE": one["weighted"]["confidence"]["ause"],
+            "within one sigma": 100 * one["weighted"]["confidence"]["within_1_sigma"],
+            "within two": 100 * one["weighted"]["confidence"]["within_2_sigma"],
+        }
+        for folder, scenes in found.items()
+        for name, one in scenes["matchers"].items()
+    }
+
+
 def loops(found: Found) -> Rows:
     rows: Rows = {}
     for block, both in found.items():

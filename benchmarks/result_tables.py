@@ -162,6 +162,16 @@ TABLES: Final[dict[str, Table]] = {
         {"bad 1": "{:.1f} %", "bad 2": "{:.1f} %", "bad 4": "{:.1f} %", "mean error": "{:.1f} px"},
         rows_of.middlebury,
     ),
+    "confidence": Table(
+        {
+            folder: f"recon evaluate middlebury $RECON_DATA/middlebury/{folder} --matcher sad,sgm "
+            f"--json --out $OUT/{Path(folder).name}"
+            for folder in ("MiddEval3/trainingQ", "2003", "2005", "2006")
+        },
+        {"calibration error": SHARE, "AUSE": SHARE}
+        | {"within one sigma": "{:.0f} %", "within two": "{:.0f} %"},
+        rows_of.confidence,
+    ),
     "movers": Table(
         {
             "seed 4": "python benchmarks/movers.py --seed 4",

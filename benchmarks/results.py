@@ -210,12 +210,14 @@ def lines(name: str, record: Record | None) -> Iterator[str]:
         cells = (columns[c].format(row[c]) if c in row else "" for c in columns)
         yield f"| {label} | {' | '.join(cells)} |"
     machine = record["machine"]
-    where = (
-        f"commit {record['commit']}, {record['date']}, {machine['cpu']}, {machine['cores']} cores"
+    where = [f"commit {record['commit']}", record["date"], machine["cpu"]]
+    where += [f"{machine['cores']} cores"]
+    where += (
+        [f"load {record['load']:g} at the start"] if record["timed"] and "load" in record else []
     )
-    busy = f", load {record['load']:g} at the start" if record["timed"] else ""
+    where += [record["note"]] if "note" in record else []
     yield ""
-    yield f"<sub>{how}: {where}{busy}</sub>"
+    yield f"<sub>{how}: {', '.join(where)}</sub>"
 
 
 if __name__ == "__main__":

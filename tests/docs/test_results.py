@@ -1,0 +1,142 @@
+"""The tables of README and docs/results.md, and `make results`, which makes them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tests.docs.blocks import ROOT
+
+RECORD = {
+    "commands": ["recon doctor"],
+    "commit": "0123abc",
+    "date": "2026-01-02",
+    "machine": {"cpu": "a processor", "cores": 2},
+    "load": 3.5,
+    "timed": True,
+    "columns": {"t_rel": "{:.2f} %", "not trusted": "{}"},
+    "rows": {"one": {"t_rel": 0.2, "not trusted": 3}, "other": {"t_rel": 0.3}},
+}
+
+
+@pytest.fixture
+def results(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return importlib.import_module("results")
+
+
+@pytest.fixture
+def elsewhere(results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A page and the file of results in a folder of their own."""
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- table: movers -->\nold\n<!-- end -->\nafter\n")
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    monkeypatch.setattr(results, "FILE", tmp_path / "results.json")
+    monkeypatch.setattr(results, "PAGES", (page,))
+    monkeypatch.setattr(results, "measured", lambda name: RECORD)
+    return page
+
+
+def test_the_tables_of_the_pages_are_those_that_were_measured(results: ModuleType) -> None:
+    assert results.outdated() == []
+
+
+def test_every_place_for_a_table_names_one_and_every_table_has_a_place(results: ModuleType) -> None:
+    places = [
+        place[2] for page in results.PAGES for place in results.PLACE.finditer(page.read_text())
+    ]
+    begun = [
+        name
+        for page in results.PAGES
+        for name in re.findall("<!-- table: (.*) -->", page.read_text())
+    ]
+
+    assert sorted(places) == sorted(begun) == sorted(results.TABLES)
+
+
+def test_no_page_of_results_has_a_table_of_figures_that_was_typed(results: ModuleType) -> None:
+    """Figures stand behind the first column: `| 12.3 % |`."""
+    for page in results.PAGES:
+        typed = results.PLACE.sub("", page.read_text())
+        assert re.findall(r"^\|[^|\n]*\|.*?\d[.\d]* (?:%|m|ms|MB)\b.*$", typed, re.MULTILINE) == []
+
+
+def test_what_was_measured_says_of_which_commit_and_machine_it_is(results: ModuleType) -> None:
+    for name, record in results.read().items():
+        assert re.fullmatch(r"[0-9a-f]{7,}", record["commit"]), name
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"]), name
+        assert record["commands"], name
+        assert record["machine"]["cpu"], name
+        assert record["machine"]["cores"], name
+        assert "kiss-icp" in record["machine"] or "states" in record["note"], name
+
+
+def test_a_table_says_of_which_commit_and_machine_it_is(
+    results: ModuleType, elsewhere: Path
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        results.main(["--only", "movers"])
+
+    origin = "commit 0123abc, 2026-01-02, a processor, 2 cores, load 3.5 at the start"
+    assert end.value.code == 0
+    assert elsewhere.read_text().splitlines() == [
+        "before",
+        "<!-- table: movers -->",
+        "| | t_rel | not trusted |",
+        "|---|---|---|",
+        "| one | 0.20 % | 3 |",
+        "| other | 0.30 % |  |",
+        "",
+        f"<sub>`make results ONLY=movers`: {origin}</sub>",
+        "<!-- end -->",
+        "after",
+    ]
+    elsewhere.write_text(elsewhere.read_text().replace("0.20", "0.19"))
+    assert results.outdated() == ["page.md"]
+
+
+def test_what_is_not_measured_again_stays(results: ModuleType, elsewhere: Path) -> None:
+    earlier = {"movers": {**RECORD, "commit": "fedcba9"}}
+    results.FILE.write_text(json.dumps(earlier))
+    with pytest.raises(SystemExit):
+        results.main(["--only", "occupancy"])
+
+    assert json.loads(results.FILE.read_text()) == {**earlier, "occupancy": RECORD}
+
+
+def test_a_table_without_its_data_is_skipped_and_says_why(
+    results: ModuleType,
+    elsewhere: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.delenv("RECON_DATA", raising=False)
+    with pytest.raises(SystemExit) as end:
+        results.main(["--only", "kitti-d", "middlebury"])
+
+    assert end.value.code == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "kitti-drift: skipped, RECON_DATA is not set",
+        "middlebury: skipped, RECON_DATA is not set",
+    ]
+    assert not results.FILE.exists()
+
+
+def test_a_table_that_fails_keeps_what_it_has(
+    results: ModuleType, elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(name: str) -> None:
+        raise LookupError(name)
+
+    results.FILE.write_text(json.dumps({"movers": RECORD}))
+    monkeypatch.setattr(results, "measured", fail)
+    with pytest.raises(SystemExit) as end:
+        results.main(["--only", "movers"])
+
+    assert end.value.code == 1
+    assert results.read() == {"movers": RECORD}
