@@ -34,11 +34,11 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from distributed import Client, LocalCluster, get_worker
+from distributed import Client, LocalCluster
 
 from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
-from recon.run.batch.cluster import Cluster, local_cluster, topic_of
+from recon.run.batch.cluster import Cluster, local_cluster
 from recon.run.batch.job import Job, Outcome
 from recon.run.machine import available_cores
 from recon.sources.synthetic import SyntheticSource
@@ -267,11 +267,9 @@ def simulated(workers: int, count: int, seconds: float) -> dict[str, Any]:
     }
 
 
-def sleep(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
-    """What a simulated worker does: it says that it begins, as a real one does, and sleeps."""
-    del anew, every_s
-    event = {"event": "job", "name": job.name, "state": "running"}
-    get_worker().log_event(topic_of(folder), event)
+def sleep(job: Job, folder: str) -> Outcome:
+    """What a simulated worker does."""
+    del folder
     time.sleep(float(job.words[0]))
     return Outcome("succeeded")
 

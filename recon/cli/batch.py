@@ -73,28 +73,31 @@ def batch(
     if (resume is None) == (not what):
         raise typer.BadParameter("give JOBS, or COMMAND and SOURCES, or --resume FOLDER")
     with one_line_errors(quiet=quiet):
-        from recon.cli.program import known_program
-        from recon.cli.show.jobs import choose_job_viewer
-        from recon.commands.batch import resume_batch, run_batch
-        from recon.run.batch.job_file import SUFFIXES, jobs_of_sources, read_jobs
-        from recon.run.batch.plan import Limits
-        from recon.run.batch.work import BatchOptions
+        from recon.cli.program import plan_jobs
+        from recon.cli.show.progress import choose_viewer
+        from recon.commands.batch import run_batch
+        from recon.run.batch.cluster import BatchOptions
+        from recon.run.batch.job_file import SUFFIXES, jobs_of_sources, read_jobs, read_plan
 
-        viewer = choose_job_viewer(quiet=quiet, verbose=verbose)
-        options = BatchOptions(out, scheduler, workers, fail_fast, viewer, viewer.on_job)
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        options = BatchOptions(resume or out, scheduler, workers, fail_fast, viewer)
         first, *sources = what or [""]
         if resume is not None:
-            summary = resume_batch(resume, options)
+            listed = read_plan(resume)
         else:
-            listed = Path(first).suffix.lower() in SUFFIXES and not sources
-            place = Path(first).parent if listed else Path()
-            entries = (
-                read_jobs(Path(first), settings=set_ or (), options=option or ())
-                if listed
-                else jobs_of_sources(first, sources, option or (), set_ or ())
+            is_file = Path(first).suffix.lower() in SUFFIXES and not sources
+            asked = read_jobs(Path(first)) if is_file else jobs_of_sources(first, sources)
+            listed = asked.with_limits(
+                set_ or (),
+                option or (),
+                threads=options.threads_of(threads),
+                memory=memory_limit,
+                timeout_s=timeout,
+                retries=retries,
             )
-            limits = Limits(threads, memory_limit, timeout, retries)
-            summary = run_batch(entries, known_program(), limits, options, place)
+        viewer.on_stage("check the jobs")
+        jobs = plan_jobs(listed)
+        summary = run_batch(jobs, options, listed if resume is None else None)
     print_json(summary) if json else print_batch(summary)
     if summary["failed"]:
         raise typer.Exit(1)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from recon.commands.config import ReconConfig
     from recon.commands.map_options import MapOptions, MapRequest
     from recon.map.localize.sequence import StartPose
-    from recon.run.batch.work import BatchOptions
+    from recon.run.batch.cluster import BatchOptions
     from recon.sources.protocol import StereoSource
 
 Start = Annotated[int | None, typer.Option("--start", help="First frame to use.", show_default="0")]
@@ -190,15 +190,13 @@ def open_workers(
     workers: int | None, scheduler: str | None, shared: opt.Shared
 ) -> BatchOptions | None:
     """Return where work is shared by several processes, shown on standard error; None = nowhere."""
-    from recon.cli.show.jobs import choose_job_viewer
-    from recon.run.batch.work import BatchOptions
+    from recon.run.batch.cluster import BatchOptions
 
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("--scheduler has workers of its own; drop --workers")
     if scheduler is None and (workers or 1) == 1:
         return None
-    viewer = choose_job_viewer(quiet=shared.quiet, verbose=shared.verbose)
-    return BatchOptions(None, scheduler, workers, progress=viewer, tell=viewer.on_job)
+    return BatchOptions(None, scheduler, workers, progress=shared.viewer())
 
 
 def read_start(text: str | None) -> tuple[StartPose | None, int | None]:

@@ -24,8 +24,7 @@ from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.spread import place_map_on
-from recon.run.batch.cluster import connect
-from recon.run.batch.work import BatchOptions
+from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     PAIR_CLOUD,
     camera_of_pair,
@@ -93,7 +92,7 @@ def run_export(
         if workers is None:
             what = Wanted(wanted, settings.mesh, formats, survey=survey)
             return remake_map(mapped, settings, what, run)
-        with connect(workers.scheduler, workers.workers_here) as cluster:
+        with workers.connect() as cluster:
             folder = run.state("tiles").resolve()
             place = partial(place_map_on, folder=folder, each=cluster.each, workers=cluster.at_once)
             what = Wanted(wanted, settings.mesh, formats, place, survey)

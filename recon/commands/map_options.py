@@ -14,7 +14,7 @@ from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
 from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
-from recon.run.batch.work import BatchOptions
+from recon.run.batch.cluster import BatchOptions
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 from recon.sources.prior import read_prior

@@ -18,10 +18,8 @@ from recon.map.drive.pieces import Piece, cut_drive, join_pieces, joined_drive
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
 from recon.map.store.map import Map
-from recon.run.batch.cluster import Cluster, connect
-from recon.run.batch.figures import result_of
-from recon.run.batch.plan import Limits
-from recon.run.batch.work import BatchOptions, JobStep
+from recon.run.batch.cluster import BatchOptions, Cluster
+from recon.run.batch.results import JobResult, work_off
 from recon.run.run import Run
 from recon.sources.protocol import StereoSource
 
@@ -54,10 +52,13 @@ def map_in_pieces(
         raise SettingsError("the run was begun in one piece", hint="resume it without --workers")
     _refuse_what_does_not_combine(config, options)
     if not len(map_.session()):
-        limits, began = spread.share_cores(Limits(options.threads)), time.perf_counter()
-        with run.stage("pieces"), connect(spread.scheduler, spread.workers_here) as cluster:
+        threads, began = spread.threads_of(options.threads), time.perf_counter()
+        with run.stage("pieces"), spread.connect() as cluster:
             pieces = _planned(plan, source, config, options, cluster)
-            done = _work_off(pieces, plan, cluster, spread, limits)
+            jobs = [piece_job(plan, n, piece, threads) for n, piece in enumerate(pieces)]
+            results = work_off(jobs, _folder(plan), cluster, spread, "pieces")
+            found = {one.job.name: _checked(one) for one in results}
+            done = [asdict(piece) | found[str(n)] for n, piece in enumerate(pieces)]
         with run.stage("join"):
             join_pieces(map_, pieces, _opened(plan, len(pieces)), config)
         map_.session().set_state({"pieces": done, "seconds": time.perf_counter() - began})
@@ -100,36 +101,19 @@ def _planned(
     return pieces
 
 
-def _work_off(
-    pieces: Sequence[Piece], plan: Path, cluster: Cluster, spread: BatchOptions, limits: Limits
-) -> list[dict[str, Any]]:
-    """Map pieces on workers; returns where, and what each took."""
-    progress, results = spread.progress, {}
-    jobs = [piece_job(plan, number, piece, limits) for number, piece in enumerate(pieces)]
-    workers, dashboard = len(cluster.workers), cluster.dashboard
-    spread.tell({"event": "cluster", "workers": workers, "dashboard": dashboard})
-    progress.on_start("pieces", len(jobs), "pieces")
-    try:
-        for one, outcome in cluster.run(jobs, _folder(plan), spread.tell):
-            if outcome.state != "succeeded":
-                kind = RegistrationError if outcome.state == "failed" else ClusterError
-                raise kind(f"frames {one.job.source} cannot be mapped", got=outcome.error)
-            result = result_of(one.job, one.number + 1, outcome, _folder(plan))
-            results[one.job.name] = result
-            progress.on_step(JobStep(result, len(results), len(jobs)))
-    finally:
-        progress.on_finish()
-    found = [results[job.name] for job in jobs]
-    return [
-        {
-            **asdict(piece),
-            "tries": one.tries,
-            "worker": one.worker,
-            "seconds": one.figures["seconds"],
-            "peak_memory_mb": one.figures["peak_memory_mb"],
-        }
-        for piece, one in zip(pieces, found, strict=True)
-    ]
+def _checked(one: JobResult) -> dict[str, Any]:
+    """Return where a piece was mapped, and what it took.
+
+    Raises:
+        RegistrationError: It cannot be mapped.
+        ClusterError: It broke too often.
+    """
+    if one.last is None or not one.ok:
+        failed = one.last is not None and one.last.state == "failed"
+        kind = RegistrationError if failed else ClusterError
+        raise kind(f"frames {one.job.source} cannot be mapped", got=one.error)
+    taken = {name: one.figures[name] for name in ("seconds", "peak_memory_mb")}
+    return {"tries": one.last.tries, "worker": one.last.worker, **taken}
 
 
 def _opened(plan: Path, count: int) -> Iterator[Map]:

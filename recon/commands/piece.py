@@ -20,7 +20,6 @@ from recon.map.drive.workspace import Workspace
 from recon.map.sessions.copying import copy_sessions
 from recon.map.store.map import MAP_FILE, Map
 from recon.run.batch.job import Job
-from recon.run.batch.plan import Limits
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 
@@ -63,14 +62,14 @@ def read_plan(path: Path) -> PiecePlan:
         return PiecePlan(pieces, content["arguments"], content["config"])
 
 
-def piece_job(plan: Path, number: int, piece: Piece, limits: Limits) -> Job:
+def piece_job(plan: Path, number: int, piece: Piece, threads: int | None) -> Job:
     """Return what a worker does for a piece: it runs `run_piece`."""
-    threads = () if limits.threads is None else ("--threads", str(limits.threads))
+    limit = () if threads is None else ("--threads", str(threads))
     return Job(
         name=str(number),
         command="piece",
         source=f"{piece.first} to {piece.last - 1}",
-        words=("piece", str(plan.resolve()), str(number), *threads),
+        words=("piece", str(plan.resolve()), str(number), *limit, "--json", "--verbose"),
         writes=True,
         folder=str(Path.cwd()),
     )

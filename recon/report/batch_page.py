@@ -14,20 +14,17 @@ from recon.io.atomic import write_bytes, write_text
 from recon.report.page import write_page
 from recon.report.style import WIDE_IN, styled, to_png
 from recon.report.table import NOT_KNOWN, Table, csv_text, join
-from recon.run.batch.figures import JobResult, outliers_first
+from recon.run.batch.job import LOGS
+from recon.run.batch.results import JobResult, accuracies, outliers_first
 from recon.run.directory import RunDirectory
 
 #: Columns of the tables for people, where any job has them; the CSV has every figure.
 _COLUMNS: Final = (
-    "frames", "path_length_m", "frames_not_trusted", "trajectory.t_rel_percent", "trajectory.ate_m",
-    "map.f_score", "t_rel_percent", "f_score", "disparity.bad.2.0", "bad.2.0", "valid_percent",
-    "points", "peak_memory_mb",
+    "trajectory.t_rel_percent", "trajectory.ate_m", "map.f_score", "t_rel_percent", "f_score",
+    "disparity.bad.2.0", "bad.2.0", "valid_percent", "frames", "path_length_m",
+    "frames_not_trusted", "points", "peak_memory_mb",
 )  # fmt: skip
-#: What a sweep is judged by: the first that its jobs have.
-_ACCURACY: Final = (
-    "trajectory.t_rel_percent", "map.f_score", "t_rel_percent", "f_score", "disparity.bad.2.0",
-    "bad.2.0", "valid_percent", "points",
-)  # fmt: skip
+_PANEL_IN: Final = 3.2
 
 
 def write_batch_page(
@@ -43,26 +40,22 @@ def write_batch_page(
     Raises:
         OutputError: A file cannot be written.
     """
-    table = batch_table(results)
     write_text(run.path("table.csv"), batch_csv(results))
-    write_text(run.path("table.md"), join([table.markdown()]))
-    sweep = sweep_figure(results) if any(one.job.swept for one in results) else b""
+    write_text(run.path("table.md"), join([batch_table(results).markdown()]))
+    sweep = sweep_figure(results)
     if sweep:
         write_bytes(run.path("sweep.png"), sweep)
-    failed = [f"{one.job.name}: {one.error}" for one in results if one.state == "failed"]
+    first = outliers_first(results)
+    table = batch_table(first)
+    failed = [f"{one.job.name}: {one.error}" for one in first if one.failed]
     write_page(
         "batch",
         run,
         found=summary,
-        head=table.head,
+        head=table.head[1:],
         jobs=[
-            {
-                "name": one.job.name,
-                "page": _page(one, run.folder),
-                "cells": cells[1:],
-                "why": why,
-            }
-            for one, cells, why in _ranked(results)
+            {"name": one.job.name, "page": _page(one, run.folder), "cells": cells[1:]}
+            for one, cells in zip(first, table.rows, strict=True)
         ],
         sweep=sweep,
         warnings=[*failed, *summary["warnings"]],
@@ -72,82 +65,70 @@ def write_batch_page(
 def batch_table(results: Sequence[JobResult]) -> Table:
     """Return the table for people: one row per job, with the figures that its kind has."""
     columns = [name for name in _COLUMNS if any(name in one.figures for one in results)]
-    rows = [
-        (one.job.name, one.state, str(one.tries), f"{one.seconds:.1f}", *_cells(one, columns))
-        for one in results
-    ]
-    return Table("Jobs", ("job", "state", "tries", "seconds", *columns), rows)
+    rows = []
+    for one in results:
+        job, figures = one.facts, (one.figures.get(name) for name in columns)
+        facts = (job["state"], str(job["tries"]), f"{one.seconds:.1f}")
+        rows.append(
+            (one.job.name, one.error or one.remark, *facts,
+             *(NOT_KNOWN if value is None else f"{value:.6g}" for value in figures))
+        )  # fmt: skip
+    return Table("Jobs", ("job", "remark", "state", "tries", "seconds", *columns), rows)
 
 
 def batch_csv(results: Sequence[JobResult]) -> str:
     """Return the table for programs: every swept setting and every figure of every job."""
     swept = list(dict.fromkeys(key for one in results for key in one.job.swept))
     names = list(dict.fromkeys(key for one in results for key in one.figures))
-    head = ["job", "command", "source", "state", "tries", "seconds", "error", *swept, *names]
-    rows = [
-        [
-            one.job.name, one.job.command, one.job.source, one.state, one.tries, one.seconds,
-            one.error, *(one.job.swept.get(key, "") for key in swept),
-            *(one.figures.get(key, "") for key in names),
-        ]
-        for one in results
-    ]  # fmt: skip
-    return csv_text([head, *rows])
+    facts = ("name", "command", "source", "state", "tries", "seconds", "error")
+    rows = []
+    for one in results:
+        job = one.facts
+        rows.append(
+            [*(job.get(key, "") for key in facts), *(one.job.swept.get(key, "") for key in swept),
+             *(one.figures.get(key, "") for key in names)]
+        )  # fmt: skip
+    return csv_text([["job", *facts[1:], *swept, *names], *rows])
 
 
 @styled
 def sweep_figure(results: Sequence[JobResult]) -> bytes:
     """Draw accuracy and time over each swept setting: a point per job, a line through the medians.
 
-    Empty if no job succeeded.
+    Jobs of each command have panels of their own. Empty if no job of a sweep succeeded.
     """
     done = [one for one in results if one.figures and one.job.swept]
-    settings = list(dict.fromkeys(key for one in done for key in one.job.swept))
-    accuracy = next((name for name in _ACCURACY if any(name in one.figures for one in done)), None)
-    if not settings:
+    rows = list(dict.fromkeys((one.job.command, key) for one in done for key in one.job.swept))
+    if not rows:
         return b""
-    shown = [name for name in (accuracy, "seconds") if name is not None]
-    figure = Figure((WIDE_IN, 3.2 * len(settings)))
-    panels = figure.subplots(len(settings), len(shown), squeeze=False)
-    for row, setting in zip(panels, settings, strict=True):
-        for axes, name in zip(row, shown, strict=True):
-            _draw(axes, done, setting, name)
+    figure = Figure((WIDE_IN, _PANEL_IN * len(rows)))
+    panels = figure.subplots(len(rows), 2, squeeze=False)
+    for (command, setting), (left, right) in zip(rows, panels, strict=True):
+        jobs = [one for one in done if one.job.command == command]
+        for name in accuracies(one.figures for one in jobs)[:1]:
+            _draw(left, jobs, setting, name)
+        _draw(right, jobs, setting, "seconds")
     return to_png(figure)
 
 
-def _draw(axes: Axes, done: Sequence[JobResult], setting: str, name: str) -> None:
-    values = list(dict.fromkeys(one.job.swept[setting] for one in done if setting in one.job.swept))
-    found = [
-        [
-            one.figures[name] for one in done
-            if one.job.swept.get(setting) == value and name in one.figures
-        ]
-        for value in values
-    ]  # fmt: skip
-    for place, figures in enumerate(found):
+def _draw(axes: Axes, jobs: Sequence[JobResult], setting: str, name: str) -> None:
+    """Draw a figure of jobs of one command over a setting."""
+    found: dict[str, list[float]] = {str(one.job.swept[setting]): [] for one in jobs}
+    for one in jobs:
+        if name in one.figures:
+            found[str(one.job.swept[setting])].append(one.figures[name])
+    for place, figures in enumerate(found.values()):
         axes.plot([place] * len(figures), figures, "o", color="C0", markersize=4, alpha=0.5)
-    medians = [float(np.median(figures)) if figures else np.nan for figures in found]
-    axes.plot(range(len(values)), medians, "-", color="C1", label="median")
-    axes.set_xticks(range(len(values)), [str(value) for value in values])
-    axes.set(xlabel=setting, ylabel=name)
+    medians = [float(np.median(figures)) if figures else np.nan for figures in found.values()]
+    axes.plot(range(len(found)), medians, "-", color="C1", label="median")
+    axes.set_xticks(range(len(found)), list(found))
+    axes.set(xlabel=setting, ylabel=name, title=jobs[0].job.command)
     axes.legend()
 
 
 def _page(one: JobResult, folder: Path) -> str:
-    """Return the page to look at in the folder of a job; "" = it has no result."""
-    if one.state != "succeeded":
-        return ""
-    return "report.html" if (folder / one.job.name / "report.html").is_file() else "summary.json"
-
-
-def _ranked(results: Sequence[JobResult]) -> list[tuple[JobResult, Sequence[str], str]]:
-    rows = dict(zip((one.job.name for one in results), batch_table(results).rows, strict=True))
-    return [(one, rows[one.job.name], one.error or one.remark) for one in outliers_first(results)]
-
-
-def _cells(one: JobResult, columns: Sequence[str]) -> list[str]:
-    figures = (one.figures.get(name) for name in columns)
-    return [
-        NOT_KNOWN if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-        for value in figures
-    ]
+    """Return what to look at of a job: its report, else its figures; its log if it failed."""
+    if not one.ok:
+        return f"{LOGS}/{one.job.name}.log" if one.failed else ""
+    there = (folder / one.job.name / "report.html").is_file()
+    return f"{one.job.name}/{'report.html' if there else 'summary.json'}"

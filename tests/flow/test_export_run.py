@@ -19,8 +19,7 @@ from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.trajectory import read_tum
-from recon.run.batch.cluster import Cluster
-from recon.run.batch.work import BatchOptions
+from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.sources.pair_input import PairInput
 from tests.hostile.refusals import assert_refused, run
 
@@ -64,7 +63,7 @@ def test_products_whose_tiles_workers_make_are_the_same_files(
         distributed.Client(local) as client,
     ):
         there = contextlib.nullcontext(Cluster(client))
-        monkeypatch.setattr("recon.commands.export.connect", lambda scheduler, workers: there)
+        monkeypatch.setattr(BatchOptions, "connect", lambda options: there)
         products, out = ["grid", "octomap"], tmp_path / "out"
         run_export(small_demo, products=products, out=out, workers=BatchOptions(workers=2))
     for name in ("map/grid.pgm", "map/grid.yaml", "map/octomap.bt", "map/octomap.ot"):

@@ -152,11 +152,8 @@ def test_a_batch_that_leads_elsewhere_is_not_resumed(here: Path) -> None:
     (here / "outside").mkdir()
     (here / "batch").mkdir()
     (here / "batch" / "job").symlink_to(here / "outside")
-    job = {
-        "name": "job", "command": "demo", "source": "", "words": ["demo"], "writes": True,
-        "folder": str(here),
-    }  # fmt: skip
-    (here / "batch" / "jobs.json").write_text(json.dumps([job]))
+    plan = {"folder": str(here), "job": [{"name": "job", "command": "demo"}]}
+    (here / "batch" / "jobs.json").write_text(json.dumps(plan))
     assert_refused(run("batch", "--resume", "batch"), "batch/job", "link")
     assert list((here / "outside").iterdir()) == []
 

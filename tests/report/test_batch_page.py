@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,23 +12,25 @@ import pytest
 from PIL import Image
 
 from recon.report.batch_page import write_batch_page
-from recon.run.batch.figures import JobResult, compare
+from recon.run.batch.job import Outcome
+from recon.run.batch.results import JobResult, compare
 from recon.run.directory import RunDirectory
 from tests.run.batch.jobs import job
+
+DONE = Outcome("succeeded", seconds=10.0, worker="host", tries=1)
 
 
 def results() -> list[JobResult]:
     def one(n: int, w: int) -> JobResult:
         drift = 0.5 + 0.01 * n + 0.1 * w
         figures = {"frames": 40, "trajectory.t_rel_percent": drift, "seconds": 10.0 + w}
-        swept = job(f"drive{n}_w={w}", swept={"window": w})
-        return JobResult(swept, "succeeded", 1, "", 10.0, "host", figures)
+        return JobResult(job(f"drive{n}_w={w}", swept={"window": w}), DONE, figures)
 
     done = [one(n, w) for n in range(5) for w in (9, 11)]
     odd = {"frames": 40, "trajectory.t_rel_percent": 99.0, "seconds": 10.0}
-    done[6] = JobResult(**{**vars(done[6]), "figures": odd})
-    failed = JobResult(job("bad"), "failed", 3, "<b>no images</b>", 1.0, "host")
-    return compare([*done, failed, JobResult(job("later"), "not run", 0, "", 0.0, "")])
+    done[6] = replace(done[6], figures=odd)
+    failed = JobResult(job("bad"), Outcome("failed", "<b>no images</b>", 1.0, tries=3))
+    return compare([*done, failed, JobResult(job("later"), None)])
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +54,7 @@ def test_the_report_shows_outliers_first_and_links_to_the_runs(folder: Path) -> 
     assert names[:2] == ["bad", "drive3_w=9"]
     assert 'href="drive3_w%3D9/report.html"' in page
     assert 'href="drive4_w%3D9/summary.json"' in page
-    assert 'href="bad' not in page
+    assert 'href="logs/bad.log"' in page
     assert 'href="later' not in page
     assert "trajectory.t_rel_percent 99 (usually" in page
     assert "&lt;b&gt;no images" in page

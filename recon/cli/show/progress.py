@@ -16,6 +16,8 @@ from recon.run.progress import Silent, Step
 
 # Weight of the newest item in the displayed rate: steady enough to read, yet responsive.
 _RATE_WEIGHT: Final = 0.2
+_SLOW_S: Final = 10.0
+"""From which on an item has seconds, instead of a second items."""
 
 
 def choose_viewer(
@@ -97,7 +99,8 @@ class ProgressBar:
         if self._progress is None:
             return
         self._bad += not step.ok
-        bad = f"{self._bad} not trusted" if self._bad else ""
+        word = "failed" if self._unit in ("jobs", "pieces") else "not trusted"
+        bad = f"{self._bad} {word}" if self._bad else ""
         task = self._progress.task_ids[0]
         self._progress.update(task, advance=1, rate=self._rate(step), state=step.state, bad=bad)
 
@@ -115,4 +118,6 @@ class ProgressBar:
         if math.isnan(self._seconds):
             self._seconds = step.seconds
         self._seconds += _RATE_WEIGHT * (step.seconds - self._seconds)
+        if self._seconds >= _SLOW_S:
+            return f"{self._seconds:.0f} s each"
         return f"{1.0 / self._seconds:.1f} {self._unit}/s" if self._seconds > 0 else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 from rich.console import Console
@@ -15,6 +15,10 @@ from rich.text import Text
 if TYPE_CHECKING:
     from recon.commands.doctor import Check
     from recon.commands.settings import SettingEntry, SettingGroup
+
+
+_MOST_JOBS: Final = 200
+"""More lines of a batch than these nobody reads."""
 
 
 def print_json(content: Mapping[str, Any]) -> None:
@@ -72,13 +76,20 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
 
 def print_batch(summary: Mapping[str, Any]) -> None:
     """Print one line per job, an error for each that failed, and the folder of the batch."""
-    table = Table(show_edge=False, pad_edge=False)
-    for title in ("job", "state", "tries", "seconds", "what is unusual"):
-        table.add_column(title)
-    for job in summary["jobs"]:
+    from recon.run.batch.results import accuracies
+
+    table, jobs = Table(show_edge=False, pad_edge=False), summary["jobs"][:_MOST_JOBS]
+    judged = accuracies(job["figures"] for job in jobs)
+    for title in ("job", "state", "tries", "seconds", *judged, "what is unusual"):
+        table.add_column(title.replace("_", " ").rpartition(".")[2])
+    for job in jobs:
         cells = (job["name"], job["state"], str(job["tries"]), f"{job['seconds']:.1f}")
-        table.add_row(*map(Text, (*cells, job.get("remark", ""))))
+        figures = (job["figures"].get(name) for name in judged)
+        found = ("" if value is None else f"{value:.4g}" for value in figures)
+        table.add_row(*map(Text, (*cells, *found, job.get("remark", ""))))
     Console().print(table)
+    if more := len(summary["jobs"]) - len(jobs):
+        typer.echo(f"and {more} more, in table.csv")
     for job in summary["jobs"]:
         if job["state"] == "failed":
             typer.echo(f"error: {job['name']}: {job['error']}", err=True)

@@ -1,7 +1,7 @@
 """Many commands as jobs, on this machine or on a cluster.
 
-- `job_file.py`: what the user asks for; `plan.py`: the jobs that come of it, all checked first;
-- `work.py`: jobs go to workers and come back; `cluster.py`: the workers, by Dask;
+- `job_file.py`: what the user asks for; `recon.cli.program` makes checked jobs of it;
+- `job.py`: a job, how it ended, and its log;
 - `process.py`: one try of a job on its worker, in a process of its own (`guard.py`);
-- `job.py`: a job and how it ended; `figures.py`: the figures of all jobs.
+- `cluster.py`: the workers, by Dask; `results.py`: what comes back, and what is unusual in it.
 """

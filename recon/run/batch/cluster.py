@@ -2,58 +2,74 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import logging
-import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from itertools import groupby, islice
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any, Final
 from uuid import uuid4
 
 from recon.core.errors import ClusterError, ReconError, SettingsError
 from recon.core.optional import require
-from recon.run.batch.job import Job, Outcome
-from recon.run.batch.process import Tell, run_job
+from recon.run.batch.job import Job, Outcome, last_outcome
+from recon.run.batch.process import run_job
+from recon.run.machine import available_cores
+from recon.run.progress import SILENT, Progress
 
 EXTRA: Final = "cluster"
 _REACH_S: Final = 20.0
 _WORKERS_S: Final = 120.0
-_LOOK_S: Final = 30.0
+_AT_ONCE: Final = 10_000
+"""Jobs that Dask has at a time: more than any cluster runs, few enough to begin at once."""
 _KEY: Final = "recon-job"
 """Dask keeps a list of the kinds of tasks, told by their keys, and looks through it at every step:
 jobs are all of one kind."""
+_LOCAL: Final = {
+    # A worker is not given a second job to wait behind its first.
+    "distributed.scheduler.worker-saturation": 1.0,
+    # Workers that die are started again, however long that takes.
+    "distributed.deploy.lost-worker-timeout": "1 day",
+    "distributed.scheduler.no-workers-timeout": _WORKERS_S,
+}
 
-
-Work = Callable[[Job, str, bool, float], Outcome]
-"""Runs a job in the folder of its batch, perhaps anew, and tells how far it is every so often."""
+_Try = tuple[Job, int]
+Work = Callable[[Job, str], Outcome]
+"""Runs a job in the folder of its batch."""
 
 
 @dataclass(frozen=True)
-class Try:
-    """One try of a job.
+class BatchOptions:
+    """How jobs are run.
 
     Attributes:
-        job: The job.
-        number: Its number, from 0.
-        anew: Whether what an earlier try left is not used.
-        only: Addresses of the workers that may run it; none = all.
+        out: Folder of the batch; None = a new one below ``outputs/``.
+        scheduler: Address of Dask's scheduler; None = workers on this machine.
+        workers: How many of these; None = one per core.
+        fail_fast: Whether the first job that fails ends the batch.
+        progress: Shown each job that ends.
     """
 
-    job: Job
-    number: int = 0
-    anew: bool = False
-    only: frozenset[str] = frozenset()
+    out: Path | None = None
+    scheduler: str | None = None
+    workers: int | None = None
+    fail_fast: bool = False
+    progress: Progress = SILENT
 
+    def connect(self) -> AbstractContextManager[Cluster]:
+        """Return the workers, for ``with``; see `local_cluster` and `join_cluster`."""
+        if self.scheduler is not None:
+            return join_cluster(self.scheduler)
+        return local_cluster(self.workers or available_cores())
 
-@dataclass(frozen=True)
-class _Running:
-    """A try that has not ended, and Dask's future of it."""
-
-    one: Try
-    future: Any
+    def threads_of(self, threads: int | None) -> int | None:
+        """Return the threads of a job, by default a share of the cores of this machine."""
+        if threads is not None or self.scheduler is not None:
+            return threads
+        return max(1, available_cores() // (self.workers or available_cores()))
 
 
 class Cluster:
@@ -62,14 +78,10 @@ class Cluster:
     Args:
         client: Dask's client of it.
         work: What a worker does for a job; None = what the job says.
-        restart: Starts workers again that have died; None = others do that.
     """
 
-    def __init__(
-        self, client: Any, work: Work | None = None, restart: Callable[[], None] | None = None
-    ) -> None:
-        self._client, self._work, self._restart = client, work or _work, restart
-        self._alive_s = time.monotonic()
+    def __init__(self, client: Any, work: Work | None = None) -> None:
+        self._client, self._work = client, work or _work
 
     @property
     def dashboard(self) -> str:
@@ -87,46 +99,37 @@ class Cluster:
         """How many jobs run at once, as far as workers are known now."""
         return sum(self.workers.values())
 
-    def run(
-        self, jobs: Sequence[Job], folder: Path, tell: Tell = lambda event: None
-    ) -> Iterator[tuple[Try, Outcome]]:
+    def run(self, jobs: Iterable[Job], folder: Path) -> Iterator[tuple[Job, Outcome]]:
         """Run jobs, and yield how each ended.
 
-        A job that broke (its worker died, it was killed or late) is tried again, and yielded when
-        it succeeded or its retries are used up. Dask is given about two jobs for each that can run,
-        and more whenever half of them have ended: what it does not know it need not keep in order.
+        One that broke (its workers died, it was killed or late) is tried again, up to its retries.
 
         Args:
             jobs: The jobs.
             folder: Folder of the batch, seen by all workers.
-            tell: Told how far each is, in another thread.
 
         Raises:
             ClusterError: The scheduler or all workers are gone.
         """
-        every_s = max(1.0, len(self.workers) / 50)
-        self._client.subscribe_topic(topic_of(folder), lambda event: tell(event[1]))
-        ended, tries = SimpleQueue[Any](), dict[str, _Running]()
-        waiting, room, late_s = deque(map(Try, jobs)), 0, 0.0
-        while waiting or tries:
-            if time.monotonic() > late_s:
-                room, late_s = 2 * self._look() + 1, time.monotonic() + _LOOK_S
-            if waiting and len(tries) <= room // 2:
-                most = min(len(waiting), room - len(tries))
-                some = [waiting.popleft() for _ in range(most)]
-                for running in self._submit(some, folder, every_s):
-                    tries[running.future.key] = running
-                    running.future.add_done_callback(ended.put)
-            for key, outcome in self._outcomes(ended, tries):
-                done = tries.pop(key).one
-                if outcome.state == "broken" and done.number < done.job.retries:
-                    waiting.appendleft(self._again(done, outcome))
-                else:
-                    yield done, outcome
-            for orphan in self._orphans(tries):
-                tries.pop(orphan.future.key)
-                orphan.future.cancel()
-                waiting.appendleft(replace(orphan.one, only=frozenset()))
+        dask, waiting = require("distributed", extra=EXTRA), iter(jobs)
+        ended, tries = dask.as_completed(with_results=True, raise_errors=False), dict[str, _Try]()
+
+        def give(some: Iterable[Job], number: int = 0, workers: Sequence[str] = ()) -> None:
+            for job, future in self._submit(list(some), str(folder), workers):
+                tries[future.key] = job, number
+                ended.add(future)
+
+        give(islice(waiting, _AT_ONCE))
+        for future, result in ended:
+            job, number = tries.pop(future.key)
+            outcome = _outcome(future, result, job, folder)
+            if outcome.state == "broken" and number < job.retries:
+                others = {*self.workers} - {outcome.worker} if outcome.full else ()
+                give([job], number + 1, [*others])
+            else:
+                yield job, outcome
+            if len(tries) < _AT_ONCE // 2:
+                give(islice(waiting, _AT_ONCE // 2))
 
     def each(self, function: Callable[[Any], None], items: Sequence[Any]) -> None:
         """Run a function with each item on some worker, and wait until all is done.
@@ -147,73 +150,24 @@ class Cluster:
                 raise error
             raise ClusterError("workers or their scheduler are gone", got=error or future.status)
 
-    def _again(self, done: Try, outcome: Outcome) -> Try:
-        """Return the next try of a job: on another worker, if the disk is full where it ran."""
-        last = done.number + 1 == done.job.retries
-        others = frozenset(self.workers) - {outcome.worker} if outcome.full else frozenset()
-        return Try(done.job, done.number + 1, last and outcome.resumed, others)
-
-    def _orphans(self, tries: Mapping[str, _Running]) -> list[_Running]:
-        """Return tries of which all workers have died that may run them: Dask would wait."""
-        tied = [running for running in tries.values() if running.one.only]
-        alive = self.workers if tied else {}
-        return [running for running in tied if not running.one.only & alive.keys()]
-
-    def _outcomes(
-        self, ended: SimpleQueue[Any], tries: Mapping[str, _Running]
-    ) -> Iterator[tuple[str, Outcome]]:
-        """Wait for futures that have ended; yield how, by key, of all that have by now."""
-        futures = [self._next(ended)]
-        while not ended.empty():
-            futures.append(ended.get())
-        futures = [one for one in futures if one is not None and one.key in tries]
-        finished = {one.key: one for one in futures if one.status == "finished"}
-        # At once, as each takes a round trip; that of none takes one as well.
-        with _reaching():
-            found = self._client.gather(finished, errors="skip") if finished else {}
-        for one in futures:
-            yield one.key, found[one.key] if one.key in found else _without_result(one)
-
-    def _next(self, ended: SimpleQueue[Any]) -> Any:
-        """Return the next future that has ended; None = none did for a while."""
-        with suppress(Empty):
-            return ended.get(timeout=_LOOK_S)
-        return None
-
-    def _look(self) -> int:
-        """Return how many jobs run at once; workers of this machine that died are started again.
-
-        Raises:
-            ClusterError: All have died, and none comes back.
-        """
-        count, now_s = self.at_once, time.monotonic()
-        self._alive_s = now_s if count else self._alive_s
-        if self._restart is not None:
-            if now_s > self._alive_s + _WORKERS_S:
-                raise ClusterError("all workers of this machine have died")
-            self._restart()
-        return count
-
-    def _submit(self, tries: Sequence[Try], folder: Path, every_s: float) -> Iterator[_Running]:
-        """Give tries to Dask: all that may run at the same places in one message."""
-        declared = self._declared() if any(one.job.needs for one in tries) else frozenset()
-        alike: dict[Any, list[Try]] = {}
-        for one in tries:
-            needs = {name: least for name, least in one.job.needs.items() if name in declared}
-            alike.setdefault((tuple(needs.items()), one.only), []).append(one)
-        for (needs_of_all, only), some in alike.items():
+    def _submit(
+        self, jobs: list[Job], folder: str, workers: Sequence[str]
+    ) -> Iterator[tuple[Job, Any]]:
+        """Give jobs to Dask, all with the same needs in one message."""
+        declared = self._declared() if any(job.needs for job in jobs) else ()
+        for needs, group in groupby(sorted(jobs, key=_needs), _needs):
+            alike = list(group)
             futures = self._client.map(
                 self._work,
-                [one.job for one in some],
-                [str(folder)] * len(some),
-                [one.anew for one in some],
-                [every_s] * len(some),
+                alike,
+                folder=folder,
                 key=_KEY,
                 pure=False,
-                resources=dict(needs_of_all) or None,
-                workers=list(only) or None,
+                resources={name: least for name, least in needs if name in declared} or None,
+                workers=workers or None,
+                allow_other_workers=bool(workers),  # where these die, too
             )
-            yield from map(_Running, some, futures)
+            yield from zip(alike, futures, strict=True)
 
     def _declared(self) -> frozenset[str]:
         """Return the resources that all workers declare."""
@@ -233,14 +187,7 @@ def local_cluster(workers: int) -> Iterator[Cluster]:
     """
     distributed = require("distributed", extra=EXTRA)
     _be_quiet()
-    require("dask", extra=EXTRA).config.set(
-        {
-            # A worker is not given a second job to wait behind its first.
-            "distributed.scheduler.worker-saturation": 1.0,
-            # Dask gives up one that it starts again and that is not there by then.
-            "distributed.deploy.lost-worker-timeout": _WORKERS_S / 2,
-        }
-    )
+    require("dask", extra=EXTRA).config.set(_LOCAL)
     try:
         local = distributed.LocalCluster(
             n_workers=workers,
@@ -254,7 +201,7 @@ def local_cluster(workers: int) -> Iterator[Cluster]:
     except RuntimeError as error:
         raise ClusterError("the workers of this machine do not start", got=error) from error
     with local, distributed.Client(local) as client:
-        yield Cluster(client, restart=lambda: local.scale(workers))
+        yield Cluster(client)
 
 
 @contextmanager
@@ -271,12 +218,24 @@ def join_cluster(address: str) -> Iterator[Cluster]:
     distributed = require("distributed", extra=EXTRA)
     _be_quiet()
     try:
-        where = {"scheduler_file" if Path(address).is_file() else "address": address}
-        client = distributed.Client(**where, timeout=_REACH_S)
-    except (OSError, TimeoutError, ValueError, TypeError, RuntimeError, ImportError) as error:
-        # The last three: a protocol without its certificates, or without its library.
+        file = Path(address)
+        where = json.loads(file.read_text())["address"] if file.is_file() else address
+        # Dask waits without end for the greeting of what is no scheduler.
+        distributed.utils.LoopRunner().run_sync(_greet, where)
+        client = distributed.Client(where, timeout=_REACH_S)
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        RuntimeError,
+        ImportError,
+        MemoryError,
+    ) as error:
+        # The last ones: a protocol without its certificates or library; an answer of nonsense.
+        got = str(error) or f"no scheduler of Dask that answers within {_REACH_S:g} s"
         raise SettingsError(
-            "the scheduler cannot be reached", where=address, got=error, expected="tcp://host:8786"
+            "the scheduler cannot be reached", where=address, got=got, expected="tcp://host:8786"
         ) from error
     with client:
         try:
@@ -290,39 +249,47 @@ def join_cluster(address: str) -> Iterator[Cluster]:
         yield Cluster(client)
 
 
-def connect(scheduler: str | None, workers: int) -> AbstractContextManager[Cluster]:
-    """Return the workers of a scheduler, or else new ones on this machine, for ``with``."""
-    return local_cluster(workers) if scheduler is None else join_cluster(scheduler)
+async def _greet(address: str) -> None:
+    """Exchange greetings with a scheduler."""
+    distributed = require("distributed", extra=EXTRA)
+    keys = distributed.Security().get_connection_args("client")
+    connecting = distributed.comm.connect(address, timeout=_REACH_S, **keys)
+    comm = await asyncio.wait_for(connecting, _REACH_S)
+    await comm.close()
 
 
-def topic_of(folder: Path | str) -> str:
-    """Return the topic of Dask's events under which the jobs of a batch are told of."""
-    return f"recon-jobs {folder}"
+def _needs(job: Job) -> list[tuple[str, float]]:
+    return sorted(job.needs.items())
 
 
-def _work(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
+def _work(job: Job, folder: str) -> Outcome:
     """Run a job on a worker."""
     distributed = require("distributed", extra=EXTRA)
-    worker = distributed.get_worker()
-    key = distributed.worker.thread_state.key
-    topic = topic_of(folder)
-    tell: Callable[[dict[str, Any]], None] = lambda event: worker.log_event(topic, event)  # noqa: E731
+    worker, key = distributed.get_worker(), distributed.worker.thread_state.key
 
     def stopped() -> bool:
         """Return whether the task was cancelled, or its client is gone."""
         task = worker.state.tasks.get(key)
         return task is None or task.state in ("cancelled", "released")
 
-    tell({"event": "job", "name": job.name, "state": "running", "worker": worker.address})
-    outcome = run_job(job, Path(folder), anew=anew, tell=tell, stopped=stopped, every_s=every_s)
-    return Outcome(**{**vars(outcome), "worker": worker.address})
+    return run_job(job, Path(folder), worker.address, stopped)
 
 
-def _without_result(future: Any) -> Outcome:
-    """Return how a try ended that gave nothing: its worker died with it."""
+def _outcome(future: Any, result: Any, job: Job, folder: Path) -> Outcome:
+    """Return how a try ended.
+
+    Raises:
+        ClusterError: The scheduler or all workers are gone.
+    """
+    if future.status == "finished":
+        return result  # type: ignore[no-any-return]
     if future.status != "error":
         raise ClusterError("the scheduler is gone", got=future.status)
-    return Outcome("broken", f"its worker died ({type(future.exception()).__name__})")
+    error, kind = future.exception(), type(future.exception()).__name__
+    if kind == "NoWorkerError":
+        raise ClusterError("all workers have died", got=error)
+    why = "its worker died" if kind == "KilledWorker" else f"{kind}: {error}"
+    return replace(last_outcome(folder, job.name), state="broken", error=why)
 
 
 @contextmanager

@@ -1,31 +1,38 @@
-"""A job of a batch: one command in a process of its own, with a folder of its own."""
+"""A job of a batch: one command in a process of its own, with a folder and a log of its own."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass as checked
+
+from recon.io.files import reading
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.run import SUMMARY
 
 State = Literal["succeeded", "failed", "broken"]
 """``failed``: by its input, so that another try would fail too. ``broken``: by anything else."""
-_DRIVE: Final = "map"
-_PIECE: Final = "piece"
+LOGS: Final = "logs"
+_TAIL_BYTES: Final = 1 << 16
+"""At the end of a log, in which the last try is found."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One command of a batch; plain values, so that it travels and is kept as JSON.
+    """One command of a batch.
 
     Attributes:
         name: Its name, and that of its folder below that of the batch.
         command: The command, such as ``evaluate trajectory``.
         source: What it works on, for people.
-        words: The command line after ``recon``, without result folder and output options.
-        writes: Whether the command has an ``--out``; else its ``--json`` is kept.
+        words: The command line after ``recon``, without the result folder.
+        writes: Whether the command has an ``--out``; else what it prints is kept.
         folder: Where relative paths of the command line begin.
         timeout_s: Longest time of one try; None = any.
         retries: How often it is tried again when its worker died, or it was killed or late.
@@ -44,59 +51,81 @@ class Job:
     needs: Mapping[str, float] = field(default_factory=dict)
     swept: Mapping[str, Any] = field(default_factory=dict)
 
-    def plain(self) -> dict[str, Any]:
-        """Return it as JSON holds it."""
-        return asdict(self)
-
-    def command_line(self, out: Path, *, anew: bool = False) -> list[str]:
-        """Return the words after ``recon`` of the next try: the rest of an earlier one, or all.
-
-        Args:
-            out: Its result folder.
-            anew: Whether what an earlier try left is not used.
-        """
-        shown = ["--json", "--verbose"] if self.writes else ["--json"]
-        if not self.writes:
-            return [*self.words, *shown]
-        if self.resumes(out) and not anew:
-            # A drive knows what it was begun with; a piece of one is told again.
-            if self.command == _PIECE:
-                return [*self.words, "--resume", str(out), *shown]
-            kept = [*_option(self.words, "--threads"), *_option(self.words, "--memory-limit")]
-            return [_DRIVE, "--resume", str(out), *kept, *shown]
-        return [*self.words, "--out", str(out), *shown]
+    def command_line(self, out: Path, *, resume: bool = False) -> list[str]:
+        """Return the words after ``recon`` of a try, which may go on with what is in ``out``."""
+        if not resume:
+            return [*self.words, *(["--out", str(out)] if self.writes else [])]
+        if self.command == "piece":
+            return [*self.words, "--resume", str(out)]
+        # A drive knows what it was begun with.
+        kept = [
+            word
+            for name in ("--threads", "--memory-limit")
+            if name in self.words
+            for word in self.words[self.words.index(name) :][:2]
+        ]
+        return ["map", "--resume", str(out), *kept, "--json", "--verbose"]
 
     def resumes(self, out: Path) -> bool:
         """Return whether an earlier try left something to go on with."""
-        return self.command in (_DRIVE, _PIECE) and (state_folder(out) / STARTED).is_file()
+        return self.command in ("map", "piece") and (state_folder(out) / STARTED).is_file()
 
 
-@dataclass(frozen=True)
+@checked(frozen=True, config=ConfigDict(allow_inf_nan=False, extra="forbid"))
 class Outcome:
-    """How one try of a job ended.
+    """How the last try of a job ended, as its log has it.
 
     Attributes:
         state: How.
         error: Why it did not succeed, in one line.
         seconds: Its time.
         worker: Where it ran.
-        resumed: Whether it went on with what an earlier try had left.
+        tries: How often the job was begun.
         full: Whether a disk is full there.
+        stale: Whether what it left is of no use: it went on with that, and failed.
     """
 
     state: State
     error: str = ""
     seconds: float = 0.0
     worker: str = ""
-    resumed: bool = False
+    tries: int = 0
     full: bool = False
+    stale: bool = False
+
+    def line(self) -> bytes:
+        """Return it as a line of a log."""
+        text = json.dumps({"try": asdict(self)}, ensure_ascii=False)
+        return text.encode(errors="replace") + b"\n"
+
+
+def log_file(folder: Path, name: str) -> Path:
+    """Return the log of a job: what its tries said, between an `Outcome` at each begin and end.
+
+    A try is ``broken`` as long as it has not ended.
+    """
+    return folder / LOGS / f"{name}.log"
+
+
+def last_outcome(folder: Path, name: str) -> Outcome:
+    """Return how a job stands: by its folder whether it succeeded, all else by its log.
+
+    Raises:
+        FormatError: The log is damaged.
+    """
+    path, last = log_file(folder, name), Outcome("broken", "was not begun")
+    if path.exists():
+        with reading(path), path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            for line in file.read(_TAIL_BYTES).splitlines():
+                if line.startswith(b'{"try": '):
+                    with suppress(json.JSONDecodeError):  # cut off, such as on a full disk
+                        last = Outcome(**json.loads(line)["try"])
+    if is_done(folder / name):
+        return replace(last, state="succeeded", error="")
+    return replace(last, state="broken") if last.state == "succeeded" else last
 
 
 def is_done(out: Path) -> bool:
     """Return whether the result of a job is there; the record is the last file of a run."""
     return (out / RECORD).is_file() and (out / SUMMARY).is_file()
-
-
-def _option(words: tuple[str, ...], name: str) -> list[str]:
-    """Return an option with its value, if it is there."""
-    return list(words[words.index(name) : words.index(name) + 2]) if name in words else []

@@ -24,214 +24,211 @@ from __future__ import annotations
 import difflib
 import itertools
 import json
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from recon.core.errors import SettingsError
+from pydantic import ConfigDict, Field, field_validator
+
+from recon.core.errors import FormatError, SettingsError
+from recon.core.settings import Settings
+from recon.io.atomic import write_text
+from recon.io.files import read_text, reading
 from recon.io.toml_file import read_toml
 from recon.io.yaml_file import read_yaml
+from recon.run.batch.job import LOGS
 
 SUFFIXES: Final = (".toml", ".yaml", ".yml")
+PLAN: Final = "jobs.json"
+"""The jobs of a batch, in its folder from the first moment."""
+_PLAN_BYTES: Final = 1 << 28
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.=+-]{0,119}")
 _FILES: Final = frozenset(
-    ("jobs.json", "run.json", "summary.json", "config.yaml", "report.html", "table.csv",
-     "table.md", "sweep.png")
+    (PLAN, LOGS, "run.json", "summary.json", "config.yaml", "report.html", "table.csv", "table.md",
+     "sweep.png")
 )  # fmt: skip
 """What a batch writes beside the folders of its jobs."""
 _MOST_JOBS: Final = 1_000_000
-_KEYS: Final = ("job", "sweep")
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A job as it is asked for.
+class Entry(Settings):
+    """A job as it is asked for; None = as the batch says."""
 
-    Attributes:
-        name: Its name.
-        command: The command, such as ``map`` or ``evaluate trajectory``.
-        source: What the command works on, in the order of its arguments; empty = it needs nothing.
-        options: Further words of the command line.
-        set: Settings, as ``key=value``.
-        threads: Threads of its process; None = as the batch says.
-        memory: Memory limit, such as ``4G``; None = as the batch says.
-        timeout_s: Longest time of one try; None = as the batch says.
-        retries: Tries after the first that broke; None = as the batch says.
-        swept: Settings that a sweep adds.
-    """
+    model_config = ConfigDict(strict=True)
 
     name: str
     command: str
-    source: tuple[str, ...] = ()
-    options: tuple[str, ...] = ()
-    set: tuple[str, ...] = ()
-    threads: int | None = None
+    source: list[str] = Field([])
+    options: list[str] = Field([])
+    set: list[str] = Field([])
+    threads: int | None = Field(None, ge=1)
     memory: str | None = None
-    timeout_s: float | None = None
-    retries: int | None = None
-    swept: Mapping[str, Any] = field(default_factory=dict)
+    timeout_s: float | None = Field(None, ge=1e-3, allow_inf_nan=False)
+    retries: int | None = Field(None, ge=0)
+
+    @field_validator("source", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        return [value] if isinstance(value, str) else value
 
 
-_JOB_KEYS: Final = tuple(one.name for one in fields(Entry) if one.name != "swept")
+@dataclass(frozen=True)
+class JobList:
+    """What a batch is asked for.
+
+    Attributes:
+        jobs: Its jobs, each with all combinations of the sweep.
+        sweep: Values by the name of the setting.
+        folder: Where relative paths begin.
+    """
+
+    jobs: Sequence[Entry]
+    sweep: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    folder: Path = field(default_factory=Path.cwd)
+
+    def combinations(self) -> Iterator[dict[str, Any]]:
+        """Yield the settings of each combination of the sweep; one without any if there is none."""
+        for values in itertools.product(*self.sweep.values()):
+            yield dict(zip(self.sweep, values, strict=True))
+
+    def with_limits(
+        self, settings: Sequence[str], options: Sequence[str], **limits: Any
+    ) -> JobList:
+        """Return it with settings and options before those of each job, and missing limits."""
+
+        def limited(one: Entry) -> Entry:
+            missing = {key: value for key, value in limits.items() if getattr(one, key) is None}
+            lists = {"set": [*settings, *one.set], "options": [*options, *one.options]}
+            return one.model_copy(update={**lists, **missing})
+
+        return replace(self, jobs=[limited(one) for one in self.jobs])
+
+    def write(self, folder: Path) -> None:
+        """Write it into the folder of its batch.
+
+        Raises:
+            OutputError: The folder cannot be written.
+        """
+        jobs = [one.model_dump(exclude_defaults=True) for one in self.jobs]
+        plan = {"folder": str(self.folder.resolve()), "sweep": self.sweep, "job": jobs}
+        write_text(folder / PLAN, json.dumps(plan))
 
 
-def read_jobs(path: Path, settings: Sequence[str] = (), options: Sequence[str] = ()) -> list[Entry]:
-    """Read a job file, with its sweep spread out.
-
-    Args:
-        path: The file.
-        settings: Further settings of each job, before its own.
-        options: Further options of each job.
+def read_jobs(path: Path) -> JobList:
+    """Read a job file.
 
     Raises:
         FormatError: The file cannot be read.
-        SettingsError: A key is unknown or missing, a value is of a wrong kind, or a name is no
-            name of a folder or stands there twice.
+        SettingsError: A key is unknown or missing, or a value is of a wrong kind.
     """
     content = read_toml(path) if path.suffix.lower() == ".toml" else read_yaml(path)
-    _check_keys(content, _KEYS, str(path))
-    listed = content.get("job")
+    return _job_list(content, path)
+
+
+def _job_list(content: Mapping[str, Any], path: Path) -> JobList:
+    _check_keys(content, ("job", "sweep", *(("folder",) if path.name == PLAN else ())), str(path))
+    listed, sweep = content.get("job"), content.get("sweep", {})
     if not isinstance(listed, list) or not listed:
-        raise SettingsError(
-            "there is no job", where=path, expected="[[job]] with name, command, source"
-        )
-    entries = [_entry(one, f"{path}: job {n}") for n, one in enumerate(listed, start=1)]
-    entries = [
-        replace(one, set=(*settings, *one.set), options=(*options, *one.options)) for one in entries
-    ]
-    spread = spread_sweep(entries, content.get("sweep", {}), str(path))
-    check_names(spread, str(path))
-    return spread
+        expected = "[[job]] with name, command, source"
+        raise SettingsError("there is no job", where=path, expected=expected)
+    _check_sweep(sweep, len(listed), str(path))
+    jobs = [_entry(one, f"{path}: job {n}") for n, one in enumerate(listed, start=1)]
+    return JobList(jobs, sweep, Path(str(content.get("folder", path.parent))))
 
 
-def jobs_of_sources(
-    command: str, sources: Sequence[str], options: Sequence[str], settings: Sequence[str]
-) -> list[Entry]:
+def read_plan(folder: Path) -> JobList:
+    """Read the jobs of a batch that was begun.
+
+    Raises:
+        FormatError: The folder is not one of a batch, or its jobs cannot be read.
+    """
+    path = folder / PLAN
+    if not path.is_file():
+        raise FormatError("folder holds no batch", where=folder, expected=f"a {PLAN}")
+    with reading(path):
+        content = json.loads(read_text(path, _PLAN_BYTES))
+        if isinstance(content, list):
+            hint = "start it again with another --out"
+            raise FormatError("batch of an earlier version", where=path, hint=hint)
+        return _job_list(content, path)
+
+
+def jobs_of_sources(command: str, sources: Sequence[str]) -> JobList:
     """Return one job for each source, named by its last part.
 
     Where two would have one name, each is named by as many of the last parts as tell all apart.
 
     Raises:
-        SettingsError: There is no source, or two are the same.
+        SettingsError: There is no source.
     """
     if not sources:
         raise SettingsError("there is no source", where=f"recon batch {command}")
-    entries = [
-        Entry(name, command, (source,), tuple(options), tuple(settings))
-        for name, source in zip(_names_of(sources), sources, strict=True)
-    ]
-    check_names(entries, f"recon batch {command}")
-    return entries
+    names = zip(_names_of(sources), sources, strict=True)
+    return JobList([Entry(name=name, command=command, source=[one]) for name, one in names])
 
 
-def spread_sweep(entries: Sequence[Entry], sweep: Any, where: str) -> list[Entry]:
-    """Return each job with each combination of the values of a sweep.
-
-    Args:
-        entries: The jobs.
-        sweep: Lists of values, by the name of the setting.
-        where: The file, for error messages.
-
-    Raises:
-        SettingsError: It is not a table of lists, or gives too many jobs.
-    """
-    plain = (str, int, float, bool)
-    if not isinstance(sweep, Mapping) or not all(
-        isinstance(values, list) and values and all(isinstance(v, plain) for v in values)
-        for values in sweep.values()
-    ):
-        expected = '"matching.sad.window_px" = [9, 11, 13]'
-        raise SettingsError("sweep is not a table of lists", where=where, expected=expected)
-    combinations = 1
-    for values in sweep.values():
-        combinations *= len(values)
-    if combinations * len(entries) > _MOST_JOBS:
-        raise SettingsError("too many jobs", where=where, got=combinations * len(entries))
-    return list(_spread(entries, sweep))
-
-
-def check_names(entries: Sequence[Entry], where: str) -> None:
+def check_names(names: Iterable[str]) -> None:
     """Check that each job has a folder of its own, below that of the batch.
 
     Raises:
         SettingsError: A name is none, or stands there twice.
     """
-    seen: dict[str, str] = {}
-    for entry in entries:
-        if not _NAME.fullmatch(entry.name):
+    seen = set[str]()
+    for name in names:
+        where, small = f"job {name}", name.lower()  # on some file systems they are the same
+        if not _NAME.fullmatch(name):
             expected = "letters, digits and _ . = + -, beginning with a letter or digit"
-            raise SettingsError(
-                "name of a job is not a name of a folder",
-                where=where,
-                got=repr(entry.name),
-                expected=expected,
-            )
-        if entry.name.lower() in _FILES:
-            raise SettingsError(
-                "name of a job is that of a file of the batch", where=where, got=entry.name
-            )
-        # On some file systems, capital and small letters are the same.
-        if entry.name.lower() in seen:
+            raise SettingsError("not a name of a folder", where=where, expected=expected)
+        if small in _FILES:
+            raise SettingsError("name of a job is that of a file of the batch", where=where)
+        if small in seen:
             hint = "if they are two jobs, name them in a file of jobs"
-            raise SettingsError("two jobs have one name", where=where, got=entry.name, hint=hint)
-        seen[entry.name.lower()] = entry.name
+            raise SettingsError("two jobs have one name", where=where, hint=hint)
+        seen.add(small)
+
+
+def name_of_swept(name: str, swept: Mapping[str, Any]) -> str:
+    """Return the name of a job with swept settings."""
+    ends = (f"_{key.rpartition('.')[2]}={_plain(str(value))}" for key, value in swept.items())
+    return name + "".join(ends)
 
 
 def _entry(content: Any, where: str) -> Entry:
     if not isinstance(content, Mapping):
         raise SettingsError("job is not a table", where=where, got=type(content).__name__)
-    _check_keys(content, _JOB_KEYS, where)
-    for key in ("name", "command"):
-        if key not in content:
-            raise SettingsError(f"job has no {key}", where=where)
-    values = {key: _value(key, value, where) for key, value in content.items()}
-    return Entry(**values)
+    _check_keys(content, tuple(Entry.model_fields), where)
+    return Entry.parse(content, where=where)
 
 
-def _value(key: str, value: Any, where: str) -> Any:
-    """Return the value of a key, checked; lists become tuples."""
-    many, number = key in ("source", "options", "set"), key in ("threads", "retries", "timeout_s")
-    if many and isinstance(value, list) and all(isinstance(one, str) for one in value):
-        right = bool(value) or key != "source"
-        value = tuple(value)
-    elif number:
-        kinds = (int, float) if key == "timeout_s" else (int,)
-        right = type(value) in kinds and value >= (0 if key == "retries" else 1e-3)
-    else:
-        right = isinstance(value, str) and (key == "source" or not many)
-        value = (value,) if many else value
-    if not right:
-        expected = "a list of texts" if many else "a number" if number else "a text"
-        raise SettingsError(f"{key} is not {expected}", where=where, got=repr(value))
-    return value
+def _check_sweep(sweep: Any, jobs: int, where: str) -> None:
+    if not isinstance(sweep, Mapping) or not all(
+        isinstance(values, list) and values and all(map(_is_plain, values))
+        for values in sweep.values()
+    ):
+        expected = '"matching.sad.window_px" = [9, 11, 13]'
+        raise SettingsError("sweep is not a table of lists", where=where, expected=expected)
+    if (count := jobs * math.prod(map(len, sweep.values()))) > _MOST_JOBS:
+        raise SettingsError("too many jobs", where=where, got=count)
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, str) or (isinstance(value, int | float) and math.isfinite(value))
 
 
 def _check_keys(content: Mapping[str, Any], known: Sequence[str], where: str) -> None:
     for key in content:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else None
-            raise SettingsError(
-                "unknown key", where=where, got=key, expected=", ".join(known), hint=hint
-            )
+            near = difflib.get_close_matches(str(key), known, n=1)
+            hint, expected = f"did you mean {near[0]}?" if near else None, ", ".join(known)
+            raise SettingsError("unknown key", where=where, got=key, expected=expected, hint=hint)
 
 
-def _spread(entries: Sequence[Entry], sweep: Mapping[str, Sequence[Any]]) -> Iterator[Entry]:
-    for entry in entries:
-        for values in itertools.product(*sweep.values()):
-            swept = dict(zip(sweep, values, strict=True))
-            texts = [f"{key}={json.dumps(value)}" for key, value in swept.items()]
-            ends = [f"_{key.rpartition('.')[2]}={_plain(value)}" for key, value in swept.items()]
-            yield replace(
-                entry, name=entry.name + "".join(ends), set=(*entry.set, *texts), swept=swept
-            )
-
-
-def _plain(value: Any) -> str:
-    """Return a value as part of the name of a folder."""
-    return re.sub(r"[^A-Za-z0-9_.+-]", "-", str(value))
+def _plain(text: str) -> str:
+    """Return a text as part of the name of a folder."""
+    return re.sub(r"[^A-Za-z0-9_.+-]", "-", text)
 
 
 def _names_of(sources: Sequence[str]) -> list[str]:

@@ -36,6 +36,11 @@ if what == "good":
     finish()
 elif what == "bad":
     sys.exit("error: nowhere: folder does not exist")
+elif what == "says much":
+    for n in range(1000):
+        print(json.dumps({"event": "frame", "index": n}), file=sys.stderr)
+    print("warning: the lens is dirty", file=sys.stderr)
+    finish()
 elif what == "killed once" and not resumed:
     begin()
     os.kill(os.getpid(), signal.SIGKILL)
@@ -43,9 +48,9 @@ elif what == "killed once":
     finish()
 elif what == "always killed":
     os.kill(os.getpid(), signal.SIGKILL)
-elif what == "full":
+elif what == "damaged":
     begin()
-    sys.exit("error: the disk is full")
+    sys.exit("error: damaged")
 elif what == "endless":
     (out.parent / f"{out.name}.pid").write_text(str(os.getpid()))
     time.sleep(600)

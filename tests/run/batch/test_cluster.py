@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import socket
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,8 +17,8 @@ from recon.core.errors import (
     MissingDependencyError,
     SettingsError,
 )
-from recon.run.batch.cluster import Cluster, Try, _Running, join_cluster, local_cluster
-from recon.run.batch.job import Job, Outcome
+from recon.run.batch.cluster import Cluster, _outcome, join_cluster, local_cluster
+from recon.run.batch.job import Job, Outcome, log_file
 from tests.run.batch.jobs import job, stand_in, tries
 
 distributed = pytest.importorskip("distributed")
@@ -35,8 +37,8 @@ def cluster() -> Iterator[Cluster]:
         yield Cluster(client)
 
 
-def run(cluster: Cluster, jobs: list[Job], folder: Path) -> dict[str, tuple[Try, Outcome]]:
-    ended = [(done.job.name, (done, outcome)) for done, outcome in cluster.run(jobs, folder)]
+def run(cluster: Cluster, jobs: list[Job], folder: Path) -> dict[str, Outcome]:
+    ended = [(done.name, outcome) for done, outcome in cluster.run(jobs, folder)]
     assert sorted(name for name, _ in ended) == sorted(one.name for one in jobs)
     return dict(ended)
 
@@ -47,9 +49,9 @@ def test_a_poisoned_job_among_fifty_is_told_and_the_rest_goes_on(
 ) -> None:
     jobs = [job(f"j{n}", "bad" if n == 17 else "good") for n in range(50)]
     ended = run(cluster, jobs, tmp_path)
-    states = [outcome.state for _, outcome in ended.values()]
+    states = [outcome.state for outcome in ended.values()]
     assert (states.count("succeeded"), states.count("failed")) == (49, 1)
-    assert ended["j17"][1].error == "nowhere: folder does not exist"
+    assert ended["j17"].error == "nowhere: folder does not exist"
     assert all(tries(tmp_path, one.name) == ["begun"] for one in jobs)
 
 
@@ -57,20 +59,20 @@ def test_a_poisoned_job_among_fifty_is_told_and_the_rest_goes_on(
 def test_a_broken_job_goes_on_and_its_retries_have_a_limit(
     cluster: Cluster, tmp_path: Path
 ) -> None:
-    jobs = [job("a", "killed once"), job("b", "always killed", retries=3), job("c", "full")]
+    jobs = [job("a", "killed once"), job("b", "always killed", retries=3), job("c", "damaged")]
     ended = run(cluster, jobs, tmp_path)
-    assert ended["a"][1].state == "succeeded"
+    assert (ended["a"].state, ended["a"].tries) == ("succeeded", 2)
     assert tries(tmp_path, "a") == ["begun", "resumed"]
-    assert (ended["b"][0].number, ended["b"][1].state) == (3, "broken")
+    assert (ended["b"].state, ended["b"].tries) == ("broken", 4)
     assert tries(tmp_path, "b") == ["begun"] * 4
-    # The last try does without what the ones before have left, which may be damaged.
+    # The last try does without what the ones before have left.
     assert tries(tmp_path, "c") == ["begun", "resumed", "begun"]
 
 
 def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
     cluster: Cluster, tmp_path: Path
 ) -> None:
-    def full_at_first(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
+    def full_at_first(job: Job, folder: str) -> Outcome:
         here, tried = distributed.get_worker().address, Path(folder) / job.name
         before = tried.read_text().split() if tried.is_file() else []
         tried.write_text(" ".join([*before, here]))
@@ -80,50 +82,57 @@ def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
 
     jobs = [job(f"j{n}") for n in range(6)]
     ended = run(Cluster(cluster._client, full_at_first), jobs, tmp_path)
-    assert {outcome.state for _, outcome in ended.values()} == {"succeeded"}
+    assert {outcome.state for outcome in ended.values()} == {"succeeded"}
     for one in jobs:
         first, second, third = (tmp_path / one.name).read_text().split()
         assert first != second != third
 
 
-def test_dask_has_jobs_of_one_kind_and_about_two_for_each_that_can_run(
+def test_dask_has_jobs_of_one_kind_and_not_all_of_very_many(
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given: list[int] = []
-    submit = Cluster._submit
-    monkeypatch.setattr(
-        Cluster, "_submit", lambda *args: given.append(len(args[1])) or submit(*args)
-    )
-    quick = Cluster(cluster._client, lambda *job: Outcome("succeeded"))
-    ended = run(quick, [job(f"j{n}") for n in range(40)], tmp_path)
-    assert {outcome.state for _, outcome in ended.values()} == {"succeeded"}
-    assert given[0] == 2 * quick.at_once + 1
-    assert (sum(given), max(given)) == (40, given[0])
+    monkeypatch.setattr("recon.run.batch.cluster._AT_ONCE", 10)
+    taken: list[str] = []
+
+    def many() -> Iterator[Job]:
+        for number in range(40):
+            taken.append(f"j{number}")
+            yield job(taken[-1])
+
+    quick = Cluster(cluster._client, lambda job, folder: Outcome("succeeded"))
+    ended = [len(taken) - number for number, _ in enumerate(quick.run(many(), tmp_path))]
+    assert (len(ended), len(taken)) == (40, 40)
+    assert max(ended) <= 10
     kinds = cluster._client.run_on_scheduler(lambda dask_scheduler: [*dask_scheduler.task_prefixes])
     assert [kind for kind in kinds if "j1" in kind] == []
 
 
-def test_workers_of_this_machine_that_died_are_started_again(
-    cluster: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun: list[str] = []
-    local = Cluster(cluster._client, restart=lambda: begun.append("again"))
-    assert local._look() == 2
-    monkeypatch.setattr(Cluster, "workers", {})
-    assert local._look() == 0
-    assert begun == ["again"] * 2
-    monkeypatch.setattr("recon.run.batch.cluster._WORKERS_S", -1.0)
-    with pytest.raises(ClusterError, match="all workers of this machine have died"):
-        local._look()
+@pytest.mark.usefixtures("stand_in")
+def test_a_worker_that_cannot_run_a_job_says_why(cluster: Cluster, tmp_path: Path) -> None:
+    ended = run(cluster, [job("a", retries=1)], tmp_path / "unseen")
+    assert ended["a"].state == "broken"
+    assert "unseen" in ended["a"].error
 
 
-def test_a_try_whose_workers_have_all_died_is_not_waited_for(cluster: Cluster) -> None:
-    alive, gone = next(iter(cluster.workers)), "tcp://192.0.2.1:9"
-    tries = {
-        name: _Running(Try(job(name), 1, only=frozenset(only)), None)
-        for name, only in (("a", ()), ("b", (alive, gone)), ("c", (gone,)))
-    }
-    assert [running.one.job.name for running in cluster._orphans(tries)] == ["c"]
+def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path: Path) -> None:
+    class Lost:
+        status = "error"
+
+        def exception(self) -> Exception:
+            return distributed.KilledWorker("a", None, 3)
+
+    begun = Outcome("broken", "its worker died", worker="w", tries=4)
+    log_file(tmp_path, "a").parent.mkdir()
+    log_file(tmp_path, "a").write_bytes(begun.line())
+    assert _outcome(Lost(), None, job("a"), tmp_path) == begun
+
+
+def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path: Path) -> None:
+    def nobody(job: Job, folder: str) -> Outcome:
+        raise distributed.scheduler.NoWorkerError(job.name, 120)
+
+    with pytest.raises(ClusterError, match="all workers have died"):
+        run(Cluster(cluster._client, nobody), [job("a")], tmp_path)
 
 
 @pytest.mark.usefixtures("stand_in")
@@ -133,16 +142,8 @@ def test_two_batches_with_jobs_of_the_same_name_share_a_scheduler(
     for number in range(2):
         folder = tmp_path / str(number)
         folder.mkdir()
-        told: list[Any] = []
-        assert [o.state for _, o in cluster.run([job("a")], folder, told.append)] == ["succeeded"]
+        assert run(cluster, [job("a")], folder)["a"].state == "succeeded"
         assert (folder / "a" / "run.json").is_file()
-
-
-@pytest.mark.usefixtures("stand_in")
-def test_events_of_running_jobs_arrive(cluster: Cluster, tmp_path: Path) -> None:
-    told: list[Any] = []
-    list(cluster.run([job("a")], tmp_path, told.append))
-    assert {"event": "job", "name": "a", "state": "running"}.items() <= told[0].items()
 
 
 @pytest.mark.usefixtures("stand_in")
@@ -150,7 +151,7 @@ def test_needs_that_no_worker_declares_do_not_keep_a_job_waiting(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     ended = run(cluster, [job("a", needs={"threads": 64.0})], tmp_path)
-    assert ended["a"][1].state == "succeeded"
+    assert ended["a"].state == "succeeded"
 
 
 def test_a_function_is_called_with_each_item_and_its_error_is_raised(
@@ -179,7 +180,61 @@ def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -
             raise OSError("Timed out trying to connect to tcp://127.0.0.1:9 after 20 s")
 
     with pytest.raises(ClusterError, match="the scheduler is gone"):
-        list(Cluster(Gone()).run([job("a")], Path()))
+        Cluster(Gone()).workers  # noqa: B018
+
+
+def silent(connection: socket.socket) -> None:
+    del connection
+
+
+def speaks_first(connection: socket.socket) -> None:
+    connection.sendall(b"SSH-2.0-OpenSSH_9.6\r\n")
+
+
+def answers(connection: socket.socket) -> None:
+    connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n" + bytes(1000))
+
+
+@pytest.mark.parametrize("server", [silent, speaks_first, answers])
+@pytest.mark.parametrize("protocol", ["tcp://", "tls://", ""])
+def test_what_is_no_scheduler_is_one_line_and_not_waited_for(
+    protocol: str, server: Callable[[socket.socket], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
+    kept: list[socket.socket] = []
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                kept.append(listening.accept()[0])
+                server(kept[-1])
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve, daemon=True).start()
+        address = f"{protocol}127.0.0.1:{listening.getsockname()[1]}"
+        with pytest.raises(SettingsError, match="scheduler cannot be reached"):
+            join_cluster(address).__enter__()
+    for connection in kept:
+        connection.close()
+
+
+@pytest.mark.parametrize("address", ["ucx://x:1", "nonsense", "tcp://", "tcp://127.0.0.1:x", ""])
+def test_what_is_no_address_of_a_scheduler_is_one_line(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
+    with pytest.raises(SettingsError, match="scheduler cannot be reached"):
+        join_cluster(address).__enter__()
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"address": 3}'])
+def test_a_file_that_names_no_scheduler_is_one_line(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
+    (tmp_path / "scheduler.json").write_text(content)
+    with pytest.raises(SettingsError, match=r"scheduler\.json: the scheduler cannot be reached"):
+        join_cluster(str(tmp_path / "scheduler.json")).__enter__()
 
 
 def test_without_dask_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

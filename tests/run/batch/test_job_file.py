@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import ReconError, SettingsError
-from recon.run.batch.job_file import jobs_of_sources, read_jobs
+from recon.run.batch.job_file import check_names, jobs_of_sources, read_jobs, read_plan
 
 FULL = """
 [[job]]
@@ -36,42 +36,63 @@ def write(folder: Path, text: str, suffix: str = "toml") -> Path:
 
 
 def test_a_job_has_all_that_it_says(tmp_path: Path) -> None:
-    monday, pair = read_jobs(write(tmp_path, FULL))
-    assert (monday.name, monday.command, monday.source) == ("monday", "map", ("drives/monday",))
-    assert (monday.options, monday.set) == (("--no-mesh",), ("odometry.method=visual",))
+    listed = read_jobs(write(tmp_path, FULL))
+    assert listed.folder == tmp_path
+    monday, pair = listed.jobs
+    assert (monday.name, monday.command, monday.source) == ("monday", "map", ["drives/monday"])
+    assert (monday.options, monday.set) == (["--no-mesh"], ["odometry.method=visual"])
     assert (monday.threads, monday.memory, monday.timeout_s, monday.retries) == (2, "4G", 60, 0)
-    assert (pair.source, pair.options, pair.timeout_s) == (("left.png", "right.png"), (), None)
+    assert (pair.source, pair.options, pair.timeout_s) == (["left.png", "right.png"], [], None)
 
 
 def test_yaml_says_the_same(tmp_path: Path) -> None:
     text = "job:\n- {name: monday, command: map, source: drives/monday, set: [a=1]}\n"
-    (entry,) = read_jobs(write(tmp_path, text, "yaml"))
-    assert (entry.name, entry.source, entry.set) == ("monday", ("drives/monday",), ("a=1",))
+    (entry,) = read_jobs(write(tmp_path, text, "yaml")).jobs
+    assert (entry.name, entry.source, entry.set) == ("monday", ["drives/monday"], ["a=1"])
 
 
-def test_a_sweep_spreads_every_job_over_every_combination(tmp_path: Path) -> None:
-    entries = read_jobs(write(tmp_path, SWEEP + FULL), settings=["x=1"], options=["--poses=p"])
-    assert len(entries) == 8
-    assert entries[0].name == "monday_window_px=9_matcher=sad"
-    assert entries[0].set == (
-        "x=1", "odometry.method=visual", "matching.sad.window_px=9", 'matching.matcher="sad"',
-    )  # fmt: skip
-    assert entries[0].options == ("--poses=p", "--no-mesh")
-    assert entries[3].swept == {"matching.sad.window_px": 11, "matching.matcher": "sgm"}
+def test_what_a_batch_says_stands_before_what_a_job_says(tmp_path: Path) -> None:
+    limits = {"threads": 1, "memory": "2G", "timeout_s": 5.0, "retries": 4}
+    listed = read_jobs(write(tmp_path, FULL)).with_limits(["x=1"], ["--poses=p"], **limits)
+    monday, pair = listed.jobs
+    assert monday.set == ["x=1", "odometry.method=visual"]
+    assert monday.options == ["--poses=p", "--no-mesh"]
+    assert (monday.threads, monday.memory, monday.timeout_s, monday.retries) == (2, "4G", 60, 0)
+    assert (pair.threads, pair.memory, pair.timeout_s, pair.retries) == (1, "2G", 5.0, 4)
+
+
+def test_what_a_batch_was_begun_with_is_read_as_it_was_written(tmp_path: Path) -> None:
+    listed = read_jobs(write(tmp_path, SWEEP + FULL)).with_limits(["x=1"], [], threads=3)
+    (tmp_path / "out").mkdir()
+    listed.write(tmp_path / "out")
+    assert read_plan(tmp_path / "out") == listed
+
+
+@pytest.mark.parametrize("content", ["", "3", "[3]", '{"x": 1}', "{", '{"job": [{"name": "a"}]}'])
+def test_a_damaged_plan_is_one_line(tmp_path: Path, content: str) -> None:
+    (tmp_path / "jobs.json").write_text(content)
+    with pytest.raises(ReconError, match=r"jobs\.json"):
+        read_plan(tmp_path)
+
+
+def test_a_batch_of_an_earlier_version_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "jobs.json").write_text('[{"name": "a", "words": ["map", "drive"]}]')
+    with pytest.raises(ReconError, match=r"earlier version.*another --out"):
+        read_plan(tmp_path)
 
 
 def test_sources_are_named_by_their_last_part() -> None:
-    entries = jobs_of_sources("map", ["a/2011_09 x", "b/.c/"], ["--no-mesh"], ["k=1"])
+    entries = jobs_of_sources("map", ["a/2011_09 x", "b/.c/"]).jobs
     assert [entry.name for entry in entries] == ["2011_09-x", "c"]
 
 
 def test_sources_with_one_last_part_are_named_by_more_of_their_paths() -> None:
-    entries = jobs_of_sources("map", ["robot1/monday", "Robot2/monday", "robot2/friday"], [], [])
+    entries = jobs_of_sources("map", ["robot1/monday", "Robot2/monday", "robot2/friday"]).jobs
     assert [entry.name for entry in entries] == ["robot1_monday", "Robot2_monday", "robot2_friday"]
-    with pytest.raises(SettingsError, match=r"two jobs have one name.*got x.*in a file"):
-        jobs_of_sources("map", ["a/x", "b/../a/x"], [], [])
-    with pytest.raises(SettingsError, match="two jobs have one name"):
-        jobs_of_sources("map", ["/", "/"], [], [])
+    for same in (["a/x", "b/../a/x"], ["/", "/"]):
+        listed = jobs_of_sources("map", same)
+        with pytest.raises(SettingsError, match=r"two jobs have one name.*in a file"):
+            check_names(one.name for one in listed.jobs)
 
 
 def one_job(**changes: str) -> str:
@@ -93,27 +114,25 @@ NAMES = ["../a", "/a", "a/b", "..", ".hidden", "", "a\\\\b", "a b", "é", "-a", 
         ("job = [3]", "job 1: job is not a table"),
         (one_job(sorce='"x"'), r"job 1: unknown key \(got sorce.*did you mean source"),
         (one_job(swept="{}"), "unknown key .*got swept"),
-        (one_job(command=""), "job 1: job has no command"),
-        (one_job(name=""), "job 1: job has no name"),
-        (one_job(source="[]"), "source is not a list of texts"),
-        (one_job(source="3"), "source is not a list of texts"),
-        (one_job(name="3"), "name is not a text"),
-        (one_job(set='"a=1"'), "set is not a list of texts"),
-        (one_job(options="[1]"), "options is not a list of texts"),
-        (one_job(threads="0"), "threads is not a number"),
-        (one_job(threads="true"), "threads is not a number"),
-        (one_job(timeout_s='"1 h"'), "timeout_s is not a number"),
-        (one_job(timeout_s="nan"), "timeout_s is not a number"),
-        (one_job(retries="-1"), "retries is not a number"),
-        (one_job() + one_job(), "two jobs have one name"),
-        (one_job() + one_job(name='"A"'), "two jobs have one name"),
+        (one_job(command=""), "job 1: setting 'command'.*required"),
+        (one_job(name=""), "job 1: setting 'name'.*required"),
+        (one_job(source="3"), "job 1: setting 'source'.*got 3"),
+        (one_job(name="3"), "'name'.*got 3"),
+        (one_job(set='"a=1"'), "'set'.*got 'a=1'"),
+        (one_job(options="[1]"), r"'options\.0'.*got 1"),
+        (one_job(threads="0"), "'threads'.*got 0"),
+        (one_job(threads="true"), "'threads'.*got True"),
+        (one_job(timeout_s='"1 h"'), "'timeout_s'.*got '1 h'"),
+        (one_job(timeout_s="nan"), "'timeout_s'.*got nan"),
+        (one_job(retries="-1"), "'retries'.*got -1"),
         ("sweep = 3\n" + one_job(), "sweep is not a table of lists"),
         ("[sweep]\na = 3\n" + one_job(), "sweep is not a table of lists"),
         ("[sweep]\na = []\n" + one_job(), "sweep is not a table of lists"),
         ("[sweep]\na = [[1]]\n" + one_job(), "sweep is not a table of lists"),
+        ("[sweep]\na = [nan]\n" + one_job(), "sweep is not a table of lists"),
+        ('folder = "/"\n' + one_job(), "unknown key .*got folder"),
         (f"[sweep]\na = {[*range(1001)]}\nb = {[*range(1001)]}\n" + one_job(), "too many jobs"),
         ("job = " + "[" * 5000, "deep|not a TOML"),
-        *((one_job(name=f'"{name}"'), "not a name of a folder") for name in NAMES),
     ],
 )  # fmt: skip
 def test_everything_else_is_one_line(tmp_path: Path, text: str, words: str) -> None:
@@ -121,6 +140,25 @@ def test_everything_else_is_one_line(tmp_path: Path, text: str, words: str) -> N
         read_jobs(write(tmp_path, text))
     assert "\n" not in str(told.value)
     assert len(str(told.value)) < 1000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_is_that_of_a_folder_below_the_batch(name: str) -> None:
+    with pytest.raises(SettingsError, match="not a name of a folder"):
+        check_names([name])
+
+
+@pytest.mark.parametrize(
+    "name", ["jobs.json", "Summary.JSON", "report.html", "table.csv", "logs", "run.json"]
+)
+def test_a_job_is_not_named_like_a_file_of_the_batch(name: str) -> None:
+    with pytest.raises(SettingsError, match="that of a file of the batch"):
+        check_names([name])
+
+
+def test_names_that_differ_in_capitals_alone_are_the_same() -> None:
+    with pytest.raises(SettingsError, match="job A: two jobs have one name"):
+        check_names(["a", "A"])
 
 
 def test_recursion_in_yaml_is_one_line(tmp_path: Path) -> None:

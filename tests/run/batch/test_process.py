@@ -9,14 +9,14 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import recon
+from recon.core.errors import FormatError
 from recon.io.lock import take_lock
 from recon.run.batch import process
-from recon.run.batch.job import Job, is_done
+from recon.run.batch.job import Job, Outcome, is_done, last_outcome, log_file
 from recon.run.batch.process import run_job
 from recon.run.directory import lock_file
 from tests.run.batch.jobs import job, stand_in, tries
@@ -26,19 +26,61 @@ usefixtures = pytest.mark.usefixtures("stand_in")
 
 
 @usefixtures
-def test_a_job_writes_its_folder_and_tells_how_far_it_is(tmp_path: Path) -> None:
-    told: list[dict[str, Any]] = []
-    outcome = run_job(job("a"), tmp_path, tell=told.append, every_s=0.0)
-    assert (outcome.state, outcome.error, outcome.resumed) == ("succeeded", "", False)
+def test_a_job_writes_its_folder_and_a_log(tmp_path: Path) -> None:
+    outcome = run_job(job("a"), tmp_path, "here")
+    assert (outcome.state, outcome.error) == ("succeeded", "")
+    assert (outcome.worker, outcome.tries) == ("here", 1)
     assert is_done(tmp_path / "a")
-    assert told == [{"event": "job", "name": "a", "state": "running", "frames": 2, "of": 2}]
+    begun, command, started, frame, ended = log_of(tmp_path, "a")
+    assert '"its worker died"' in begun
+    assert command == f"recon map good --out {tmp_path / 'a'}"
+    assert ("start" in started, "frame" in frame) == (True, True)
+    assert '"succeeded"' in ended
+
+
+@usefixtures
+def test_the_log_has_what_is_said_but_few_of_many_frames(tmp_path: Path) -> None:
+    run_job(job("a", "says much"), tmp_path)
+    log = log_of(tmp_path, "a")
+    assert "warning: the lens is dirty" in log
+    assert sum('"frame"' in line for line in log) < 10
 
 
 @usefixtures
 def test_a_result_that_is_there_is_not_made_again(tmp_path: Path) -> None:
-    for _ in range(2):
-        assert run_job(job("a"), tmp_path).state == "succeeded"
+    outcomes = [run_job(job("a"), tmp_path, worker) for worker in ("here", "there")]
     assert tries(tmp_path, "a") == ["begun"]
+    assert outcomes[0] == outcomes[1]
+    assert outcomes[0].seconds > 0
+
+
+@usefixtures
+def test_what_is_left_of_a_log_counts(tmp_path: Path) -> None:
+    """Of a worker that died, which is as if the try had no end."""
+    log_file(tmp_path, "a").parent.mkdir()
+    tried = Outcome("broken", "its worker died", worker="w", tries=6)
+    log_file(tmp_path, "a").write_bytes(b"x" * 200_000 + b"\n" + tried.line() + b'{"try": {"s')
+    assert last_outcome(tmp_path, "a") == tried
+    assert run_job(job("a"), tmp_path).tries == 7
+
+
+@pytest.mark.parametrize(
+    "line", ['{"try": 3}', '{"try": {"state": "x"}}', '{"try": {"seconds": NaN}}', '{"try": {}}']
+)
+def test_a_log_that_is_none_is_one_line(tmp_path: Path, line: str) -> None:
+    log_file(tmp_path, "a").parent.mkdir()
+    log_file(tmp_path, "a").write_text(line)
+    with pytest.raises(FormatError, match=r"a\.log"):
+        last_outcome(tmp_path, "a")
+
+
+@usefixtures
+def test_a_log_that_leads_elsewhere_is_not_followed(tmp_path: Path) -> None:
+    log_file(tmp_path, "a").parent.mkdir()
+    log_file(tmp_path, "a").symlink_to(tmp_path / "precious")
+    with pytest.raises(FormatError, match="link"):
+        run_job(job("a"), tmp_path)
+    assert not (tmp_path / "precious").exists()
 
 
 @usefixtures
@@ -53,7 +95,7 @@ def test_a_killed_job_is_broken_and_goes_on_where_it_was(tmp_path: Path) -> None
     assert killed.state == "broken"
     assert killed.error == "its process was killed by signal 9; out of memory?"
     again = run_job(job("a", "killed once"), tmp_path)
-    assert (again.state, again.resumed) == ("succeeded", True)
+    assert (again.state, again.tries) == ("succeeded", 2)
     assert tries(tmp_path, "a") == ["begun", "resumed"]
 
 
@@ -75,16 +117,25 @@ def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(tmp_path: Path
 
 
 @usefixtures
-def test_a_job_can_begin_anew(tmp_path: Path) -> None:
-    run_job(job("a", "killed once"), tmp_path)
-    assert run_job(job("a", "killed once"), tmp_path, anew=True).state == "broken"
-    assert tries(tmp_path, "a") == ["begun", "begun"]
+def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path: Path) -> None:
+    outcome = run_job(job("a", "damaged"), tmp_path)
+    assert (outcome.state, outcome.error, outcome.stale) == ("broken", "damaged", False)
+    # What fails although it goes on with what was left begins anew.
+    assert run_job(job("a", "damaged"), tmp_path).stale
+    assert run_job(job("a", "damaged"), tmp_path).stale is False
+    assert tries(tmp_path, "a") == ["begun", "resumed", "begun"]
 
 
 @usefixtures
-def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path: Path) -> None:
-    outcome = run_job(job("a", "full"), tmp_path)
-    assert (outcome.state, outcome.error) == ("broken", "the disk is full")
+def test_what_is_resumed_where_the_disk_is_full_goes_on_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "_LEAST_FREE_BYTES", 1 << 62)
+    for _ in range(2):
+        outcome = run_job(job("a", "damaged"), tmp_path)
+        assert (outcome.state, outcome.full, outcome.stale) == ("broken", True, False)
+    assert run_job(job("b", "bad"), tmp_path).state == "broken"
+    assert tries(tmp_path, "a") == ["begun", "resumed"]
 
 
 @usefixtures
@@ -122,7 +173,7 @@ def test_a_folder_that_this_worker_does_not_see_is_one_line(tmp_path: Path) -> N
 
 def test_a_command_without_a_result_folder_gets_one(tmp_path: Path) -> None:
     """With the real program."""
-    words = ("datasets", "list", "euroc")
+    words = ("datasets", "list", "euroc", "--json")
     outcome = run_job(Job("a", "datasets list", "euroc", words, writes=False, folder="."), tmp_path)
     assert outcome.state == "succeeded", outcome.error
     assert '"name": "euroc"' in (tmp_path / "a" / "summary.json").read_text()
@@ -156,6 +207,10 @@ def test_the_process_of_a_job_dies_with_its_worker(tmp_path: Path) -> None:
     worker.wait()
     worker.stdout.close()
     assert all(ended(pid) for pid in pids)
+
+
+def log_of(folder: Path, name: str) -> list[str]:
+    return log_file(folder, name).read_text().splitlines()
 
 
 def ended(pid: int, within_s: float = 30.0) -> bool:

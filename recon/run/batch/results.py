@@ -1,0 +1,209 @@
+"""What comes back from the jobs of a batch, and which of it is unusual."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+from recon.io.files import read_text, reading
+from recon.run.batch.cluster import BatchOptions, Cluster
+from recon.run.batch.job import Job, Outcome
+from recon.run.run import SUMMARY
+
+ACCURACY: Final = (
+    "trajectory.t_rel_percent", "map.f_score", "t_rel_percent", "f_score", "disparity.bad.2.0",
+    "bad.2.0", "valid_percent", "points",
+)  # fmt: skip
+"""What jobs are judged by: of each command the first that its jobs have."""
+_LEAST_SPREAD: Final = {
+    "t_rel_percent": 0.1, "ate_m": 0.1, "expected_drift_percent": 0.1, "frames_not_trusted": 1.0,
+    "valid_percent": -1.0,
+}  # fmt: skip
+"""What is compared, drift and trust, by the last part of its name: what it differs by at least
+from drive to drive; negative where less is worse."""
+_SUMMARY_BYTES: Final = 1 << 26
+_LEAST_JOBS: Final = 4
+"""Fewer of one kind have no usual value."""
+#: The spread of a normal distribution from its median absolute deviation.
+_SIGMAS: Final = 1.4826
+#: Smallest spread, as a share of the median.
+_LEAST_SHARE: Final = 0.1
+_UNUSUAL: Final = 3.5
+"""Standard deviations from which a figure is unusual: 0.05 % of normal ones are."""
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """A job of a batch that has ended, or was not run; a `Step` of the progress.
+
+    Attributes:
+        job: The job.
+        last: How its last try ended; None = it was not run.
+        figures: Numbers of its summary by dotted name; none if it has none.
+        warnings: Warnings of its summary.
+        unusual: By how many standard deviations drift or trust are worse than usual; 0 = not.
+        remark: That figure with its usual value; "" = there is none.
+    """
+
+    job: Job
+    last: Outcome | None
+    figures: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    unusual: float = 0.0
+    remark: str = ""
+
+    @property
+    def seconds(self) -> float:
+        """Time of its last try."""
+        return self.last.seconds if self.last else 0.0
+
+    @property
+    def ok(self) -> bool:
+        """Whether it succeeded."""
+        return self.last is not None and self.last.state == "succeeded"
+
+    @property
+    def failed(self) -> bool:
+        """Whether it was run and did not succeed."""
+        return self.last is not None and not self.ok
+
+    @property
+    def state(self) -> str:
+        """Its name, for people."""
+        return self.job.name
+
+    @property
+    def error(self) -> str:
+        """Why it failed; "" if it did not."""
+        return self.last.error if self.last else ""
+
+    @property
+    def event(self) -> dict[str, Any]:
+        """How it ended."""
+        return {"event": "job", **self.facts}
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """How it ended, as the summary has it, without figures and warnings."""
+        return {
+            "name": self.job.name,
+            "command": self.job.command,
+            "source": self.job.source,
+            "state": "succeeded" if self.ok else "failed" if self.failed else "not run",
+            "tries": self.last.tries if self.last else 0,
+            "seconds": self.seconds,
+            "worker": self.last.worker if self.last else "",
+            **({"error": self.error} if self.failed else {}),
+            **({"swept": dict(self.job.swept)} if self.job.swept else {}),
+            **({"remark": self.remark} if self.remark else {}),
+        }
+
+
+def work_off(
+    jobs: Sequence[Job], folder: Path, cluster: Cluster, options: BatchOptions, unit: str = "jobs"
+) -> Iterator[JobResult]:
+    """Run jobs on workers and show how many are done; yields the result of each that ends.
+
+    Args:
+        jobs: The jobs.
+        folder: Folder of the batch.
+        cluster: The workers.
+        options: How they are run.
+        unit: What they are called.
+
+    Raises:
+        ClusterError: The scheduler or all workers are gone.
+    """
+    progress = options.progress
+    progress.on_stage(f"{len(cluster.workers)} workers, dashboard {cluster.dashboard}")
+    progress.on_start(folder.name, len(jobs), unit)
+    try:
+        for job, outcome in cluster.run(jobs, folder):
+            result = result_of(job, outcome, folder)
+            progress.on_step(result)
+            yield result
+    finally:
+        progress.on_finish()
+
+
+def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
+    """Return the result of a job, with the figures of its summary.
+
+    Raises:
+        FormatError: Its summary cannot be read.
+    """
+    if outcome.state != "succeeded":
+        return JobResult(job, outcome)
+    path = folder / job.name / SUMMARY
+    with reading(path):
+        summary = json.loads(read_text(path, _SUMMARY_BYTES))
+        if not outcome.seconds:  # its worker died before it could say so
+            outcome = replace(outcome, seconds=float(summary.get("seconds", 0.0)))
+        warnings = tuple(map(str, summary.get("warnings", ())))
+        return JobResult(job, outcome, dict(_flat(summary)), warnings)
+
+
+def compare(results: Sequence[JobResult]) -> list[JobResult]:
+    """Return the results with a remark where drift or trust are worse than in the other jobs.
+
+    Others are those of the same command with the same swept settings; how much worse is told by
+    the distance from their median in (robust) standard deviations.
+    """
+    groups: dict[str, list[JobResult]] = {}
+    for one in results:
+        key = json.dumps([one.job.command, dict(one.job.swept)], sort_keys=True, default=str)
+        groups.setdefault(key, []).append(one)
+    found = {name: worst for group in groups.values() for name, worst in _worst(group)}
+    return [
+        replace(one, unusual=far, remark=remark)
+        for one in results
+        for far, remark in [found.get(one.job.name, (0.0, ""))]
+    ]
+
+
+def outliers_first(results: Iterable[JobResult]) -> list[JobResult]:
+    """Return failed jobs first, then the most unusual ones."""
+    return sorted(results, key=lambda one: (not one.failed, -one.unusual, one.job.name))
+
+
+def accuracies(figures: Iterable[Mapping[str, float]]) -> list[str]:
+    """Return the names in `ACCURACY` of what jobs with these figures are judged by."""
+    firsts = {next((name for name in ACCURACY if name in one), "") for one in figures}
+    return [name for name in ACCURACY if name in firsts]
+
+
+def _flat(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Yield the finite numbers of a summary by dotted name; those in lists are left out."""
+    for key, value in summary.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif type(value) in (int, float) and math.isfinite(value):
+            yield f"{prefix}{key}", value
+
+
+def _worst(group: Sequence[JobResult]) -> Iterator[tuple[str, tuple[float, str]]]:
+    """Yield names of jobs with an unusual figure, how far it is from the usual one, and which."""
+    done = [one for one in group if one.figures]
+    names = sorted(set.intersection(*(set(one.figures) for one in done))) if done else []
+    compared = [name for name in names if name.rpartition(".")[2] in _LEAST_SPREAD]
+    if len(done) < _LEAST_JOBS or not compared:
+        return
+    far = {name: _far(name, [one.figures[name] for one in done]) for name in compared}
+    for number, one in enumerate(done):
+        most, name = max((far[name][number], name) for name in compared)
+        if most >= _UNUSUAL:
+            usual = statistics.median(each.figures[name] for each in done)
+            yield one.job.name, (most, f"{name} {one.figures[name]:.4g} (usually {usual:.4g})")
+
+
+def _far(name: str, values: Sequence[float]) -> list[float]:
+    """Return by how many standard deviations figures are worse than their median."""
+    least, median = _LEAST_SPREAD[name.rpartition(".")[2]], statistics.median(values)
+    spread = _SIGMAS * statistics.median(abs(value - median) for value in values)
+    spread = math.copysign(max(spread, _LEAST_SHARE * abs(median), abs(least)), least)
+    return [(value - median) / spread for value in values]

@@ -1,0 +1,206 @@
+"""Command lines of jobs are those of the program, and stay in their folder."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from recon.cli import app
+from recon.cli.program import _NOT_OPTIONS, COMMANDS, _command, plan_jobs
+from recon.commands import config
+from recon.commands.piece import piece_job
+from recon.core.errors import SettingsError
+from recon.map.drive.pieces import Piece
+from recon.run.batch.job import Job
+from recon.run.batch.job_file import Entry, JobList
+from tests.docs.blocks import ROOT
+
+DRIVE = {"name": "a", "command": "map", "source": ["drive"]}
+
+
+def plan(*jobs: Mapping[str, Any], folder: Path = ROOT, **sweep: Sequence[Any]) -> list[Job]:
+    names = {key.replace("__", "."): values for key, values in sweep.items()}
+    return plan_jobs(JobList([Entry.model_validate(job) for job in jobs], names, folder))
+
+
+def line(folder: Path = ROOT, /, **changes: Any) -> list[str]:
+    (job,) = plan({**DRIVE, **changes}, folder=folder)
+    return job.command_line(Path("out"))
+
+
+def test_a_command_line_has_what_the_job_says() -> None:
+    changes = {"options": ["--no-mesh"], "set": ["matching.sad.window_px=9"]}
+    assert line(**changes, threads=2, memory="4G") == [
+        "map", "drive", "--set", "matching.sad.window_px=9", "--threads", "2", "--memory-limit",
+        "4G", "--no-mesh", "--json", "--verbose", "--out", "out",
+    ]  # fmt: skip
+
+
+def test_limits_are_needs_of_a_worker() -> None:
+    (job,) = plan({**DRIVE, "threads": 2, "memory": "2G", "timeout_s": 5.0, "retries": 0})
+    assert (job.timeout_s, job.retries) == (5.0, 0)
+    assert job.needs == {"threads": 2.0, "memory": 2e9}
+
+
+def test_an_option_that_a_command_does_not_have_is_left_out_of_the_limits() -> None:
+    sources = ["a.txt", "b.txt"]
+    words = line(command="evaluate trajectory", source=sources, threads=1, memory="2G")
+    assert words == ["evaluate", "trajectory", *sources, "--json", "--out", "out"]
+
+
+SOURCES = {
+    "merge": 2, "pair": 2, "disparity": 2, "rectify": 2, "demo": 0, "evaluate trajectory": 2,
+    "evaluate map": 2, "evaluate disparity": 2,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_whole_command_line_of_a_job_is_one_of_the_program(command: str) -> None:
+    options = ["--map", "run"] if command == "localize" else []
+    words = line(command=command, source=["x"] * SOURCES.get(command, 1), options=options)
+    name = command.split()
+    assert words[: len(name)] == name
+    _command(command).make_context("recon", words[len(name) :])
+
+
+INPUTS = {
+    "--poses", "--calib", "--config", "--map", "--georeference", "--truth", "--align-to", "--mask",
+    "--confidence", "--results", "--times",
+}  # fmt: skip
+"""Options that name files which are read."""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_option_that_names_an_output_is_one_of_a_job(command: str) -> None:
+    options = [one for one in _command(command).params if one.opts[0].startswith("--")]
+    kinds = {one.opts[0]: getattr(one, "type_descriptor", None) or one.type for one in options}
+    paths = {name for name, kind in kinds.items() if "path" in str(kind).lower()}
+    assert "--config" in paths or "--out" in paths or command.startswith("evaluate")
+    assert paths - INPUTS <= _NOT_OPTIONS
+
+
+def test_the_folder_of_a_scene_is_a_pair_with_calibration_and_truth(tmp_path: Path) -> None:
+    for name in ("im0.png", "im1.png", "calib.txt", "disp0GT.pfm"):
+        (tmp_path / name).touch()
+    words = line(tmp_path, command="pair", source=[str(tmp_path)])
+    assert words[:7] == [
+        "pair", f"{tmp_path}/im0.png", f"{tmp_path}/im1.png", "--calib", f"{tmp_path}/calib.txt",
+        "--truth", f"{tmp_path}/disp0GT.pfm",
+    ]  # fmt: skip
+
+
+def test_a_scene_that_is_not_there_is_left_to_its_job(tmp_path: Path) -> None:
+    words = line(tmp_path, command="pair", source=["nowhere"])
+    assert words[:3] == ["pair", f"{tmp_path}/nowhere/im0.png", f"{tmp_path}/nowhere/im1.png"]
+
+
+def test_a_run_that_was_begun_is_resumed_with_its_limits(tmp_path: Path) -> None:
+    (job,) = plan({**DRIVE, "threads": 3, "memory": "2G"})
+    assert job.command_line(tmp_path, resume=True) == [
+        "map", "--resume", str(tmp_path), "--threads", "3", "--memory-limit", "2G", "--json",
+        "--verbose",
+    ]  # fmt: skip
+
+
+def test_a_piece_that_was_begun_is_told_again_what_it_is_of(tmp_path: Path) -> None:
+    job = piece_job(tmp_path / "pieces.json", 3, Piece(80, 140, 20), 2)
+    words = ["piece", str(tmp_path / "pieces.json"), "3", "--threads", "2", "--json", "--verbose"]
+    assert job.command_line(tmp_path / "3") == [*words, "--out", str(tmp_path / "3")]
+    resumed = job.command_line(tmp_path / "3", resume=True)
+    assert resumed == [*words, "--resume", str(tmp_path / "3")]
+
+
+def test_a_sweep_spreads_every_job_over_every_combination() -> None:
+    sweep = {"matching__sad__window_px": [9, 11], "matching__matcher": ["sad", "sgm"]}
+    jobs = plan(DRIVE, {**DRIVE, "name": "b"}, **sweep)
+    assert len(jobs) == 8
+    assert jobs[0].name == "a_window_px=9_matcher=sad"
+    found = jobs[0].words
+    assert found[-4:] == (
+        "--set", "matching.sad.window_px=9", "--set", 'matching.matcher="sad"',
+    )  # fmt: skip
+    assert jobs[7].name == "b_window_px=11_matcher=sgm"
+    assert jobs[7].swept == {"matching.sad.window_px": 11, "matching.matcher": "sgm"}
+
+
+def test_of_a_large_sweep_each_value_is_checked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked: list[Any] = []
+    load = config.load_config
+    monkeypatch.setattr(config, "load_config", lambda *words: checked.append(words) or load(*words))
+    windows, frames = [5, 7, 9, 11, 13], [*range(1, 601)]
+    jobs = plan(DRIVE, matching__sad__window_px=windows, checkpoints__every_frames=frames)
+    assert len(jobs) == 5 * 600
+    assert len(checked) == 5 + 600 - 1
+
+
+def test_a_wrong_value_of_a_sweep_is_refused() -> None:
+    with pytest.raises(SettingsError, match=r"job a: .*matching\.sad\.window_px"):
+        plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"command": "mapp"}, "job a: unknown command .*got mapp"),
+        ({"command": "batch"}, "unknown command"),
+        ({"command": "rm -rf /"}, "unknown command"),
+        ({"command": "map drive2"}, "unknown command"),
+        ({"command": ""}, "unknown command"),
+        ({"source": []}, "job a: job has no source"),
+        ({"name": "../a"}, "not a name of a folder"),
+        ({"set": ["matching.window_px=9"]}, "job a: .*matching.sad.window_px"),
+        ({"options": ["--no-such"]}, "job a: No such option.*no-such"),
+        ({"options": ["another"]}, "unexpected extra argument"),
+        ({"source": ["a", "b"]}, "unexpected extra argument"),
+        ({"command": "evaluate trajectory"}, "Missing argument"),
+        ({"memory": "much"}, "cannot read this size"),
+    ],
+)
+def test_jobs_that_are_none_are_one_line(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(SettingsError, match=words) as told:
+        line(**changes)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--"], ["--help"], ["-q"], ["-o/abs"], ["-vo/abs"], ["--out", "/abs"], ["--out=/abs"],
+        ["--resume", "x"], ["--into", "run"], ["--into", "run", "--remove", "0"], ["--json"],
+    ],
+)  # fmt: skip
+def test_a_job_writes_into_its_own_folder_alone(options: list[str]) -> None:
+    with pytest.raises(SettingsError, match="job a: a job cannot have this option"):
+        line(options=options)
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("audit", ["--mend", "/abs.yaml"]),
+        ("audit", ["--mend=/abs.yaml"]),
+        ("evaluate occupancy", ["--picture=/abs.png"]),
+        ("evaluate middlebury", ["--latex"]),
+    ],
+)
+def test_no_other_file_is_written_by_a_job(command: str, options: list[str]) -> None:
+    with pytest.raises(SettingsError, match="a job cannot have this option"):
+        line(command=command, options=options)
+    with pytest.raises(SettingsError, match="source is an option"):
+        line(command=command, source=["x", *options])
+
+
+@pytest.mark.parametrize("options", [["--set", "a=b"], ["--set=a=b"], ["-sa=b"], ["-s", "a=b"]])
+def test_settings_among_the_options_are_refused(options: list[str]) -> None:
+    with pytest.raises(SettingsError, match="job a: a setting among the options"):
+        line(options=options)
+
+
+def test_no_help_loses_words_in_brackets_to_the_markup() -> None:
+    texts = [each.callback.__doc__ or "" for each in app.registered_commands if each.callback]
+    assert "recon\\[cluster]" in "".join(texts)
+    assert [text for text in texts if re.search(r"(?<!\\)\[[a-z]+\]", text)] == []
