@@ -21,14 +21,9 @@ _OVERLAP_M: Final = 5e-4  # overlap of pieces of wall, so that no ray passes bet
 _FRAME_M: Final = 0.07
 
 _PLASTERS = [
-    (0.80, 0.74, 0.62),
-    (0.72, 0.66, 0.60),
-    (0.82, 0.80, 0.76),
-    (0.77, 0.62, 0.47),
-    (0.66, 0.70, 0.68),
-    (0.80, 0.70, 0.66),
-    (0.70, 0.58, 0.50),
-]
+    (0.80, 0.74, 0.62), (0.72, 0.66, 0.60), (0.82, 0.80, 0.76), (0.77, 0.62, 0.47),
+    (0.66, 0.70, 0.68), (0.80, 0.70, 0.66), (0.70, 0.58, 0.50),
+]  # fmt: skip
 _BRICKS = [(0.58, 0.33, 0.26), (0.64, 0.44, 0.33), (0.50, 0.32, 0.28), (0.66, 0.55, 0.42)]
 _ROOFS = [(0.48, 0.26, 0.20), (0.30, 0.30, 0.32), (0.40, 0.28, 0.24)]
 _DOORS = [(0.30, 0.18, 0.12), (0.16, 0.26, 0.22), (0.36, 0.12, 0.12), (0.20, 0.24, 0.34)]
@@ -37,21 +32,7 @@ _TRIM = [(0.84, 0.82, 0.78), (0.62, 0.58, 0.52), (0.45, 0.42, 0.40)]
 
 @dataclass(frozen=True)
 class HousePlan:
-    """Dimensions (metres) and colours of one house.
-
-    Attributes:
-        width: Width of the facade.
-        depth: Depth of the house.
-        floors: Number of storeys.
-        storey: Height of a storey.
-        window: Width and height of a window.
-        sill: Height of the lower edge of a window above the floor.
-        pitched: Gable roof rather than parapet.
-        wall: Paint of the walls.
-        trim: Paint of ledges and frames.
-        door: Paint of the door.
-        roof: Paint of the roof.
-    """
+    """Dimensions (metres) and colours of one house."""
 
     width: float
     depth: float
@@ -59,7 +40,7 @@ class HousePlan:
     storey: float
     window: tuple[float, float]
     sill: float
-    pitched: bool
+    pitched: bool  # a gable roof rather than a parapet
     wall: Paint
     trim: Paint
     door: Paint
@@ -77,7 +58,8 @@ def draw_plan(width: float, rng: np.random.Generator) -> HousePlan:
     colours = _BRICKS if brick else _PLASTERS
     base = np.clip(np.array(colours[rng.integers(len(colours))]) + rng.normal(0, 0.03, 3), 0, 1)
     part = int(rng.integers(1, 2**30))
-    wall = Paint(Material.BRICK if brick else Material.PLASTER, _rgb(base), part)
+    r, g, b = base.tolist()
+    wall = Paint(Material.BRICK if brick else Material.PLASTER, (r, g, b), part)
     return HousePlan(
         width=width,
         depth=float(rng.uniform(8.0, 11.0)),
@@ -96,16 +78,11 @@ def draw_plan(width: float, rng: np.random.Generator) -> HousePlan:
 def house(plan: HousePlan, rng: np.random.Generator) -> TriangleSoup:
     """Build a house, in the axes described above."""
     holes, door = _openings(plan, rng)
-    parts = [_facade(plan, np.vstack([holes, door])), _leaf(door, plan.door)]
-    parts += [_windows(holes, rng), _reveals(np.vstack([holes, door]), plan.trim)]
-    parts.append(_ledges(plan, holes))
-    parts += [_blind_walls(plan), _gable(plan) if plan.pitched else _flat_roof(plan)]
-    parts.append(_downpipe(plan, rng))
+    every = np.vstack([holes, door])
+    parts = [_facade(plan, every), _leaf(door, plan.door), _windows(holes, rng)]
+    parts += [_reveals(every, plan.trim), _ledges(plan, holes), _blind_walls(plan)]
+    parts += [_gable(plan) if plan.pitched else _flat_roof(plan), _downpipe(plan, rng)]
     return merge(parts)
-
-
-def _rgb(values: Float64) -> tuple[float, float, float]:
-    return (float(values[0]), float(values[1]), float(values[2]))
 
 
 def _openings(plan: HousePlan, rng: np.random.Generator) -> tuple[Float64, Float64]:
@@ -139,13 +116,9 @@ def _facade(plan: HousePlan, holes: Float64) -> TriangleSoup:
     low = np.column_stack([xs[column], zs[row]]) - _OVERLAP_M
     high = np.column_stack([xs[column + 1], zs[row + 1]]) + _OVERLAP_M
     size, zero = high - low, np.zeros(len(low))
-    return quads(
-        np.column_stack([low[:, 0], zero, low[:, 1]]),
-        np.column_stack([size[:, 0], zero, zero]),
-        np.column_stack([zero, zero, size[:, 1]]),
-        plan.wall,
-        low,
-    )
+    corners = np.column_stack([low[:, 0], zero, low[:, 1]])
+    along, up = np.column_stack([size[:, 0], zero, zero]), np.column_stack([zero, zero, size[:, 1]])
+    return quads(corners, along, up, plan.wall, low)
 
 
 def _leaf(door: Float64, paint: Paint) -> TriangleSoup:
@@ -159,38 +132,24 @@ def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
     x0, z0, x1, z1 = holes.T
     w, h, f = x1 - x0, z1 - z0, np.full(len(holes), _FRAME_M)
     # Left end, lower end, width and height of the six bars of each window.
-    bars = np.array(
-        [
-            [x0, z0, w, f],
-            [x0, z1 - f, w, f],
-            [x0, z0, f, h],
-            [x1 - f, z0, f, h],
-            [x0 + w / 2 - f / 2, z0, f, h],
-            [x0, z0 + 0.68 * h, w, f],
-        ]
-    )
+    bars = np.array([
+        [x0, z0, w, f], [x0, z1 - f, w, f], [x0, z0, f, h], [x1 - f, z0, f, h],
+        [x0 + w / 2 - f / 2, z0, f, h], [x0, z0 + 0.68 * h, w, f],
+    ])  # fmt: skip
     bars = bars.transpose(2, 0, 1).reshape(-1, 4)
     glass = Paint(Material.GLASS, (0.22, 0.25, 0.29))
     wood = Paint(Material.PLAIN, (0.86, 0.85, 0.82))
     panes = np.column_stack([x0, z0, w, h])
-    return merge(
-        [
-            _upright(panes, _REVEAL_M, glass, parts),
-            _upright(bars, _REVEAL_M - 0.03, wood, np.repeat(parts, 6)),
-        ]
-    )
+    frames = _upright(bars, _REVEAL_M - 0.03, wood, np.repeat(parts, 6))
+    return merge([_upright(panes, _REVEAL_M, glass, parts), frames])
 
 
 def _upright(rectangles: Float64, y: float, paint: Paint, parts: NDArray[Any]) -> TriangleSoup:
     """Return rectangles (N, 4) of x, z, width and height, parallel to the facade."""
     x, z, width, height = rectangles.T
     zero = np.zeros(len(x))
-    soup = quads(
-        np.column_stack([x, zero + y, z]),
-        np.column_stack([width, zero, zero]),
-        np.column_stack([zero, zero, height]),
-        paint,
-    )
+    along, up = np.column_stack([width, zero, zero]), np.column_stack([zero, zero, height])
+    soup = quads(np.column_stack([x, zero + y, z]), along, up, paint)
     return replace(soup, part=np.repeat(parts, 2).astype(np.int32))
 
 
@@ -216,19 +175,15 @@ def _ledges(plan: HousePlan, holes: Float64) -> TriangleSoup:
     high = np.array([[w, 0.02, z1] for _, z1, _ in bands])
     x0, z0, x1 = holes[:, 0], holes[:, 1], holes[:, 2]
     flat = np.full(len(holes), 0.02)
-    sills = boxes(
-        np.stack([x0 - 0.08, flat - 0.14, z0 - 0.07], axis=1),
-        np.stack([x1 + 0.08, flat, z0], axis=1),
-        plan.trim,
-    )
+    under = np.stack([x0 - 0.08, flat - 0.14, z0 - 0.07], axis=1)
+    sills = boxes(under, np.stack([x1 + 0.08, flat, z0], axis=1), plan.trim)
     return merge([boxes(low, high, plan.trim), sills])
 
 
 def _blind_walls(plan: HousePlan) -> TriangleSoup:
     w, d, h = plan.width, plan.depth, plan.eaves
-    return quads(
-        [[0, 0, 0], [w, 0, 0], [0, d, 0]], [[0, d, 0], [0, d, 0], [w, 0, 0]], [0, 0, h], plan.wall
-    )
+    feet, along = [[0, 0, 0], [w, 0, 0], [0, d, 0]], [[0, d, 0], [0, d, 0], [w, 0, 0]]
+    return quads(feet, along, [0, 0, h], plan.wall)
 
 
 def _gable(plan: HousePlan) -> TriangleSoup:
@@ -236,12 +191,9 @@ def _gable(plan: HousePlan) -> TriangleSoup:
     w, d, h, out = plan.width, plan.depth, plan.eaves + 0.05, 0.35
     rise = 0.42 * d
     slope = rise / (d / 2)
-    front = quads(
-        [0, -out, h - out * slope], [w, 0, 0], [0, d / 2 + out, rise + out * slope], plan.roof
-    )
-    back = quads(
-        [0, d + out, h - out * slope], [w, 0, 0], [0, -d / 2 - out, rise + out * slope], plan.roof
-    )
+    foot, climb = h - out * slope, rise + out * slope
+    front = quads([0, -out, foot], [w, 0, 0], [0, d / 2 + out, climb], plan.roof)
+    back = quads([0, d + out, foot], [w, 0, 0], [0, -d / 2 - out, climb], plan.roof)
     corners = np.array([[[x, 0, h], [x, d, h], [x, d / 2, h + rise]] for x in (0.0, w)])
     return merge([front, back, painted(corners, corners[..., 1:].copy(), plan.wall)])
 

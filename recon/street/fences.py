@@ -6,7 +6,6 @@ Axes of a section: x along the street, y away from the road, z up, its base at z
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -61,13 +60,7 @@ def shop_window(rng: np.random.Generator) -> TriangleSoup:
     return merge(parts)
 
 
-SECTIONS: Final[tuple[Callable[[np.random.Generator], TriangleSoup], ...]] = (
-    picket_fence,
-    railing,
-    hedge,
-    wires,
-    shop_window,
-)
+SECTIONS: Final = (picket_fence, railing, hedge, wires, shop_window)
 
 
 def _row(step_m: float, size_m: tuple[float, float, float], paint: Paint) -> TriangleSoup:

@@ -18,11 +18,7 @@ _EXPOSURE: Final = 0.9
 
 
 def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
-    """Render one view.
-
-    Returns:
-        float64 (H, W, 3), display values in [0, 1].
-    """
+    """Render one view as float64 (H, W, 3), display values in [0, 1]."""
     size = (view.height_px, view.width_px)
     pixels = view.pixels()
     sample = stage.look(view.origin, view.directions(pixels), 1.0 / view.focal_px)
@@ -36,18 +32,7 @@ def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
 def record(
     image: Float64, *, gain: float, offset_dn: float, noise_dn: float, key: list[int]
 ) -> UInt8:
-    """Apply a sensor model to display values.
-
-    Args:
-        image: float64 (H, W, 3) in [0, 1].
-        gain: Factor on brightness.
-        offset_dn: Grey levels added.
-        noise_dn: Standard deviation of Gaussian noise, grey levels.
-        key: Seed of the noise; equal keys give equal noise.
-
-    Returns:
-        uint8 (H, W, 3).
-    """
+    """Apply a sensor model to display values (H, W, 3) in [0, 1]; ``key`` seeds the noise."""
     levels = 255.0 * gain * image + offset_dn
     if noise_dn > 0:
         levels += noise_dn * np.random.default_rng(key).standard_normal(levels.shape)
@@ -83,19 +68,11 @@ def _edges(sample: Sample, size: tuple[int, int]) -> Bool:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A pinhole camera in a scene.
+    """A pinhole camera in a scene."""
 
-    Attributes:
-        T_scene_camera: float64 (4, 4).
-        focal_px: Focal length.
-        centre_px: Principal point, column and row.
-        width_px: Image width.
-        height_px: Image height.
-    """
-
-    T_scene_camera: Float64
+    T_scene_camera: Float64  # (4, 4)
     focal_px: float
-    centre_px: tuple[float, float]
+    centre_px: tuple[float, float]  # principal point, column and row
     width_px: int
     height_px: int
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -22,59 +22,28 @@ ROAD_HALF_M: Final = 5.2
 _LANE_HALF_M = 3.05
 
 
-class Grain(NamedTuple):
-    """Grain of a material.
-
-    Attributes:
-        wavelength_m: Coarsest wavelength.
-        contrast: Strength, in the exponent of the brightness.
-    """
-
-    wavelength_m: float
-    contrast: float
-
-
+#: Of each grain: coarsest wavelength in metres, strength in the exponent of the brightness.
 GRAIN: Final = {
-    Material.PLAIN: Grain(0.6, 0.5),
-    Material.ASPHALT: Grain(0.6, 0.5),
-    Material.PAVING: Grain(0.8, 0.4),
-    Material.KERB: Grain(0.5, 0.45),
-    Material.PLASTER: Grain(2.2, 0.30),
-    Material.BRICK: Grain(1.2, 0.45),
-    Material.GLASS: Grain(1.6, 0.9),
-    Material.DOOR: Grain(0.5, 0.35),
-    Material.ROOF: Grain(0.8, 0.5),
-    Material.CAR_PAINT: Grain(0.5, 0.09),
-    Material.CAR_GLASS: Grain(0.7, 0.09),
-    Material.BARK: Grain(0.25, 1.0),
-    Material.LEAVES: Grain(0.6, 2.0),
-    Material.METAL: Grain(0.3, 0.35),
-    Material.GRASS: Grain(0.7, 0.9),
-    Material.POSTER: Grain(0.35, 0.6),
-}
-_WAVELENGTHS = np.array([GRAIN[m].wavelength_m for m in Material])
-_CONTRASTS = np.array([GRAIN[m].contrast for m in Material])
+    Material.PLAIN: (0.6, 0.5), Material.ASPHALT: (0.6, 0.5), Material.PAVING: (0.8, 0.4),
+    Material.KERB: (0.5, 0.45), Material.PLASTER: (2.2, 0.30), Material.BRICK: (1.2, 0.45),
+    Material.GLASS: (1.6, 0.9), Material.DOOR: (0.5, 0.35), Material.ROOF: (0.8, 0.5),
+    Material.CAR_PAINT: (0.5, 0.09), Material.CAR_GLASS: (0.7, 0.09), Material.BARK: (0.25, 1.0),
+    Material.LEAVES: (0.6, 2.0), Material.METAL: (0.3, 0.35), Material.GRASS: (0.7, 0.9),
+    Material.POSTER: (0.35, 0.6),
+}  # fmt: skip
+_WAVELENGTHS, _CONTRASTS = np.array([GRAIN[material] for material in Material]).T.copy()
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Points of one material, the input of its recipe.
+    """Points of one material, the input of its recipe."""
 
-    Attributes:
-        uv: float64 (N, 2), metres on the surface.
-        spread: float64 (N, 2), footprint of the pixel along u and v.
-        height_m: float64 (N,), above the road.
-        grain: float64 (N,), noise of mean 0.
-        rgb: float64 (N, 3), base colour as displayed.
-        part: int32 (N,), number of the object.
-    """
-
-    uv: Float64
-    spread: Float64
-    height_m: Float64
-    grain: Float64
-    rgb: Float64
-    part: Int32
+    uv: Float64  # (N, 2), metres on the surface
+    spread: Float64  # (N, 2), footprint of the pixel along u and v
+    height_m: Float64  # (N,), above the road
+    grain: Float64  # (N,), noise of mean 0
+    rgb: Float64  # (N, 3), base colour as displayed
+    part: Int32  # (N,), number of the object
 
     @property
     def u(self) -> Float64:
@@ -91,17 +60,7 @@ Recipe = Callable[[Patch], Float64]
 
 
 def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Float64:
-    """Return diffuse colour of points.
-
-    Args:
-        soup: The scene.
-        faces: int32 (N,), the triangles hit by the rays.
-        hits: The hit points.
-        seed: Seed of the grain.
-
-    Returns:
-        float64 (N, 3), linear light, in [0, 1].
-    """
+    """Return float64 (N, 3), diffuse colours in [0, 1], linear light, of points on ``faces``."""
     material = soup.material[faces]
     grain = fractal_noise(
         hits.xyz, hits.smear, hits.width, _WAVELENGTHS[material], _OCTAVES, _ROUGHNESS, seed
@@ -264,40 +223,27 @@ def _poster(p: Patch) -> Float64:
 
 
 RECIPES: Final[dict[Material, Recipe]] = {
-    Material.ASPHALT: _asphalt,
-    Material.PAVING: _paving,
-    Material.KERB: _kerb,
-    Material.PLASTER: _plaster,
-    Material.BRICK: _brick,
-    Material.GLASS: _glass,
-    Material.DOOR: _door,
-    Material.ROOF: _roof,
-    Material.CAR_PAINT: _car_paint,
-    Material.CAR_GLASS: _car_glass,
-    Material.LEAVES: _leaves,
-    Material.METAL: _metal,
+    Material.ASPHALT: _asphalt, Material.PAVING: _paving, Material.KERB: _kerb,
+    Material.PLASTER: _plaster, Material.BRICK: _brick, Material.GLASS: _glass,
+    Material.DOOR: _door, Material.ROOF: _roof, Material.CAR_PAINT: _car_paint,
+    Material.CAR_GLASS: _car_glass, Material.LEAVES: _leaves, Material.METAL: _metal,
     Material.POSTER: _poster,
-}
+}  # fmt: skip
 
 
 def sky_colour(directions: Float64, pixel: float, seed: int) -> Float64:
-    """Return linear light (N, 3) of the sky: blue above, haze below, clouds.
+    """Return linear light (N, 3) of the sky, z up: blue above, haze below, clouds.
 
-    Args:
-        directions: (N, 3), z up, any length.
-        pixel: Width of a pixel, radians.
-        seed: Seed of the clouds.
+    ``pixel`` is the width of a pixel in radians.
     """
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     climb = np.clip(unit[:, 2:], 0.0, 1.0)
     haze = np.exp(-climb / 0.22)
     blue = np.array([0.36, 0.55, 0.83]) ** GAMMA
     white = np.array([0.86, 0.89, 0.93]) ** GAMMA
-    flat = unit * [1.0, 1.0, 2.5]
-    n = len(unit)
-    clouds = fractal_noise(
-        flat, np.zeros((n, 3)), np.full(n, pixel), np.full(n, 0.4), 6, 0.65, seed + 5
-    )
+    flat, n = unit * [1.0, 1.0, 2.5], len(unit)
+    width, wavelength = np.full(n, pixel), np.full(n, 0.4)
+    clouds = fractal_noise(flat, np.zeros((n, 3)), width, wavelength, 6, 0.65, seed + 5)
     cover = np.clip(0.35 + 1.1 * clouds, 0.0, 1.0)[:, None]
     clear = blue + (white - blue) * haze
     return np.asarray(clear + (white - clear) * 0.85 * cover)

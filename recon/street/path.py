@@ -28,21 +28,14 @@ R_STREET_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """The centre line of the road, parametrised by the distance along it.
+    """The centre line of the road, parametrised by the distance along it."""
 
-    Attributes:
-        along_m: float64 (N,), distances, increasing; the drive begins at 0.
-        xy_m: float64 (N, 2), street axes.
-        heading_rad: float64 (N,), direction, counter-clockwise from x.
-        span_m: Range of distances with objects; a repeated street is laid out over one period.
-        loop_m: Length of one lap if the line is closed, else None.
-    """
-
-    along_m: Float64
-    xy_m: Float64
-    heading_rad: Float64
+    along_m: Float64  # (N,), distances, increasing; the drive begins at 0
+    xy_m: Float64  # (N, 2), street axes
+    heading_rad: Float64  # (N,), direction, counter-clockwise from x
+    #: Range of distances with objects; a repeated street is laid out over one period.
     span_m: tuple[float, float]
-    loop_m: float | None = None
+    loop_m: float | None = None  # length of one lap if the line is closed
 
     def heading(self, along_m: float) -> float:
         """Return the direction of the road at a distance along it."""
@@ -59,9 +52,8 @@ class CentreLine:
     def place(self, along_m: float, lateral_m: float, height_m: float = 0.0) -> Float64:
         """Return ``T_street_object`` of an object at that position that faces along the road."""
         x, y = self.points(np.array([along_m]), np.array([lateral_m]))[0]
-        return se3.make_transform(
-            se3.exp_so3(np.array([0.0, 0.0, self.heading(along_m)])), np.array([x, y, height_m])
-        )
+        turn = se3.exp_so3(np.array([0.0, 0.0, self.heading(along_m)]))
+        return se3.make_transform(turn, np.array([x, y, height_m]))
 
     def bends(self, from_m: float, to_m: float) -> bool:
         """Return whether any part of a stretch lies on a corner."""

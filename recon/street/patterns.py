@@ -44,12 +44,8 @@ def tile_tone(
 ) -> Float64:
     """Return a random tone in [-1, 1) per tile, averaged if a pixel covers several.
 
-    Args:
-        uv: float64 (N, 2), metres.
-        tile: Size of a tile along u and v.
-        spread: float64 (N, 2), footprint of the pixel.
-        seed: int (N,), number of the object.
-        bond: Offset of each row from the one below, as a fraction of the tile (bricks: 0.5).
+    ``seed`` is the number of the object; ``bond`` the offset of each row from the one below, as a
+    fraction of the tile (bricks: 0.5).
     """
     total = np.zeros(len(uv))
     for su, sv in ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)):

@@ -9,28 +9,14 @@ import numpy as np
 
 from recon.core.geometry import se3
 from recon.core.values.arrays import Float64
-from recon.street.shapes import (
-    FAR_UV,
-    boxes,
-    bumpy_ball,
-    cylinder,
-    disc,
-    extrusion,
-    frustum,
-    quads,
-)
+from recon.street import shapes
+from recon.street.shapes import FAR_UV, boxes, cylinder, disc, frustum, quads
 from recon.street.soup import Material, Paint, TriangleSoup, merge, move
 
 _PAINTS = [
-    (0.62, 0.63, 0.65),
-    (0.12, 0.13, 0.15),
-    (0.82, 0.82, 0.80),
-    (0.55, 0.10, 0.10),
-    (0.13, 0.22, 0.42),
-    (0.34, 0.36, 0.38),
-    (0.22, 0.34, 0.26),
-    (0.72, 0.66, 0.48),
-]
+    (0.62, 0.63, 0.65), (0.12, 0.13, 0.15), (0.82, 0.82, 0.80), (0.55, 0.10, 0.10),
+    (0.13, 0.22, 0.42), (0.34, 0.36, 0.38), (0.22, 0.34, 0.26), (0.72, 0.66, 0.48),
+]  # fmt: skip
 _POSTERS = [(0.62, 0.30, 0.22), (0.25, 0.42, 0.62), (0.66, 0.58, 0.25), (0.35, 0.52, 0.36)]
 
 
@@ -53,12 +39,10 @@ def car(rng: np.random.Generator) -> TriangleSoup:
 def _body(length: float, width: float, paint: Paint, van: bool) -> TriangleSoup:
     """Return the lower body with sills, bumpers, bonnet and boot."""
     a = length / 2
-    boot = (
-        [(-a + 0.06, 0.92), (-a, 0.6)] if van else [(-a + 0.55, 0.97), (-a + 0.08, 0.9), (-a, 0.6)]
-    )
+    boot = [(-a + 0.06, 0.92)] if van else [(-a + 0.55, 0.97), (-a + 0.08, 0.9)]
     profile = [(-a + 0.05, 0.24), (a - 0.1, 0.2), (a, 0.36), (a - 0.03, 0.62), (a - 0.25, 0.76)]
-    profile += [(a - 1.05, 0.93), (0.0, 0.97), *boot]
-    return extrusion(profile, width, paint)
+    profile += [(a - 1.05, 0.93), (0.0, 0.97), *boot, (-a, 0.6)]
+    return shapes.extrusion(profile, width, paint)
 
 
 def _cabin(length: float, width: float, height: float, paint: Paint, van: bool) -> TriangleSoup:
@@ -115,7 +99,7 @@ def tree(rng: np.random.Generator) -> TriangleSoup:
         away[2] = abs(away[2]) * 1.3 + 0.75 * spread
         shade = tuple(float(c) for c in np.clip(green * rng.uniform(0.85, 1.15), 0, 1))
         leaves = Paint(Material.LEAVES, (shade[0], shade[1], shade[2]), part + k)
-        ball = bumpy_ball(radii, leaves, bump=0.22, wavelength=0.28, seed=part + k)
+        ball = shapes.bumpy_ball(radii, leaves, bump=0.22, wavelength=0.28, seed=part + k)
         parts.append(move(ball, _at(away[0], away[1], away[2] + height)))
     return merge(parts)
 
@@ -137,13 +121,12 @@ def sign(rng: np.random.Generator) -> TriangleSoup:
     if rng.random() < 0.5:
         blue = Paint(Material.POSTER, (0.16, 0.30, 0.62), part)
         return merge([pole, boxes([-0.08, -0.3, 2.2], [-0.045, 0.3, 2.85], blue)])
-    to_face = se3.make_transform(
-        se3.exp_so3(np.array([0, 0, np.pi / 2])), np.array([-0.05, 0.0, 2.5])
-    )
-    red = move(disc(0.33, Paint(Material.PLAIN, (0.70, 0.10, 0.10), part), 20), to_face)
-    to_front = se3.make_transform(to_face[:3, :3], np.array([-0.055, 0.0, 2.5]))
-    white = move(disc(0.23, Paint(Material.PLAIN, (0.88, 0.88, 0.86), part), 20), to_front)
-    return merge([pole, red, white])
+    turn = se3.exp_so3(np.array([0, 0, np.pi / 2]))
+    rings = [pole]
+    for x, radius, rgb in ((-0.05, 0.33, (0.70, 0.10, 0.10)), (-0.055, 0.23, (0.88, 0.88, 0.86))):
+        ring = disc(radius, Paint(Material.PLAIN, rgb, part), 20)
+        rings.append(move(ring, se3.make_transform(turn, np.array([x, 0.0, 2.5]))))
+    return merge(rings)
 
 
 def bollard(rng: np.random.Generator) -> TriangleSoup:
@@ -161,9 +144,8 @@ def advertising_pillar(rng: np.random.Generator) -> TriangleSoup:
     posters = Paint(Material.POSTER, _POSTERS[rng.integers(len(_POSTERS))], part)
     stone = Paint(Material.PLAIN, (0.40, 0.42, 0.40), part + 1)
     hat = move(cylinder((0.75, 0.05), 0.5, stone, 16), _at(0.0, 0.0, 2.7))
-    return merge(
-        [cylinder((0.6, 0.6), 2.7, posters, 24), cylinder((0.65, 0.65), 0.3, stone, 24), hat]
-    )
+    foot = cylinder((0.65, 0.65), 0.3, stone, 24)
+    return merge([cylinder((0.6, 0.6), 2.7, posters, 24), foot, hat])
 
 
 def bin_(rng: np.random.Generator) -> TriangleSoup:
@@ -172,14 +154,11 @@ def bin_(rng: np.random.Generator) -> TriangleSoup:
     colours = [(0.20, 0.30, 0.22), (0.28, 0.28, 0.30), (0.45, 0.36, 0.18)]
     paint = Paint(Material.PLAIN, colours[rng.integers(3)], part)
     lid = Paint(Material.PLAIN, (0.18, 0.19, 0.20), part + 1)
-    bucket = move(frustum([-0.3, -0.3, -1.0], [0.3, 0.3, 0.0], (0.06, 0.06, 0.06), paint), _flip())
+    # Half a turn about x, as it narrows towards the base.
+    flip = se3.make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    bucket = move(frustum([-0.3, -0.3, -1.0], [0.3, 0.3, 0.0], (0.06, 0.06, 0.06), paint), flip)
     return merge([bucket, boxes([-0.33, -0.33, 1.0], [0.33, 0.33, 1.08], lid)])
 
 
 def _at(x: float, y: float, z: float) -> Float64:
     return se3.make_transform(np.eye(3), np.array([x, y, z]))
-
-
-def _flip() -> Float64:
-    """Return half a turn about x, for shapes that narrow towards the base instead of the top."""
-    return se3.make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))

@@ -20,21 +20,13 @@ from recon.street.street import StreetWorld
 
 @dataclass(frozen=True, eq=False)
 class SyntheticFrame:
-    """One stereo pair with its exact ground truth.
-
-    Attributes:
-        pair: The images, uint8 (H, W, 3) RGB.
-        depth_m: float32 (H, W), depth of the left image; NaN = sky.
-        truth: Disparity of the left image, NaN = sky; and which points the right camera also sees.
-        T_world_camera: float64 (4, 4), pose of the left camera; that of frame 0 is the identity.
-        ground_plane: float64 (4,), ``(a, b, c, d)``: ``a·x + b·y + c·z + d`` is the height of a
-            point in left camera axes above the road.
-    """
+    """One stereo pair with its exact ground truth."""
 
     pair: StereoPair
-    depth_m: Float32
-    truth: DisparityTruth
-    T_world_camera: Float64
+    depth_m: Float32  # (H, W), depth of the left image; NaN = sky
+    truth: DisparityTruth  # of the left image, NaN = sky; and which points the right camera sees
+    T_world_camera: Float64  # (4, 4), pose of the left camera; that of frame 0 is the identity
+    #: (4,), ``a·x + b·y + c·z + d`` is the height above the road of a point in camera axes.
     ground_plane: Float64
 
     def __post_init__(self) -> None:
@@ -44,7 +36,11 @@ class SyntheticFrame:
 
 
 class StreetCamera:
-    """The rig in a street; renders frames in any order."""
+    """The rig in a street; renders frames in any order.
+
+    Raises:
+        SettingsError: A frame is asked for that there is not.
+    """
 
     def __init__(self, world: StreetWorld) -> None:
         self.world = world
@@ -62,11 +58,7 @@ class StreetCamera:
         return make_stage(self.world.soup, self.world.to_sun, settings.seed, settings.threads)
 
     def render(self, index: int) -> SyntheticFrame:
-        """Render one stereo pair with its ground truth.
-
-        Raises:
-            SettingsError: There is no such frame.
-        """
+        """Render one stereo pair with its ground truth."""
         depth = self.depth(index)
         return SyntheticFrame(
             pair=self.pair(index),
@@ -77,11 +69,7 @@ class StreetCamera:
         )
 
     def pair(self, index: int) -> StereoPair:
-        """Render only the images.
-
-        Raises:
-            SettingsError: There is no such frame.
-        """
+        """Render only the images."""
         # Prepared before the threads start, so that it is done only once.
         views, stage = self.views(index), self.stage
         smooth, threads = self.world.settings.smooth_edges, self.world.settings.threads
@@ -89,44 +77,25 @@ class StreetCamera:
         with ThreadPoolExecutor(max_workers=1 if threads == 1 else 2) as pool:
             images = list(pool.map(lambda view: take_image(stage, view, smooth), views))
         left, right = (self._record(image, index, side) for side, image in enumerate(images))
-        return StereoPair(
-            left=left,
-            right=right,
-            timestamp_s=index / self.world.settings.frame_rate_hz,
-            index=index,
-            name=f"{index:06d}",
-        )
+        time_s = index / self.world.settings.frame_rate_hz
+        return StereoPair(left, right, timestamp_s=time_s, index=index, name=f"{index:06d}")
 
     def depth(self, index: int) -> Float32:
-        """Return True depth of the left image.
-
-        Returns:
-            float32 (H, W), metres; NaN = sky.
-
-        Raises:
-            SettingsError: There is no such frame.
-        """
+        """Return float32 (H, W), true depth of the left image in metres; NaN = sky."""
         view = self.views(index)[0]
         depth = self.stage.depth(view.origin, view.directions(view.pixels()))
         return depth.reshape(view.height_px, view.width_px).astype(np.float32)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
-        """Return the true disparity of the left image, without rendering the images.
-
-        Raises:
-            SettingsError: There is no such frame.
-        """
+        """Return the true disparity of the left image, without rendering the images."""
         return self._truth(index, self.depth(index))
 
     def views(self, index: int) -> tuple[View, View]:
-        """Return the left and right view of a frame, in street axes.
-
-        Raises:
-            SettingsError: There is no such frame.
-        """
+        """Return the left and right view of a frame, in street axes."""
         if not 0 <= index < len(self):
+            expected = f"0 to {len(self) - 1}"
             raise SettingsError(
-                "no such frame", got=index, expected=f"0 to {len(self) - 1}", hint="raise `frames`"
+                "no such frame", got=index, expected=expected, hint="raise `frames`"
             )
         return stereo_views(self.world.camera, self.world.T_street_camera[index])
 

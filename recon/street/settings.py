@@ -58,63 +58,24 @@ class StreetSettings(Settings):
 class StreetScene(StreetSettings):
     """A street in every detail; the defaults are those of `recon demo`."""
 
-    speed_m_per_frame: float = Field(
-        default=1.0, ge=0.0, le=5.0, description="Distance driven between two frames."
-    )
-    frame_rate_hz: float = Field(
-        default=10.0, ge=1e-3, le=1e6, description="Frame rate; affects only the timestamps."
-    )
-    block_m: tuple[_SideM, _SideM] = Field(
-        default=(100.0, 70.0), description="Side lengths of the block for path = block."
-    )
-    repeat_m: float | None = Field(
-        default=None,
-        ge=20.0,
-        le=1000.0,
-        description="Period after which a straight street repeats itself. None = never.",
-    )
-    fences: bool = Field(
-        default=False,
-        description="Fences, railings, hedges, wires and shop windows along the pavement instead "
-        "of parked cars and street furniture.",
-    )
-    sway: float = Field(
-        default=1.0,
-        ge=0.0,
-        le=5.0,
-        description="Amount of lateral drift and pitching of the car; 0 = none.",
-    )
-    yaw_deg: float = Field(
-        default=1.5, ge=-45.0, le=45.0, description="Yaw of the mounted rig; positive = right."
-    )
-    roll_deg: float = Field(
-        default=0.3, ge=-30.0, le=30.0, description="Roll of the mounted rig; positive = clockwise."
-    )
-    noise_dn: float = Field(
-        default=1.0,
-        ge=0.0,
-        le=50.0,
-        description="Sensor noise, standard deviation in grey levels (0 to 255).",
-    )
-    right_gain: float = Field(
-        default=1.0,
-        gt=0.0,
-        le=4.0,
-        description="Brightness of the right camera relative to the left.",
-    )
-    right_offset_dn: float = Field(
-        default=0.0, ge=-128.0, le=128.0, description="Grey levels added in the right image."
-    )
-    smooth_edges: bool = Field(
-        default=True,
-        description="Cast four rays instead of one per pixel at edges (antialiasing).",
-    )
-    threads: int = Field(
-        default=0,
-        ge=0,
-        le=256,
-        description="Rendering threads, 0 = one per core; does not affect the result.",
-    )
+    speed_m_per_frame: float = Field(default=1.0, ge=0.0, le=5.0)
+    frame_rate_hz: float = Field(default=10.0, ge=1e-3, le=1e6)  # affects only the time stamps
+    block_m: tuple[_SideM, _SideM] = (100.0, 70.0)  # sides of the block for path = block
+    #: Period after which a straight street repeats itself; None = never.
+    repeat_m: float | None = Field(default=None, ge=20.0, le=1000.0)
+    #: Fences, railings, hedges, wires and shop windows instead of parked cars and furniture.
+    fences: bool = False
+    sway: float = Field(default=1.0, ge=0.0, le=5.0)  # of drift and pitching of the car; 0 = none
+    yaw_deg: float = Field(default=1.5, ge=-45.0, le=45.0)  # of the mounted rig; positive = right
+    roll_deg: float = Field(default=0.3, ge=-30.0, le=30.0)  # positive = clockwise
+    #: Sensor noise, standard deviation in grey levels (0 to 255).
+    noise_dn: float = Field(default=1.0, ge=0.0, le=50.0)
+    #: Brightness of the right camera relative to the left, and grey levels added in its images.
+    right_gain: float = Field(default=1.0, gt=0.0, le=4.0)
+    right_offset_dn: float = Field(default=0.0, ge=-128.0, le=128.0)
+    smooth_edges: bool = True  # four rays instead of one per pixel at edges (antialiasing)
+    #: Rendering threads, 0 = one per core; does not affect the result.
+    threads: int = Field(default=0, ge=0, le=256)
 
     @classmethod
     def of(cls, settings: StreetSettings) -> StreetScene:

@@ -18,14 +18,9 @@ FAR_UV = 100.0
 def quads(
     origins: Any, edges_u: Any, edges_v: Any, paint: Paint, uv_origins: Any = (0.0, 0.0)
 ) -> TriangleSoup:
-    """Return parallelograms in one paint; the array arguments are broadcast.
+    """Return parallelograms in one paint, each (3,) or (N, 3): a corner, the edges from there.
 
-    Args:
-        origins: (N, 3) or (3,), one corner of each.
-        edges_u: (N, 3) or (3,), edge from that corner along u.
-        edges_v: (N, 3) or (3,), edge from that corner along v.
-        paint: Paint of all.
-        uv_origins: (N, 2) or (2,), texture coordinates of that corner, metres.
+    ``uv_origins``, (2,) or (N, 2), are the texture coordinates of that corner in metres.
     """
     p, u, v = np.broadcast_arrays(*np.atleast_2d(origins, edges_u, edges_v))
     p, u, v = p.astype(np.float64), u.astype(np.float64), v.astype(np.float64)
@@ -50,26 +45,14 @@ def boxes(low: Any, high: Any, paint: Paint) -> TriangleSoup:
 def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint) -> TriangleSoup:
     """Return the four walls of a box that narrows towards the top.
 
-    Args:
-        low: (3,) lower corner.
-        high: (3,) upper corner of its bounding box.
-        inset: Inset of the top at the back (-x), at the front (+x) and at each side.
-        paint: Paint of the walls.
+    ``inset`` is that of the top at the back (-x), at the front (+x) and at each side.
     """
     (x0, y0, z0), (x1, y1, z1), (back, front, side) = low, high, inset
     bottom = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]], dtype=np.float64)
-    top = np.array(
-        [
-            [x0 + back, y0 + side, z1],
-            [x1 - front, y0 + side, z1],
-            [x1 - front, y1 - side, z1],
-            [x0 + back, y1 - side, z1],
-        ],
-        dtype=np.float64,
-    )
+    xa, xb, ya, yb = x0 + back, x1 - front, y0 + side, y1 - side
+    top = np.array([[xa, ya, z1], [xb, ya, z1], [xb, yb, z1], [xa, yb, z1]], dtype=np.float64)
     walls = []
-    for k in range(4):
-        n = (k + 1) % 4
+    for k, n in ((0, 1), (1, 2), (2, 3), (3, 0)):
         corners = np.array([[bottom[k], bottom[n], top[n]], [bottom[k], top[n], top[k]]])
         walls.append(painted(corners, corners[..., [k % 2, 2]] + [FAR_UV * (k % 2), 0.0], paint))
     return merge(walls)
@@ -123,15 +106,10 @@ def extrusion(profile: Any, width_m: float, paint: Paint) -> TriangleSoup:
 def bumpy_ball(
     radii_m: Any, paint: Paint, *, bump: float, wavelength: float, seed: int, splits: int = 3
 ) -> TriangleSoup:
-    """Return an ellipsoid with bumps, such as the crown of a tree.
+    """Return an ellipsoid (semi-axes: 3) with bumps, such as the crown of a tree.
 
-    Args:
-        radii_m: (3,) semi-axes.
-        paint: Paint of the surface.
-        bump: Height of the bumps as a fraction of the radius.
-        wavelength: Their spacing as a fraction of the radius.
-        seed: Seed of the shape.
-        splits: Number of times that the faces of an icosahedron are split in four.
+    Height and wavelength of the bumps are fractions of the radius; ``splits`` is how often the
+    faces of an icosahedron are split in four.
     """
     flat, places = _icosphere_corners(splits)
     hills = value_noise(flat / wavelength, seed)

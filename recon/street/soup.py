@@ -15,58 +15,29 @@ from recon.core.values.arrays import Float64, Int32, UInt8, freeze
 class Material(IntEnum):
     """Kinds of surface; `recon.street.materials` has a recipe for each."""
 
-    PLAIN = 0
-    ASPHALT = 1
-    PAVING = 2
-    KERB = 3
-    PLASTER = 4
-    BRICK = 5
-    GLASS = 6
-    DOOR = 7
-    ROOF = 8
-    CAR_PAINT = 9
-    CAR_GLASS = 10
-    BARK = 11
-    LEAVES = 12
-    METAL = 13
-    GRASS = 14
-    POSTER = 15
+    PLAIN, ASPHALT, PAVING, KERB, PLASTER, BRICK, GLASS, DOOR = range(8)
+    ROOF, CAR_PAINT, CAR_GLASS, BARK, LEAVES, METAL, GRASS, POSTER = range(8, 16)
 
 
 @dataclass(frozen=True)
 class Paint:
-    """Appearance of a surface.
+    """Appearance of a surface."""
 
-    Attributes:
-        material: The recipe.
-        rgb: Base colour as displayed, each in [0, 1].
-        part: Number of the object, which seeds its variations.
-    """
-
-    material: Material = Material.PLAIN
-    rgb: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    part: int = 0
+    material: Material = Material.PLAIN  # the recipe
+    rgb: tuple[float, float, float] = (0.5, 0.5, 0.5)  # base colour as displayed, each in [0, 1]
+    part: int = 0  # number of the object, which seeds its variations
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleSoup:
-    """Triangles with their paint; they share no vertices.
+    """Triangles with their paint; they share no vertices."""
 
-    Attributes:
-        vertices: float64 (F, 3, 3), corners, metres.
-        normals: float64 (F, 3, 3), unit normals at the corners, only for shading.
-        uv: float64 (F, 3, 2), texture coordinates of the corners, metres.
-        rgb: float64 (F, 3), base colour.
-        material: uint8 (F,), a `Material`.
-        part: int32 (F,), number of the object.
-    """
-
-    vertices: Float64
-    normals: Float64
-    uv: Float64
-    rgb: Float64
-    material: UInt8
-    part: Int32
+    vertices: Float64  # (F, 3, 3), corners, metres
+    normals: Float64  # (F, 3, 3), unit normals at the corners, only for shading
+    uv: Float64  # (F, 3, 2), texture coordinates of the corners, metres
+    rgb: Float64  # (F, 3), base colour
+    material: UInt8  # uint8 (F,), a `Material`
+    part: Int32  # (F,), number of the object
 
     def __post_init__(self) -> None:
         freeze(self, "vertices", np.float64, (None, 3, 3))

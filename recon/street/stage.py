@@ -26,36 +26,22 @@ _SHELTER_M: Final = 1.0  # a horizontal surface with an object this close above 
 
 
 class Sample(NamedTuple):
-    """What rays hit.
+    """What rays hit."""
 
-    Attributes:
-        rgb: float64 (N, 3), linear light.
-        normal: float64 (N, 3), shading normal; 0 for the sky.
-        label: int64 (N,), differs between objects, materials, and shadow and light.
-    """
-
-    rgb: Float64
-    normal: Float64
-    label: NDArray[np.int64]
+    rgb: Float64  # (N, 3), linear light
+    normal: Float64  # (N, 3), shading normal; 0 for the sky
+    label: NDArray[np.int64]  # (N,), differs between objects, materials, and shadow and light
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A scene with its light.
-
-    Attributes:
-        soup: The triangles.
-        table: The triangles, precomputed for hits.
-        rays: The triangles in the ray caster.
-        to_sun: float64 (3,), unit vector towards the sun.
-        seed: Seed of grain and clouds.
-    """
+    """A scene with its light."""
 
     soup: TriangleSoup
-    table: SurfaceTable
-    rays: RayScene
-    to_sun: Float64
-    seed: int
+    table: SurfaceTable  # the triangles, precomputed for hits
+    rays: RayScene  # the triangles in the ray caster
+    to_sun: Float64  # (3,), unit vector towards the sun
+    seed: int  # of grain and clouds
 
     def depth(self, origin: Float64, directions: Float64) -> Float64:
         """Return float64 (N,), depth along rays of unit depth; NaN where they hit nothing."""
@@ -70,13 +56,7 @@ class Stage:
         return ~self.rays.blocked(origin, xyz - origin, far=_SIGHT)
 
     def look(self, origin: Float64, directions: Float64, pixel: float) -> Sample:
-        """Trace rays and shade what they hit.
-
-        Args:
-            origin: (3,), camera centre.
-            directions: (N, 3), of unit depth.
-            pixel: Width of a pixel at unit depth.
-        """
+        """Trace rays of unit depth, where a pixel is ``pixel`` wide, and shade what they hit."""
         faces = self.rays.first_hit(origin, directions)
         hit = np.flatnonzero(faces >= 0)
         sky = np.flatnonzero(faces < 0)

@@ -31,19 +31,14 @@ _SEEDLINGS: Final = 5
 class StreetWorld:
     """A street, a rig and its path: everything that an image depends on.
 
-    Attributes:
-        settings: The settings it was built from.
-        soup: The scene, street axes (x along the street at its start, y left, z up, road at 0).
-        camera: The rectified rig.
-        T_street_camera: float64 (frames, 4, 4), poses of the left camera.
-        to_sun: float64 (3,), unit vector towards the sun, street axes.
+    Street axes: x along the street at its start, y left, z up, road at 0.
     """
 
     settings: StreetScene
-    soup: TriangleSoup
+    soup: TriangleSoup  # the scene, street axes
     camera: RectifiedCamera
-    T_street_camera: Float64
-    to_sun: Float64
+    T_street_camera: Float64  # (frames, 4, 4), poses of the left camera
+    to_sun: Float64  # (3,), unit vector towards the sun, street axes
 
     def __post_init__(self) -> None:
         freeze(self, "T_street_camera", np.float64, (self.settings.frames, 4, 4))
@@ -75,10 +70,9 @@ class StreetWorld:
         return se3.make_transform(R_map_street @ self.T_street_camera[0][:3, :3], np.zeros(3))
 
     def ground_plane(self, index: int) -> Float64:
-        """Return the road in the axes of a left camera.
+        """Return float64 (4,): ``a·x + b·y + c·z + d`` is how high a point is above the road.
 
-        Returns:
-            float64 (4,), ``(a, b, c, d)``: ``a·x + b·y + c·z + d`` is the height above the road.
+        The point is in the axes of a left camera.
         """
         return np.array(self.T_street_camera[index][2])
 
@@ -117,15 +111,9 @@ def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> Triangl
 
 def rig(settings: StreetSettings) -> RectifiedCamera:
     """Return the rectified cameras of the settings, with principal points at the centre."""
-    return RectifiedCamera(
-        focal_px=settings.focal_px,
-        cx_px=(settings.width_px - 1) / 2,
-        cy_px=(settings.height_px - 1) / 2,
-        cx_right_px=(settings.width_px - 1) / 2,
-        baseline_m=settings.baseline_m,
-        width_px=settings.width_px,
-        height_px=settings.height_px,
-    )
+    width, height = settings.width_px, settings.height_px
+    cx, cy, focal = (width - 1) / 2, (height - 1) / 2, settings.focal_px
+    return RectifiedCamera(focal, cx, cy, cx, settings.baseline_m, width, height)
 
 
 def _sun(seed: int) -> Float64:
@@ -133,9 +121,8 @@ def _sun(seed: int) -> Float64:
     rng = np.random.default_rng([seed, 99])
     azimuth = rng.choice([-1.0, 1.0]) * rng.uniform(1.1, 2.3)
     climb = rng.uniform(0.75, 1.0)
-    return np.array(
-        [np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)]
-    )
+    level = np.cos(climb)
+    return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(climb)])
 
 
 def _ground(road: CentreLine) -> TriangleSoup:
@@ -143,19 +130,19 @@ def _ground(road: CentreLine) -> TriangleSoup:
     a, top = ROAD_HALF_M, KERB_M
     grey = Paint(Material.ASPHALT, (0.40, 0.40, 0.41))
     strips = [_strip(road, ((-a, 0.0), (a, 0.0)), grey)]
+    stone = Paint(Material.KERB, (0.58, 0.57, 0.55))
+    slabs = Paint(Material.PAVING, (0.56, 0.54, 0.51))
+    grass = Paint(Material.GRASS, (0.33, 0.38, 0.20))
     for side in (1.0, -1.0):
-        stone = Paint(Material.KERB, (0.58, 0.57, 0.55))
-        slabs = Paint(Material.PAVING, (0.56, 0.54, 0.51))
-        grass = Paint(Material.GRASS, (0.33, 0.38, 0.20))
         b, c, d = side * (a + 0.15), side * (_WALL_M + 3.0), side * 60.0
         strips += [
             _strip(road, ((side * a, 0.0), (side * a, top)), stone),
             _strip(road, ((side * a, top), (b, top)), stone),
             _strip(road, ((b, top), (c, top)), slabs),
-            _yard(road, c, grass)
-            if _inside(road, side)
-            else _strip(road, ((c, top), (d, top)), grass),
         ]
+        inside = _inside(road, side)
+        beside = _yard(road, c, grass) if inside else _strip(road, ((c, top), (d, top)), grass)
+        strips.append(beside)
     return merge(strips)
 
 
@@ -163,12 +150,11 @@ def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Pain
     """Return a band along the road between two edges (lateral, height)."""
     along = _stations(road)
     rims, uvs = [], []
-    run = 0.0
     for lateral, height in edges:
         xy = road.points(along, np.full(len(along), lateral))
         rims.append(np.column_stack([xy, np.full(len(along), height)]))
         across = lateral if edges[0][1] == edges[1][1] else height
-        uvs.append(np.column_stack([along, np.full(len(along), across + run)]))
+        uvs.append(np.column_stack([along, np.full(len(along), across)]))
     corners, uv = [_band(*pair) for pair in (rims, uvs)]
     return painted(corners, uv, paint)
 
@@ -307,16 +293,10 @@ def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Itera
         if kind < 0.3:
             yield move(props.sign(rng), road.place(at, kerb, KERB_M))
         elif kind < 0.6:
-            yield from _row_of_bollards(road, at, kerb, rng)
+            for k in range(int(rng.integers(2, 5))):
+                yield move(props.bollard(rng), road.place(at + 1.5 * k, kerb, KERB_M))
         elif kind < 0.85:
             yield move(props.bin_(rng), road.place(at, side * (_WALL_M - 0.6), KERB_M))
         else:
             T = road.place(at, side * (ROAD_HALF_M + 1.2), KERB_M)
             yield move(props.advertising_pillar(rng), T)
-
-
-def _row_of_bollards(
-    road: CentreLine, at_m: float, lateral_m: float, rng: np.random.Generator
-) -> Iterator[TriangleSoup]:
-    for k in range(int(rng.integers(2, 5))):
-        yield move(props.bollard(rng), road.place(at_m + 1.5 * k, lateral_m, KERB_M))

@@ -21,6 +21,7 @@ _BEYOND_M: Final = 2.0
 """Surfaces this far beyond the range are included, as a map may place them slightly nearer."""
 _COMPACT_AT: Final = 4_000_000
 _SLICE_M: Final = 0.05
+_QUARTERS: Final = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
 
 
 def true_surface(
@@ -83,7 +84,7 @@ def true_occupancy(
         cells = np.floor(se3.apply(T_map_camera[index], xyz) / resolution_m).astype(np.int64)
         low = xyz @ world.ground_plane(index)[:3] + world.ground_plane(index)[3] <= band_m[1]
         seen.add(cells[near])
-        seen.know(cells[away <= range_m + _BEYOND_M])
+        seen.add(cells[away <= range_m + _BEYOND_M], frames=0)
         columns.add(cells[near & low] * [1, 1, 0])
     keys, frames = seen.counts()
     raster, known = _raster(*columns.counts(), least_frames)
@@ -137,18 +138,12 @@ class _Counter:
         self._keys = np.zeros(0, np.int64)
         self._frames = np.zeros(0, np.int64)
 
-    def add(self, cells: NDArray[np.int64]) -> None:
-        """Count the cells (N, 3) of one frame; duplicates count once."""
-        self._merge(distinct_keys(pack_keys(cells)), 1)
-
-    def know(self, cells: NDArray[np.int64]) -> None:
-        """Include cells (N, 3) without counting a frame."""
-        self._merge(distinct_keys(pack_keys(cells)), 0)
-
-    def _merge(self, keys: NDArray[np.int64], count: int) -> None:
+    def add(self, cells: NDArray[np.int64], frames: int = 1) -> None:
+        """Count the cells (N, 3) of one frame, or none; duplicates count once."""
+        keys = distinct_keys(pack_keys(cells))
         self._keys, place = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)
-        frames = np.concatenate([self._frames, np.full(len(keys), count)])
-        self._frames = np.bincount(place, weights=frames).astype(np.int64)
+        counts = np.concatenate([self._frames, np.full(len(keys), frames)])
+        self._frames = np.bincount(place, weights=counts).astype(np.int64)
 
     def counts(self) -> tuple[Int32, NDArray[np.int64]]:
         """Return cells (N, 3) in order, and the number of frames in which each appeared."""
@@ -163,14 +158,8 @@ def footprint(
 ) -> OccupancyGrid:
     """Return OCCUPIED where a surface lies in the height band, else FREE.
 
-    Objects taller than the band, such as houses, are hollow.
-
-    Args:
-        world: The street.
-        T_map_street: float64 (4, 4), the map axes to use.
-        band_m: Heights above the road.
-        raster: Smallest column and row (in cells from the map origin), rows and columns, cell
-            size in metres.
+    Objects taller than the band, such as houses, are hollow. ``raster`` has the smallest column
+    and row (in cells from the map origin), the number of rows and columns, the size of a cell.
     """
     low, (rows, columns), resolution_m = raster
     origin = (float(low[0] * resolution_m), float(low[1] * resolution_m))
@@ -184,7 +173,9 @@ def footprint(
     inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
     occupied = np.zeros((rows, columns), dtype=np.bool_)
     occupied[cells[inside, 1], cells[inside, 0]] = True
-    centres = _quarter_centres((rows, columns), origin, resolution_m)
+    row, column = np.indices((rows, columns))
+    corners = np.stack([column, row], axis=-1).reshape(-1, 1, 2)
+    centres = ((corners + _QUARTERS) * resolution_m + origin).reshape(-1, 2)
     occupied |= _covered(world, T_map_street, centres, band_m).reshape(rows, columns, 4).any(axis=2)
     values = np.where(occupied, OCCUPIED, FREE).astype(np.int8)
     return OccupancyGrid(values, resolution_m, origin)
@@ -194,11 +185,8 @@ def _outlines(vertices: Float64, band_m: tuple[float, float], step_m: float) -> 
     """Return points (N, 3) every ``step_m`` along horizontal cuts through triangles in a band."""
     levels = np.arange(band_m[0], band_m[1] + 1e-9, _SLICE_M)
     lowest, highest = vertices[..., 2].min(axis=1), vertices[..., 2].max(axis=1)
-    cuts = [
-        _sample_segments(*_level_cut(vertices[(lowest < z) & (highest > z)], z), step_m)
-        for z in levels
-    ]
-    return np.concatenate(cuts)
+    cuts = [_level_cut(vertices[(lowest < z) & (highest > z)], z) for z in levels]
+    return np.concatenate([_sample_segments(*ends, step_m) for ends in cuts])
 
 
 def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
@@ -223,16 +211,6 @@ def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
     first = np.cumsum(pieces + 1) - (pieces + 1)
     share = (np.arange(len(segment)) - first[segment]) / pieces[segment]
     return np.asarray(start[segment] + share[:, None] * (end - start)[segment])
-
-
-def _quarter_centres(
-    shape: tuple[int, int], origin_m: tuple[float, float], resolution_m: float
-) -> Float64:
-    """Return centres (rows·columns·4, 2) of the quarters of each cell, map axes, cell by cell."""
-    row, column = np.indices(shape)
-    corner = np.stack([column, row], axis=-1).reshape(-1, 1, 2)
-    quarters = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
-    return np.asarray(((corner + quarters) * resolution_m + origin_m).reshape(-1, 2))
 
 
 def _covered(

@@ -139,14 +139,7 @@ def fractal_noise(
 def lattice_values(
     ix: NDArray[Any], iy: NDArray[Any], iz: NDArray[Any], seed: int
 ) -> NDArray[np.float64]:
-    """Return random values in [-1, 1) of integer lattice points, plain numpy.
-
-    Args:
-        ix: Integers, any shape.
-        iy: The same shape.
-        iz: The same shape.
-        seed: Another seed is another pattern.
-    """
+    """Return random values in [-1, 1) of integer lattice points of any shape, plain numpy."""
     x, y, z = (np.asarray(k).astype(np.int64).astype(np.uint64) for k in (ix, iy, iz))
     offset = np.uint64(seed * _S % 2**64)
     h = (x * _AX) ^ (y * _AY) ^ (z * _AZ + offset)

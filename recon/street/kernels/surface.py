@@ -17,43 +17,25 @@ Float64 = NDArray[np.float64]
 
 
 class SurfaceTable(NamedTuple):
-    """Per triangle, all that is linear in a point on it.
+    """Per triangle, all that is linear in a point on it."""
 
-    Attributes:
-        anchor: float64 (F, 3), a corner.
-        normal: float64 (F, 3), unit normal of the plane.
-        to_uv: float64 (F, 2, 3); surface coordinates are ``uv + to_uv @ (xyz - anchor)``.
-        uv: float64 (F, 2), at the anchor.
-        to_shading: float64 (F, 3, 3), the same for the shading normal.
-        shading: float64 (F, 3), at the anchor.
-    """
-
-    anchor: Float64
-    normal: Float64
-    to_uv: Float64
-    uv: Float64
-    to_shading: Float64
-    shading: Float64
+    anchor: Float64  # (F, 3), a corner
+    normal: Float64  # (F, 3), unit normal of the plane
+    to_uv: Float64  # (F, 2, 3); surface coordinates are ``uv + to_uv @ (xyz - anchor)``
+    uv: Float64  # (F, 2), at the anchor
+    to_shading: Float64  # (F, 3, 3), the same for the shading normal
+    shading: Float64  # (F, 3), at the anchor
 
 
 class SurfaceHits(NamedTuple):
-    """Points that rays met, with the footprint of the pixel on the surface.
+    """Points that rays met, with the footprint of the pixel on the surface."""
 
-    Attributes:
-        xyz: float64 (N, 3), metres.
-        normal: float64 (N, 3), unit shading normal towards the viewer.
-        uv: float64 (N, 2), surface coordinates, metres.
-        width: float64 (N,), short side of the footprint, metres.
-        smear: float64 (N, 3), long side of the footprint, metres; 0 when seen straight on.
-        spread: float64 (N, 2), extent of the footprint along u and v.
-    """
-
-    xyz: Float64
-    normal: Float64
-    uv: Float64
-    width: Float64
-    smear: Float64
-    spread: Float64
+    xyz: Float64  # (N, 3), metres
+    normal: Float64  # (N, 3), unit shading normal towards the viewer
+    uv: Float64  # (N, 2), surface coordinates, metres
+    width: Float64  # (N,), short side of the footprint, metres
+    smear: Float64  # (N, 3), long side of the footprint, metres; 0 when seen straight on
+    spread: Float64  # (N, 2), extent of the footprint along u and v
 
 
 @kernel
@@ -64,14 +46,10 @@ def describe_hits(
     directions: Float64,
     pixel: float,
 ) -> SurfaceHits:
-    """Describe the points in which rays pierce the planes of their triangles.
+    """Describe the points in which rays pierce the planes of the triangles that they meet.
 
-    Args:
-        table: Of the scene.
-        faces: int32 (N,), the triangle that each ray meets.
-        origin: float64 (3,), where the rays start.
-        directions: float64 (N, 3), of unit depth, so that their factor is the depth.
-        pixel: Width of a pixel at unit depth (``1 / focal_px``).
+    Directions are of unit depth, so that their factor is the depth; ``pixel`` is the width of a
+    pixel there (``1 / focal_px``).
     """
     n = len(faces)
     xyz, normals, uvs = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2))
