@@ -36,7 +36,7 @@ def settings(
     with one_line_errors(quiet=quiet):
         from dataclasses import asdict
 
-        from recon.commands.settings import list_settings, settings_page
+        from recon.commands.settings_list import list_settings, settings_page
 
         groups = list_settings(name)
     if json:

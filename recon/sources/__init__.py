@@ -6,5 +6,5 @@
 - `frame_list.py`: which frames are pairs, and which of them are used; `times.py`, `calibration.py`;
 - `part.py`, `live.py`: a part of a drive, and a drive that arrives in its own time;
 - `one_pair.py`, `pair_input.py`: a single pair; `image_pairs.py`: images of two cameras by name;
-- `datasets.py`: the list of public data sets.
+- `datasets.py`, `fetching.py`: public data sets and how they are fetched.
 """

@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from recon.cli import app
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
-from recon.commands.settings import SettingEntry, list_settings, settings_page
+from recon.commands.settings_list import SettingEntry, list_settings, settings_page
 from recon.core.settings import setting_names
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"

@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from recon.commands.doctor import Check
-    from recon.commands.settings import SettingEntry, SettingGroup
+    from recon.commands.settings_list import SettingEntry, SettingGroup
+    from recon.run.installation import Check
 
 
 _MOST_JOBS: Final = 200
