@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 
@@ -70,9 +71,14 @@ class Altered:
 
     @property
     def truth(self) -> SequenceTruth:
+        """The true path alone."""
+        return SequenceTruth(self.trajectory)
+
+    @property
+    def trajectory(self) -> Trajectory:
         """The true path; the first camera is its origin."""
         poses = se3.invert(self.T_world_camera[0]) @ self.T_world_camera
-        return SequenceTruth(Trajectory(poses, self.stamps_s))
+        return Trajectory(poses, self.stamps_s)
 
     @property
     def stamps_s(self) -> Float64:
@@ -313,7 +319,7 @@ def write_kitti(altered: Altered, folder: Path) -> None:
         with (folder / "calib.txt").open("a" if number else "w") as file:
             file.write(f"P{number}: {' '.join(f'{value:.9e}' for value in rows)}\n")
     np.savetxt(folder / "times.txt", altered.stamps_s, fmt="%.9e")
-    write_kitti_poses(folder / "poses.txt", altered.truth.trajectory)
+    write_kitti_poses(folder / "poses.txt", altered.trajectory)
 
 
 def table(result: dict[str, dict[str, Any]]) -> str:

@@ -16,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
+import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 from altered_drives import Altered, Change, alterations, errors_of, thinned
@@ -30,7 +31,7 @@ from recon.run.threads import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
-from recon.street.settings import StreetScene
+from recon.street.settings import StreetScene, StreetSettings
 from recon.street.street import StreetWorld, build_street
 
 SCENE: Final = {"seed": 3, "frames": 72, "width_px": 400, "height_px": 136, "focal_px": 225.0}
@@ -47,19 +48,19 @@ def blurred(image: UInt8) -> UInt8:
 
 
 def overexposed(image: UInt8) -> UInt8:
-    return np.clip(4.0 * image + 60.0, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(4.0 * image + 60.0, 0, 255), np.uint8)
 
 
 def covered(image: UInt8) -> UInt8:
     """All but a strip of a seventh of the height, at the bottom."""
-    seen = image.copy()
+    seen: UInt8 = image.copy()
     seen[: 6 * len(image) // 7] = 90
     return seen
 
 
 def bare(image: UInt8) -> UInt8:
     """A tenth of the contrast."""
-    return np.rint(110.0 + 0.1 * image).astype(np.uint8)
+    return np.asarray(np.rint(110.0 + 0.1 * image), np.uint8)
 
 
 def spoiled(plain: Altered, what: Callable[[UInt8], UInt8], count: int) -> Altered:
@@ -106,7 +107,7 @@ def turning() -> Altered:
 class TurningSource(SyntheticSource):
     """A street seen along another path."""
 
-    def __init__(self, settings: StreetScene, T_street_camera: Float64) -> None:
+    def __init__(self, settings: StreetSettings, T_street_camera: Float64) -> None:
         super().__init__(settings)
         self._poses = T_street_camera
 

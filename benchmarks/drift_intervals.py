@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 from altered_drives import Altered, alterations
 
@@ -90,7 +91,7 @@ def bare(grey: UInt8, depth_m: Depth, rng: np.random.Generator) -> UInt8:
 
 
 def to_grey(levels: Any, rng: np.random.Generator) -> UInt8:
-    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)
 
 
 CONDITIONS: Final[dict[str, tuple[Weather, dict[str, Any]]]] = {
@@ -184,8 +185,7 @@ def judge_rendered(drive: RenderedDrive) -> dict[str, Any]:
 
 
 def judge_altered(name: str, altered: Altered) -> dict[str, Any]:
-    truth = altered.truth.trajectory
-    return judge(name, altered.frames(), altered.calibration, truth)
+    return judge(name, altered.frames(), altered.calibration, altered.trajectory)
 
 
 def judge(

@@ -30,9 +30,11 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import psutil
 from distributed import Client, LocalCluster
 
@@ -165,12 +167,12 @@ def long(options: argparse.Namespace) -> dict[str, Any]:
         line = [sys.executable, "-m", "recon", "map", str(drive), "--no-mesh", "--json", "--quiet"]
         line += ["--threads", str(options.threads)]
         alone = run_of(line, folder / "alone", [])
-        with LocalCluster(
+        with LocalCluster(  # type: ignore[no-untyped-call]
             options.workers[0], threads_per_worker=1, dashboard_address=None
         ) as local:
             where = ["--scheduler", local.scheduler_address]
             spread = run_of(line, folder / "spread", where)
-            with Client(local) as client:
+            with Client(local) as client:  # type: ignore[no-untyped-call]
                 spread["bytes_given_by_workers"] = sum(client.run(given).values())
     faster = round(alone["seconds"] / spread["seconds"], 2)
     return {"frames": alone["frames"], "alone": alone, "spread": spread, "times as fast": faster}
@@ -235,7 +237,10 @@ def scheduler(options: argparse.Namespace) -> dict[str, Any]:
 def simulated(workers: int, count: int, seconds: float) -> dict[str, Any]:
     """Run jobs that sleep on simulated workers; what each costs, and where that ends."""
     jobs = [Job(f"j{n}", "sleep", "", (str(seconds),), True, "") for n in range(count)]
-    with crowd(workers) as (address, process), Client(address) as client:
+    with (
+        crowd(workers) as (address, process),
+        Client(address) as client,  # type: ignore[no-untyped-call]
+    ):
         cluster, per_job, took = Cluster(client, sleep), 0.0, 0.0
         while len(cluster.workers) < workers:
             time.sleep(1)
@@ -290,20 +295,20 @@ def process_s(process: psutil.Process) -> float:
 def crowd(workers: int) -> Iterator[tuple[str, psutil.Process]]:
     """A scheduler in a process of its own, and the workers in others; its address and process."""
     with tempfile.TemporaryDirectory() as name:
-        place, root = Path(name) / "scheduler.json", Path(__file__).parents[1]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": root}
+        place = Path(name) / "scheduler.json"
+        start = partial(subprocess.Popen, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         dask = [sys.executable, "-m", "dask"]
-        started: list[subprocess.Popen[bytes]] = []
+        started: list[subprocess.Popen[str]] = []
         try:
             head = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file"]
-            started.append(subprocess.Popen([*dask, "scheduler", *head, str(place)], **quiet))
+            started.append(start([*dask, "scheduler", *head, str(place)]))
             while not place.is_file() or not place.read_text():
                 time.sleep(0.1)
             address = json.loads(place.read_text())["address"]
             for first in range(0, workers, CROWD):
                 count = min(CROWD, workers - first)
                 farm = [sys.executable, "-c", FARM, address, str(count), name]
-                started.append(subprocess.Popen(farm, **quiet))
+                started.append(start(farm))
             yield address, psutil.Process(started[0].pid)
         finally:
             for process in reversed(started):

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 from altered_drives import alterations
 from degraded_drives import run
 

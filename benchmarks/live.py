@@ -19,12 +19,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 from altered_drives import alterations, write_kitti
@@ -128,7 +129,7 @@ def quietly(source: StereoSource, config: ReconConfig) -> dict[str, Any]:
     frames = FrameReconstructor(source.calibration, config, threads=1)
     rough = make_odometry("visual", config.odometry)
     exact = make_odometry(config.odometry.method, config.odometry)
-    seconds, poses = Counter[str](), []
+    seconds, poses = defaultdict[str, float](float), []
     pairs = iter(source)
     with serial_algebra():
         while (pair := timed(seconds, "read", lambda: next(pairs, None))) is not None:
@@ -148,7 +149,7 @@ def quietly(source: StereoSource, config: ReconConfig) -> dict[str, Any]:
     }
 
 
-def timed(seconds: Counter[str], name: str, work: Callable[[], Any]) -> Any:
+def timed(seconds: dict[str, float], name: str, work: Callable[[], Any]) -> Any:
     """What the work gives; its processor time is added."""
     before_s = time.process_time()
     result = work()

@@ -16,20 +16,21 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
-from altered_drives import Altered, alterations
+from altered_drives import Altered, Change, alterations
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.demo import demo_source
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
-from recon.core.values.arrays import UInt8
+from recon.core.values.arrays import Float64, UInt8
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import localize_sequence
@@ -112,21 +113,18 @@ def taken(drive: Altered, which: slice) -> Altered:
     )
 
 
-def each(change: Any) -> Any:
+def each(change: Callable[[Float64], Any]) -> Change:
     """A change of both images, rounded to grey levels."""
 
-    def changed(_: int, *both: UInt8) -> tuple[UInt8, ...]:
-        return tuple(
-            np.clip(np.rint(change(image.astype(np.float64))), 0, 255).astype(np.uint8)
-            for image in both
-        )
+    def changed(image: UInt8) -> UInt8:
+        return np.asarray(np.clip(np.rint(change(image.astype(np.float64))), 0, 255), np.uint8)
 
-    return changed
+    return lambda _, left, right: (changed(left), changed(right))
 
 
-def noisy(index: int, *both: UInt8) -> tuple[UInt8, ...]:
+def noisy(index: int, left: UInt8, right: UInt8) -> tuple[UInt8, UInt8]:
     random = np.random.default_rng(index)
-    return each(lambda image: image + random.normal(0.0, 8.0, image.shape))(index, *both)
+    return each(lambda image: image + random.normal(0.0, 8.0, image.shape))(index, left, right)
 
 
 def found(case: Altered, map_: Map, config: ReconConfig) -> dict[str, Any]:

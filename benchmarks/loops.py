@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 
 from recon.commands.config import ReconConfig, load_config
@@ -86,6 +87,15 @@ class Drifting:
         self._true = result.T_world_camera
         self._drifted = se3.orthonormalise(self._drifted @ longer)
         return OdometryResult(self._drifted.copy(), result.health)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later poses depend on."""
+        return {"inner": self.inner.state(), "true": self._true, "drifted": self._drifted}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a state."""
+        self.inner.restore(state["inner"])
+        self._true, self._drifted = state["true"], state["drifted"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -250,8 +260,8 @@ def draw(folder: Path, name: str, before: MappedSequence, after: MappedSequence)
     if after.loops is None:
         return
     pairs = [(loop.first, loop.last) for loop in after.loops.closure.closed]
-    path = loops_figure(before.trajectory, after.trajectory, pairs, after.T_map_world)
-    (folder / f"{name}_path.png").write_bytes(path)
+    drawn = loops_figure(before.trajectory, after.trajectory, pairs, after.T_map_world)
+    (folder / f"{name}_path.png").write_bytes(drawn)
     for moment, mapped in (("before", before), ("after", after)):
         path = seen_from_above(mapped.trajectory, mapped.T_map_world)
         grid = grid_figure(flat_grid(mapped), {"path": path})

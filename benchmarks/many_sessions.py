@@ -21,6 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import psutil
 
 from recon.commands.config import load_config

@@ -24,6 +24,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Protocol
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 
 from recon.map.store.records import Store
@@ -48,7 +49,7 @@ def split(tree: Any) -> tuple[str, list[np.ndarray[Any, Any]]]:
     return json.dumps(plain(tree)), arrays
 
 
-def joined(text: str, array: Callable[[int], np.ndarray[Any, Any]]) -> Any:
+def joined(text: str, array: Callable[[int], np.ndarray[Any, Any]]) -> dict[str, Any]:
     """The tree again."""
 
     def restored(value: Any) -> Any:
@@ -58,7 +59,7 @@ def joined(text: str, array: Callable[[int], np.ndarray[Any, Any]]) -> Any:
             return {name: restored(item) for name, item in value.items()}
         return [restored(item) for item in value] if isinstance(value, list) else value
 
-    return restored(json.loads(text))
+    return dict(restored(json.loads(text)))
 
 
 class _Backend(Protocol):

@@ -20,9 +20,11 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 import pyoctomap
 from numpy.typing import NDArray
@@ -116,8 +118,8 @@ def ray_casting(rays: int, rounds: int) -> list[dict[str, Any]]:
             ends = to_centres(scene(rays), resolution_m)
             ms = medians_ms(
                 {
-                    "recon": lambda e=ends, r=resolution_m: ours(e, r),
-                    "octomap": lambda e=ends, r=resolution_m: octomap(e, r),
+                    "recon": partial(ours, ends, resolution_m),
+                    "octomap": partial(octomap, ends, resolution_m),
                 },
                 rounds,
             )

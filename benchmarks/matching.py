@@ -20,6 +20,7 @@ from functools import partial
 from typing import Any
 from unittest.mock import patch
 
+import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.peak:
         print(peak_mb(options.peak, options.threads))
         return
-    sizes = [tuple(map(int, size.split("x"))) for size in options.size] or SIZES
+    sizes = [sizes_in(text) for text in options.size] or SIZES
     result = {
         "opencv": cv2.__version__,
         "threads": options.threads,
@@ -95,6 +96,12 @@ def growth(threads: int, rounds: int) -> list[dict[str, Any]]:
     return rows
 
 
+def sizes_in(text: str) -> tuple[int, int, int]:
+    """Height, width and number of disparities, from such as 480x640x64."""
+    height, width, ndisp = map(int, text.split("x"))
+    return height, width, ndisp
+
+
 def memory(name: str, threads: int) -> dict[str, Any]:
     """Peak memory of a process that matches one large pair; "none" only makes the pair."""
     command = [sys.executable, __file__, "--peak", name, "--threads", str(threads)]
@@ -118,8 +125,8 @@ def make_pair(height: int, width: int, ndisp: int) -> RectifiedPair:
     scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     right = cv2.remap(scene, x + y * (0.5 * ndisp / height), y, cv2.INTER_LINEAR)
-    noisy = [add_noise(view, rng) for view in (scene, right)]
-    return RectifiedPair(*noisy, stand_in_camera(width, height, ndisp))
+    left, right = (add_noise(view, rng) for view in (scene, right))
+    return RectifiedPair(left, right, stand_in_camera(width, height, ndisp))
 
 
 def add_noise(image: UInt8, rng: np.random.Generator) -> UInt8:
@@ -128,7 +135,7 @@ def add_noise(image: UInt8, rng: np.random.Generator) -> UInt8:
 
 def ours(pair: RectifiedPair, threads: int) -> dict[str, Run]:
     """`sad`, `sad` without its second, slanted window (StereoBM has none), and `sgm`."""
-    matchers = {
+    matchers: dict[str, Matcher] = {
         "sad": SadMatcher(SadSettings(window_px=WINDOW_PX), threads),
         "sgm": SgmMatcher(SgmSettings(), threads),
     }
@@ -146,7 +153,7 @@ def opencv(pair: RectifiedPair, ndisp: int) -> dict[str, Run]:
     ndisp = -(-ndisp // 16) * 16
     bm = cv2.StereoBM.create(ndisp, WINDOW_PX)
     bm.setTextureThreshold(10)
-    engines = {"opencv-bm": bm}
+    engines: dict[str, cv2.StereoBM | cv2.StereoSGBM] = {"opencv-bm": bm}
     for name, mode in (("hh", cv2.STEREO_SGBM_MODE_HH), ("3way", cv2.STEREO_SGBM_MODE_SGBM_3WAY)):
         sgbm = cv2.StereoSGBM.create(0, ndisp, 3, P1=8 * 9, P2=32 * 9, mode=mode)
         sgbm.setPreFilterCap(63)

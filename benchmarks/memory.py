@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 
 from recon.core.values import Trajectory

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 
 from recon.commands.config import ReconConfig, load_config
@@ -31,7 +32,7 @@ from recon.commands.map_options import MapOptions, MapRequest
 from recon.commands.merge import run_merge
 from recon.core.geometry import se3
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud, Trajectory
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float32, Float64
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.models.ply import read_ply
@@ -188,7 +189,7 @@ def hold(run: Path, source: SyntheticSource, sigma_m: float) -> Path:
     places_m = source.world.T_street_camera[:, :3, 3]
     noise_m = np.random.default_rng(1).normal(0.0, sigma_m, places_m.shape)
     file, out = run.with_suffix(".txt"), run.with_name(f"held_{run.name}")
-    np.savetxt(file, np.column_stack([source.truth.trajectory.timestamps_s, places_m + noise_m]))
+    np.savetxt(file, np.column_stack([source.trajectory.timestamps_s, places_m + noise_m]))
     run_merge([run], None, MapOptions("merge", out, mesh=False), Survey(file))
     return out
 
@@ -258,16 +259,24 @@ def world_on_second_day(lane: str, settings: StreetScene) -> StreetWorld:
 
 def true_street(days: Sequence[SyntheticSource], T_first_second: Float64) -> PointCloud:
     """What both days saw of what stands on the second one, in the world of the first."""
-    second_m = se3.apply(T_first_second, days[1].truth.surface.xyz.astype(np.float64))
-    first_m = days[0].truth.surface.xyz
+    second_m = se3.apply(T_first_second, seen_of(days[1]).astype(np.float64))
+    first_m = seen_of(days[0])
     left = near(PointCloud(first_m, frame="world"), left_cars(days), 0.1)
     xyz = np.concatenate([second_m, first_m[~left]]).astype(np.float32)
     return PointCloud(xyz, frame="world")
 
 
+def seen_of(day: SyntheticSource) -> Float32:
+    """Points on all surfaces that a drive saw."""
+    surface = day.truth.surface
+    if surface is None:
+        raise SystemExit("a rendered street has a surface")
+    return surface.xyz
+
+
 def left_cars(days: Sequence[SyntheticSource]) -> Float64:
     """Points on the surfaces that the first drive saw and that are gone on the second day."""
-    seen = days[0].truth.surface.xyz.astype(np.float64)
+    seen = seen_of(days[0]).astype(np.float64)
     soups = [corners_of(day.world) for day in days]
     gone = np.setdiff1d(soups[0], soups[1])
     T = days[0].world.T_world_street
@@ -277,7 +286,7 @@ def left_cars(days: Sequence[SyntheticSource]) -> Float64:
     there = seen[near(PointCloud(seen.astype(np.float32), frame="world"), corners, 0.35)]
     # Where something stands on the second day, points are of that.
     T_first_second = T @ days[1].world.T_street_camera[0]
-    later = se3.apply(T_first_second, days[1].truth.surface.xyz.astype(np.float64))
+    later = se3.apply(T_first_second, seen_of(days[1]).astype(np.float64))
     return there[~near(PointCloud(there.astype(np.float32), frame="world"), later, 0.35)]
 
 

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 import open3d as o3d
 
@@ -47,6 +48,7 @@ class Traffic(SyntheticSource):
 
     def __init__(self, settings: StreetScene, pace: float) -> None:
         super().__init__(settings)
+        self._step_m = settings.speed_m_per_frame
         self._pace = pace
 
     def movers(self, index: int) -> list[TriangleSoup]:
@@ -54,13 +56,12 @@ class Traffic(SyntheticSource):
         if self.world.settings.fences:
             return []
         rng = np.random.default_rng([self.settings.seed, 5])
-        step = self.settings.speed_m_per_frame
         oncoming, leading, crossing = (props.car(rng) for _ in range(3))
         person = cylinder((0.25, 0.2), 1.75, Paint(Material.BARK, (0.5, 0.35, 0.3), 3), 12)
-        at, way = step * index, self._pace * index
+        at, way = self._step_m * index, self._pace * index
         return [
             move(oncoming, placed(60.0 - 1.2 * way, 1.6, np.pi)),
-            move(leading, placed(10.0 + 1.3 * step * way, -1.5, 0.0)),
+            move(leading, placed(10.0 + 1.3 * self._step_m * way, -1.5, 0.0)),
             move(crossing, placed(34.0, -8.0 + 0.7 * way, np.pi / 2)),
             move(person, placed(14.0 + 0.15 * way, -3.4, 0.0)),
             move(person, placed(22.0 - 0.12 * way, 3.2, 0.0)),
@@ -187,11 +188,13 @@ class Surface:
         xyz = se3.apply(T_world_street, corners.astype(np.float64)).astype(np.float32)
         self._scene = o3d.t.geometry.RaycastingScene()
         faces = np.arange(len(xyz), dtype=np.uint32).reshape(-1, 3)
-        self._scene.add_triangles(o3d.core.Tensor(xyz), o3d.core.Tensor(faces))
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(xyz), o3d.core.Tensor.from_numpy(faces)
+        )
 
     def distance(self, xyz: Any) -> Float64:
         """Return float64 (N,), distance of points."""
-        points = o3d.core.Tensor(np.ascontiguousarray(xyz, np.float32))
+        points = o3d.core.Tensor.from_numpy(np.ascontiguousarray(xyz, np.float32))
         return np.asarray(self._scene.compute_distance(points).numpy(), np.float64)
 
 

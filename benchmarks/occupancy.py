@@ -16,6 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import checkout  # noqa: F401 - what is measured
+
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
 from recon.commands.evaluate_occupancy import run_evaluate_occupancy

@@ -9,6 +9,7 @@ import typer
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json
+from recon.core.words import counted
 
 
 def doctor(
@@ -57,6 +58,6 @@ def _compile(*, json: bool, quiet: bool) -> None:
     if json:
         print_json({"kernels": done.kernels, "seconds": round(done.seconds, 1)})
     elif done.kernels:
-        typer.echo(f"{done.kernels} kernels compiled in {done.seconds:.0f} s, and kept")
+        typer.echo(f"{counted(done.kernels, 'kernel')} compiled in {done.seconds:.0f} s, and kept")
     else:
         typer.echo("the kernels are compiled already")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from recon.core.values import Trajectory
+from recon.core.words import counted
 from recon.evaluation.association import TOLERANCE_S, associate
 from recon.evaluation.interpolated_truth import interpolation_warnings
 from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
@@ -91,4 +92,4 @@ def _read_paths(
 def _warnings(compared: int, fewer: int) -> list[str]:
     if 2 * compared >= fewer:
         return []
-    return [f"only {compared} of {fewer} poses have a partner in time; see --tolerance"]
+    return [f"a partner in time for only {compared} of {counted(fewer, 'pose')}; see --tolerance"]

@@ -9,6 +9,7 @@ from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
 from recon.commands.resume import begin_or_resume, with_resume_hint
+from recon.core.words import counted
 from recon.evaluation.drive_errors import compare_with_truth
 from recon.export.products import Products, write_products
 from recon.export.trajectories import export_paths
@@ -118,9 +119,8 @@ def map_whole(
 def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
     """Return what the user should know about the drive."""
     left_out = source.left_out if isinstance(source, IncompleteSource) else 0
-    images = "image has" if left_out == 1 else "images have"
     return [
-        *([f"{left_out} {images} no partner: left out"] if left_out else ()),
+        *([f"{counted(left_out, 'image')} without a partner: left out"] if left_out else ()),
         *health_warnings(mapped.health),
         *(() if mapped.expected_drift is None else mapped.expected_drift.warnings()),
         *(() if mapped.prior is None else mapped.prior.warnings()),

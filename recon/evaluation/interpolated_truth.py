@@ -9,6 +9,7 @@ import numpy as np
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool
+from recon.core.words import counted
 from recon.evaluation.segments import Segments
 
 _EVEN: Final = 0.02
@@ -49,8 +50,8 @@ def interpolation_warnings(truth: Trajectory, segments: Segments) -> list[str]:
         return []
     resting = int((found[segments.first] | found[segments.last]).sum())
     first, last = np.flatnonzero(found)[[0, -1]]
-    which = f"{int(found.sum())} true poses (between {first} and {last})"
-    where = f"{resting} of {len(segments.first)} segments begin or end there"
+    which = f"{counted(int(found.sum()), 'true pose')} (between {first} and {last})"
+    where = f"{resting} of {counted(len(segments.first), 'segment')} begin or end there"
     return [f"{which} turn evenly, as interpolated ones do: {where}"]
 
 

@@ -15,6 +15,7 @@ from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.evaluation.association import TOLERANCE_S, associate
 from recon.evaluation.map import evaluate_map, register_cloud, within_reach
 from recon.export.finished_map import doubts_of
@@ -241,7 +242,7 @@ def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
         raise EvaluationError(
             "run and true poses differ in length",
             where=poses,
-            got=f"{len(truth)} poses",
+            got=counted(len(truth), "pose"),
             expected=f"{len(path)}",
         )
     fit = fit_to_path(path.positions_m, truth.positions_m, drift_at_end(path))

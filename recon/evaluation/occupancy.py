@@ -31,6 +31,7 @@ from recon.core.values import (
     VoxelMetrics,
 )
 from recon.core.values.arrays import Bool, Int32
+from recon.core.words import counted
 
 _TOLERANCE: Final = 1
 
@@ -78,7 +79,7 @@ def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) 
     if not (truth.frames >= truth.least_frames).any() or not truth.seen.any():
         raise EvaluationError(
             "no surface was seen in enough frames to compare",
-            expected=f"surfaces seen in {truth.least_frames} frames",
+            expected=f"surfaces seen in {counted(truth.least_frames, 'frame')}",
             hint="use a drive with more frames",
         )
 

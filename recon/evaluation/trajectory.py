@@ -16,6 +16,7 @@ from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.settings import Settings
 from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Float64, Int32
+from recon.core.words import counted
 from recon.evaluation.roll import open_roll_axis, without_roll
 from recon.evaluation.segments import Segments, choose_segments
 from recon.io.files import StrPath
@@ -267,14 +268,14 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
     if len(estimate) != len(truth):
         raise EvaluationError(
             "estimated and true trajectory differ in length",
-            got=f"{len(estimate)} poses",
-            expected=f"{len(truth)} poses",
+            got=counted(len(estimate), "pose"),
+            expected=counted(len(truth), "pose"),
             hint="without timestamps (TUM, or --times) both must have one pose per frame",
         )
     least = rules.rpe_frames + 1
     if len(truth) < least:
         raise EvaluationError(
-            "too few poses to compare", got=f"{len(truth)} poses", expected=f"{least} or more"
+            "too few poses to compare", got=counted(len(truth), "pose"), expected=f"{least} or more"
         )
     if truth.path_length_m < MIN_PATH_M:
         raise EvaluationError(

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import MeshingError
 from recon.core.values.arrays import Float32, Int32
+from recon.core.words import counted
 
 _POINTS, _SURFACE = "points.npz", "surface.npz"
 
@@ -74,7 +75,7 @@ def screened_poisson(
     if len(faces) == 0:
         raise MeshingError(
             "Poisson reconstruction found no surface",
-            got=f"{len(xyz)} points",
+            got=counted(len(xyz), "point"),
             hint="check that the normals point out of the surface",
         )
     return vertices, faces, density

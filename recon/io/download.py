@@ -14,6 +14,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from recon.core.errors import DownloadError, OutputError
+from recon.core.words import counted
 from recon.io.atomic import write_text
 
 _PIECE_BYTES: Final = 1_000_000
@@ -56,7 +57,7 @@ def download(
         except _BrokenOffError as error:
             tries = 1 if _size(part) > before else tries + 1
             if tries >= _TRIES:
-                got = f"{error}, {_size(part)} bytes are there"
+                got = f"{error}, {counted(_size(part), 'byte')} arrived"
                 what = "the download breaks off again and again"
                 hint = "the same command goes on from there"
                 raise DownloadError(what, where=address, got=got, hint=hint) from error
@@ -77,9 +78,13 @@ def _receive(address: str, part: Path, size: int | None, on_bytes: OnBytes) -> N
             _forget(part)
             raise _BrokenOffError("the server sends another part than was asked for")
         total = size if response.length is None else begin + response.length
-        if size not in (None, total):
-            what, got = "the server has another file than the list of data sets", f"{total} bytes"
-            raise DownloadError(what, where=address, got=got, expected=f"{size} bytes")
+        if size is not None and total is not None and total != size:
+            raise DownloadError(
+                "the server has another file than the list of data sets",
+                where=address,
+                got=counted(total, "byte"),
+                expected=counted(size, "byte"),
+            )
         _need_room(part.parent, (total or 0) - begin)
         if begin == 0:
             _forget(part)
@@ -91,7 +96,7 @@ def _receive(address: str, part: Path, size: int | None, on_bytes: OnBytes) -> N
                 raise DownloadError("the server sends more than it said", where=address)
             on_bytes(done, total)
     if total is not None and _size(part) < total:
-        raise _BrokenOffError(f"{_size(part)} of {total} bytes")
+        raise _BrokenOffError(f"{_size(part)} of {counted(total, 'byte')}")
 
 
 def _written(part: Path, begin: int, response: http.client.HTTPResponse) -> Iterator[int]:

@@ -10,6 +10,7 @@ import numpy as np
 from recon.core.decimals import parse_numbers
 from recon.core.errors import FormatError
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.files import StrPath
 
 
@@ -78,7 +79,9 @@ class Fields:
         if shape is None:
             return array.ravel()
         if array.size != np.prod(shape):
-            raise self._wrong(name, f"{array.size} numbers", f"{int(np.prod(shape))} numbers")
+            raise self._wrong(
+                name, counted(array.size, "number"), counted(int(np.prod(shape)), "number")
+            )
         return array.reshape(shape)
 
     def number(self, name: str) -> float:

@@ -13,6 +13,7 @@ from recon.core.geometry.se3 import (
 )
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.atomic import write_text
 from recon.io.files import StrPath, read_table, reader
 
@@ -116,7 +117,7 @@ def _from_kitti(
         raise FormatError(
             "numbers of poses and timestamps differ",
             where=path,
-            got=f"{len(table)} poses",
+            got=counted(len(table), "pose"),
             expected=f"{len(times)}",
         )
     check_positions(table[:, 3::4], lines, path)

@@ -10,6 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import invert
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.odometry.agreement import Sight, explain_motion
 from recon.odometry.protocol import (
     Odometry,
@@ -111,10 +112,12 @@ class CheckedOdometry:
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
         if np.isfinite(health.sigma_m):
             return []
-        return [f"only {found.informative} patches of the image can distinguish motions"]
+        patches = counted(found.informative, "patch", "patches")
+        return [f"only {patches} of the image can distinguish motions"]
 
 
 def _contradiction(share: float, informative: int) -> list[str]:
     if share >= MIN_SHARE:
         return []
-    return [f"only {100 * share:.0f} % of {informative} patches of the image moved like that"]
+    patches = counted(informative, "patch", "patches")
+    return [f"only {100 * share:.0f} % of {patches} of the image moved like that"]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Bool
+from recon.core.words import counted
 from recon.odometry.protocol import OdometryHealth
 
 _MANY: Final = 0.1
@@ -43,12 +44,14 @@ def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:
     """Return one line about a drive with poses that are not to be trusted; empty = it has none."""
     bad = [index for index, record in enumerate(health) if not record.ok]
     if len(bad) > _MANY * len(health):
-        poses = f"the poses of {len(bad)} of {len(health)} frames are not"
+        poses = f"the poses of {len(bad)} of {counted(len(health), 'frame')} are not"
         follows = "an error once made stays in all that follows"
         return [f"PATH AND MAP ARE NOT TO BE TRUSTED: {poses}, and {follows}"]
     if not bad:
         return []
-    poses = f"{len(bad)} of {len(health)} poses are not to be trusted ({name_frames(bad)})"
+    poses = (
+        f"{len(bad)} of {counted(len(health), 'pose')} are not to be trusted ({name_frames(bad)})"
+    )
     guessed = ", and what follows may be misplaced" if stretches(health).max() > 0 else ""
     return [f"{poses}: nothing of them is in the map{guessed}"]
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.odometry.icp_points import select_points
 from recon.odometry.kiss_icp import KissIcp, KissIcpOptions
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
@@ -37,7 +38,7 @@ class KissOdometry:
         """Register the next frame; one with too few points is extrapolated."""
         points = select_points(frame, self._max_range_m)
         if len(points) < _MIN_POINTS:
-            note = f"{len(points)} points are too few for ICP; the last motion goes on"
+            note = f"too few for ICP: {counted(len(points), 'point')}; the last motion goes on"
             first = not self._poses
             health = OdometryHealth(first, skipped=not first, icp_points=len(points), notes=(note,))
             return self._keep(self._extrapolated(), health)

@@ -9,6 +9,7 @@ import numpy as np
 from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
+from recon.core.words import counted
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 
 
@@ -36,7 +37,7 @@ class KnownPoses:
             raise RegistrationError(
                 "no known pose for this frame",
                 where=f"frame {index}",
-                got=f"{len(self._poses)} poses",
+                got=counted(len(self._poses), "pose"),
                 expected="one for each frame",
                 hint="the pose file must list every frame of the source",
             )

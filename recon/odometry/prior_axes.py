@@ -13,6 +13,7 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import as_step, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame
@@ -73,7 +74,7 @@ def find_axes(
         misfits = ", ".join(f"{axes} axes {sigmas[axes]:.1f}" for axes in priors)
         raise RegistrationError(
             "the prior does not fit what the cameras see",
-            got=f"{misfits} standard deviations off in {len(off)} motions",
+            got=f"{misfits} standard deviations off in {counted(len(off), 'motion')}",
             expected=f"at most {MAX_SIGMAS:g}",
             hint="it must be the path of this rig, in metres and on its clock; see "
             "odometry.prior.axes, and odometry.prior.sigma_m if it is no better",

@@ -10,6 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import as_step, invert
 from recon.core.values import Disparity
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
 from recon.odometry.locate_camera import MIN_INLIERS, enough_agree, locate_camera
 from recon.odometry.motion import Motion
@@ -226,7 +227,7 @@ class VisualOdometry:
         points = len(begun.window.xyz_world)
         sees = points >= MIN_INLIERS
         self._state = begun if sees else replace(state, motion=motion)
-        why = f"{what if sees else 'nothing to follow in the image'} ({points} features)"
+        why = f"{what if sees else 'nothing to follow in the image'} ({counted(points, 'feature')})"
         if prior_motion is None or self._prior is None:
             notes = (f"lost: {why}; the last motion goes on",)
             health = OdometryHealth(ok=False, skipped=not sees, notes=notes)

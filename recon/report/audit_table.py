@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from recon.core.words import counted
+
 _UNKNOWN = "not known"
 
 
@@ -75,7 +77,7 @@ def _interval(figure: Mapping[str, float]) -> str:
 def _frames(summary: Mapping[str, Any]) -> str:
     frozen = max(summary["frozen_left_frames"], summary["frozen_right_frames"])
     step_s = summary["usual_step_s"]
-    rate = "" if step_s is None else f" at {1 / step_s:.3g} Hz, {summary['gaps']} gaps"
+    rate = "" if step_s is None else f" at {1 / step_s:.3g} Hz, {counted(summary['gaps'], 'gap')}"
     return (
         f"{summary['frames']}{rate}; {summary['frames_read']} examined, "
         f"{summary['repeated_frames']} repeated"
@@ -105,7 +107,7 @@ def _percent(summary: Mapping[str, Any]) -> float | None:
 
 def _time(summary: Mapping[str, Any]) -> str:
     if summary["lag_frames"]:
-        return f"right camera {summary['lag_frames']:+d} frames late"
+        return f"right camera {counted(summary['lag_frames'], 'frame', form='+d')} late"
     skew = summary["time_skew_frames"]
     # Avoids a negative zero.
     return _known("right camera {:+.2f} frames late", skew and round(skew, 2) + 0.0)

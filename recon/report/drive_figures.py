@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import UNKNOWN, OccupancyGrid, Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.evaluation.trajectory import TrajectoryComparison
 from recon.odometry.protocol import OdometryHealth
 from recon.report.colour import GRID_FREE, GRID_OCCUPIED, GRID_UNKNOWN, colour_grid, unit_colour
@@ -134,7 +135,9 @@ def drift_figure(
     """Draw the drift of position and rotation, with both paths starting at the identity."""
     if len(estimate) != len(truth):
         figure = Figure((WIDE_IN, 4.6))
-        note = f"{len(estimate)} poses, but {len(truth)} true ones: not compared"
+        note = (
+            f"{counted(len(estimate), 'pose')}, but {counted(len(truth), 'true one')}: not compared"
+        )
         write_note(figure.subplots(), note)
         return to_png(figure)
     drift = invert(truth.T_world_camera) @ estimate.T_world_camera

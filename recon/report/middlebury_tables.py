@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from recon.core.words import counted
 from recon.report.table import NOT_KNOWN, Row, Table, csv_text, number
 
 Figures = Mapping[str, Any]
@@ -15,9 +16,10 @@ _LENGTHS: Final = ("avgerr", "rms", "a50", "a90", "a95", "a99")
 _DEPTHS: Final = ("mean_m", "median_m", "rms_m", "median_percent", "over_5_percent", "infinite")
 _CONFIDENCE: Final = ("ece", "ause", "within_1_sigma", "within_2_sigma")
 _KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("all", "sparse"))
+_UNITS: Final = "bad and invalid in %, avgerr to a99 in px"
 _OF_EACH_SCENE: Final = {
-    "bad 1 of each scene, nonocc, dense": ("nonocc", "dense", "bad", "1"),
-    "bad 2 of each scene, nonocc, dense": ("nonocc", "dense", "bad", "2"),
+    "bad 1 (%) of each scene, nonocc, dense": ("nonocc", "dense", "bad", "1"),
+    "bad 2 (%) of each scene, nonocc, dense": ("nonocc", "dense", "bad", "2"),
     "avgerr (px) of each scene, nonocc, dense": ("nonocc", "dense", "avgerr"),
 }
 
@@ -26,8 +28,11 @@ def middlebury_tables(summary: Figures) -> list[Table]:
     """Return all tables: weighted means of each mask and filling, then figures of each scene."""
     matchers = summary["matchers"]
     averaged, scenes = len(summary["mean_over"]), len(scene_names(matchers))
-    mean = "Weighted mean" + (f" of {averaged} of {scenes} scenes" if averaged < scenes else "")
-    tables = [_weighted_table(f"{mean}, {', '.join(kind)}", matchers, kind) for kind in _KINDS]
+    some = f" of {averaged} of {counted(scenes, 'scene')}" if averaged < scenes else ""
+    mean = f"Weighted mean{some}"
+    tables = [
+        _weighted_table(f"{mean}, {', '.join(kind)} ({_UNITS})", matchers, kind) for kind in _KINDS
+    ]
     tables += [_scene_table(title, matchers, path) for title, path in _OF_EACH_SCENE.items()]
     if any(_at(found, ("weighted", "confidence")) for found in matchers.values()):
         tables.append(_confidence_table(f"Confidence, {mean.lower()}, all, sparse", matchers))

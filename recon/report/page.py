@@ -18,6 +18,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
+from recon.core.units import with_unit
+from recon.core.words import counted
 from recon.io.atomic import write_text
 from recon.report.drive_figures import timing_figure
 from recon.report.table import NOT_KNOWN
@@ -71,7 +73,7 @@ def page_environment() -> Environment:
     )
     environment.tests["finite"] = _is_number
     environment.filters.update(
-        embedded=_embedded, known=_known, leaves=summary_rows, words=_words,
+        counted=counted, embedded=_embedded, known=_known, leaves=summary_rows, words=_words,
         last_part=lambda name: Path(name).name or name, shortest="{:.3g}".format, timing=_timing,
     )  # fmt: skip
     # Sections add their titles to the contents.
@@ -103,8 +105,14 @@ def summary_rows(summary: Mapping[Any, Any], prefix: str = "") -> list[tuple[str
         elif isinstance(value, Sequence) and any(isinstance(item, Mapping) for item in value):
             rows += summary_rows(dict(enumerate(value)), f"{prefix}{key}.")
         else:
-            rows.append((f"{prefix}{key}", _text(value)))
+            name, text = f"{prefix}{key}", _text(value)
+            rows.append((name, text if _is_text(value) else with_unit(text, name)))
     return rows
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether a value of a summary has no unit: it is unknown, a text, or yes or no."""
+    return value is None or isinstance(value, str | bool) or value == []
 
 
 def _known(value: Any, form: str) -> str:

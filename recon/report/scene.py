@@ -20,6 +20,7 @@ from plotly.colors import get_colorscale
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Float32, Float64, UInt8
+from recon.core.words import counted
 from recon.report.colour import value_range
 from recon.report.thin import thin_cloud, thin_mesh
 
@@ -131,7 +132,7 @@ def quantise_colours(rgb: UInt8) -> tuple[UInt8, UInt8]:
 def _cloud_trace(thinned: PointCloud, points: int, T: Float64, marker: Json) -> go.Scatter3d:
     return go.Scatter3d(
         mode="markers",
-        name=f"cloud ({len(thinned):,} of {points:,} points)",
+        name=f"cloud ({len(thinned):,} of {counted(points, 'point', form=',')})",
         hoverinfo="skip",
         marker={"size": 1.6, "showscale": False, **marker},
         **_xyz(apply(T, thinned.xyz)),
@@ -146,7 +147,7 @@ def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> go.Mesh3d:
         colouring = _palette_scale(of_faces)
         colouring |= {"intensity": colouring.pop("color"), "intensitymode": "cell"}
     return go.Mesh3d(
-        name=f"mesh ({len(mesh.faces):,} triangles)",
+        name=f"mesh ({counted(len(mesh.faces), 'triangle', form=',')})",
         hoverinfo="skip",
         showlegend=True,
         showscale=False,

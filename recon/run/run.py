@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime, timezone
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -93,9 +94,9 @@ class Run(RunDirectory):
 
     @contextmanager
     def report(self, summary: dict[str, Any]) -> Iterator[None]:
-        """Time the writing of the report, which finds the cost of the run so far in the summary."""
+        """Time the writing of the report, which finds the cost of the run in the summary."""
         self.progress.on_stage("report")
-        summary |= self._cost()
+        summary |= self._cost
         with self.stage("report"):
             yield
 
@@ -121,7 +122,7 @@ class Run(RunDirectory):
         """
         inputs = tuple(inputs)
         self.check_targets(inputs)
-        summary |= {**self._cost(), "out": str(self.folder)}
+        summary |= {**self._cost, "out": str(self.folder)}
         self.write_json(SUMMARY, summary)
         with self.stage("hash"):
             hashed = fingerprint(inputs)
@@ -133,7 +134,7 @@ class Run(RunDirectory):
                 "versions": versions(),
                 "source": source,
                 "inputs": hashed,
-                "timings": self.watch.seconds,
+                "timings": self._timings(),
                 "peak_memory_mb": summary["peak_memory_mb"],
                 "warnings": list(summary.get("warnings", ())),
                 **(record or {}),
@@ -142,13 +143,21 @@ class Run(RunDirectory):
             },
         )
 
+    @cached_property
     def _cost(self) -> dict[str, Any]:
-        """Return seconds in all and per stage (stages overlap), and peak memory."""
+        """Seconds in all and per stage (stages overlap), and peak memory, until the report.
+
+        Taken once: report, summary and record have the same figures.
+        """
         return {
             "seconds": round(time.perf_counter() - self._start, 3),
-            "stages": {name: round(value, 3) for name, value in self.watch.seconds.items()},
+            "stages": self._timings(),
             "peak_memory_mb": round(peak_memory_mb(), 1),
         }
+
+    def _timings(self) -> dict[str, float]:
+        """Return seconds of each stage so far."""
+        return {name: round(value, 3) for name, value in self.watch.seconds.items()}
 
 
 class WholeRun(Run):

@@ -21,6 +21,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.frames_csv import FRAMES, read_frames
 from recon.sources.calibration import read_rig
@@ -224,7 +225,7 @@ def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Fr
             if by == "name"
             else "numbers of left and right images differ",
             where=folder,
-            got=f"{len(left)} left and {len(right)} right images",
+            got=f"{len(left)} left and {counted(len(right), 'right image')}",
             hint="give both images of a pair the same name, or their timestamps as names",
         )
     return list(zip(left, right, strict=True))

@@ -9,6 +9,7 @@ from typing import Final, TypeVar
 
 from recon.core.decimals import is_count
 from recon.core.errors import SourceError
+from recon.core.words import counted
 from recon.sources.settings import SourceSettings
 
 Item = TypeVar("Item")
@@ -39,7 +40,9 @@ class FrameList:
     shift: int = 0
 
     def __str__(self) -> str:
-        text = f", right images {self.shift:+d} frames later" if self.shift else ""
+        text = (
+            f", right images {counted(self.shift, 'frame', form='+d')} later" if self.shift else ""
+        )
         if any(self.alone):
             text += f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
         if self.chosen is None:
@@ -147,16 +150,16 @@ def _shift_right(
         return frames
     whole = [k for k, (left, right) in enumerate(frames) if left is not None and right is not None]
     # Where cameras have different rates, only the frames of the slower one count.
-    counted = whole if len(whole) < _ONE_RATE * len(frames) else range(len(frames))
+    chosen = whole if len(whole) < _ONE_RATE * len(frames) else range(len(frames))
     rights: list[Right | None] = [None] * len(frames)
-    for k, later in zip(counted[max(0, -by) :], counted[max(0, by) :], strict=False):
+    for k, later in zip(chosen[max(0, -by) :], chosen[max(0, by) :], strict=False):
         rights[k] = frames[later][1]
     shifted = [(left, right) for (left, _), right in zip(frames, rights, strict=True)]
     if all(left is None or right is None for left, right in shifted):
         raise SourceError(
             "no pair is left with right images that were taken later",
             where=where,
-            got=f"source.shift_frames={by}, {len(counted)} frames",
+            got=f"source.shift_frames={by}, {counted(len(chosen), 'frame')}",
             expected="fewer frames than the recording has, or 0",
         )
     return shifted
@@ -177,6 +180,6 @@ def check_most(pairs: int, images: int, where: Path) -> None:
         raise SourceError(
             "most images have no partner",
             where=where,
-            got=f"{pairs} pairs of {images} images",
+            got=f"{counted(pairs, 'pair')} of {counted(images, 'image')}",
             hint="give both images of a pair the same name or time, and copy missing files again",
         )

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from recon.core.errors import SourceError
+from recon.core.words import counted
 from recon.sources.image_names import natural_key
 from recon.sources.images import IMAGES
 
@@ -124,7 +125,8 @@ def _match(
         raise SourceError(
             "images do not pair up: most have no partner",
             where=lonely[0].parent,
-            got=f"{len(pairs)} pairs of {len(sides[0])} left, {len(sides[1])} right; {names}",
+            got=f"{counted(len(pairs), 'pair')} of {len(sides[0])} left, {len(sides[1])} right; "
+            f"{names}",
             hint="correct their names",
         )
     return ImagePairs(pairs, by_order=False, lonely=lonely)

@@ -22,6 +22,7 @@ from recon.core.errors import SourceError
 from recon.core.geometry.se3 import invert
 from recon.core.values import Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
 from recon.io.files import StrPath
 from recon.io.trajectory import read_kitti_poses
@@ -177,7 +178,7 @@ def _read_truth(
         raise SourceError(
             "fewer poses than images",
             where=path,
-            got=f"{len(poses)} poses",
+            got=counted(len(poses), "pose"),
             expected=f"{len(listing.names)}",
         )
     calibration = folder / "calib.txt"

@@ -18,6 +18,7 @@ from typing import Final
 from recon.core.decimals import is_count
 from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, Rig
+from recon.core.words import counted
 from recon.io.cameras.kitti import read_kitti_rig
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.images import ImageSource, image_size, list_images, pair_listed
@@ -69,7 +70,7 @@ def _read_list(view: Path) -> list[tuple[float, Path]]:
         raise SourceError(
             "numbers of times and images differ",
             where=path,
-            got=f"{len(stamps)} times",
+            got=counted(len(stamps), "time"),
             expected=f"{len(images)}",
         )
     named = {int(image.stem): image for image in images}

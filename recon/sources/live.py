@@ -13,6 +13,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.values import StereoPair
+from recon.core.words import counted
 from recon.run.progress import Progress, Step
 from recon.sources.protocol import DerivedSource, StereoSource
 
@@ -125,10 +126,10 @@ class LiveSource(DerivedSource):
         """Return what was left out, in words."""
         lines = []
         if self._unmatched:
-            what = "tracked, but not matched: the map lacks what they saw"
-            lines.append(f"{self._unmatched} frames came too fast and were {what}")
+            what = "only tracked, not matched: the map lacks what they saw"
+            lines.append(f"{counted(self._unmatched, 'frame')} came too fast, {what}")
         if self.dropped:
-            lines.append(f"{self.dropped} frames came too fast and were dropped")
+            lines.append(f"{counted(self.dropped, 'frame')} came too fast, dropped")
         return lines
 
     def _play(self, start: int) -> None:

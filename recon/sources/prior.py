@@ -13,6 +13,7 @@ from recon.core.errors import FormatError, SourceError
 from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.trajectory import read_tum
 from recon.sources.bag import BagSource
 from recon.sources.bag_topics import list_topics
@@ -69,7 +70,7 @@ def _read_topic(source: BagSource, name: str) -> ReadPrior:
     path = _path_of(poses, where, stamped=source.stamped)
     camera = bag.frame_id(source.topics[0])
     T_child_camera = _static_transform(bag, child, camera)
-    origin = f"{name}, {len(path)} poses of {child or 'an unnamed frame'} in {parent}"
+    origin = f"{name}, {counted(len(path), 'pose')} of {child or 'an unnamed frame'} in {parent}"
     if T_child_camera is None:
         return ReadPrior(path, f"{origin}, no static transform to {camera or 'the camera'}")
     moved = Trajectory(path.T_world_camera @ T_child_camera, path.timestamps_s)

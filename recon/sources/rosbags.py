@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError, ReconError
 from recon.core.optional import require
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 
 IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
@@ -267,7 +268,9 @@ class Bag:
                 seconds, nanoseconds = struct.unpack_from(order + "iI", content, 4)
         except (struct.error, IndexError) as error:
             raise FormatError(
-                "message is too short", where=self.paths[0], got=f"{len(content)} bytes on {topic}"
+                "message is too short",
+                where=self.paths[0],
+                got=f"{counted(len(content), 'byte')} on {topic}",
             ) from error
         return int(seconds) * _NS_PER_S + int(nanoseconds)
 

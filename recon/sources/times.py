@@ -13,6 +13,7 @@ from recon.core.geometry.interpolation import interpolate_poses
 from recon.core.geometry.se3 import invert
 from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.files import read_table, read_text, reader
 from recon.io.trajectory import read_tum
 from recon.sources.frame_list import FrameList
@@ -54,7 +55,7 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
         raise SourceError(
             "fewer times than images",
             where=path,
-            got=f"{len(table)} times",
+            got=counted(len(table), "time"),
             expected=f"{len(listing.names)}",
         )
     check_seconds(seconds, path)
@@ -142,7 +143,8 @@ def truth_at(
     """
     covered = (stamps_s >= path.timestamps_s[0]) & (stamps_s <= path.timestamps_s[-1])
     if not covered.all():
-        return None, f", ground truth for only {covered.sum()} of {len(stamps_s)} frames: not used"
+        frames = counted(len(stamps_s), "frame")
+        return None, f", ground truth for only {covered.sum()} of {frames}: not used"
     poses = interpolate_poses(path, stamps_s)
     if T_body_camera is not None:
         poses = poses @ T_body_camera

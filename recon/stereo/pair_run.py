@@ -16,6 +16,7 @@ from recon.core.values import (
     RectifiedPair,
     TriangleMesh,
 )
+from recon.core.words import counted
 from recon.stereo.frame import ReconstructedFrame
 from recon.stereo.settings import StereoSettings
 
@@ -51,7 +52,7 @@ class PairRun:
     def __repr__(self) -> str:
         parts = (self.disparity, self.cloud, self.mesh)
         made = ", ".join(repr(part) for part in parts if part is not None)
-        return f"PairRun({self.name!r}, {made}, {len(self.warnings)} warnings)"
+        return f"PairRun({self.name!r}, {made}, {counted(len(self.warnings), 'warning')})"
 
 
 def disparity_figures(disparity: Disparity) -> dict[str, Any]:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 
 def test_benchmarks_import_what_is_there(trees: dict[Path, ast.Module], root: Path) -> None:
@@ -19,6 +24,47 @@ def test_benchmarks_import_what_is_there(trees: dict[Path, ast.Module], root: Pa
     ]
 
     assert missing == []
+
+
+@pytest.mark.parametrize("child", [False, True])
+def test_a_benchmark_measures_the_checkout_that_it_stands_in(
+    root: Path, tmp_path: Path, child: bool
+) -> None:
+    other = tmp_path / "other" / "recon"
+    other.mkdir(parents=True)
+    (other / "__init__.py").write_text("raise SystemExit('another recon was imported')")
+    starts_another = (
+        "import checkout, subprocess, sys; "
+        "sys.exit(subprocess.call([sys.executable, '-c', 'import recon; print(recon.__file__)']))"
+    )
+    if child:  # as when a benchmark of the folder runs, whose own place Python looks at first
+        command, path = ["-c", starts_another], [root / "benchmarks", other.parent]
+    else:
+        command, path = [str(root / "benchmarks" / "map_store.py"), "--help"], [other.parent]
+    done = subprocess.run(
+        [sys.executable, *command],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (str(root / "recon" / "__init__.py") if child else "usage: map_store.py") in done.stdout
+
+
+def test_every_benchmark_says_first_what_is_measured(root: Path) -> None:
+    """What stands before the first import from the library decides from where that comes."""
+    late = []
+    for path in sorted((root / "benchmarks").glob("*.py")):
+        tree = ast.parse(path.read_text()).body
+        names = [n.names[0].name if isinstance(n, ast.Import) else str(n.module) for n in tree
+                 if isinstance(n, ast.Import | ast.ImportFrom)]  # fmt: skip
+        ours = [name.partition(".")[0] in {"recon", "tests"} for name in names]
+        if any(ours) and "checkout" not in names[: ours.index(True)]:
+            late.append(path.name)
+
+    assert late == []
 
 
 def _file(root: Path, module: str) -> Path:

@@ -131,3 +131,21 @@ def test_no_file_names_a_path_of_one_machine(root: Path) -> None:
 @pytest.mark.parametrize("script", [".ci/run", "scripts/setup.sh"])
 def test_script_can_be_executed(script: str, root: Path) -> None:
     assert (root / script).stat().st_mode & 0o111
+
+
+THINGS = """
+frame pair point place loop pose image position view inlier feature warning session drive scene
+segment byte row face triangle voxel tile gap coefficient
+"""
+
+
+def test_numbers_of_things_are_written_by_one_function(root: Path) -> None:
+    """So that none reads "1 frames"; constants, which are in capitals, are more than one."""
+    plural = re.compile(
+        rf"(\{{[^{{}}:]*[a-z][^{{}}:]*\}}+|%d) ({'|'.join(THINGS.split())})s\b(?! the)"
+    )
+    files = [*(root / "recon").rglob("*.py"), *(root / "recon").rglob("*.j2")]
+    found = [
+        f"{path.name}: {one[0]}" for path in files for one in plural.finditer(path.read_text())
+    ]
+    assert found == []

@@ -36,6 +36,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     printed = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.setattr(sys, "argv", [str(BENCHMARK), *options])
+        patch.syspath_prepend(BENCHMARK.parent)
         runpy.run_path(str(BENCHMARK), run_name="__main__")
     return json.loads(printed.getvalue())
 

@@ -35,7 +35,7 @@ def test_page_of_a_drive_shows_all_that_the_run_has(drive: SimpleNamespace) -> N
     assert '<div class="scene">' in shown["In 3-D"]
     table = rows(shown["All figures"])
     assert ("nested.a", "1, –") in table
-    assert ("fps", "4.25") in table
+    assert ("fps", "4.25 frames/s") in table
     assert ("segments", "3 of 5 m") in rows(shown["Path against truth"])
     assert "frame 5: lost" in page
     assert "drive &lt;1&gt;" in page
@@ -50,7 +50,7 @@ def test_page_of_a_pair_shows_all_that_the_run_has(view: SimpleNamespace) -> Non
     assert ("pixels compared", "1,440") in rows(shown["Disparity against truth"])
     figures = key_figures(page)
     assert figures["Pixels with a disparity"] == "75.0 %"
-    assert figures["Off by more than 2 px"] == "10.0 %"
+    assert figures["Bad 2: off by more than 2 px"] == "10.0 %"
     assert figures["Points"] == "2,000"
     assert len(page.encode()) < MAX_BYTES
 

@@ -35,7 +35,10 @@ def summary(error: float | None = 3.25, *, depth: bool = True) -> dict[str, Any]
 def tables(found: dict[str, Any], form: Callable[[Table], str] = Table.text) -> dict[str, list]:
     """The lines of each table, by its title."""
     parts = join(map(form, middlebury_tables(found))).strip("\n").split("\n\n")
-    return {title.lstrip("#% "): lines for title, *lines in map(str.splitlines, parts)}
+    return {
+        title.lstrip("#% ").partition(" (bad")[0]: lines
+        for title, *lines in map(str.splitlines, parts)
+    }
 
 
 def csv_rows(found: dict[str, Any]) -> list[dict[str, str]]:

@@ -213,7 +213,7 @@ def test_figures_of_each_part_are_rows_of_their_own() -> None:
         }
     )
     assert rows == [
-        ("by_length.0.length_m", "50"),
+        ("by_length.0.length_m", "50 m"),
         ("by_length.0.segments", "15"),
         ("views_dropped", "none"),
         ("nested.a", "1, –"),

@@ -47,7 +47,7 @@ def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
     drive.mapped.loops = DriveLoops(trajectory, Closure(bent, (right,), (wrong,)), 11, 3, {})
     page = map_html(drive)
     assert key_figures(page)["Loops closed, path moved by"] == "1 of 3, 2.50 m"
-    assert "1 loops were closed, with 11 keyframes" in blocks(page)["Loops"]
+    assert "1 loop closed, with 11 keyframes" in blocks(page)["Loops"]
     drive.mapped.loops = DriveLoops(trajectory, Closure(trajectory, (), (wrong,)), 11, 3, {})
     page = map_html(drive)
     assert key_figures(page)["Loops closed, path moved by"] == "0 of 3, 0.00 m"

@@ -65,7 +65,7 @@ def test_a_single_pair_needs_no_names_in_common(tmp_path: Path) -> None:
         (
             ["l1.png", "l2.png", "l3.png"],
             ["r3.png", "r4.png", "r5.png"],
-            r"most have no partner \(got 1 pairs of 3 left, 3 right; l1\.png, l2\.png, r4\.png …",
+            r"most have no partner \(got 1 pair of 3 left, 3 right; l1\.png, l2\.png, r4\.png …",
         ),
         (["lx.png", "ly.png"], ["r.png"], r"do not pair up \(got 2 left, 1 right"),
     ],

@@ -167,7 +167,7 @@ def empty_both(folder: Path) -> None:
         (write("times.txt", "5\n5\n5\n"), SourceError, r"times\.txt: times are not those.*got 0 s"),
         (write("times.txt", "0\nnan\n1\n"), FormatError, r"times\.txt:2: number is not finite"),
         (write("poses.txt", IDENTITY), SourceError,
-         r"poses\.txt: fewer poses than images \(got 1 poses, expected 3\)"),
+         r"poses\.txt: fewer poses than images \(got 1 pose, expected 3\)"),
         (write("poses.txt", IDENTITY * 2 + "nan " * 12), FormatError,
          r"poses\.txt:3: number is not finite"),
         (write("poses.txt", "2" + IDENTITY[1:]), FormatError, r"poses\.txt:1: .*rigid transform"),

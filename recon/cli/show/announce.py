@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable
 from typing import TextIO
 
+from recon.core.words import counted
 from recon.sources.protocol import StereoSource
 
 
@@ -32,7 +33,7 @@ def announce(
         "frames": len(source),
     }
     if not quiet:
-        many = f", {len(source)} pairs" if len(source) else ""
+        many = f", {counted(len(source), 'pair')}" if len(source) else ""
         _write(f"{source.name}: {source.description}{many}", event, verbose, stream)
 
 

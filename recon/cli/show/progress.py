@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from typing import Any, Final, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from recon.cli.show.line import FittingColumn
 from recon.run.progress import Progress as Shown
 from recon.run.progress import Silent, Step
 
@@ -82,13 +83,14 @@ class ProgressBar:
         self.on_finish()
         self._seconds, self._unit, self._bad = math.nan, unit, 0
         self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[state]}", markup=False),
-            TextColumn("{task.fields[bad]}", style="bold red"),
+            FittingColumn(
+                [MofNCompleteColumn(), TextColumn("{task.fields[bad]}", style="bold red")],
+                [
+                    TextColumn("{task.fields[rate]}"),
+                    TimeRemainingColumn(),
+                    TextColumn("{task.fields[state]}", markup=False),
+                ],
+            ),
             console=self._console,
         )
         self._progress.add_task(name, total=total or None, rate="", state="", bad="")

@@ -12,6 +12,9 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from recon.core.units import with_unit
+from recon.core.words import counted
+
 if TYPE_CHECKING:
     from recon.commands.settings_list import SettingEntry, SettingGroup
     from recon.run.installation import Check
@@ -27,11 +30,14 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 
 def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """Print a two-column table of figures; nested values appear only in ``--json``."""
+    """Print a table of figures with their units; nested values appear only in ``--json``."""
     table = Table(show_header=False)
     for name, value in figures.items():
-        if isinstance(value, str | int | float) and value is not None:
-            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+        if isinstance(value, str | bool):
+            table.add_row(name, str(value))
+        elif isinstance(value, int | float):
+            text = f"{value:.4g}" if isinstance(value, float) else str(value)
+            table.add_row(name, with_unit(text, name))
     if title:
         typer.echo(title)
     Console().print(table)
@@ -58,6 +64,8 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     shown = {key: value for key, value in summary.items() if key != "out"}
     for group in ("live", "prior", "loops", "links", "trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
+    bad = summary.get("disparity", {}).get("bad", {})
+    shown |= {f"disparity.bad {float(limit):g}": share for limit, share in bad.items()}
     latency_ms = summary.get("live", {}).get("latency_ms", {})
     shown |= {f"live.latency_ms.{key}": value for key, value in latency_ms.items()}
     for part in ("voxels", "grid"):
@@ -65,7 +73,9 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
         shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
     for drive in summary.get("sessions", ()):
         place = "" if drive["linked"] else ", apart"
-        shown[f"session {drive['number']}"] = f"{drive['name']}: {drive['frames']} frames{place}"
+        shown[f"session {drive['number']}"] = (
+            f"{drive['name']}: {counted(drive['frames'], 'frame')}{place}"
+        )
     if stages:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
     print_figures("", shown)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Float32, Int32, UInt8, extent_text, freeze
+from recon.core.words import counted
 
 Frame = Literal["camera", "world", "map"]
 
@@ -51,7 +52,7 @@ class PointCloud:
 
     def __repr__(self) -> str:
         known = [f.name for f in fields(self)[1:-1] if getattr(self, f.name) is not None]
-        parts = (f"{len(self)} points", extent_text(self.xyz), f"{self.frame} axes", *known)
+        parts = (counted(len(self), "point"), extent_text(self.xyz), f"{self.frame} axes", *known)
         return f"PointCloud({', '.join(parts)})"
 
     def __len__(self) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze, size_text
+from recon.core.words import counted
 
 FREE: Final = 0
 OCCUPIED: Final = 100
@@ -42,7 +43,7 @@ class OccupancyVoxels:
 
     def __repr__(self) -> str:
         occupied = int(np.sum(self.log_odds > 0))
-        sizes = f"{len(self)} voxels of {self.resolution_m:g} m, {occupied} occupied"
+        sizes = f"{counted(len(self), 'voxel')} of {self.resolution_m:g} m, {occupied} occupied"
         return f"OccupancyVoxels({sizes})"
 
     def __len__(self) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.core.values.arrays import Float32, Int32, UInt8, extent_text, freeze
+from recon.core.words import counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,5 +33,6 @@ class TriangleMesh:
         freeze(self, "rgb", np.uint8, (len(self.vertices), 3))
 
     def __repr__(self) -> str:
-        sizes = f"{len(self.faces)} faces, {len(self.vertices)} vertices"
+        vertices = counted(len(self.vertices), "vertex", "vertices")
+        sizes = f"{counted(len(self.faces), 'face')}, {vertices}"
         return f"TriangleMesh({sizes}, {extent_text(self.vertices)})"

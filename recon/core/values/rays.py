@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from recon.core.values.arrays import UInt8, freeze
 from recon.core.values.cloud import PointCloud
+from recon.core.words import counted
 
 _CERTAIN: Final = 255
 
@@ -54,7 +55,7 @@ class RayCloud:
         freeze(self, "count", np.uint8, (len(self.places),))
 
     def __repr__(self) -> str:
-        return f"RayCloud({len(self)} rays)"
+        return f"RayCloud({counted(len(self), 'ray')})"
 
     def __len__(self) -> int:
         return len(self.places)

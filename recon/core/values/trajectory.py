@@ -11,6 +11,7 @@ from typing_extensions import Self
 
 from recon.core.errors import ShapeError
 from recon.core.values.arrays import Float64, freeze
+from recon.core.words import counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +36,9 @@ class Trajectory:
 
     def __repr__(self) -> str:
         seconds = self.timestamps_s[-1] - self.timestamps_s[0] if len(self) else 0.0
-        return f"Trajectory({len(self)} poses, {self.path_length_m:.4g} m, {seconds:.4g} s)"
+        return (
+            f"Trajectory({counted(len(self), 'pose')}, {self.path_length_m:.4g} m, {seconds:.4g} s)"
+        )
 
     def select(self, frames: NDArray[Any]) -> Self:
         """Return the poses of some frames, by numbers or bool (N,)."""

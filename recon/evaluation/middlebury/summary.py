@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.evaluation.middlebury.rules import scene_weight, weighted_mean
 from recon.evaluation.middlebury.scenes import ResultFolder
 from recon.evaluation.middlebury.score import MASKS, Figures, rounded
@@ -98,7 +99,7 @@ def _missing(
         if lacking:
             yield (
                 f"{result.name}: no result for {', '.join(lacking)}; means are over "
-                f"{len(common)} of {len(scenes)} scenes, which all have"
+                f"{len(common)} of {counted(len(scenes), 'scene')}, which all have"
             )
 
 

@@ -14,6 +14,7 @@ from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32
+from recon.core.words import counted
 from recon.export.mesh.cut import Plane, cut_mesh
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.seams import close_seam, open_edges
@@ -168,7 +169,7 @@ class _Mesher:
             return ()
         worst = max(failed, key=self.points.__getitem__)
         share = sum(self.points[key] for key in failed) / self.points.total()
-        tiles = f"{len(failed)} of {len(self.points)} tiles"
+        tiles = f"{len(failed)} of {counted(len(self.points), 'tile')}"
         return (f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})",)
 
     def _surface(self, key: PieceKey) -> TriangleMesh | MeshingError:

@@ -14,6 +14,7 @@ from recon.core.errors import MeshingError
 from recon.core.settings import Settings
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32
+from recon.core.words import counted
 from recon.export.mesh.surgery import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
@@ -220,7 +221,7 @@ def usable(cloud: PointCloud) -> PointCloud:
         distant = spread[1] > 1e-5 * spread[2] and spread[1] > 0
         raise MeshingError(
             "all points lie in one place or on one line",
-            got=f"{len(cloud)} points, up to {farthest:.3g} m from the origin",
+            got=f"{counted(len(cloud), 'point')}, up to {farthest:.3g} m from the origin",
             hint="subtract an offset from all coordinates" if distant else None,
         )
     return cloud

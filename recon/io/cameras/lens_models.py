@@ -10,6 +10,7 @@ import numpy as np
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.values import CameraIntrinsics, LensModel
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.files import StrPath
 
 # Name -> our model and the permitted numbers of coefficients; a writer uses the first that fits.
@@ -76,7 +77,7 @@ def name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str,
             return name, padded
     raise CalibrationError(
         f"a {form} file cannot store this lens model",
-        got=f"{camera.model} with {most} coefficients",
+        got=f"{camera.model} with {counted(most, 'coefficient')}",
         expected=", ".join(models),
         hint="calibrate with --set calibration.radial_terms=2, or write another format",
     )

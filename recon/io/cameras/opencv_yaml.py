@@ -13,6 +13,7 @@ from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration, check_unsized
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.io.atomic import write_text
 from recon.io.file_storage import read_file_storage
 from recon.io.files import StrPath, reader, reading
@@ -174,7 +175,7 @@ def _camera(
         raise FormatError(
             f"{distortion_names[0]!r} has the wrong size",
             where=path,
-            got=f"{distortion.size} coefficients",
+            got=counted(distortion.size, "coefficient"),
             expected="4, 5, 8, 12 or 14",
         )
     return CameraIntrinsics(matrix, distortion, *size_px, model)

@@ -21,6 +21,7 @@ from PIL.PpmImagePlugin import PpmImageFile
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from recon.core.errors import FormatError
+from recon.core.words import counted
 from recon.io.files import StrPath
 
 _PNG_START: Final = b"\x89PNG\r\n\x1a\n"
@@ -77,12 +78,16 @@ def _check_png(content: bytes, path: StrPath) -> None:
     name = b""
     while name != b"IEND":
         if at + 12 > len(content):
-            raise _truncated("PNG", path, f"the file ends after {len(content)} bytes, before IEND")
+            raise _truncated(
+                "PNG", path, f"the file ends after {counted(len(content), 'byte')}, before IEND"
+            )
         length = int.from_bytes(content[at : at + 4], "big")
         name = content[at + 4 : at + 8]
         end = at + 8 + length
         if end + 4 > len(content):
-            raise _truncated("PNG", path, f"the file ends inside a chunk of {length} bytes")
+            raise _truncated(
+                "PNG", path, f"the file ends inside a chunk of {counted(length, 'byte')}"
+            )
         if zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
             raise _truncated("PNG", path, f"checksum of chunk {name!r} differs")
         at = end + 4
@@ -111,20 +116,22 @@ def _check_pnm(content: bytes, path: StrPath) -> None:
     else:
         found = (len(content) - header.end()) // (2 if top > 255 else 1)
     if found < samples:
-        raise _truncated("PGM/PPM", path, f"{found} of {samples} samples")
+        raise _truncated("PGM/PPM", path, f"{found} of {counted(samples, 'sample')}")
 
 
 def _check_bmp(content: bytes, path: StrPath) -> None:
     """Compute the size from rows padded to four bytes, as a header may declare a size of 0."""
     if len(content) < _BMP_HEADER.size:
-        raise _truncated("BMP", path, f"the file ends after {len(content)} bytes, in its header")
+        raise _truncated(
+            "BMP", path, f"the file ends after {counted(len(content), 'byte')}, in its header"
+        )
     header = _BMP_HEADER.unpack_from(content)
     _, offset, width, height, _, bits, compression, stored = header
     rows = (width * bits + 31) // 32 * 4 * abs(height)
     run_lengths = compression in {1, 2}
     needed = offset + (stored if run_lengths else rows)
     if len(content) < needed:
-        raise _truncated("BMP", path, f"{len(content)} of {needed} bytes")
+        raise _truncated("BMP", path, f"{len(content)} of {counted(needed, 'byte')}")
 
 
 def stated_size(content: bytes) -> tuple[int, int] | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.core.errors import FormatError
 from recon.core.values.arrays import Float32, frozen_array
+from recon.core.words import counted
 from recon.io.atomic import write_bytes
 from recon.io.files import StrPath, read_bytes, reader
 
@@ -73,7 +74,7 @@ def _unpack(body: bytes, order: str, shape: tuple[int, int], path: StrPath) -> F
         raise FormatError(
             "PFM file is truncated",
             where=path,
-            got=f"{len(body)} bytes",
+            got=counted(len(body), "byte"),
             expected=f"{4 * pixels} for {shape[1]}x{shape[0]} pixels",
         )
     values = np.frombuffer(body, dtype=order, count=pixels).reshape(shape)[::-1]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
 from recon.core.values.arrays import UInt8
+from recon.core.words import counted
 
 # Encoding: channels, bits per channel, and how OpenCV makes RGB of it, if it is not there already.
 # OpenCV names a Bayer pattern from pixel (1, 1) on, ROS from pixel (0, 0) on.
@@ -79,7 +80,7 @@ def pixels_of_ros_image(
         raise FormatError(
             "image message has too few bytes",
             where=where,
-            got=f"{data.size} bytes, {step} per row",
+            got=f"{counted(data.size, 'byte')}, {step} per row",
             expected=f"{width_px}x{height_px} pixels of {name}",
         )
     rows = np.lib.stride_tricks.as_strided(data, (height_px, row), (step, 1))

@@ -13,6 +13,7 @@ import cv2
 
 from recon.core.errors import FormatError
 from recon.core.values.arrays import UInt8
+from recon.core.words import counted
 from recon.io.files import StrPath, reader
 from recon.io.images.image import MAX_MEGAPIXELS, silent_opencv, swap_red_and_blue
 
@@ -67,7 +68,7 @@ class VideoFile:
         return FormatError(
             "video cannot be decoded to its end",
             where=self.path,
-            got=f"{index} frames",
+            got=counted(index, "frame"),
             expected=f"{self.frames}",
             hint="copy the file again, or cut it before the damage",
         )
@@ -97,7 +98,7 @@ def open_video(path: StrPath) -> VideoFile:
         raise FormatError(
             "video is truncated",
             where=file,
-            got=f"{frames} frames",
+            got=counted(frames, "frame"),
             expected=f"{promised:.0f}, as its header says",
             hint=f"copy the file again, or repair it: ffmpeg -i {file.name} -c copy whole.mkv",
         )

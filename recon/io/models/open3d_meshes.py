@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError, MeshingError, OutputError
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Int32
+from recon.core.words import counted
 from recon.io.files import StrPath
 
 
@@ -75,7 +76,9 @@ def decimate(
             target_faces, boundary_weight=3.0
         )
     if not smaller.has_triangles():
-        raise MeshingError("decimation left no face", got=f"target of {target_faces} faces")
+        raise MeshingError(
+            "decimation left no face", got=f"target of {counted(target_faces, 'face')}"
+        )
     return (
         np.asarray(smaller.vertices).astype(np.float32),
         np.asarray(smaller.triangles).astype(np.int32),

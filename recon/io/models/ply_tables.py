@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from recon.core.decimals import parse_numbers
 from recon.core.errors import FormatError
+from recon.core.words import counted
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, reader, reading
 
@@ -299,7 +300,7 @@ def _pieces(
             raise FormatError(
                 f"the file is truncated in its element {name!r}",
                 where=path,
-                got=f"{rows} rows",
+                got=counted(rows, "row"),
                 expected=f"{count}",
             )
         yield table

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import UInt8
+from recon.core.words import counted
 from recon.io.atomic import atomic_path, write_text
 from recon.io.files import StrPath, read_bytes, reader
 from recon.io.yaml_file import read_yaml
@@ -90,8 +91,8 @@ def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
     return {
         "image": image,
         "mode": "trinary",
-        "resolution": float(grid.resolution_m),
-        "origin": [float(grid.origin_m[0]), float(grid.origin_m[1]), 0.0],
+        "resolution": float(_shortest(grid.resolution_m)),
+        "origin": [*(float(_shortest(place)) for place in grid.origin_m), 0.0],
         "negate": 0,
         "occupied_thresh": _OCCUPIED_THRESH,
         "free_thresh": _FREE_THRESH,
@@ -105,7 +106,12 @@ def _world_file(grid: OccupancyGrid) -> str:
     """
     side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
     centre = (x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
-    return "".join(f"{number:.12g}\n" for number in (side_m, 0, 0, -side_m, *centre))
+    return "".join(f"{_shortest(number)}\n" for number in (side_m, 0, 0, -side_m, *centre))
+
+
+def _shortest(number: float) -> str:
+    """Return a number without the rounding of a product: -64.6, where -646 · 0.1 is just below."""
+    return f"{number:.12g}"
 
 
 def _fields(path: Path) -> dict[str, Any]:
@@ -146,7 +152,7 @@ def _read_pgm(path: Path) -> UInt8:
         raise FormatError(
             "the map's image is truncated",
             where=path,
-            got=f"{len(body)} bytes",
+            got=counted(len(body), "byte"),
             expected=f"{rows * columns}",
         )
     pixels: NDArray[np.uint8] = np.frombuffer(body, np.uint8)

@@ -12,6 +12,7 @@ import numpy as np
 
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.submaps import SubmapEntry
 from recon.places.closure import Closure, close_loops
@@ -99,13 +100,16 @@ class DriveLoops:
         closed, refused = len(self.closure.closed), len(self.closure.refused)
         if refused and not closed:
             what = "they contradict the odometry; the map may show a place twice"
-            return [f"{refused} loops were found and none closed: {what}"]
+            return [f"{counted(refused, 'loop')} found and none closed: {what}"]
         if refused:
-            return [f"{refused} of {refused + closed} loops contradict the others; they are left"]
+            loops = counted(refused + closed, "loop")
+            return [f"{refused} of {loops} contradict the others; they are left"]
         elsewhere = self.refused.get(CONTRADICTED, 0)
         if elsewhere >= _TELLING and not closed:
             why = "streets look alike, or the odometry is far off"
-            return [f"{elsewhere} places were recognised where the drive cannot have been: {why}"]
+            return [
+                f"{counted(elsewhere, 'place')} recognised where the drive cannot have been: {why}"
+            ]
         return []
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from recon.core.errors import RegistrationError
 from recon.core.values import Trajectory
+from recon.core.words import counted
 from recon.map.settings import DriveSettings
 from recon.odometry.known_poses import KnownPoses
 from recon.odometry.prior import MotionPrior
@@ -138,7 +139,7 @@ def _of_frames(known_poses: Trajectory, source: StereoSource) -> Trajectory:
     if lines is None:
         raise RegistrationError(
             "fewer known poses than frames",
-            got=f"{count} poses",
+            got=counted(count, "pose"),
             expected=f"{len(source)}",
             hint="the pose file must list every frame of the source",
         )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from recon.core.values.arrays import Float64, freeze
+from recon.core.words import counted
 from recon.odometry.protocol import OdometryHealth
 
 
@@ -61,7 +62,7 @@ class FrameResult:
     @property
     def state(self) -> str:
         """The frame for people: share of valid pixels, and whether the pose is trusted."""
-        pose = f"tracking, {self.health.inliers} inliers" if self.ok else "pose not trusted"
+        pose = counted(self.health.inliers, "inlier") if self.ok else "pose not trusted"
         return f"{100 * self.valid_share:.0f} % valid, {pose}"
 
 

@@ -14,6 +14,7 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
+from recon.core.words import counted
 from recon.map.drive.sequence import MappedSequence
 from recon.map.ground.axes import base_axes
 from recon.map.settings import DriveSettings
@@ -57,7 +58,7 @@ class MapRun:
 
     def __repr__(self) -> str:
         made = f"{self.mapped}, {self.grid}, {self.mesh}"
-        return f"MapRun({self.name!r}, {made}, {len(self.warnings)} warnings)"
+        return f"MapRun({self.name!r}, {made}, {counted(len(self.warnings), 'warning')})"
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of path, map and errors."""

@@ -11,6 +11,7 @@ import numpy as np
 from recon.core.errors import MappingError
 from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
+from recon.core.words import counted
 from recon.map.drive.sequence import MappedSequence
 from recon.map.fusion.builder import fusion_range_m
 from recon.odometry.protocol import OdometryHealth
@@ -68,7 +69,7 @@ def _explain_poses(health: Sequence[OdometryHealth]) -> tuple[str, str] | None:
             "check the prior: its axes (--set odometry.prior.axes=auto finds them), its unit "
             "(metres) and its clock"
         )
-    return f"{len(bad)} of {len(health)} poses are not to be trusted ({most})", hint
+    return f"{len(bad)} of {counted(len(health), 'pose')} are not to be trusted ({most})", hint
 
 
 def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
@@ -85,7 +86,7 @@ def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
         got = f"the nearest point is {nearest_m:.1f} m away, the map ends at {reach_m:.1f} m"
         return got, "allow larger errors with --set fusion.max_depth_error_m="
     frames = len(mapped.trajectory)
-    return f"of {frames} frames, too few saw the same place", (
+    return f"of {counted(frames, 'frame')}, too few saw the same place", (
         "use recon pair for a single pair, or lower fusion.min_count"
     )
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Bool, Float64
+from recon.core.words import counted
 from recon.map.localize.belief import MAX_SIGMA_M, Belief
 from recon.map.localize.search import Search
 from recon.map.localize.surroundings import Surroundings
@@ -93,7 +94,7 @@ class Located:
         parts = [self.state.value, *([self.note] if self.note else [])]
         if self.T_world_camera is not None:
             at = " ".join(f"{metres:.2f}" for metres in self.T_world_camera[:3, 3])
-            parts += [f"at {at} m, sigma {self.sigma_m:.2g} m, {self.inliers} inliers"]
+            parts += [f"at {at} m, sigma {self.sigma_m:.2g} m, {counted(self.inliers, 'inlier')}"]
         return f"Located({', '.join(parts)})"
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.values import Rig, StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
+from recon.core.words import counted
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
@@ -74,8 +75,8 @@ class LocalizedFrame:
 
     @property
     def ok(self) -> bool:
-        """Whether its pose is known, be it by odometry alone for some metres."""
-        return self.located.T_world_camera is not None
+        """Whether its pose is trusted, if it has one; where the drive is lost, it was not."""
+        return self.located.state is not State.LOST
 
     @property
     def event(self) -> dict[str, Any]:
@@ -100,7 +101,8 @@ class LocalizedFrame:
         found = self.located
         if found.state is not State.TRACKING:
             return f"{found.state.value}: {found.note}"
-        return f"{found.state.value}, {found.inliers} inliers in {found.views} views"
+        by = f"{counted(found.inliers, 'inlier')} in {counted(found.views, 'view')}"
+        return f"{found.state.value}, {by}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +126,8 @@ class LocalizedDrive:
 
     @property
     def placed(self) -> list[LocalizedFrame]:
-        """The frames whose pose is known: tracked, or coasting."""
-        return [frame for frame in self.frames if frame.ok]
+        """The frames whose pose is known: tracked, or coasting for some metres."""
+        return [frame for frame in self.frames if frame.located.T_world_camera is not None]
 
     @property
     def trajectory(self) -> Trajectory:
@@ -161,7 +163,7 @@ class LocalizedDrive:
         if not self.tracked:
             return ["the drive was not found in the map: no frame has a pose"]
         times = "once" if lost == 1 else f"{lost} times"
-        of = f"{coasting} of {len(states)} poses are by odometry alone"
+        of = f"{coasting} of {counted(len(states), 'pose')} are by odometry alone"
         return [
             *([f"{of}: nothing in the map confirms them (coasting)"] if coasting else ()),
             *(

@@ -7,6 +7,7 @@ from collections.abc import Collection
 import numpy as np
 
 from recon.core.errors import FormatError, SettingsError
+from recon.core.words import counted
 from recon.map.settings import DriveSettings
 from recon.map.store.cast_submaps import check_rays
 from recon.map.store.frames import FRAMES
@@ -97,6 +98,6 @@ def _refuse_again(session: Session, target: Map) -> None:
             raise FormatError(
                 "the map has this drive already",
                 where=session.where,
-                got=f"{session.info.source}, {len(session)} frames",
+                got=f"{session.info.source}, {counted(len(session), 'frame')}",
                 expected="another drive",
             )

@@ -16,6 +16,7 @@ from recon.core.geometry.interpolation import interpolate_poses, nearest_sorted
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
+from recon.core.words import counted
 from recon.io.files import read_table, reader
 from recon.io.trajectory import check_positions
 from recon.map.store.map import Map
@@ -174,7 +175,7 @@ class Measured:
             return []
         named = [f"at {self.times_s[n]:.3f} s ({off_m[n]:.1f} m off)" for n in worst[:_NAMED]]
         more = ", …" if len(worst) > _NAMED else ""
-        of_all = f"{len(worst)} of {len(off_m)} positions"
+        of_all = f"{len(worst)} of {counted(len(off_m), 'position')}"
         return [f"{of_all} contradict the others and are left out: {', '.join(named)}{more}"]
 
 
@@ -214,7 +215,7 @@ def measure_along(
         raise EvaluationError(
             "the positions do not say how the map is turned",
             where=survey.positions,
-            got=f"{len(here)} positions within {span_m(position_m[:, :2]):.2f} m",
+            got=f"{counted(len(here), 'position')} within {span_m(position_m[:, :2]):.2f} m",
             expected=f"{_LEAST_SPAN_M:g} m or more",
             hint="eastings and northings are in metres, not degrees",
         )

@@ -12,6 +12,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
 from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.core.values.arrays import Bool, Float64
+from recon.core.words import counted
 from recon.io.files import StrPath, reading
 from recon.map.store.links import LINKS, Link
 from recon.map.store.records import CACHE_BYTES, Store
@@ -83,7 +84,7 @@ class Map:
         return cls(Store.temporary())
 
     def __repr__(self) -> str:
-        return f"Map({self.store.name!r}, {len(self.sessions)} sessions)"
+        return f"Map({self.store.name!r}, {counted(len(self.sessions), 'session')})"
 
     def session(self, number: int = 0) -> Session:
         """Return a drive in the map.

@@ -12,6 +12,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
+from recon.core.words import counted
 from recon.io.files import reading
 from recon.map.store.frames import FRAMES, frames_in, frames_record
 from recon.map.store.keyframes import Keyframes
@@ -107,7 +108,7 @@ class Session:
         return len(self._poses)
 
     def __repr__(self) -> str:
-        return f"Session({self.info.source!r}, {len(self)} of {self.info.frames} frames)"
+        return f"Session({self.info.source!r}, {len(self)} of {counted(self.info.frames, 'frame')})"
 
     @property
     def where(self) -> str:

@@ -9,6 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
+from recon.core.words import counted
 from recon.rig.audit.geometry import MIN_FEATURES, Geometry
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.right_turn import RightTurn
@@ -147,8 +148,9 @@ def find_series_faults(sample: Sample, gaps: Gaps) -> Iterator[Finding]:
         yield Finding(
             "duplicates",
             False,
-            f"{repeats.both} of {repeats.steps} frames repeat the previous one; the recorder wrote "
-            "frames twice, or the rig stood still: drop them, or record at the cameras' own rate",
+            f"{repeats.both} of {counted(repeats.steps, 'frame')} repeat the previous one; the "
+            "recorder wrote frames twice, or the rig stood still: drop them, or record at the "
+            "cameras' own rate",
         )
     blank = _blank_sides(sample)
     for side, run in enumerate(repeats.frozen):
@@ -157,15 +159,15 @@ def find_series_faults(sample: Sample, gaps: Gaps) -> Iterator[Finding]:
             yield Finding(
                 "frozen",
                 True,
-                f"the {_SIDES[side]} camera is frozen for {run} frames while the other goes on; "
-                "it hung or lost frames: record again",
+                f"the {_SIDES[side]} camera is frozen for {counted(run, 'frame')} while the other "
+                "goes on; it hung or lost frames: record again",
             )
     if gaps.count:
         yield Finding(
             "gaps",
             False,
-            f"frames are missing at {gaps.count} places, at most {gaps.longest_s:.2f} s after "
-            f"frame {gaps.after} (usual {gaps.usual_s:.3f} s); the path may jump there",
+            f"frames are missing at {counted(gaps.count, 'place')}, at most {gaps.longest_s:.2f} s "
+            f"after frame {gaps.after} (usual {gaps.usual_s:.3f} s); the path may jump there",
         )
 
 
@@ -184,8 +186,7 @@ def find_geometry_faults(geometry: Geometry, source: StereoSource) -> Iterator[F
         yield Finding(
             "lag",
             True,
-            f"the {late} camera is {abs(lag)} frame{'s' * (abs(lag) > 1)} late; "
-            + _in_step(source, lag),
+            f"the {late} camera is {counted(abs(lag), 'frame')} late; " + _in_step(source, lag),
         )
     elif skew is not None and abs(skew[0]) > max(_SKEW_FRAMES, 4 * skew[1]):
         yield Finding(

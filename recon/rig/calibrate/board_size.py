@@ -12,6 +12,7 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.board import CalibrationBoard
+from recon.core.words import counted
 from recon.rig.calibrate.detect import find_chessboard, refine_corners
 from recon.rig.opencv_boards import dictionary_names, find_markers, marker_count
 
@@ -61,7 +62,7 @@ def check_chessboard(
         larger = any(n > m for n, m in zip(size, claimed, strict=True))
         # If the given board was seen whole, a smaller one is part of it.
         if most >= enough and size != claimed and (larger or not seen[claimed]):
-            raise _wrong_size(size, f"{most} of {voters} images", board)
+            raise _wrong_size(size, f"{most} of {counted(voters, 'image')}", board)
 
 
 def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBoard) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.core.words import counted
 from recon.io.images.image import write_image
 from recon.io.images.video import VIDEOS, VideoFile
 from recon.sources.image_pairs import ImagePairs
@@ -62,7 +63,7 @@ def pick_views(
         raise SourceError(
             "the board never stands still in the video",
             where=files[0],
-            got=f"{len(looks)} frames",
+            got=counted(len(looks), "frame"),
             hint="hold it still for a second or two in each place",
         )
     pairs = []

@@ -10,6 +10,7 @@ from pathlib import Path
 from recon.core.errors import CalibrationError, SourceError
 from recon.core.values.arrays import UInt8
 from recon.core.values.board import CalibrationBoard
+from recon.core.words import counted
 from recon.io.images.image import read_image
 from recon.rig.calibrate.board_size import check_charuco, check_chessboard, grown_size
 from recon.rig.calibrate.bundle import Sighting, View
@@ -67,7 +68,7 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
         raise CalibrationError(
             "the board was not found in any image",
             where=files[0].parent,
-            got=f"{len(files)} images",
+            got=counted(len(files), "image"),
             expected=str(board),
             hint="all of it must be in view, with a light margin, sharp and evenly lit",
         )

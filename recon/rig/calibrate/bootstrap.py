@@ -15,6 +15,7 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import StereoCalibration
 from recon.core.values.arrays import Float64
+from recon.core.words import counted
 from recon.rig.calibrate.bundle import RigState, moved, solve_scaled
 from recon.rig.calibrate.settings import CalibrationSettings
 from recon.rig.calibrate.stereo import StereoFit, stereo_of
@@ -95,7 +96,7 @@ def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibr
     if len(rigs) < settings.bootstrap / 2:
         raise CalibrationError(
             "views do not determine the rig",
-            got=f"{count} views",
+            got=counted(count, "view"),
             hint="take more, with the board tilted, near and far, and in every image corner",
         )
     return rigs

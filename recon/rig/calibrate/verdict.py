@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from recon.core.values.board import CalibrationBoard
+from recon.core.words import counted
 from recon.sources.image_pairs import ImagePairs
 
 Verdict = Literal["good", "usable", "repeat"]
@@ -100,7 +101,8 @@ def _find_fit_faults(
     """Yield reasons for which depth may be worse than expected."""
     used = summary["views_used"]
     if used < _FEW_VIEWS:
-        text = f"only {used} different views: the expected error is unsure; take {_ENOUGH_VIEWS}"
+        views = counted(used, "different view")
+        text = f"only {views}: the expected error is unsure; take {_ENOUGH_VIEWS}"
         yield CalibrationFinding("views", "warning", text)
     for side in ("left", "right"):
         share = summary[f"coverage_{side}"]
@@ -150,10 +152,9 @@ def _find_left_out(
         text = f"dropped, since they do not fit: {_listed(summary['views_dropped'])}"
         yield CalibrationFinding("dropped", "note", text)
     if summary["views_repeated"]:
-        text = (
-            f"{len(summary['views_repeated'])} views show the board where another one does and "
-            "count once; move and tilt it between two views"
-        )
+        views = counted(len(summary["views_repeated"]), "view")
+        again = "with the board where another one has it, counted once"
+        text = f"{views} {again}; move and tilt it between two views"
         yield CalibrationFinding("repeats", "note", text)
 
 

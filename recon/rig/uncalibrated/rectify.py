@@ -15,6 +15,7 @@ from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3, hat
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, UInt8
+from recon.core.words import counted
 from recon.rig.audit.row_alignment import align_rows
 from recon.rig.uncalibrated.fundamental import epipoles, find_fundamental, level_homographies
 from recon.rig.uncalibrated.shaping import shape_views
@@ -282,7 +283,7 @@ def _fundamental(features: PairFeatures, min_features: int) -> tuple[Float64, Pa
     if F is None or agreeing.sum() < min_features:
         raise CalibrationError(
             "too few matched features agree on one camera geometry",
-            got=f"{int(agreeing.sum())} of {len(features)} matches",
+            got=f"{int(agreeing.sum())} of {counted(len(features), 'match', 'matches')}",
             expected=f"at least {min_features}",
             hint="are these two views of the same scene, with texture?",
         )

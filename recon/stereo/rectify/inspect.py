@@ -14,6 +14,7 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Bool, Float32
+from recon.core.words import counted
 from recon.stereo.rectify.features import PairFeatures, match_features
 
 _NEAR_PX: Final = 1.0
@@ -94,8 +95,8 @@ def check_inspection(inspection: PairInspection, where: str | None = None) -> tu
         raise CalibrationError(
             "left and right images are swapped",
             where=where,
-            got=f"{100 * inspection.negative_share:.0f} % of {inspection.near} features farther "
-            "right in the right image",
+            got=f"{100 * inspection.negative_share:.0f} % of {counted(inspection.near, 'feature')} "
+            "farther right in the right image",
             expected="farther left",
             hint="give the left camera's images first (or un-mirror the images)",
         )

@@ -2,17 +2,24 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from typing import Any
 
 import numpy as np
 import pytest
+from recon.sources.fetching import Megabyte
 from rich.console import Console
 
 from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
 from recon.evaluation.middlebury.summary import SceneDone
 from recon.map.drive.frame_result import FrameResult
+from recon.map.localize.localizer import Located, State
+from recon.map.localize.sequence import LocalizedFrame
 from recon.odometry.protocol import OdometryHealth
-from recon.run.progress import SILENT, Progress, Silent
+from recon.run.batch.figures import JobResult
+from recon.run.batch.work import JobStep
+from recon.run.progress import SILENT, Progress, Silent, Step
+from tests.run.batch.jobs import job
 
 
 class Terminal(io.StringIO):
@@ -122,3 +129,61 @@ def test_the_bar_counts_scenes_and_names_one_without_truth() -> None:
     assert "trainingQ [1]" in stream.getvalue()
     assert "2/2" in stream.getvalue()
     assert "Pipes: no truth" in stream.getvalue()
+
+
+def located(state: State) -> LocalizedFrame:
+    tracked = Located(state, np.eye(4), np.eye(6), 2, 120)
+    found = tracked if state is State.TRACKING else Located(state, note="no place is recognised")
+    return LocalizedFrame(7, 0.0, 0.25, found)
+
+
+JOB = JobStep(JobResult(job("night"), "failed", 1, "no images", 0.25, "w"), 1, 1200)
+
+
+@pytest.mark.parametrize("width", [80, 60])
+@pytest.mark.parametrize(
+    "name", ["kitti06", "2011_09_26_drive_0013_sync, a drive of very long name"]
+)
+@pytest.mark.parametrize(
+    ("steps", "unit", "bad"),
+    [
+        pytest.param([frame(1), frame(2, ok=False)], "frames", "not trusted", id="map demo live"),
+        pytest.param([located(State.TRACKING), located(State.LOST)], "frames", "", id="localize"),
+        pytest.param([SceneDone("Motorcycle", None, 0.25)] * 2, "scenes", "", id="middlebury"),
+        pytest.param([Megabyte(1, 0.25), Megabyte(2, 0.25)], "MB", "", id="datasets"),
+        pytest.param([JOB, JOB], "pieces", "", id="pieces"),
+    ],
+)
+def test_the_bar_fits_the_terminal_and_what_counts_is_never_cut(
+    steps: list[Step], unit: str, bad: str, name: str, width: int
+) -> None:
+    stream = Terminal()
+    bar = ProgressBar(Console(file=stream, force_terminal=True, width=width, color_system=None))
+    bar.on_start(name, 1200, unit)
+    for step in steps:
+        bar.on_step(step)
+    bar.on_finish()
+    *_, last = (line for line in stream.getvalue().splitlines() if "2/1200" in line)
+    last = last.rpartition("\x1b[2K")[2]
+    assert len(last) <= width
+    assert last.startswith(name[:8])
+    assert f" 4.0 {unit}/s " in f"{last} "
+    assert bad in last
+    assert re.search(r" \d:\d\d:\d\d ", last) or width < 80
+
+
+def test_a_wide_terminal_shows_the_state_of_the_last_frame_too() -> None:
+    stream = Terminal()
+    run(ProgressBar(Console(file=stream, force_terminal=True, width=100)))
+    assert "70 % valid, 120 inliers" in stream.getvalue()
+
+
+def test_frames_that_are_searched_are_not_called_untrusted() -> None:
+    stream = Terminal()
+    bar = ProgressBar(Console(file=stream, force_terminal=True, width=140))
+    bar.on_start("drive", 3)
+    for state in (State.TRACKING, State.SEARCHING, State.SEARCHING):
+        bar.on_step(located(state))
+    bar.on_finish()
+    assert "searching: no place is recognised" in stream.getvalue()
+    assert "not trusted" not in stream.getvalue()

@@ -202,7 +202,7 @@ def test_a_header_that_promises_more_than_memory_is_refused(tmp_path: Path) -> N
 
 def test_text_among_the_numbers_is_refused(tmp_path: Path) -> None:
     path = write_raw(tmp_path / "a.ply", XYZ, b"1 2 3\n1 two 3\n", 2)
-    with pytest.raises(FormatError, match=r"element 'vertex'.*got 1 rows, expected 2"):
+    with pytest.raises(FormatError, match=r"element 'vertex'.*got 1 row, expected 2"):
         read_ply(path)
 
 

@@ -112,3 +112,12 @@ def test_a_truncated_image_is_a_format_error(tmp_path: Path, keep: int) -> None:
     image.write_bytes(image.read_bytes()[:keep])
     with pytest.raises(FormatError):
         read_nav2(description)
+
+
+def test_the_origin_is_written_as_it_is_meant(tmp_path: Path) -> None:
+    origin_m = (-646 * 0.1, 3 * 0.1)
+    assert origin_m == (-64.60000000000001, 0.30000000000000004)
+    _, path = write_nav2(tmp_path / "grid", OccupancyGrid(np.zeros((2, 2), np.int8), 0.1, origin_m))
+    assert yaml.safe_load(path.read_text())["origin"] == [-64.6, 0.3, 0.0]
+    assert "-64.6\n" in path.read_text()
+    assert read_nav2(path).origin_m == (-64.6, 0.3)

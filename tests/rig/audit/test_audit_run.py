@@ -236,7 +236,7 @@ def test_frames_that_are_missing_are_reported_with_the_place(
     grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
     source = open_source(drives.write_kitti(grey, faults.rectified(street), tmp_path))
     findings = {finding.code: finding.text for finding in audit_source(source, CONFIG).findings}
-    assert "missing at 1 places, at most 0.40 s after frame 3" in findings["gaps"]
+    assert "missing at 1 place, at most 0.40 s after frame 3" in findings["gaps"]
 
 
 def test_noise_is_no_frozen_camera() -> None:

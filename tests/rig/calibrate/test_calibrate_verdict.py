@@ -97,4 +97,4 @@ def test_what_was_left_out_is_noted_and_changes_no_verdict() -> None:
     )
     assert verdict == "good"
     assert set(found) == {"square", "board", "dropped", "repeats"}
-    assert found["repeats"].startswith("2 views show the board where another one does")
+    assert found["repeats"].startswith("2 views with the board where another one has it")
