@@ -23,6 +23,7 @@ from recon.rig import capture
 from recon.rig.capture import RecordingSettings
 from recon.rig.capture_folder import CaptureFolder
 from recon.sources.registry import open_source
+from tests.scenery.patience import LONG_S
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
@@ -212,7 +213,7 @@ def test_cameras_of_different_size_are_reported(pairs: list[StereoPair], tmp_pat
         run_capture(devices, tmp_path / "out", RecordingSettings())
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 60) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = LONG_S) -> None:
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until
@@ -229,7 +230,7 @@ def test_interrupting_the_command_leaves_a_drive_and_exit_code_0(tmp_path: Path)
     done = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     wait_for(lambda: (out / FRAMES).is_file() and len((out / FRAMES).read_text()) > len(HEADER))
     done.send_signal(signal.SIGINT)
-    stdout, stderr = done.communicate(timeout=60)
+    stdout, stderr = done.communicate()
     assert (done.returncode, stderr) == (0, "")
     frames = json.loads(stdout)["frames"]
     assert 0 < frames < 400

@@ -3,7 +3,8 @@
 ``python break_at_write.py (kill|interrupt|full|count) N ARGUMENTS…``: a write is what makes a file
 appear whole under its name, or a commit of the map. ``kill`` ends the process by SIGKILL before it
 (even N) or after it (odd N), ``interrupt`` does what Ctrl-C does, ``full`` lets the disk be full
-from there on, ``count`` prints how many writes there were.
+from there on, ``count`` writes how many writes there were to ``$COUNT``. A live drive leaves no
+frame out here and is committed after each, so that its writes, too, are the same every time.
 """
 
 from __future__ import annotations
@@ -16,9 +17,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from recon.cli import main
 from recon.core.errors import OutputError
+from recon.map.drive import drive
 from recon.map.store.records import Store
+from tests.scenery.patience import be_patient
 
 MODE, LAST = sys.argv[1], int(sys.argv[2])
 _replace, _fsync, _commit = Path.replace, os.fsync, Store.commit
@@ -59,6 +64,8 @@ def fsync(handle: int) -> None:
 
 Path.replace, os.fsync = replace, fsync  # type: ignore[method-assign,assignment]
 Store.commit = commit  # type: ignore[method-assign]
+be_patient(pytest.MonkeyPatch())
+drive._COMMIT_S = 0.0  # type: ignore[misc]
 sys.argv = ["recon", *sys.argv[3:]]
 try:
     main()

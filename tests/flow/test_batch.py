@@ -20,6 +20,7 @@ from tests.flow.test_killed_runs import content
 from tests.flow.test_paper import write_scene
 from tests.hostile.refusals import assert_refused, run, run_apart
 from tests.scenery.kitti import write_kitti
+from tests.scenery.patience import LONG_S
 from tests.scenery.planes import slanted_pair
 
 psutil = pytest.importorskip("psutil")
@@ -142,7 +143,7 @@ def test_a_client_that_is_killed_leaves_no_process_and_what_is_missing_is_done(
     left = below(client, "recon", "spawn")
     client.kill()
     client.wait()
-    _, alive = psutil.wait_procs(left, timeout=60)
+    _, alive = psutil.wait_procs(left, timeout=LONG_S)
     assert alive == []
     assert not (out / "summary.json").exists()
     batches.finish(out)
@@ -164,12 +165,12 @@ def test_an_interrupted_batch_says_how_to_go_on(batches: Batches, tmp_path: Path
     wait_until(lambda: below(client, "recon.run.batch.guard"), client, "first job")
     left = below(client, "recon", "spawn")
     client.send_signal(signal.SIGINT)
-    _, told = client.communicate(timeout=120)
+    _, told = client.communicate()
     assert client.returncode == 130
     assert (
         told.decode().splitlines()[-1].endswith(f"recon batch --resume {out} does what is missing")
     )
-    assert psutil.wait_procs(left, timeout=60)[1] == []
+    assert psutil.wait_procs(left, timeout=LONG_S)[1] == []
 
 
 @pytest.mark.slow
@@ -180,7 +181,7 @@ def test_a_job_that_fails_by_its_input_is_reported_and_the_exit_code_is_1(
     scene = str(batches.jobs.parent / "scene")
     sources = [scene, str(tmp_path / "nowhere")]
     words = ("batch", "pair", *sources, "--out", tmp_path / "out")
-    ended = run_apart(*words, "--workers", "1", "--json", seconds=600)
+    ended = run_apart(*words, "--workers", "1", "--json")
     assert ended.code == 1, ended.err
     summary = json.loads(ended.out)
     assert (summary["succeeded"], summary["failed"]) == (1, 1)

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +15,11 @@ import pytest
 from recon.map.store.map import Map
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
-from tests.flow.test_killed_runs import BREAKER, content, kill
+from tests.flow.test_killed_runs import BREAKER, content
 from tests.scenery.kitti import write_kitti
 
 STREET = StreetScene(frames=40, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
-KILLS = 6
-PLAYED_S = 16.0
-"""Long enough for some commits."""
+ROOT = Path(__file__).parents[2]
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
@@ -32,10 +29,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drive")
     write_kitti(SyntheticSource(STREET), folder)
     return folder
-
-
-def _recon(*words: object) -> list[str]:
-    return [sys.executable, "-m", "recon", *map(str, words), "--quiet"]
 
 
 def _frames(file: Path) -> int:
@@ -57,46 +50,44 @@ def _frames(file: Path) -> int:
         return frames
 
 
-def test_a_live_drive_that_is_killed_leaves_a_map_that_opens(drive: Path, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    rate = 0.1 * STREET.frames / PLAYED_S
-    begun = time.monotonic()
-    subprocess.run(
-        _recon("live", drive, "--rate", rate, "--out", tmp_path / "whole"), check=True, text=True
-    )
-    whole_s = time.monotonic() - begun
-    found = []
-    for number in range(KILLS):
-        out = tmp_path / str(number)
-        command = _recon("live", drive, "--rate", rate, "--out", out)
-        # The last of them while the products are made, or not at all.
-        if kill(command, rng.uniform(0.2, 1.0) * whole_s) and not (out / "run.json").exists():
-            found.append(_frames(out / ".partial" / ".state" / "map.recon"))
+def _broken(mode: str, at: int, out: Path, *words: object) -> int:
+    """Run a command that ends at its n-th write, or count its writes; the exit code."""
+    command = [sys.executable, str(BREAKER), mode, str(at), *map(str, words)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COUNT": f"{out}.count"}
+    ended = subprocess.run([*command, "--quiet", "--out", str(out)], env=environment, check=False)
+    return ended.returncode
 
-    assert len(found) >= 2
-    assert max(found) > 0
-    assert _frames(tmp_path / "whole" / "map" / "map.recon") > 0
+
+def test_a_live_drive_that_is_killed_leaves_a_map_that_opens(drive: Path, tmp_path: Path) -> None:
+    words = ("live", drive, "--rate", 1000, "--no-mesh")
+    assert _broken("count", 0, tmp_path / "whole", *words) == 0
+    assert _frames(tmp_path / "whole" / "map" / "map.recon") == STREET.frames
+    writes, kept = int((tmp_path / "whole.count").read_text()), []
+    # At the first commits, in the middle, when the last frame is in, and while products are made.
+    for at in sorted({2, 3, STREET.frames // 2, STREET.frames // 2 + 1, STREET.frames, writes - 6}):
+        out = tmp_path / str(at)
+        assert _broken("kill", at, out, *words) == -signal.SIGKILL
+        assert not (out / "run.json").exists()
+        kept.append(_frames(out / ".partial" / ".state" / "map.recon"))
+    assert kept == sorted(kept)
+    assert kept[0] < STREET.frames // 3 < kept[2] < kept[-1] == STREET.frames
 
 
 def test_a_merge_that_is_killed_leaves_a_whole_folder_or_none(drive: Path, tmp_path: Path) -> None:
     runs = [tmp_path / "first", tmp_path / "second"]
     for run, first in zip(runs, (0, 6), strict=True):
-        words = ("map", drive, "--no-mesh", "--start", first, "--end", first + 14, "--out", run)
-        subprocess.run(_recon(*words), check=True)
-    os.environ["COUNT"] = str(tmp_path / "count")
-
-    def merged(mode: str, at: int, out: Path) -> int:
-        words = ["merge", *map(str, runs), "--no-mesh", "--quiet", "--out", str(out)]
-        command = [sys.executable, str(BREAKER), mode, str(at), *words]
-        return subprocess.run(command, check=False).returncode
-
-    assert merged("count", 0, tmp_path / "whole") == 0
-    writes, whole = int((tmp_path / "count").read_text()), content(tmp_path / "whole")
+        words = ("map", drive, "--no-mesh", "--start", first, "--end", first + 14)
+        assert _broken("count", 0, run, *words) == 0
+    merge = ("merge", *runs, "--no-mesh")
+    assert _broken("count", 0, tmp_path / "whole", *merge) == 0
+    writes, whole = int((tmp_path / "whole.count").read_text()), content(tmp_path / "whole")
     for at in sorted({2, 5, writes // 2, writes - 6, writes - 3, writes - 1, writes}):
         out = tmp_path / str(at)
-        assert merged("kill", at, out) == -signal.SIGKILL
+        assert _broken("kill", at, out, *merge) == -signal.SIGKILL
         if not (out / "run.json").exists():
-            assert merged("count", 0, out) == 0  # what is left of the other is in nobody's way
+            assert (
+                _broken("count", 0, out, *merge) == 0
+            )  # what is left of the other is in nobody's way
         assert content(out) == whole
         record = json.loads((out / "run.json").read_text())
         assert all((out / name).is_file() for name in record["files"])

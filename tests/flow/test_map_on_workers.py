@@ -17,6 +17,7 @@ from tests.flow.test_batch import below, wait_until
 from tests.flow.test_killed_runs import begun, content
 from tests.hostile.refusals import assert_refused, run
 from tests.scenery.kitti import write_kitti
+from tests.scenery.patience import LONG_S
 
 psutil = pytest.importorskip("psutil")
 pytest.importorskip("distributed")
@@ -115,7 +116,7 @@ def test_a_client_that_is_killed_leaves_what_resume_goes_on_with(
     left = below(client, "recon", "spawn")
     client.kill()
     client.communicate()
-    assert psutil.wait_procs(left, timeout=60)[1] == []
+    assert psutil.wait_procs(left, timeout=LONG_S)[1] == []
     done = subprocess.run(
         [sys.executable, "-m", "recon", "map", "--resume", str(tmp_path / "out"), "--json"],
         capture_output=True,

@@ -23,7 +23,6 @@ from tests.hostile.calibrations import (
 from tests.hostile.refusals import assert_refused, refusal, run, run_apart
 
 # The first match may have to compile.
-pytestmark = pytest.mark.timeout(300)
 LEVELS = 20_000
 
 

@@ -16,7 +16,6 @@ from recon.map.store.map import Map
 from recon.map.store.records import Store
 from tests.hostile.refusals import refusal
 
-pytestmark = pytest.mark.timeout(120)
 MOST_BYTES: Final = 64_000_000
 """Much more than the files of these tests, and much less than they claim."""
 

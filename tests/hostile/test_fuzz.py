@@ -15,7 +15,6 @@ from tests.hostile.refusals import refusal
 
 # Few where the examples are always the same; `make fuzz` searches long.
 EXAMPLES: Final = 25 if settings.default.derandomize else 300
-pytestmark = pytest.mark.timeout(600)
 
 
 def valid(kind: Kind, folder: Path) -> bytes:

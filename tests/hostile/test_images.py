@@ -20,7 +20,6 @@ from tests.hostile.calibrations import OURS
 from tests.hostile.refusals import assert_refused, refusal, run
 
 # The first match may have to compile.
-pytestmark = pytest.mark.timeout(300)
 
 
 def chunk(name: bytes, content: bytes) -> bytes:

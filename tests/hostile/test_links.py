@@ -15,7 +15,7 @@ import pytest
 
 from tests.hostile.refusals import assert_refused, run
 
-pytestmark = [pytest.mark.timeout(120), pytest.mark.usefixtures("blank_figures")]
+pytestmark = pytest.mark.usefixtures("blank_figures")
 EXPORT: Final = ("export", "run", "--to", "cloud", "--out", "evil")
 
 

@@ -15,7 +15,6 @@ from recon.sources.stamps import stamp_of_name
 from tests.hostile.refusals import assert_refused, refusal, run
 
 # The first match may have to compile.
-pytestmark = pytest.mark.timeout(300)
 NAMES = {
     "Latin-1": os.fsdecode(b"caf\xe9"),
     "no UTF-8 at all": os.fsdecode(b"\xff\xfe\x80"),

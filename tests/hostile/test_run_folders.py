@@ -16,7 +16,7 @@ from tests.hostile.calibrations import deep
 from tests.hostile.refusals import assert_refused, run
 from tests.hostile.runs import STATE
 
-pytestmark = [pytest.mark.timeout(120), pytest.mark.usefixtures("blank_figures")]
+pytestmark = pytest.mark.usefixtures("blank_figures")
 Alter = Callable[[Path], None]
 
 

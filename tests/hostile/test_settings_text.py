@@ -12,7 +12,6 @@ from tests.hostile.calibrations import CONTENT, NUMBERS, deep, expanding
 from tests.hostile.refusals import assert_refused, refusal, run
 
 # The first match may have to compile.
-pytestmark = pytest.mark.timeout(300)
 
 
 def refused(path: Path | None, overrides: list[str], *words: str) -> None:

@@ -22,8 +22,8 @@ from recon.map.store.records import Store
 from recon.run.run import Run
 from tests.hostile.refusals import assert_refused, run
 from tests.hostile.runs import DRIVE
+from tests.scenery.patience import LONG_S
 
-pytestmark = pytest.mark.timeout(120)
 PROGRAM: Final = f"PYTHONPATH={Path(recon.__file__).parents[1]} {sys.executable} -m recon"
 
 
@@ -111,7 +111,7 @@ def test_a_run_that_is_ended_by_a_signal_leaves_nothing(here: Path, number: int)
         "    with WholeRun('merge', Path('run')) as run:\n"
         "        run.path('file').write_text('half')\n"
         "        print('ready', flush=True)\n"
-        "        time.sleep(60)\n"
+        "        time.sleep(600)\n"
         "cli.app = app\ncli.main()\n"
     )
     surroundings = os.environ | {"PYTHONPATH": str(Path(recon.__file__).parents[1])}
@@ -125,7 +125,7 @@ def test_a_run_that_is_ended_by_a_signal_leaves_nothing(here: Path, number: int)
         assert process.stdout.readline() == b"ready\n"
         assert (here / ".run.partial" / "file").exists()
         process.send_signal(number)
-        assert process.wait(30) != 0
+        assert process.wait(LONG_S) != 0
     assert list(here.iterdir()) == []
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from recon.run import lookahead
 from recon.run.lookahead import OneBehind, look_ahead, side_by_side
 from tests.run.pools import observed_pool
+from tests.scenery.patience import LONG_S
 
 
 @given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
@@ -28,7 +29,7 @@ def test_results_of_several_threads_come_in_order(items: list[int], threads: int
 
 def test_as_many_items_are_worked_on_as_there_are_threads() -> None:
     # Each waits for the other: one thread alone would wait for ever.
-    both = threading.Barrier(2, timeout=30)
+    both = threading.Barrier(2, timeout=LONG_S)
 
     def meet(item: int) -> int:
         both.wait()
@@ -83,8 +84,8 @@ def test_nothing_is_begun_after_an_interruption(monkeypatch: pytest.MonkeyPatch)
 
     def work(item: int) -> None:
         begun.append(item)
-        next_drawn.wait(30)
-        for _ in range(600):
+        next_drawn.wait(LONG_S)
+        for _ in range(round(LONG_S / 0.05)):
             if dropped.wait(0.05):
                 return
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
@@ -148,7 +149,7 @@ def test_one_job_at_a_time_is_behind() -> None:
     behind, gate, done = OneBehind(), threading.Event(), []
 
     def first() -> None:
-        gate.wait(10.0)
+        gate.wait(LONG_S)
         done.append("first")
 
     behind.begin(first)

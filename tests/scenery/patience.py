@@ -1,4 +1,4 @@
-"""A machine on which live drives lose nothing, however slow it is."""
+"""Tests on a machine that is slow, or busy: nothing is left out, and nothing comes too late."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import pytest
 
 from recon.map.drive.map_behind import MapBehind, Registered
 from recon.sources import live
+
+LONG_S = 300.0
+"""How long to wait for what comes at once, unless it never does."""
 
 
 def be_patient(monkeypatch: pytest.MonkeyPatch) -> None:

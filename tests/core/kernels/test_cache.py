@@ -16,6 +16,7 @@ import recon
 from recon.core.kernels import voxels
 from recon.core.kernels.cache import cache_folder, cache_parent, when_compiling
 from recon.core.kernels.compiled import kernel
+from tests.scenery.patience import LONG_S
 
 compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
 
@@ -173,7 +174,7 @@ def test_processes_that_compile_for_different_types_do_not_mix_up_their_code(
         )
         for arguments in (("first", "second", "3"), ("second", "first", "2.5"))
     ]
-    assert [process.wait(60) for process in both] == [0, 0]
+    assert [process.wait(LONG_S) for process in both] == [0, 0]
     check = "from race_kernel import double; print(double(3), double(2.5))"
     found = subprocess.run(
         [sys.executable, "-c", check], env=environment, capture_output=True, text=True, check=True

@@ -32,6 +32,7 @@ from recon.places.closure import close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.stereo.frame import ReconstructedFrame
 from tests.run.pools import observed_pool
+from tests.scenery.patience import LONG_S
 
 CAMERA = RectifiedCamera(200.0, 159.5, 59.5, 159.5, 0.5, 320, 120)
 LAP = 60
@@ -177,7 +178,7 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
 
     def slow(self: LoopDetector, frame: int, *_: object, **__: object) -> None:
         looked.append(frame)
-        dropped.wait(30)
+        dropped.wait(LONG_S)
 
     monkeypatch.setattr(LoopDetector, "add", slow)
     monkeypatch.setattr(drive_loops, "ThreadPoolExecutor", pool)

@@ -11,6 +11,7 @@ from recon.core.errors import MappingError
 from recon.core.values import RectifiedCamera, RectifiedPair
 from recon.map.drive.map_behind import MapBehind, Registered
 from recon.odometry.protocol import OdometryHealth, OdometryResult
+from tests.scenery.patience import LONG_S
 
 GREY = np.zeros((16, 16), np.uint8)
 CAMERA = RectifiedCamera(10.0, 8.0, 8.0, 8.0, 0.5, 16, 16)
@@ -34,7 +35,7 @@ class Mapper:
 
     def __call__(self, registered: Registered, matched: bool) -> None:
         self.begun.set()
-        self.go.wait(10)
+        self.go.wait(LONG_S)
         self.done.append((registered.pair.index, matched))
 
 
@@ -47,7 +48,7 @@ def test_of_frames_that_wait_the_newest_is_matched() -> None:
     source, mapper = Counted(), Mapper()
     behind = MapBehind(source, mapper)
     behind.add(_frame(0))
-    mapper.begun.wait(10)
+    mapper.begun.wait(LONG_S)
     for index in range(1, 5):
         behind.add(_frame(index))
 
@@ -83,7 +84,7 @@ def test_what_goes_wrong_is_raised_where_frames_are_added() -> None:
     with behind._news:
         behind._waiting.append(_frame(0))
         behind._news.notify_all()
-    begun.wait(10)
+    begun.wait(LONG_S)
 
     with pytest.raises(MappingError, match="no"):
         behind.wait()
@@ -96,7 +97,7 @@ def test_frames_that_wait_are_forgotten_when_it_is_stopped() -> None:
     mapper = Mapper()
     behind = MapBehind(Counted(), mapper)
     behind.add(_frame(0))
-    mapper.begun.wait(10)
+    mapper.begun.wait(LONG_S)
     behind.add(_frame(1))
     mapper.go.set()
 

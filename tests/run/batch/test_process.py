@@ -20,6 +20,7 @@ from recon.run.batch.job import Job, Outcome, is_done, last_outcome, log_file
 from recon.run.batch.process import run_job
 from recon.run.directory import lock_file
 from tests.run.batch.jobs import job, stand_in, tries
+from tests.scenery.patience import LONG_S
 
 __all__ = ["stand_in"]
 usefixtures = pytest.mark.usefixtures("stand_in")
@@ -213,7 +214,7 @@ def log_of(folder: Path, name: str) -> list[str]:
     return log_file(folder, name).read_text().splitlines()
 
 
-def ended(pid: int, within_s: float = 30.0) -> bool:
+def ended(pid: int, within_s: float = LONG_S) -> bool:
     """Whether a process is gone or a zombie, now or soon."""
     late = time.monotonic() + within_s
     while time.monotonic() < late:
