@@ -71,7 +71,7 @@ class Table:
             for c, cell in enumerate(row):
                 if c and cell != NOT_KNOWN:
                     line = lines.setdefault(c if self.best == "columns" else r, {})
-                    line[r, c] = float(cell)
+                    line[r, c] = float(cell.removesuffix(" %"))
         return {
             place
             for line in lines.values()

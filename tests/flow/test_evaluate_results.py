@@ -135,7 +135,9 @@ def test_latex_is_printed_alone(scenes: Path, results: Path, tmp_path: Path) -> 
     given = ("--matcher", "none", "--results", results / "mine", "--out", tmp_path / "run")
     done = evaluate(scenes, *given, "--latex")
     assert done.exit_code == 0
-    assert done.stdout.startswith("% Weighted mean, nonocc, dense\n\\begin{tabular}")
+    title, begin = done.stdout.splitlines()[:2]
+    assert title.startswith("% Weighted mean, nonocc, dense (bad and invalid in %")
+    assert begin.startswith(r"\begin{tabular}")
     assert done.stdout.rstrip().endswith(r"\end{tabular}")
     assert done.stderr.startswith("results: ")
 

@@ -99,7 +99,7 @@ def test_one_run_is_held_at_measured_positions(runs: Path, tmp_path: Path) -> No
     held = read_trajectory(open_run(out).path_file)
     assert 1.005 < held.path_length_m / before.path_length_m < 1.012
     page = (out / "report.html").read_text()
-    assert "Map of one drive" in page
+    assert "Map of 1 drive" in page
     assert "From measured positions" in page
 
 

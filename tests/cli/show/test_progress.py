@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recon.sources.fetching import Megabyte
 from rich.console import Console
 
 from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
+from recon.commands.datasets import _Megabyte
 from recon.evaluation.middlebury.summary import SceneDone
 from recon.map.drive.frame_result import FrameResult
 from recon.map.localize.localizer import Located, State
 from recon.map.localize.sequence import LocalizedFrame
 from recon.odometry.protocol import OdometryHealth
-from recon.run.batch.figures import JobResult
-from recon.run.batch.work import JobStep
+from recon.run.batch.job import Outcome
+from recon.run.batch.results import JobResult
 from recon.run.progress import SILENT, Progress, Silent, Step
 from tests.run.batch.jobs import job
 
@@ -137,7 +137,7 @@ def located(state: State) -> LocalizedFrame:
     return LocalizedFrame(7, 0.0, 0.25, found)
 
 
-JOB = JobStep(JobResult(job("night"), "failed", 1, "no images", 0.25, "w"), 1, 1200)
+JOB = JobResult(job("night"), Outcome("failed", "no images", 0.25))
 
 
 @pytest.mark.parametrize("width", [80, 60])
@@ -150,8 +150,9 @@ JOB = JobStep(JobResult(job("night"), "failed", 1, "no images", 0.25, "w"), 1, 1
         pytest.param([frame(1), frame(2, ok=False)], "frames", "not trusted", id="map demo live"),
         pytest.param([located(State.TRACKING), located(State.LOST)], "frames", "", id="localize"),
         pytest.param([SceneDone("Motorcycle", None, 0.25)] * 2, "scenes", "", id="middlebury"),
-        pytest.param([Megabyte(1, 0.25), Megabyte(2, 0.25)], "MB", "", id="datasets"),
-        pytest.param([JOB, JOB], "pieces", "", id="pieces"),
+        pytest.param([_Megabyte(1, 0.25), _Megabyte(2, 0.25)], "MB", "", id="datasets"),
+        pytest.param([JOB, JOB], "jobs", "2 failed", id="batch"),
+        pytest.param([JOB, JOB], "pieces", "2 failed", id="pieces"),
     ],
 )
 def test_the_bar_fits_the_terminal_and_what_counts_is_never_cut(
