@@ -44,7 +44,7 @@ def plan_jobs(listed: JobList) -> list[Job]:
     for texts, name in sets.items():
         _check_settings(texts, name, listed)
     folder = listed.folder.resolve()
-    plain = [_job(entry, folder) for entry in listed.jobs]
+    plain = [_job(entry, folder, sets=bool(entry.set or listed.sweep)) for entry in listed.jobs]
     jobs = [job for one in plain for job in _swept(one, listed)]
     check_names(job.name for job in jobs)
     return jobs
@@ -69,7 +69,7 @@ def _check_settings(texts: Sequence[str], name: str, listed: JobList) -> None:
             load_config(None, [*texts, *_texts(swept)])
 
 
-def _job(entry: Entry, folder: Path) -> Job:
+def _job(entry: Entry, folder: Path, *, sets: bool) -> Job:
     where, command = f"job {entry.name}", " ".join(entry.command.split())
     if command not in COMMANDS:
         known = ", ".join(COMMANDS)
@@ -77,6 +77,8 @@ def _job(entry: Entry, folder: Path) -> Job:
     if not entry.source and command not in _WITHOUT_SOURCE:
         raise SettingsError("job has no source", where=where)
     takes = {option for one in _command(command).params for option in one.opts}
+    if sets and "--set" not in takes:
+        raise SettingsError("command has no settings", where=where, got=command)
     with naming(where):
         sources, found = _sources(command, entry.source, folder)
         _check(command, len(sources), tuple(entry.options))

@@ -41,39 +41,47 @@ def write_batch_page(
         OutputError: A file cannot be written.
     """
     write_text(run.path("table.csv"), batch_csv(results))
-    write_text(run.path("table.md"), join([batch_table(results).markdown()]))
+    write_text(run.path("table.md"), join(table.markdown() for table in batch_tables(results)))
     sweep = sweep_figure(results)
     if sweep:
         write_bytes(run.path("sweep.png"), sweep)
     first = outliers_first(results)
-    table = batch_table(first)
+    pages = {one.job.name: _page(one, run.folder) for one in first}
     failed = [f"{one.job.name}: {one.error}" for one in first if one.failed]
     write_page(
         "batch",
         run,
         found=summary,
-        head=table.head[1:],
-        jobs=[
-            {"name": one.job.name, "page": _page(one, run.folder), "cells": cells[1:]}
-            for one, cells in zip(first, table.rows, strict=True)
-        ],
+        tables=batch_tables(first),
+        pages=pages,
         sweep=sweep,
         warnings=[*failed, *summary["warnings"]],
     )
 
 
-def batch_table(results: Sequence[JobResult]) -> Table:
-    """Return the table for people: one row per job, with the figures that its kind has."""
-    columns = [name for name in _COLUMNS if any(name in one.figures for one in results)]
+def batch_tables(results: Sequence[JobResult]) -> list[Table]:
+    """Return a table for people for each command: a row per job, with the figures of its kind."""
+    commands = dict.fromkeys(one.job.command for one in results)
+    return [
+        _table(command, [one for one in results if one.job.command == command])
+        for command in commands
+    ]
+
+
+def _table(command: str, jobs: Sequence[JobResult]) -> Table:
+    columns = [name for name in _COLUMNS if any(name in one.figures for one in jobs)]
     rows = []
-    for one in results:
-        job, figures = one.facts, (one.figures.get(name) for name in columns)
-        facts = (job["state"], str(job["tries"]), f"{one.seconds:.1f}")
-        rows.append(
-            (one.job.name, one.error or one.remark, *facts,
-             *(NOT_KNOWN if value is None else f"{value:.6g}" for value in figures))
-        )  # fmt: skip
-    return Table("Jobs", ("job", "remark", "state", "tries", "seconds", *columns), rows)
+    for one in jobs:
+        facts, figures = one.facts, (one.figures.get(name) for name in columns)
+        shown = (facts["state"], str(facts["tries"]), f"{one.seconds:.1f}")
+        rows.append((one.job.name, one.error or one.remark, *shown, *map(_cell, figures)))
+    return Table(command, ("job", "remark", "state", "tries", "seconds", *columns), rows)
+
+
+def _cell(value: float | None) -> str:
+    if value is None:
+        return NOT_KNOWN
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def batch_csv(results: Sequence[JobResult]) -> str:

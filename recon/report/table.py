@@ -49,7 +49,8 @@ class Table:
     def markdown(self) -> str:
         """Write the table in Markdown."""
         rule = ["---", *["---:"] * (len(self.head) - 1)]
-        lines = [f"| {' | '.join(row)} |" for row in (self.head, rule, *self.rows)]
+        rows = ([cell.replace("|", r"\|") for cell in row] for row in (self.head, rule, *self.rows))
+        lines = [f"| {' | '.join(row)} |" for row in rows]
         return "\n".join([f"### {self.title}", *lines])
 
     def latex(self) -> str:

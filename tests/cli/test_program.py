@@ -158,6 +158,14 @@ def test_a_wrong_value_of_a_sweep_is_refused() -> None:
         ({"source": ["a", "b"]}, "unexpected extra argument"),
         ({"command": "evaluate trajectory"}, "Missing argument"),
         ({"memory": "much"}, "cannot read this size"),
+        (
+            {
+                "command": "evaluate disparity",
+                "source": ["a", "b"],
+                "set": ["matching.sad.window_px=9"],
+            },
+            "job a: command has no settings .*evaluate disparity",
+        ),
     ],
 )
 def test_jobs_that_are_none_are_one_line(changes: dict[str, Any], words: str) -> None:

@@ -71,7 +71,7 @@ class Batches:
 
 def content_of_jobs(out: Path) -> dict[str, bytes]:
     found = {}
-    for job in sorted(path for path in out.iterdir() if path.is_dir()):
+    for job in sorted(path.parent for path in out.glob("*/run.json")):
         found |= {f"{job.name}/{name}": data for name, data in content(job).items()}
     return found
 

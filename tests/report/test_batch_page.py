@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from recon.report.batch_page import write_batch_page
+from recon.report.batch_page import batch_tables, sweep_figure, write_batch_page
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult, compare
 from recon.run.directory import RunDirectory
@@ -29,7 +29,7 @@ def results() -> list[JobResult]:
     done = [one(n, w) for n in range(5) for w in (9, 11)]
     odd = {"frames": 40, "trajectory.t_rel_percent": 99.0, "seconds": 10.0}
     done[6] = replace(done[6], figures=odd)
-    failed = JobResult(job("bad"), Outcome("failed", "<b>no images</b>", 1.0, tries=3))
+    failed = JobResult(job("bad"), Outcome("failed", "<b>no images</b> | none", 1.0, tries=3))
     return compare([*done, failed, JobResult(job("later"), None)])
 
 
@@ -66,7 +66,7 @@ def test_the_csv_has_every_figure_and_swept_setting(folder: Path) -> None:
     assert len(rows) == 12
     assert rows[0]["window"] == "9"
     assert float(rows[6]["trajectory.t_rel_percent"]) == 99.0
-    assert rows[10]["error"] == "<b>no images</b>"
+    assert rows[10]["error"] == "<b>no images</b> | none"
 
 
 def test_the_table_for_people_leaves_out_columns_that_no_job_has(folder: Path) -> None:
@@ -75,6 +75,30 @@ def test_the_table_for_people_leaves_out_columns_that_no_job_has(folder: Path) -
     assert "map.f_score" not in head
 
 
+def test_a_bar_in_an_error_is_no_column(folder: Path) -> None:
+    lines = [line for line in (folder / "table.md").read_text().splitlines() if line]
+    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines if line[0] == "|"}) == 1
+
+
 def test_a_sweep_is_drawn(folder: Path) -> None:
     picture = np.asarray(Image.open(folder / "sweep.png").convert("L"))
     assert picture.std() > 5
+
+
+def test_jobs_of_each_command_have_a_table_and_panels_of_their_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn: list[tuple[str, list[float]]] = []
+    monkeypatch.setattr(
+        "recon.report.batch_page._draw",
+        lambda axes, jobs, setting, name: drawn.append((name, [one.figures[name] for one in jobs])),
+    )
+    drive = JobResult(job("drive", swept={"w": 9}), DONE, {"points": 7.0, "seconds": 400.0})
+    pair = replace(drive.job, name="pair", command="pair")
+    both = [drive, JobResult(pair, DONE, {"valid_percent": 80.0, "seconds": 9.0})]
+    sweep_figure(both)
+    assert drawn == [
+        ("points", [7.0]), ("seconds", [400.0]), ("valid_percent", [80.0]), ("seconds", [9.0]),
+    ]  # fmt: skip
+    assert [table.title for table in batch_tables(both)] == ["map", "pair"]
+    assert "valid_percent" not in batch_tables(both)[0].head

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -85,22 +86,24 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
 
 
 def print_batch(summary: Mapping[str, Any]) -> None:
-    """Print one line per job, an error for each that failed, and the folder of the batch."""
+    """Print one line per job, what is unusual, why jobs failed, and the folder of the batch."""
     from recon.run.batch.results import accuracies
 
     table, jobs = Table(show_edge=False, pad_edge=False), summary["jobs"][:_MOST_JOBS]
     judged = accuracies(job["figures"] for job in jobs)
-    for title in ("job", "state", "tries", "seconds", *judged, "what is unusual"):
-        table.add_column(title.replace("_", " ").rpartition(".")[2])
+    for title in ("job", "state", "tries", "seconds", *judged):
+        table.add_column(re.sub(r"(?<=[a-z])[._]", " ", title), overflow="fold")
     for job in jobs:
         cells = (job["name"], job["state"], str(job["tries"]), f"{job['seconds']:.1f}")
         figures = (job["figures"].get(name) for name in judged)
         found = ("" if value is None else f"{value:.4g}" for value in figures)
-        table.add_row(*map(Text, (*cells, *found, job.get("remark", ""))))
+        table.add_row(*map(Text, (*cells, *found)))
     Console().print(table)
     if more := len(summary["jobs"]) - len(jobs):
         typer.echo(f"and {more} more, in table.csv")
     for job in summary["jobs"]:
+        if "remark" in job:
+            typer.echo(f"unusual: {job['name']}: {job['remark']}")
         if job["state"] == "failed":
             typer.echo(f"error: {job['name']}: {job['error']}", err=True)
     typer.echo(f"results: {summary['out']}")

@@ -36,6 +36,10 @@ _LOCAL: Final = {
     "distributed.scheduler.no-workers-timeout": _WORKERS_S,
 }
 
+#: An address or file that is none; a protocol without certificates or library; a mad answer.
+_NO_SCHEDULER: Final = (
+    ValueError, TypeError, KeyError, RuntimeError, ImportError, MemoryError,
+)  # fmt: skip
 _Try = tuple[Job, int]
 Work = Callable[[Job, str], Outcome]
 """Runs a job in the folder of its batch."""
@@ -223,16 +227,7 @@ def join_cluster(address: str) -> Iterator[Cluster]:
         # Dask waits without end for the greeting of what is no scheduler.
         distributed.utils.LoopRunner().run_sync(_greet, where)
         client = distributed.Client(where, timeout=_REACH_S)
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        KeyError,
-        RuntimeError,
-        ImportError,
-        MemoryError,
-    ) as error:
-        # The last ones: a protocol without its certificates or library; an answer of nonsense.
+    except (OSError, asyncio.TimeoutError, *_NO_SCHEDULER) as error:
         got = str(error) or f"no scheduler of Dask that answers within {_REACH_S:g} s"
         raise SettingsError(
             "the scheduler cannot be reached", where=address, got=got, expected="tcp://host:8786"

@@ -136,8 +136,8 @@ def _listen(stream: IO[bytes], log: IO[bytes], said: list[str]) -> None:
             shown_s = time.monotonic()
         with contextlib.suppress(OSError, ValueError):  # a full disk; a log that was closed
             log.write(line)
-        text = line.decode("utf-8", "replace").strip()
-        is_plain = any(map(str.isalnum, text)) and not text.startswith("{")  # no frame of a box
+        text = line.decode("utf-8", "replace").strip().strip("│ ")  # a box around it
+        is_plain = any(map(str.isalnum, text)) and not text.startswith("{")
         if text.startswith("error: ") or (is_plain and not said[0].startswith("error: ")):
             said[0] = text
 

@@ -36,6 +36,8 @@ if what == "good":
     finish()
 elif what == "bad":
     sys.exit("error: nowhere: folder does not exist")
+elif what == "boxed":
+    sys.exit("╭─ Error ─╮\\n│ No such option: --x │\\n╰─────────╯")
 elif what == "says much":
     for n in range(1000):
         print(json.dumps({"event": "frame", "index": n}), file=sys.stderr)

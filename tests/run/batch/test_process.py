@@ -91,6 +91,11 @@ def test_bad_input_is_a_failure_with_the_line_of_the_command(tmp_path: Path) -> 
 
 
 @usefixtures
+def test_an_error_in_a_box_is_its_line(tmp_path: Path) -> None:
+    assert run_job(job("a", "boxed"), tmp_path).error == "No such option: --x"
+
+
+@usefixtures
 def test_a_killed_job_is_broken_and_goes_on_where_it_was(tmp_path: Path) -> None:
     killed = run_job(job("a", "killed once"), tmp_path)
     assert killed.state == "broken"
