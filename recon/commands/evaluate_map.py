@@ -19,6 +19,7 @@ from recon.evaluation.map_comparison import (
     possible_frames,
     read_mapped_cloud,
 )
+from recon.io.files import naming
 from recon.io.models.ply import read_ply
 from recon.report.map_errors import write_map_errors
 from recon.run.finished import CLOUD
@@ -65,14 +66,15 @@ def run_evaluate_map(
     if not thresholds_m:
         raise SettingsError("there is no threshold", where="--threshold")
     mapped, truth = read_mapped_cloud(run), read_ply(reference)
-    if icp:
-        reach_m, frames = max(thresholds_m), possible_frames(mapped, frame, align_to)
-        placed, moved, frame = place_by_icp(mapped, truth, frames, align_to, reach_m)
-    else:
-        frame = frame or "camera"
-        placed, moved = place_cloud(mapped, frame, align_to)
-    truth = replace(truth, frame=placed.cloud.frame)
-    by_threshold = [plain(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
+    with naming(f"{run}, {reference}"):
+        if icp:
+            reach_m, frames = max(thresholds_m), possible_frames(mapped, frame, align_to)
+            placed, moved, frame = place_by_icp(mapped, truth, frames, align_to, reach_m)
+        else:
+            frame = frame or "camera"
+            placed, moved = place_cloud(mapped, frame, align_to)
+        truth = replace(truth, frame=placed.cloud.frame)
+        by_threshold = [plain(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
     beyond = add_within_reach(placed, truth, by_threshold)
     aligned = icp or align_to is not None
     doubts = doubt_axes(placed, truth, by_threshold[0], frame, aligned=aligned)

@@ -136,14 +136,16 @@ def settings_error(
         names: Dotted names of all settings, to suggest one for an unknown name.
     """
     first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"]) or "settings"
+    key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         return SettingsError(
             f"unknown setting {key!r}", where=where, hint=suggest_names(key, names)
         )
     # Our own message, without the prefix that pydantic adds.
     said = first.get("ctx", {}).get("error", first["msg"])
-    return SettingsError(f"setting {key!r}: {said}", where=where, got=repr(first.get("input")))
+    what = f"setting {key!r}: {said}" if first["loc"] else str(said)
+    group = isinstance(first["input"], Mapping | BaseModel)
+    return SettingsError(what, where=where, got=None if group else repr(first["input"]))
 
 
 def suggest_names(unknown: str, names: Sequence[str]) -> str:

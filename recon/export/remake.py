@@ -29,7 +29,7 @@ from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_vi
 from recon.export.octomap import export_octomap
 from recon.export.survey import georeference
 from recon.io.atomic import atomic_path
-from recon.io.files import reading
+from recon.io.files import naming, reading
 from recon.io.models.las import SUFFIXES as LAS
 from recon.io.models.las import write_las
 from recon.io.models.mesh import read_mesh, write_mesh
@@ -170,7 +170,7 @@ def mesh_cloud(
     with run.stage("read"):
         cloud = read_ply(path)
         write_ply(run.path(_LAYER), cloud)
-    with run.stage("mesh"):
+    with run.stage("mesh"), naming(path):
         if camera is None:
             mesh, coverage = reconstruct_mesh(cloud, settings), None
         else:

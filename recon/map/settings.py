@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from recon.core.settings import Settings
 from recon.map.fusion.builder import FusionSettings
 from recon.map.ground.axes import AxesSettings
 from recon.map.ground.grid import GridSettings
 from recon.map.ground.surface import GroundSettings
+from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
 from recon.odometry.settings import OdometrySettings
@@ -52,3 +54,19 @@ class DriveSettings(StereoSettings):
     memory: MemorySettings = MemorySettings()
     ground: GroundSettings = GroundSettings()
     grid: GridSettings = GridSettings()
+
+    @model_validator(mode="after")
+    def _check_margins(self) -> Self:
+        """Refuse margins wider than a tile: each tile would be made of all those around it."""
+        resolution_m, filters = self.occupancy.resolution_m, self.map_filters
+        tile_m = max(self.submaps.tile_m, BLOCK_EDGE * resolution_m)
+        for name, reach_m in (
+            ("map_filters.voxel_m", 2 * (filters.voxel_m or 0.0)),
+            ("map_filters.radius_m", filters.radius_m or 0.0),
+            ("grid.min_blob_cells", self.grid.min_blob_cells * resolution_m),
+        ):
+            if reach_m > tile_m:
+                raise ValueError(
+                    f"{name} reaches {reach_m:g} m, beyond a tile of {tile_m:g} m (submaps.tile_m)"
+                )
+        return self

@@ -323,9 +323,11 @@ def _read_text(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
     width = sum(int(np.prod(field.shape)) for _, field in _fields(dtype))
     rows = []
     for _ in range(count):
-        words = stream.readline().split()
+        line = stream.readline()
+        if not line:
+            break
         try:
-            numbers = parse_numbers(words)
+            numbers = parse_numbers(line.split())
         except ValueError:
             break
         if len(numbers) != width:
