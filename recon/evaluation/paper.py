@@ -260,12 +260,22 @@ def apply_method(
     if method == CORRECTED:
         rebuilt = FrameReconstructor(experiment.camera, config, threads=threads)
         frame = rebuilt.reconstruct(experiment.pair)
-        return _result(method, experiment, frame.pair, frame.disparity, frame.cloud)
-    pair = _printed_pair(experiment)
-    disparity = PrintedMatcher(config.paper.patch_px, method == AS_PRINTED).match(pair)
-    pair = replace(pair, camera=camera_of_table_1(pair.camera))
-    cloud = back_project(disparity, pair, _EVERY_POINT, normals=False)
-    return _result(method, experiment, pair, disparity, cloud)
+        pair, disparity, cloud = frame.pair, frame.disparity, frame.cloud
+    else:
+        pair = _printed_pair(experiment)
+        disparity = PrintedMatcher(config.paper.patch_px, method == AS_PRINTED).match(pair)
+        pair = replace(pair, camera=camera_of_table_1(pair.camera))
+        cloud = back_project(disparity, pair, _EVERY_POINT, normals=False)
+    depth_m, truth = depth_from_disparity(disparity.values, pair.camera), experiment.truth
+    known_m = depth_m[np.isfinite(depth_m)]
+    figures = {
+        "valid_percent": 100.0 * float(disparity.valid.mean()),
+        "points": len(cloud),
+        "depth_median_m": float(np.median(known_m)) if len(known_m) else None,
+        "disparity": None if truth is None else plain(evaluate_disparity(disparity, truth)),
+        "depth": None if truth is None else compare_depth(depth_m, truth, experiment.camera),
+    }
+    return MethodResult(method, pair, disparity, depth_m, cloud, figures)
 
 
 def try_patches(
@@ -313,25 +323,6 @@ def compare_depth(
         "median_ratio": float(np.median(found / true)),
         "pixels": int(both.sum()),
     }
-
-
-def _result(
-    method: str,
-    experiment: Experiment,
-    pair: RectifiedPair,
-    disparity: Disparity,
-    cloud: PointCloud,
-) -> MethodResult:
-    depth_m, truth = depth_from_disparity(disparity.values, pair.camera), experiment.truth
-    known_m = depth_m[np.isfinite(depth_m)]
-    figures = {
-        "valid_percent": 100.0 * float(disparity.valid.mean()),
-        "points": len(cloud),
-        "depth_median_m": float(np.median(known_m)) if len(known_m) else None,
-        "disparity": None if truth is None else plain(evaluate_disparity(disparity, truth)),
-        "depth": None if truth is None else compare_depth(depth_m, truth, experiment.camera),
-    }
-    return MethodResult(method, pair, disparity, depth_m, cloud, figures)
 
 
 def _printed_pair(experiment: Experiment) -> RectifiedPair:

@@ -53,9 +53,6 @@ def test_the_second_lap_runs_where_the_first_did(block):
     # The car keeps to the outer lane, so a lap of the car is longer than one of the line.
     expected_m = LAP_M - 2 * math.pi * LANE_M
     assert block.world.trajectory.distances_m[100] == pytest.approx(expected_m, rel=0.005)
-
-
-def test_the_same_place_gives_the_same_image_a_lap_later(block):
     assert np.array_equal(block.pair(3).left, block.pair(103).left)
     assert not np.array_equal(block.pair(3).left, block.pair(53).left)
 
@@ -80,27 +77,19 @@ def test_the_inside_of_a_corner_has_no_house(block):
     assert np.linalg.norm(walls[:, :2] - inner, axis=1).min() > 2.0
 
 
-def test_a_repeated_street_looks_the_same_each_period(repeated):
+def test_a_repeated_street_looks_and_is_the_same_each_period(repeated):
     here, later, elsewhere = (repeated.pair(k).left.astype(float) for k in (2, 12, 5))
 
     # Only the grain of the surfaces is of the place, and the end of the street comes nearer.
     assert np.abs(later - here).mean() < 0.3 * np.abs(elsewhere - here).mean()
-
-
-def test_a_repeated_street_has_the_same_shape_each_period(repeated):
     here, later = repeated.depth(2), repeated.depth(12)
-
     both = (here < 60.0) & (later < 60.0)
     assert both.mean() > 0.5
     assert np.allclose(here[both], later[both], atol=1e-4)
 
 
 @pytest.mark.parametrize(
-    "values",
-    [
-        {"path": "block", "block_m": (100.0, 40.0)},
-        {"path": "curve", "repeat_m": 40.0},
-    ],
+    "values", [{"path": "block", "block_m": (100.0, 40.0)}, {"path": "curve", "repeat_m": 40.0}]
 )
 def test_an_impossible_street_is_refused(values):
     with pytest.raises(SettingsError, match=r"block_m|repeat_m"):

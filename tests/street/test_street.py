@@ -47,15 +47,11 @@ def test_a_curved_street_turns_by_its_rate():
     assert poses[-1, 1, 3] > 5.0  # positive = to the left
 
 
-def test_steps_have_the_length_of_the_speed():
+def test_poses_are_rigid_and_their_steps_have_the_length_of_the_speed():
     poses = _poses(frames=60, speed_m_per_frame=1.0)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     # The lane lies 1.55 m inside or outside of the centre line, whose curve is above 180 m.
     assert np.allclose(steps, 1.0, atol=0.02)
-
-
-def test_poses_are_rigid():
-    poses = _poses(frames=30, sway=3.0)
     rotation = poses[:, :3, :3]
     assert np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-12)
     assert np.allclose(np.linalg.det(rotation), 1.0)
