@@ -36,6 +36,7 @@ from recon.map.fusion.builder import fusion_range_m
 from recon.map.ground.floor import add_floors, find_floors
 from recon.map.ground.grid import flatten
 from recon.map.ground.surface import estimate_ground_surface
+from recon.map.store.session import NO_LOOPS
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
 from recon.report.drive_figures import grid_figure, loops_figure, seen_from_above
@@ -146,8 +147,7 @@ def closing(
     if mapped.loops is None:
         raise SystemExit("loop closure is off")
     surface = true_surface(source.camera, range_m=fusion_range_m(mapped.camera, config.fusion))
-    odometry = mapped.loops.odometry
-    before = replace(mapped, trajectory=odometry, T_corrected_world=None, loops=None)
+    before = without_loops(mapped)
     if pictures is not None:
         draw(pictures, "drift" if drift_percent else "block", before, mapped)
     frames = len(mapped.trajectory)
@@ -158,6 +158,16 @@ def closing(
         "loops": mapped.loops.figures(),
         "ms_per_frame": {name: round(1e3 * s / frames, 2) for name, s in seconds.items()},
     }
+
+
+def without_loops(mapped: MappedSequence) -> MappedSequence:
+    """Return a drive as it is before its loops are closed, with its path and cloud made."""
+    closed, before = dict(mapped.session.loops), replace(mapped, loops=None)
+    mapped.session.set_loops(NO_LOOPS)
+    made = len(before.trajectory), len(before.cloud)
+    mapped.session.set_loops(closed)
+    assert all(made)
+    return before
 
 
 def deceiving(source: Filmed, options: argparse.Namespace) -> dict[str, Any]:

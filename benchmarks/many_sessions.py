@@ -23,9 +23,10 @@ from typing import Any
 
 import checkout  # noqa: F401 - what is measured
 import psutil
+from recon.export.make import make
+from recon.export.product import Order
 
 from recon.commands.config import load_config
-from recon.export.products import write_products
 from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
 from recon.map.store.map import MAP_FILE, Map
@@ -64,7 +65,7 @@ def build(folder: Path, sessions: int) -> Path:
         pairs = zip(pairwise(range(sessions)), pairwise(true), strict=True)
         join_sessions(map_, [link for ends, both in pairs for link in _links(*ends, both)])
         map_.commit()
-        write_products(place_map(map_, config), run)
+        make(Order(map_, place_map(map_, config), run, config.mesh), ("cloud", "octomap", "grid"))
         record = {"T_map_world": map_.first.T_map_world.tolist()}
         run.finish({"warnings": []}, source="wall", inputs=(), record=record)
     return folder

@@ -27,7 +27,7 @@ from recon.core.values import PointCloud, StereoPair, join_clouds
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.fusion.builder import fusion_range_m
-from recon.map.tiles import Tiles
+from recon.map.sessions.placed import place_map
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
 from recon.street import props
@@ -134,9 +134,7 @@ def cloud_of(mapped: MappedSequence, config: ReconConfig, *, remove: bool) -> Po
     """Return the fused cloud with or without what moved, street world."""
     fusion = config.fusion.model_copy(update={"remove_moving": remove})
     settings = config.model_copy(update={"fusion": fusion})
-    tiles = Tiles.of_submaps(mapped.submaps, settings, mapped.T_map_world)
-    tiles.with_looks(mapped.looks)
-    cloud = join_clouds(tile.cloud for tile in tiles)
+    cloud = join_clouds(tile.cloud for tile in place_map(mapped.map, settings).tiles)
     T = se3.invert(mapped.T_map_world)
     return replace(cloud, xyz=se3.apply(T, cloud.xyz), normals=None, frame="world")
 

@@ -1,6 +1,6 @@
 """One story per command of the program, as functions of the library.
 
-`map.py` is `recon map`, and so on; each reads like the paragraph that explains it. What several of
+`map.py` is `recon map`, and so on (`export.py`: also `recon occupancy` and `recon mesh`); each reads like the paragraph that explains it. What several of
 them share:
 
 - `config.py`: settings of all stages; `settings_list.py`: the same, described;

@@ -8,7 +8,7 @@ from typing import Final
 from recon.commands.config import ReconConfig
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.map.drive.map_run import MapRun
+from recon.export.map_run import MapRun
 from recon.map.fusion.builder import fusion_range_m
 from recon.run.progress import SILENT, Progress
 from recon.sources.synthetic import SyntheticSource

@@ -9,9 +9,9 @@ from recon.commands.config import ReconConfig, run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth
+from recon.evaluation.doubts import doubts_of
 from recon.evaluation.drive_errors import LEAST_FRAMES, known_occupancy
 from recon.evaluation.occupancy import evaluate_occupancy
-from recon.export.finished_map import doubts_of
 from recon.io.atomic import check_targets
 from recon.io.images.image import write_image
 from recon.io.occupancy.nav2 import read_nav2

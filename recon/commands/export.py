@@ -1,31 +1,33 @@
-"""`recon export`: products of a finished run, with other settings or formats."""
+"""`recon export`, `recon occupancy`, `recon mesh`: products of a finished run, made again."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
-from recon.commands.occupancy import REMADE
-from recon.core.errors import SettingsError
-from recon.export.remake import (
-    ON_REQUEST,
-    Wanted,
-    copy_file,
-    from_rays,
-    known_products,
-    mesh_cloud,
-    remake_map,
-)
+from recon.core.errors import FormatError, SettingsError
+from recon.export.cloud_file import copy_file, mesh_cloud
+from recon.export.make import known_products, make, need_rays
+from recon.export.product import Order
 from recon.io.files import StrPath
+from recon.io.models.las import SUFFIXES as SURVEYED
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.sessions.measured import Survey
+from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.sessions.spread import place_map_on
+<<<<<<< HEAD
 from recon.run.batch.cluster import BatchOptions
+=======
+from recon.map.store.map import MAP_FILE, Map
+from recon.run.batch.cluster import connect
+from recon.run.batch.work import BatchOptions
+>>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
 from recon.run.finished import (
+    DOUBTS,
+    MAPPED_BY,
     PAIR_CLOUD,
     camera_of_pair,
     is_pair_run,
@@ -33,6 +35,9 @@ from recon.run.finished import (
     refuse_as_target,
 )
 from recon.run.run import Run
+
+REMADE: Final = ("occupancy", "grid", "ground", "submaps")
+"""Sections of the configuration that may differ from those of the run where rays are cast."""
 
 
 def run_export(
@@ -45,21 +50,22 @@ def run_export(
     threads: int | None = None,
     workers: BatchOptions | None = None,
     survey: Survey | None = None,
+    command: str = "export",
 ) -> dict[str, Any]:
-    """Make products of a finished run, and write them.
+    """Make products of a finished run, and write them: what `recon export` does.
 
     Args:
-        source: Folder of a run of map, demo or pair.
+        source: Folder of a run of map, demo, live, merge or pair.
         config: Its settings with changes, such as ``load_config(f"{source}/config.yaml",
             ["grid.max_height_m=3"])``; None = its own.
-        products: Which of `PRODUCTS` and `ON_REQUEST`; empty = those of `PRODUCTS` that such a
-            run can give.
+        products: Which of `PRODUCTS`; empty = those of `USUAL` that such a run can give.
         formats: Formats of the mesh, such as ``("ply", "glb")``.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores.
-        workers: Where the tiles of grid and OctoMap are made; None = here. Changes no product.
+        workers: Where the tiles of the map are made; None = here. Changes no product.
         survey: Measured positions in whose coordinates LAS and LAZ are written; None = in those
             of the map.
+        command: Command name, for the record and the default folder.
 
     Returns:
         The figures of ``summary.json``.
@@ -75,18 +81,16 @@ def run_export(
     refuse_as_target(source, out)
     if survey is not None:
         _check_survey(survey, wanted)
-    if workers is not None and not from_rays(wanted):
+    if workers is not None and not need_rays(wanted):
         raise SettingsError(
             "only grids and OctoMaps are made on workers",
             got=", ".join(wanted),
             hint="drop --workers and --scheduler; a mesh uses --threads",
         )
-    if pair:
-        settings = config or run_settings(source)
-        with Run("export", out, settings, threads=threads) as run:
-            return _export_pair(source, settings, wanted, run, formats)
-    mapped, ran = open_run(source), run_settings(source)
+    mapped = None if pair else open_run(source)
+    ran = run_settings(source)
     settings = config or ran
+<<<<<<< HEAD
     check_changes(ran, settings, (*(REMADE if from_rays(wanted) else ()), "mesh"))
     with Run("export", out, settings, threads=threads) as run:
         if workers is None:
@@ -97,6 +101,108 @@ def run_export(
             place = partial(place_map_on, folder=folder, each=cluster.each, workers=cluster.at_once)
             what = Wanted(wanted, settings.mesh, formats, place, survey)
             return remake_map(mapped, settings, what, run)
+=======
+    if mapped is None:
+        with Run(command, out, settings, threads=threads) as run:
+            return _export_pair(source, settings, wanted, run, formats)
+    check_changes(ran, settings, (*(REMADE if need_rays(wanted) else ()), "mesh"))
+    with Map.open(source) as map_, Run(command, out, settings, threads=threads) as run:
+        with run.stage("map"):
+            placed = _placed(map_, settings, run, workers)
+        made = make(Order(map_, placed, run, settings.mesh, formats, survey), wanted)
+        doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
+        figures = {
+            "run": str(source),
+            "frames": len(placed.path_m),
+            **made.figures,
+            "T_map_world": T_map_world,
+            "warnings": [*doubts, *made.warnings],
+        }
+        record = {MAPPED_BY: mapped.mapped_by, "T_map_world": T_map_world, DOUBTS: doubts}
+        run.finish(figures, source=str(source), inputs=[source / MAP_FILE], record=record)
+    return figures
+
+
+def run_occupancy(
+    run: StrPath,
+    config: ReconConfig | None = None,
+    *,
+    out: StrPath | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Make voxels and grid of a run with other settings: what `recon occupancy` does.
+
+    Args:
+        run: Folder of the run that mapped the drive.
+        config: As for `run_export`, like all that follows.
+        out: As before.
+        threads: As before.
+
+    Raises:
+        ReconError: As for `run_export`.
+    """
+    if is_pair_run(Path(run)):
+        raise FormatError("the run made no map: it is one of recon pair", where=run)
+    products = ("octomap", "grid")
+    return run_export(run, config, products=products, out=out, threads=threads, command="occupancy")
+
+
+def run_mesh(
+    source: Path,
+    config: ReconConfig,
+    *,
+    formats: Sequence[str] = ("ply",),
+    out: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Reconstruct the surface of a cloud file or of a run's map, and write a MeshLab project.
+
+    A cloud file is meshed in one piece, since its scale is unknown; the cloud of a pair as
+    `recon pair` does. The map of a run is meshed in pieces, and faces in observed free space are
+    removed.
+
+    Args:
+        source: A PLY file, or the folder of a run of map, demo or pair.
+        config: Settings of the mesh; the rest is that of the run.
+        formats: File suffixes without the dot, such as ``("ply", "glb")``.
+        out: Result folder; None = a new one below ``outputs/``.
+        threads: Threads to use; None = all cores.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: The cloud cannot be read or gives no surface, a format is unknown, or the
+            folder cannot be written; nothing is left behind.
+    """
+    check_mesh_formats(formats)
+    cloud, camera = source, None
+    if source.is_dir():
+        refuse_as_target(source, out)
+        if not is_pair_run(source):
+            settings = run_settings(source).model_copy(update={"mesh": config.mesh})
+            return run_export(
+                source,
+                settings,
+                products=["mesh"],
+                formats=formats,
+                out=out,
+                threads=threads,
+                command="mesh",
+            )
+        cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
+    with Run("mesh", out, config, threads=threads) as run:
+        return _finished(source, cloud, run, mesh_cloud(cloud, camera, config.mesh, run, formats))
+
+
+def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | None) -> PlacedMap:
+    """Cut a map into tiles, here or on workers."""
+    if workers is None:
+        return place_map(map_, settings, run.threads)
+    with connect(workers.scheduler, workers.workers_here) as cluster:
+        folder = run.state("tiles").resolve()
+        return place_map_on(map_, settings, folder, cluster.each, cluster.at_once)
+>>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
 
 
 def _export_pair(
@@ -104,27 +210,33 @@ def _export_pair(
 ) -> dict[str, Any]:
     """Return products of a run of `recon pair`."""
     cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
-    figures: dict[str, Any] = {"run": str(source), "cloud": str(cloud), "warnings": []}
+    figures: dict[str, Any] = {"run": str(source), "warnings": []}
     if "cloud" in products:
         copy_file(cloud, run.path(PAIR_CLOUD))
     if "mesh" in products:
         figures |= mesh_cloud(cloud, camera, config.mesh, run, formats)
+    return _finished(source, cloud, run, figures)
+
+
+def _finished(source: Path, cloud: Path, run: Run, figures: dict[str, Any]) -> dict[str, Any]:
+    """Complete a run that made something of a cloud file."""
+    figures = {"cloud": str(cloud), **figures}
     run.finish(figures, source=str(source), inputs=[cloud])
     return figures
 
 
 def _check_survey(survey: Survey, products: Sequence[str]) -> None:
-    """Refuse a coordinate system that there is not, and one for nothing.
+    """Refuse an unknown coordinate system, and one of which no product would make use.
 
     Raises:
         SettingsError: So it is.
     """
-    if not set(products) & set(ON_REQUEST):
+    if not set(products) & set(SURVEYED):
         raise SettingsError(
             "only LAS and LAZ have the coordinates of a survey",
             where="--to",
             got=", ".join(products),
-            expected=" or ".join(ON_REQUEST),
+            expected=" or ".join(SURVEYED),
         )
     if survey.crs is not None:
         check_crs(survey.crs)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from recon.commands import occupancy
 from recon.commands.config import ReconConfig, check_changes, run_settings
+from recon.commands.export import REMADE
 from recon.commands.map_options import MapOptions
 from recon.export.joined import JoinedMap, export_sessions, joined_figures, joined_warnings
-from recon.export.products import write_products
+from recon.export.make import make
+from recon.export.product import Order
 from recon.map.sessions.copying import check_session, copy_sessions
 from recon.map.sessions.joining import join_new
 from recon.map.sessions.measured import Survey, hold
@@ -21,7 +22,7 @@ from recon.report.joined_page import write_joined_page
 from recon.run.finished import open_run
 from recon.run.run import Run, WholeRun
 
-REMADE = (*occupancy.REMADE, "mesh", "memory")
+_REMADE: Final = (*REMADE, "mesh", "memory")
 """Sections of the configuration that may differ from those of the first run."""
 Fill = Callable[[Run, Map], Sequence[int]]
 """Puts drives into the empty map of a run; gives the numbers of those that are new in it."""
@@ -70,11 +71,9 @@ def make_joined(
             join_new(map_, new)
         map_.commit()
         with run.stage("map"):
-            placed = place_map(map_, settings)
-        made = write_products(placed, run, settings.mesh if options.mesh else None)
-        joined = JoinedMap(
-            map_, settings, made, None if made.mesh is None else made.mesh.to_show(run)
-        )
+            placed = place_map(map_, settings, run.threads)
+        made = make(Order(map_, placed, run, settings.mesh), options.products)
+        joined = JoinedMap(map_, made)
         summary = {**joined_figures(joined), "warnings": [*left_out, *joined_warnings(joined)]}
         export_sessions(joined, run)
         with run.report(summary):
@@ -111,5 +110,5 @@ def joined_settings(folder: Path, config: ReconConfig | None) -> ReconConfig:
     open_run(folder)
     ran = run_settings(folder)
     if config is not None:
-        check_changes(ran, config, REMADE)
+        check_changes(ran, config, _REMADE)
     return config or ran

@@ -11,10 +11,11 @@ from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
 from recon.commands.resume import begin_or_resume, with_resume_hint
 from recon.core.words import counted
 from recon.evaluation.drive_errors import compare_with_truth
-from recon.export.products import Products, write_products
+from recon.export.make import make
+from recon.export.map_run import MapRun
+from recon.export.product import Order
 from recon.export.trajectories import export_paths
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.map_run import MapRun
 from recon.map.drive.refuse_empty import check_map
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace
@@ -64,7 +65,7 @@ def run_map(
         mapped = (map_in_pieces if apart else map_whole)(source, config, options, run, map_)
         with run.stage("cloud"):
             check_map(mapped, source.name, findings)
-        made = write_products(mapped, run, config.mesh if options.mesh else None)
+        made = make(Order(map_, mapped.placed, run, config.mesh), options.products)
         with run.stage("compare"):
             given = options.known_poses is not None
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
@@ -72,20 +73,17 @@ def run_map(
             name=source.name,
             config=config,
             mapped=mapped,
-            cloud=made.cloud,
-            grid=made.grid,
-            camera_height_m=made.camera_height_m,
-            mesh=None if made.mesh is None else made.mesh.to_show(run),
+            made=made,
             truth=source.truth,
             metrics=errors.path,
             map_metrics=errors.surface,
             occupancy_metrics=errors.occupancy,
             warnings=(*findings, *_warnings(source, mapped), *made.warnings, *errors.warnings),
         )
-        result.summary.update(_summary(source, result, made, options))
+        result.summary.update(_summary(source, result, options))
         with run.stage("write"):
             export_paths(mapped, made.camera_height_m, run)
-            keep_map(map_, run.path(MAP_FILE), config)
+            keep_map(map_, run.path(MAP_FILE))
         with run.report(result.summary):
             write_map_page(result, run)
         config.memory.check("report")
@@ -129,17 +127,11 @@ def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
     ]
 
 
-def _summary(
-    source: StereoSource, result: MapRun, made: Products, options: MapOptions
-) -> dict[str, Any]:
+def _summary(source: StereoSource, result: MapRun, options: MapOptions) -> dict[str, Any]:
     given, prior = options.known_poses is not None, result.mapped.prior
     return {
         "odometry": "known poses" if given else result.config.odometry.method,
         **result.figures(),
-        "points": made.points,
-        "points_removed": made.removed,
-        "voxels": made.voxels,
-        "faces": 0 if made.mesh is None else made.mesh.faces,
         **({"frames_left_out": source.left_out} if isinstance(source, IncompleteSource) else {}),
         **({"live": source.figures()} if isinstance(source, LiveSource) else {}),
         **({} if prior is None else {"prior": {"from": options.prior_origin, **plain(prior)}}),

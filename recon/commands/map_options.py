@@ -12,6 +12,7 @@ from typing_extensions import Self
 from recon.commands.config import ReconConfig
 from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
+from recon.export.make import USUAL
 from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
 from recon.run.batch.cluster import BatchOptions
@@ -56,6 +57,11 @@ class MapOptions:
     resume: bool = False
     arguments: Mapping[str, Any] = field(default_factory=dict)
     workers: BatchOptions | None = None
+
+    @property
+    def products(self) -> tuple[str, ...]:
+        """What is made of the map."""
+        return tuple(name for name in USUAL if self.mesh or name != "mesh")
 
     def run(self, config: ReconConfig) -> Run:
         """Return the run, which begins when it is entered."""

@@ -132,7 +132,7 @@ def _mapped(
         mapped = map_whole(source, settings, options, run, drive)
         check_map(mapped, source.name)
         kept = run.state("kept.recon")
-        keep_map(drive, kept, settings)
+        keep_map(drive, kept)
     return copied(kept, map_, settings)
 
 

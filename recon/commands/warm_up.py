@@ -12,15 +12,16 @@ import numpy as np
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.demo import demo_source
+from recon.commands.export import run_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.commands.occupancy import run_occupancy
 from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling
 from recon.core.values import StereoPair
-from recon.io.occupancy.octomap import octomap_pieces
+from recon.io.occupancy.octomap import read_octomap
 from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
 from recon.sources.pair_input import PairInput
 from recon.stereo.frame import FrameReconstructor
@@ -70,7 +71,7 @@ def compile_kernels() -> WarmUp:
             MapOptions(audit=False, command="demo", out=folder / "drive", mesh=False),
         )
         run_occupancy(folder / "drive", out=folder / "occupancy")
-        _read_again(folder / "drive" / OCTOMAP)
+        read_octomap(folder / "drive" / OCTOMAP)  # as an evaluation does
         _move_submaps(map_sequence(source, config))
         colour = next(iter(source))
         grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
@@ -82,13 +83,9 @@ def compile_kernels() -> WarmUp:
     return WarmUp(len(compiled), time.perf_counter() - begun)
 
 
-def _read_again(octomap: Path) -> None:
-    """Read the map as a mesh of a run does, which asks where the cameras saw free space."""
-    for _ in octomap_pieces(octomap):
-        pass
-
-
 def _move_submaps(mapped: MappedSequence) -> None:
     """Move the submaps as closed loops do; so small a drive has none."""
     turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
-    len(mapped.corrected(np.tile(turn, (len(mapped.submaps.entries), 1, 1))).tiles)
+    submaps = mapped.session.submaps
+    turns = np.stack([turn] * len(submaps))
+    len(Tiles.of_submaps(submaps, mapped.config, mapped.T_map_world, turns))

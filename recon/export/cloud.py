@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
+from recon.export.product import Made, Order
 from recon.io.models.ply import write_ply_tiles
 from recon.map.tiles import Tiles
 
@@ -39,8 +40,16 @@ class WrittenCloud:
     warnings: list[str]
 
 
-def export_cloud(tiles: Tiles, path: Path, removed: Path) -> WrittenCloud:
-    """Write the points of all tiles into one PLY file, and what was removed into another.
+def cloud_product(order: Order) -> Made:
+    """Write ``map/cloud.ply``, and ``map/removed.ply`` with what moved."""
+    files = [order.run.path(f"map/{name}.ply") for name in ("cloud", "removed")]
+    written = export_cloud(order.placed.tiles, *files)
+    figures = {"points": written.points, "points_removed": written.removed}
+    return Made(figures, written.warnings, written.sample)
+
+
+def export_cloud(tiles: Tiles, path: Path, removed: Path | None) -> WrittenCloud:
+    """Write the points of all tiles into one PLY file, and perhaps what was removed into another.
 
     Raises:
         OutputError: It cannot be written.
@@ -56,7 +65,7 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path) -> WrittenCloud:
 
     points = write_ply_tiles(path, clouds(), frame="map")
     left_out = 0
-    if tiles.config.fusion.remove_moving:
+    if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
         left_out = write_ply_tiles(removed, (cloud for cloud in moved if len(cloud)), frame="map")
     return WrittenCloud(points, left_out, sample.cloud(), _doubts(tiles, points, left_out))

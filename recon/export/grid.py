@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
-from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.grid import log_odds
+from recon.export.product import Made, Order
 from recon.io.occupancy.nav2 import write_nav2
+from recon.map.ground.axes import base_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.floor import add_floors
 from recon.map.ground.grid import flatten, ground_depths
@@ -54,6 +56,23 @@ class WrittenGrid:
     grid: OccupancyGrid
     camera_height_m: float | None
     warnings: tuple[str, ...]
+
+
+def grid_product(order: Order) -> Made:
+    """Write ``map/grid.*``."""
+    placed, stem = order.placed, order.run.path("map/grid")
+    written = export_grid(placed.tiles, placed.path_m, placed.trusted, stem)
+    (rows, columns), height_m = written.grid.cells.shape, written.camera_height_m
+    figures = {
+        "resolution_m": written.grid.resolution_m,
+        "rows": rows,
+        "columns": columns,
+        "occupied_cells": int((written.grid.cells == OCCUPIED).sum()),
+        "free_cells": int((written.grid.cells == FREE).sum()),
+        "camera_height_m": height_m,
+        "T_base_camera": base_axes(order.map.first.T_map_world, height_m).tolist(),
+    }
+    return Made(figures, written.warnings, written.grid)
 
 
 def export_grid(tiles: Tiles, path_m: Float64, trusted: Bool, stem: Path) -> WrittenGrid:

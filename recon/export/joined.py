@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from recon.core.values import Trajectory, TriangleMesh
-from recon.export.products import Products
+from recon.core.values import Trajectory
+from recon.export.make import Products
 from recon.io.trajectory import write_kitti_poses, write_tum
-from recon.map.ground.axes import base_axes
 from recon.map.sessions.lengths import doubts_of_lengths
 from recon.map.sessions.measured import doubts_of_positions, misfit_rms_m
-from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
 from recon.run.directory import RunDirectory
 
@@ -25,15 +23,11 @@ class JoinedMap:
 
     Attributes:
         map: The map.
-        settings: The settings of its products.
         made: The products.
-        mesh: The surface in map axes; None = not made, or too large for memory.
     """
 
     map: Map
-    settings: DriveSettings
     made: Products
-    mesh: TriangleMesh | None = None
 
     @property
     def paths(self) -> dict[int, Trajectory]:
@@ -50,8 +44,7 @@ class JoinedMap:
 
 def joined_figures(joined: JoinedMap) -> dict[str, Any]:
     """Return the figures for ``summary.json``."""
-    map_, made = joined.map, joined.made
-    T_map_world = map_.first.T_map_world
+    map_ = joined.map
     placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
@@ -73,13 +66,9 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
         ],
         "links": {"count": len(kept), "refused": len(map_.links) - len(kept), "pairs": dict(pairs)},
         "positions_misfit_rms_m": misfit_rms_m(map_),
-        "points": made.points,
-        "points_removed": made.removed,
-        "voxels": made.voxels,
-        "faces": 0 if made.mesh is None else made.mesh.faces,
-        "T_map_world": T_map_world.tolist(),
-        "camera_height_m": made.camera_height_m,
-        "T_base_camera": base_axes(T_map_world, made.camera_height_m).tolist(),
+        "faces": 0,
+        **joined.made.figures,
+        "T_map_world": map_.first.T_map_world.tolist(),
     }
 
 

@@ -5,9 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from recon.core.errors import MappingError
+from recon.export.product import Made, Order
 from recon.io.occupancy.octomap import write_octomap_tiles
 from recon.map.ground.grid import drop_undecided
 from recon.map.tiles import Tiles
+
+
+def octomap_product(order: Order) -> Made:
+    """Write ``map/octomap.bt`` and ``.ot``."""
+    voxels, warnings = export_octomap(order.placed.tiles, order.run.path("map/octomap"))
+    return Made({"voxels": voxels}, warnings)
 
 
 def export_octomap(tiles: Tiles, stem: Path) -> tuple[int, list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from recon.core.geometry.alignment import fit_points
 from recon.core.values.arrays import Float64
-from recon.io.models.las import check_inside
+from recon.export.product import Made, Order
+from recon.io.models.las import check_inside, write_las
 from recon.map.sessions.measured import (
     LARGEST_MISFIT,
     Survey,
@@ -76,6 +78,24 @@ class Georeference:
         if abs(self.scale - 1.0) > _LARGEST_STRETCH:
             return [*lines, f"{apart}, {self.scale:.2f} times as far apart: not in metres?"]
         return [*lines, f"{apart}: another clock, another antenna offset, or drift"]
+
+
+def survey_product(suffix: str) -> Callable[[Order], Made]:
+    """Return what writes ``map/cloud.las`` or ``.laz``, perhaps in survey coordinates."""
+
+    def write(order: Order) -> Made:
+        survey, T_file_map = order.survey, np.eye(4)
+        placed = None if survey is None else georeference(order.map, survey)
+        if placed is not None:
+            T_file_map = placed.T_survey_map
+        clouds = (tile.cloud for tile in order.placed.tiles)
+        path, crs = order.run.path(f"map/cloud.{suffix}"), None if survey is None else survey.crs
+        points = write_las(path, clouds, T_file_map, crs)
+        if placed is None:
+            return Made({"points": points})
+        return Made({**placed.figures(), "points": points}, placed.warnings())
+
+    return write
 
 
 def georeference(map_: Map, survey: Survey) -> Georeference:

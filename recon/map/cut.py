@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -133,7 +133,6 @@ class Cutter:
         T_corrected_world: Float64 | None = None,
         *,
         first: int = 0,
-        fuse: bool = True,
     ) -> Cut:
         """Cut submaps; it ends early where a tile does not fit into memory.
 
@@ -142,13 +141,11 @@ class Cutter:
             parts: Where the pieces go.
             T_corrected_world: float64 (S, 4, 4), a rigid correction of each; None = none.
             first: Number of the first one in its map.
-            fuse: Cut the fused cloud as well as the occupancy.
         """
         cut = Cut()
         for place, submap in enumerate(submaps):
             T = None if T_corrected_world is None else T_corrected_world[place]
-            fused = submap.fused if fuse else submap.fused.select(np.zeros(0, np.intp))
-            moved = self._moved(replace(submap, fused=fused), T)
+            moved = self._moved(submap, T)
             cut.add(moved)
             for kind, key, part, nbytes in self._pieces(moved, parts):
                 parts.put(kind, key, part.to_tree(), first + place)

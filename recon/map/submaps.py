@@ -189,7 +189,7 @@ class SubmapBuilder:
             self._index,
             self._first_frame,
             self._frames,
-            self._fused.take(),
+            self._fused.take().rounded(),
             self._occupancy.take(),
         )
         self._first_frame += self._frames

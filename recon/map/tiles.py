@@ -114,7 +114,6 @@ class Tiles:
         T_corrected_world: Float64 | None = None,
         *,
         drives: Sequence[int] = (),
-        fuse: bool = True,
     ) -> Tiles:
         """Cut the map of drives; tiles are halved until the fullest one fits into memory.
 
@@ -126,16 +125,13 @@ class Tiles:
                 corrected.
             drives: Number of submaps of each drive, in the order of the drives: what a later one
                 saw counts more. Empty = all are of one.
-            fuse: Make the cloud of the submaps; else it is put in as it was written.
 
         Raises:
             FormatError: A submap is damaged.
             OutputError: There is no room for the tiles.
         """
         halvings, tiles = 0, cls(config, T_map_world)
-        while not tiles._take(
-            tiles._cutter.cut(submaps, tiles._parts, T_corrected_world, fuse=fuse), drives
-        ):
+        while not tiles._take(tiles._cutter.cut(submaps, tiles._parts, T_corrected_world), drives):
             halvings += 1
             tiles = cls(config, T_map_world, halvings)
         return tiles
@@ -216,7 +212,7 @@ class Tiles:
         Filters see a margin around the tile, so that the tiles together equal the filtered whole
         (except for statistical limits, which are those of the tile).
         """
-        if self._parts.numbers(FUSED, key):
+        if self._parts.numbers(FUSED, key) and not self._parts.numbers(_POINTS, key):
             for kind, cloud in zip((_POINTS, _REMOVED), self._fused(key), strict=True):
                 self._parts.put(kind, key, _cloud_tree(cloud))
             self._parts.drop(FUSED, key)

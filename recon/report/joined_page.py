@@ -31,5 +31,5 @@ def write_joined_page(joined: JoinedMap, summary: dict[str, Any], run: RunDirect
         warnings=summary["warnings"],
         grid=grid_figure(made.grid, from_above),
         resolution_m=made.grid.resolution_m,
-        view=plot_scene(Scene(np.eye(4), made.cloud, joined.mesh, ways)),
+        view=plot_scene(Scene(np.eye(4), made.cloud, made.mesh, ways)),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from recon.core.geometry.se3 import apply
-from recon.map.drive.map_run import MapRun
+from recon.export.map_run import MapRun
 from recon.report.drive_figures import (
     drift_figure,
     grid_figure,

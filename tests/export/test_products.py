@@ -17,7 +17,8 @@ from recon.core.geometry.se3 import apply
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.export.cloud import CloudSample
 from recon.export.grid import export_grid
-from recon.export.products import write_products
+from recon.export.make import Products, make
+from recon.export.product import Order
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.io.occupancy.nav2 import read_nav2
 from recon.map.drive.sequence import MappedSequence, map_sequence
@@ -38,6 +39,11 @@ def mapped() -> MappedSequence:
     return map_sequence(SyntheticSource(STREET), load_config(None, SETTINGS))
 
 
+def write_products(mapped: MappedSequence, run: Run) -> Products:
+    order = Order(mapped.map, mapped.placed, run, load_config().mesh)
+    return make(order, ("cloud", "octomap", "grid"))
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Run]:
     with Run("map", tmp_path / "run") as run:
@@ -48,7 +54,7 @@ def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: Run) ->
     written = write_products(mapped, folder)
     whole = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     back = read_ply(folder.path("map/cloud.ply"))
-    assert written.points == len(back) == len(written.cloud) > 1000
+    assert written.figures["points"] == len(back) == len(written.cloud) > 1000
     assert back.frame == "map"
     for name in ("xyz", "normals", "rgb"):
         np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
@@ -56,7 +62,7 @@ def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: Run) ->
 
 def test_the_octomap_of_tiles_is_that_of_the_whole(mapped: MappedSequence, folder: Run) -> None:
     written = write_products(mapped, folder)
-    assert written.voxels == len(mapped.voxels) > 1000
+    assert written.figures["voxels"] == len(mapped.voxels) > 1000
     whole = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels, mapped.config.grid))
     for theirs, end in zip(whole, ("bt", "ot"), strict=True):
         assert folder.path(f"map/octomap.{end}").read_bytes() == theirs.read_bytes()
@@ -115,7 +121,7 @@ def test_a_map_too_large_for_an_octomap_has_all_else(
     folder.path("map/octomap.bt").unlink()
     folder.path("map/octomap.ot").unlink()
     written = write_products(mapped, folder)
-    assert written.voxels == whole.voxels
+    assert written.figures["voxels"] == whole.figures["voxels"]
     [warning] = written.warnings
     assert "no OctoMap" in warning
     np.testing.assert_array_equal(written.grid.cells, whole.grid.cells)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,13 @@ from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.trajectory import read_tum
+<<<<<<< HEAD
 from recon.run.batch.cluster import BatchOptions, Cluster
+=======
+from recon.map.store.records import Store
+from recon.run.batch.cluster import Cluster
+from recon.run.batch.work import BatchOptions
+>>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
 from recon.sources.pair_input import PairInput
 from tests.hostile.refusals import assert_refused, run
 
@@ -127,21 +134,24 @@ def test_only_what_is_asked_for_is_made(small_demo: Path, tmp_path: Path) -> Non
 
 
 def test_a_cloud_needs_no_rays(small_demo: Path, tmp_path: Path) -> None:
-    for name in ("run.json", "config.yaml", "map/cloud.ply"):
-        target = tmp_path / "run" / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes((small_demo / name).read_bytes())
-    summary = run_export(tmp_path / "run", products=["cloud"], out=tmp_path / "out")
+    run = shutil.copytree(small_demo, tmp_path / "run")
+    with Store.open(run / "map/map.recon") as store:
+        store.delete("rays")
+        store.commit()
+    summary = run_export(run, products=["cloud"], out=tmp_path / "out")
     assert summary["points"] > 1000
+    with pytest.raises(FormatError, match=r"kept no rays to build occupancy from"):
+        run_export(run, products=["grid"], out=tmp_path / "other")
+    (run / "map/map.recon").unlink()
     with pytest.raises(FormatError, match=r"folder has no map \(expected a map/map\.recon"):
-        run_export(tmp_path / "run", products=["grid"], out=tmp_path / "other")
+        run_export(run, products=["cloud"], out=tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--to", "cloud,gird"], "--to: unknown product (got gird, expected cloud, grid, octomap"),
+        (["--to", "cloud,gird"], "--to: unknown product (got gird, expected cloud, octomap, grid"),
         (["--to", "mesh", "--format", "step"], "unknown mesh format (got step"),
         (["--to", "grid", "--set", "fusion.min_count=1"], "no effect here"),
     ],

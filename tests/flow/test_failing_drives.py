@@ -21,7 +21,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError, RegistrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
-from recon.map.drive.map_run import MapRun
+from recon.export.map_run import MapRun
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source

@@ -42,7 +42,7 @@ def _frames(file: Path) -> int:
             assert np.isfinite(session.odometry.T_world_camera).all()
             assert session.submaps.frames == session.ray_frames == len(session)
             for entry in session.submaps.entries:
-                assert session.submaps.get(entry.index).frames == entry.frames
+                assert session.submaps[entry.index].frames == entry.frames
             assert all(stored.keyframe.frame < len(session) for stored in session.keyframes)
         frames = sum(map(len, map_.sessions))
         if frames:

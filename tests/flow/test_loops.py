@@ -15,9 +15,9 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.values import SequenceTruth, StereoPair
+from recon.export.map_run import MapRun
 from recon.io.trajectory import read_tum
 from recon.map.drive.frame_result import FrameResult
-from recon.map.drive.map_run import MapRun
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

@@ -79,9 +79,13 @@ def test_submaps_put_together_are_the_map_of_the_whole_drive() -> None:
     parts = join_fused(submap.fused for submap in submaps).cloud(FUSION.voxel_m, 1)
     assert len(submaps) > 3
     np.testing.assert_array_equal(parts.count, whole.count)
-    for name in ("xyz", "normals", "sigma_m", "confidence", "weight"):
-        # float32 sums in another order.
-        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-4, atol=1e-5)
+    # float32 sums in another order, rounded as maps keep them.
+    for name, rtol, atol in (
+        ("xyz", 0, 2e-5), ("normals", 0, 4e-3), ("sigma_m", 1e-4, 0), ("confidence", 3e-3, 0),
+        ("weight", 3e-4, 0),
+    ):  # fmt: skip
+        got, expected = getattr(parts, name), getattr(whole, name)
+        np.testing.assert_allclose(got, expected, rtol=rtol, atol=atol)
     cells = join_occupancy(submap.occupancy for submap in submaps).voxels(OCCUPANCY.resolution_m)
     order, ours = np.lexsort(occupancy.voxels().keys.T), np.lexsort(cells.keys.T)
     np.testing.assert_array_equal(cells.keys[ours], occupancy.voxels().keys[order])

@@ -200,20 +200,20 @@ def test_submaps_are_found_again(tmp_path: Path) -> None:
     with Store.create(tmp_path / "map.recon") as store:
         submaps = _fill(Submaps(store))
         store.commit()
-        entries, sums = submaps.entries, submaps.get(1).fused.sums
+        entries, sums = submaps.entries, submaps[1].fused.sums
     with Store.open(tmp_path / "map.recon", read_only=True) as store:
         again = Submaps(store)
         assert again.entries == entries
-        np.testing.assert_array_equal(again.get(1).fused.sums, sums)
+        np.testing.assert_array_equal(again[1].fused.sums, sums)
 
 
 def test_a_missing_or_foreign_submap_is_one_clear_line(store: Submaps) -> None:
     store.store.delete("submap", (0, 0))
     with pytest.raises(FormatError, match=r"map.*lacks a record"):
-        store.get(0)
+        store[0]
     store.store.put("submap", (0, 0), {"a": 1})
     with pytest.raises(FormatError, match="map"):
-        store.get(0)
+        store[0]
     store.store.delete("submap_entry", (0, 1))
     with pytest.raises(FormatError, match="submaps of the drive are missing"):
         Submaps(store.store)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,20 +15,29 @@ from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32
+<<<<<<< HEAD
 from recon.core.words import counted
+=======
+from recon.core.values.cloud import Frame
+from recon.export.cloud import export_cloud
+>>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
 from recon.export.mesh.cut import Plane, cut_mesh
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.seams import close_seam, open_edges
+from recon.export.product import Made, Order
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.occupancy.free_space import looked_through
 from recon.map.rectangle import Rectangle
+from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
 from recon.run.lookahead import side_by_side
 from recon.run.machine import available_cores
 
 WHOLE: Final = "mesh/mesh.ply"
+LAYER: Final = "mesh/cloud.ply"
+"""The points of the MeshLab project, where the run has no other cloud."""
 SAMPLE_FACES: Final = 2_000_000
 """Largest number of triangles of a mesh that is loaded whole for images."""
 _MOST_AT_ONCE: Final = 4
@@ -79,10 +89,30 @@ class WrittenMesh:
         """Number of vertices."""
         return sum(piece.vertices for piece in self.pieces)
 
-    def to_show(self, run: RunDirectory) -> TriangleMesh | None:
-        """Return the mesh for images; None if it is too large for memory."""
-        whole = run.path(WHOLE)
-        return read_mesh(whole) if self.faces <= SAMPLE_FACES else None
+
+def mesh_product(order: Order) -> Made:
+    """Write ``mesh/``: the surface in its formats, and a MeshLab project beside the cloud."""
+    tiles, run, cloud = order.placed.tiles, order.run, order.run.path("map/cloud.ply")
+    if not cloud.is_file():
+        cloud = run.path(LAYER)
+        export_cloud(tiles, cloud, None)
+    # Each piece being meshed takes memory of its own.
+    at_once = run.threads if tiles.config.memory.limit_mb is None else 1
+    written = export_mesh(tiles, order.mesh, run, cloud, at_once)
+    in_other_formats(run, order.formats, "map")
+    figures = {"vertices": written.vertices, "faces": written.faces, "tiles": len(written.pieces)}
+    whole, warnings = run.path(WHOLE), [*written.warnings]
+    if order.mesh.free_space and not has_occupancy(order.map):
+        warnings.append("the map kept no rays: which faces lie in free space is not known")
+    shown = read_mesh(whole) if written.faces <= SAMPLE_FACES else None
+    return Made({"points": written.points, **figures}, warnings, shown)
+
+
+def in_other_formats(run: RunDirectory, formats: Sequence[str], frame: Frame | None) -> None:
+    """Write ``mesh/mesh.ply`` again in other formats."""
+    for suffix in dict.fromkeys(formats):
+        if suffix != "ply":
+            write_mesh(run.path(f"mesh/mesh.{suffix}"), read_mesh(run.path(WHOLE)), frame)
 
 
 def export_mesh(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any, Final
@@ -14,7 +14,6 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
 from recon.map.store.keyframes import Keyframes
-from recon.map.store.submaps import SubmapEntry
 from recon.places.closure import Closure, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.drift import path_lengths
@@ -48,15 +47,6 @@ class DriveLoops:
         """float64 (N,), how far each pose was moved."""
         moved = self.closure.trajectory.positions_m - self.odometry.positions_m
         return np.asarray(np.linalg.norm(moved, axis=1))
-
-    def submap_corrections(self, entries: Sequence[SubmapEntry]) -> Float64 | None:
-        """Return ``T_corrected_world`` (S, 4, 4) of each submap: that of its middle frame.
-
-        None if no loop was closed, so that no submap moves by a rounding error.
-        """
-        if not self.closure.closed:
-            return None
-        return np.stack([self.closure.correction(self.odometry, one.middle) for one in entries])
 
     def figures(self) -> dict[str, Any]:
         """Return the figures for ``summary.json``."""

@@ -18,11 +18,10 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert, orthonormalise
 from recon.core.values.arrays import Float64
-from recon.map.drive.drive_loops import LoopWatch
+from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
-from recon.map.store.cast_submaps import with_occupancy
 from recon.map.store.map import Map
 from recon.map.store.rays import RAYS
 from recon.map.store.records import Key
@@ -115,24 +114,18 @@ def joined_drive(source: StereoSource, settings: DriveSettings, work: Workspace)
 
     Raises:
         FormatError: The map is damaged.
-        OutputError: There is no room for the occupancy.
+        OutputError: The map cannot be written.
     """
     session = work.map.session()
-    with work.stopwatch.stage("map"):
-        submaps = with_occupancy(session, settings, threads=work.threads or 1)
     reconstructor = FrameReconstructor(source.calibration, settings, threads=work.threads)
-    mapped = MappedSequence(
-        trajectory=session.odometry,
-        health=session.health,
-        session=session,
-        submaps=submaps,
+    return MappedSequence(
+        map=work.map,
         config=settings,
-        T_map_world=session.T_map_world,
-        camera=session.camera,
         sample=reconstructor.reconstruct(next(source.frames(len(source) // 2))),
-        seconds=work.stopwatch.seconds["map"] + (session.state() or {})["seconds"],
+        seconds=(session.state() or {})["seconds"],
+        loops=_close_loops(session, work) if settings.loops.enabled else None,
+        threads=work.threads or 1,
     )
-    return _closed(mapped, session, work) if settings.loops.enabled else mapped
 
 
 def _append_frames(session: Session, part: Session, piece: Piece) -> Float64:
@@ -169,7 +162,7 @@ def _append_submap(
         return
     nothing, fused = np.zeros(len(submap.occupancy.rows.blocks), np.bool_), submap.fused
     if piece.lead:
-        fused = fused.moved(T_world_part, settings.fusion.voxel_m)
+        fused = fused.moved(T_world_part, settings.fusion.voxel_m).rounded()
     number, first, frames = len(session.submaps), session.submaps.frames, submap.frames - lead
     kept = Submap(number, first, frames, fused, submap.occupancy.select(nothing))
     session.submaps.add(kept)
@@ -186,14 +179,14 @@ def _keyframes(session: Session, part: Session, piece: Piece) -> Iterator[Stored
             yield StoredKeyframe(keyframe, poses[frame], float(path_m[frame]))
 
 
-def _closed(mapped: MappedSequence, session: Session, work: Workspace) -> MappedSequence:
+def _close_loops(session: Session, work: Workspace) -> DriveLoops:
     """Close the loops that were found in a drive."""
     with work.stopwatch.stage("close_loops"):
         watch = LoopWatch(session.keyframes)
         try:
-            watch.restore(mapped.trajectory.T_world_camera, mapped.trusted.tolist())
-            loops = watch.close(mapped.trajectory)
+            watch.restore(session.odometry.T_world_camera, session.trusted.tolist())
+            loops = watch.close(session.odometry)
         finally:
             watch.stop()
         session.set_loops(loops.record())
-        return mapped.closed(loops)
+        return loops

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-
-import numpy as np
 
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply, invert
@@ -24,13 +22,11 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of
 from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace
-from recon.map.occupancy.looks import Looks
+from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
-from recon.map.store.cast_submaps import looks_of
+from recon.map.store.map import Map
 from recon.map.store.session import Session
-from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles
-from recon.odometry.health import trusted_poses
 from recon.odometry.path_drift import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
 from recon.run.progress import SILENT, Progress
@@ -41,64 +37,74 @@ from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
 @dataclass(frozen=True, eq=False)
 class MappedSequence:
-    """A mapped drive, before its results are written.
+    """A drive whose map is made: the map itself, and what it cost and looked like.
 
     Attributes:
-        trajectory: Pose of the left camera in each frame.
-        health: Health of each pose.
-        session: What the map keeps of the drive.
-        submaps: Fused cloud and occupancy, in submaps of consecutive frames.
+        map: The map, in which the drive is the only session.
         config: The configuration.
-        T_map_world: float64 (4, 4).
-        camera: The rectified camera.
         sample: The frame in the middle of the drive, for display.
         seconds: Wall-clock time from the first frame to the last.
-        T_corrected_world: float64 (S, 4, 4), correction still to be applied to each submap; the
-            trajectory already includes it. None = none.
         loops: Result of loop closure; None = it was not run.
         prior: How the external trajectory was used; None = there was none.
+        threads: Threads with which rays are cast, where they are.
     """
 
-    trajectory: Trajectory
-    health: tuple[OdometryHealth, ...]
-    session: Session
-    submaps: Submaps
+    map: Map
     config: DriveSettings
-    T_map_world: Float64
-    camera: RectifiedCamera
     sample: ReconstructedFrame
     seconds: float
-    T_corrected_world: Float64 | None = None
     loops: DriveLoops | None = None
     prior: UsedPrior | None = None
+    threads: int = 1
 
     def __repr__(self) -> str:
         trusted = int(self.trusted.sum())
         return f"MappedSequence({self.trajectory}, {trusted} of them trusted, {self.seconds:.4g} s)"
 
     @property
-    def path_m(self) -> Float64:
-        """float64 (N, 3), positions of the camera, map axes."""
-        return apply(self.T_map_world, self.trajectory.positions_m)
+    def session(self) -> Session:
+        """What the map keeps of the drive."""
+        return self.map.first
+
+    @property
+    def camera(self) -> RectifiedCamera:
+        """The rectified camera."""
+        return self.session.camera
+
+    @property
+    def T_map_world(self) -> Float64:
+        """float64 (4, 4), from world to map axes."""
+        return self.session.T_map_world
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Pose of the left camera in each frame, after loop closure."""
+        return self.session.trajectory
+
+    @property
+    def health(self) -> tuple[OdometryHealth, ...]:
+        """Health of each pose."""
+        return self.session.health
 
     @property
     def trusted(self) -> Bool:
         """bool (N,), which poses are to be trusted."""
-        return trusted_poses(self.health)
+        return self.session.trusted
+
+    @property
+    def path_m(self) -> Float64:
+        """float64 (N, 3), positions of the camera, map axes."""
+        return apply(self.T_map_world, self.trajectory.positions_m)
 
     @cached_property
+    def placed(self) -> PlacedMap:
+        """The map in tiles, from which its products are made."""
+        return place_map(self.map, self.config, self.threads)
+
+    @property
     def tiles(self) -> Tiles:
         """Fused cloud and occupancy, tile by tile."""
-        tiles = Tiles.of_submaps(
-            self.submaps, self.config, self.T_map_world, self.T_corrected_world
-        )
-        return tiles.with_looks(self.looks)
-
-    @cached_property
-    def looks(self) -> Looks | None:
-        """What each frame saw, from its rays; None where they were not kept."""
-        T_map_camera = self.T_map_world @ self.trajectory.T_world_camera
-        return looks_of([(self.session, T_map_camera, ())], self.config.occupancy)
+        return self.placed.tiles
 
     @cached_property
     def cloud(self) -> PointCloud:
@@ -115,30 +121,6 @@ class MappedSequence:
     def expected_drift(self) -> ExpectedDrift | None:
         """How far the path may be off; None where no motion was measured."""
         return expected_drift(self.trajectory, self.health, self.camera)
-
-    def corrected(self, T_corrected_world: Float64) -> MappedSequence:
-        """Return the drive with each submap and its part of the path moved rigidly.
-
-        Args:
-            T_corrected_world: float64 (S, 4, 4), one correction per submap.
-        """
-        entries = self.submaps.entries
-        of_frame = np.repeat(np.arange(len(entries)), [entry.frames for entry in entries])
-        poses = T_corrected_world[of_frame] @ self.trajectory.T_world_camera
-        return replace(
-            self,
-            trajectory=replace(self.trajectory, T_world_camera=poses),
-            T_corrected_world=T_corrected_world,
-        )
-
-    def closed(self, loops: DriveLoops) -> MappedSequence:
-        """Return the drive after loop closure: the corrected path, and submaps that follow it."""
-        return replace(
-            self,
-            trajectory=loops.closure.trajectory,
-            T_corrected_world=loops.submap_corrections(self.submaps.entries),
-            loops=loops,
-        )
 
 
 def map_sequence(
@@ -192,28 +174,28 @@ def map_sequence(
     finally:
         drive.stop()
         progress.on_finish()
-    return replace(_mapped(drive, source, reconstructor), prior=used)
+    return _mapped(drive, source, reconstructor, work, used)
 
 
 def _mapped(
-    drive: Drive, source: StereoSource, reconstructor: FrameReconstructor
+    drive: Drive,
+    source: StereoSource,
+    reconstructor: FrameReconstructor,
+    work: Workspace,
+    prior: UsedPrior | None,
 ) -> MappedSequence:
     """Complete a drive."""
     drive.finish()
     session = drive.session
-    mapped = MappedSequence(
-        trajectory=session.odometry,
-        health=session.health,
-        session=session,
-        submaps=session.submaps,
+    return MappedSequence(
+        map=work.map,
         config=drive.config,
-        T_map_world=session.T_map_world,
-        camera=reconstructor.camera,
         sample=drive.sample or _sample_again(len(session), source, reconstructor),
         seconds=drive.seconds,
+        loops=drive.close_loops(session.odometry),
+        prior=prior,
+        threads=work.threads or 1,
     )
-    loops = drive.close_loops(mapped.trajectory)
-    return mapped if loops is None else mapped.closed(loops)
 
 
 def _sample_again(

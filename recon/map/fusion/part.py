@@ -22,8 +22,15 @@ KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")
 PRECISE_SIGMA_M: Final = 0.08
 """Voxels at least this precise need one frame less."""
 
+_PLACED: Final = slice(0, 4)
 _OFFSET: Final = slice(1, 4)
 _TURNED: Final = slice(4 + NORMAL.start, 4 + NORMAL.stop)
+_PLACE_BITS: Final = 12
+"""Of weights and offsets: the mean of a voxel of 0.1 m moves by some µm at most."""
+_VALUE_BITS: Final = 8
+"""Of colours, normals and the rest: half a level of 255, a tenth of a degree."""
+_INFORMATION_BITS: Final = 16
+"""It decides which voxels are precise enough to be exported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +71,13 @@ class FusedPart:
             self.known,
         )
 
+    def rounded(self) -> FusedPart:
+        """Return the sums to as many digits as they mean something, so that they compress."""
+        sums = self.sums.copy()
+        sums[:, _PLACED] = _rounded(sums[:, _PLACED], _PLACE_BITS)
+        sums[:, _PLACED.stop :] = _rounded(sums[:, _PLACED.stop :], _VALUE_BITS)
+        return replace(self, sums=sums, information=_rounded(self.information, _INFORMATION_BITS))
+
     def to_tree(self) -> dict[str, Any]:
         """Return everything, as a tree of arrays and plain values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
@@ -87,11 +101,6 @@ class FusedPart:
         sums[:, _OFFSET] = self.sums[:, :1] * (points - (cells + 0.5) * voxel_m)
         sums[:, _TURNED] = rotate(T_new_world, sums[:, _TURNED])
         return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
-
-    def moved_keys(self, T_new_world: Float64, voxel_m: float) -> NDArray[np.int64]:
-        """Return int64 (N,), packed cell of each row after a rigid motion; rows may share one."""
-        points = apply(T_new_world, self.points(voxel_m))
-        return voxels.pack_keys(np.floor(points / voxel_m).astype(np.int64))
 
     def cloud(self, voxel_m: float, least: int) -> PointCloud:
         """Return one point per voxel that enough frames saw.
@@ -180,6 +189,14 @@ def _merged(part: FusedPart) -> FusedPart:
         part.known,
     )
     return merged.select(np.argsort(order[begin], kind="stable"))
+
+
+def _rounded(values: Float32, bits: int) -> Float32:
+    """Return numbers with fewer bits behind the point of their mantissa; the rest is zero."""
+    drop = 23 - bits
+    half = np.int32(1 << (drop - 1))
+    whole = np.ascontiguousarray(values).view(np.int32) + half
+    return np.asarray((whole >> drop << drop).view(np.float32))
 
 
 def _unit(vectors: Float32) -> Float32:

@@ -71,7 +71,7 @@ class _Part:
         with reading(self.session.where):
             fusion = self.session.info.config["fusion"]
             voxel_m, least = float(fusion["voxel_m"]), int(fusion["min_count"])
-        fused = self.session.submaps.get(self.index).fused
+        fused = self.session.submaps[self.index].fused
         cloud = fused.cloud(voxel_m, min(least, len(self.session)))
         return apply(self.T_map_submap, cloud.xyz.astype(np.float64))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from recon.map.store.session import Session
 from recon.map.store.submaps import Submaps
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
+from recon.run.lookahead import side_by_side
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,27 +48,31 @@ def settings_of(session: Session) -> DriveSettings:
     return DriveSettings.parse(config, where=session.where)
 
 
-def place_map(map_: Map, settings: DriveSettings, *, fuse: bool = True) -> PlacedMap:
-    """Cut the linked drives of a finished map into tiles, with occupancy made from their rays.
+def place_map(map_: Map, settings: DriveSettings, threads: int = 1) -> PlacedMap:
+    """Cut the linked drives of a map into tiles.
+
+    Occupancy that the drive kept is taken where it was made with these settings; else it is made
+    from its rays. A map without rays has a cloud, and no occupancy.
 
     Args:
         map_: The map.
         settings: The settings of its products.
-        fuse: Make the cloud; else it is put into the tiles as it was written.
+        threads: Submaps whose rays are cast at a time. Changes no result.
 
     Raises:
-        FormatError: A drive kept no rays, or the map is damaged.
+        FormatError: The map is damaged, or some of its drives kept no rays.
         SettingsError: The settings need finer or longer rays than were kept.
         OutputError: There is no room for the tiles.
     """
-    placed, made = PlacedSubmaps(map_, settings), _kept_once(settings)
-    for number in range(len(placed)):
-        submap = placed[number]
-        made.add(replace(submap, index=number, first_frame=made.frames))
+    placed = PlacedSubmaps(map_, settings)
     tiles = Tiles.of_submaps(
-        made, settings, map_.first.T_map_world, placed.corrections, drives=placed.drives, fuse=fuse
+        placed if placed.ready else _made_once(placed, settings, threads),
+        settings,
+        map_.first.T_map_world,
+        placed.corrections,
+        drives=placed.drives,
     )
-    return with_path(map_, tiles.with_looks(_looks(map_, settings)))
+    return with_path(map_, tiles.with_looks(looks_in(map_, settings)))
 
 
 class PlacedSubmaps:
@@ -82,17 +87,19 @@ class PlacedSubmaps:
         settings: How occupancy is made.
 
     Raises:
-        FormatError: A drive kept no rays, or the map is damaged.
+        FormatError: The map is damaged, or some of its drives kept no rays.
         SettingsError: The settings need finer or longer rays than were kept.
 
     Attributes:
         drives: Number of submaps of each drive.
         corrections: float64 (S, 4, 4), what is still to be applied to each; None = nothing.
+        ready: Whether they are read as they are, without a ray being cast.
     """
 
     def __init__(self, map_: Map, settings: DriveSettings) -> None:
         sessions = map_.linked
-        for session in sessions:
+        self.ready = len(sessions) == 1 and not _to_be_cast(sessions[0], settings)
+        for session in [] if self.ready else sessions:
             check_rays(session, settings)
         self._settings = settings
         self._apart = [_without_place(map_, session) for session in sessions]
@@ -100,13 +107,17 @@ class PlacedSubmaps:
         alone = len(sessions) == 1
         self.corrections = sessions[0].corrections() if alone else None
         self._parts = (
-            [_alone(sessions[0], settings)]
+            [(sessions[0].submaps if self.ready else CastSubmaps(sessions[0], settings), None)]
             if alone
             else [_beside(map_, session, settings) for session in sessions]
         )
 
     def __len__(self) -> int:
         return sum(self.drives)
+
+    def __iter__(self) -> Iterator[Submap]:
+        """Return the submaps in order, read one at a time."""
+        return map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, number: int) -> Submap:
         """Return a submap by its number among those of all drives.
@@ -116,8 +127,8 @@ class PlacedSubmaps:
         """
         drive = int(np.searchsorted(np.cumsum(self.drives), number, side="right"))
         own = number - sum(self.drives[:drive])
-        cast, T = self._parts[drive]
-        submap = cast[own]
+        submaps, T = self._parts[drive]
+        submap = submaps[own]
         frames = range(submap.first_frame, submap.first_frame + submap.frames)
         if not self._apart[drive].isdisjoint(frames):
             return replace(submap, fused=submap.fused.select(np.zeros(0, np.intp)))
@@ -135,14 +146,29 @@ def with_path(map_: Map, tiles: Tiles) -> PlacedMap:
     return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
 
 
-def _kept_once(settings: DriveSettings) -> Submaps:
-    """Return room for submaps that may be cut several times, and are slow to make."""
-    return Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
+def has_occupancy(map_: Map) -> bool:
+    """Return whether a map knows what is free, or can find it out from its rays."""
+    first = map_.first
+    return first.ray_frames > 0 or any(entry.cells for entry in first.submaps.entries)
 
 
-def _alone(session: Session, settings: DriveSettings) -> tuple[CastSubmaps, Float64 | None]:
-    """Return the submaps of the only drive, none of which is moved."""
-    return CastSubmaps(session, settings), None
+def _to_be_cast(session: Session, settings: DriveSettings) -> bool:
+    """Return whether the occupancy of the only drive of a map is made from its rays.
+
+    One that is being mapped has that of its own settings; a finished one kept rays alone, if any.
+    """
+    if not any(entry.cells for entry in session.submaps.entries):
+        return session.ray_frames > 0
+    made, wanted = settings_of(session).occupancy, settings.occupancy
+    return made.model_copy(update={"keep_rays": wanted.keep_rays}) != wanted
+
+
+def _made_once(placed: PlacedSubmaps, settings: DriveSettings, threads: int) -> Submaps:
+    """Return submaps that may be cut several times, and are slow to make, in a temporary store."""
+    made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
+    for submap in side_by_side(placed.__getitem__, range(len(placed)), threads=threads):
+        made.add(replace(submap, index=len(made), first_frame=made.frames))
+    return made
 
 
 def _beside(map_: Map, session: Session, settings: DriveSettings) -> tuple[CastSubmaps, Float64]:
@@ -155,8 +181,8 @@ def _beside(map_: Map, session: Session, settings: DriveSettings) -> tuple[CastS
     return CastSubmaps(session, settings, map_.first.T_map_world, poses, without), moves
 
 
-def _looks(map_: Map, settings: DriveSettings) -> Looks | None:
-    """Return what single frames of the linked drives saw, where they lie in the map."""
+def looks_in(map_: Map, settings: DriveSettings) -> Looks | None:
+    """Return what single frames of the linked drives saw, where they lie; None = not known."""
     return looks_of(
         (
             (s, s.T_map_world @ s.trajectory.T_world_camera, _no_evidence(map_, s))

@@ -1,8 +1,8 @@
 """The tiles of a finished map, made by several processes that share files.
 
-First each cuts some submaps into tiles, into a file of its own; then each makes the voxels of some
-tiles from all these files, into another one. What comes of it is what one process makes: parts are
-numbered by submap, and joined in that order wherever that is done.
+First each cuts some submaps into tiles, into a file of its own; then each makes voxels and points
+of some tiles from all these files, into another one. What comes of it is what one process makes:
+parts are numbered by submap, and joined in that order wherever that is done.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Final
 from recon.core.errors import MappingError
 from recon.core.values.arrays import Float64
 from recon.map.cut import Cutter
-from recon.map.sessions.placed import PlacedMap, PlacedSubmaps, with_path
+from recon.map.sessions.placed import PlacedMap, PlacedSubmaps, looks_in, with_path
 from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
 from recon.map.store.tile_parts import TileKey, TileParts
@@ -50,18 +50,20 @@ class SubmapTask:
 
 @dataclass(frozen=True, eq=False)
 class TileTask:
-    """Tiles whose voxels are to be made.
+    """Tiles whose content is to be made.
 
     Attributes:
+        map: File of the map.
         parts: Files with what all submaps observed, in order.
         settings: The settings of the products.
         T_map_world: float64 (4, 4).
         halvings: How often tiles are halved.
         drives: Number of submaps of each drive.
         keys: The tiles.
-        file: Where their voxels go.
+        file: Where their content goes.
     """
 
+    map: Path
     parts: tuple[Path, ...]
     settings: DriveSettings
     T_map_world: Float64
@@ -74,7 +76,7 @@ class TileTask:
 def place_map_on(
     map_: Map, settings: DriveSettings, folder: Path, each: Each, workers: int
 ) -> PlacedMap:
-    """Do what `place_map` does without a cloud, on several processes.
+    """Do what `place_map` does, and make all tiles, on several processes.
 
     Args:
         map_: The map, in a file.
@@ -91,6 +93,7 @@ def place_map_on(
     """
     if map_.store.path is None:
         raise MappingError("other processes cannot read a temporary map")
+    file = map_.store.path.resolve()
     placed, halvings, tiles = PlacedSubmaps(map_, settings), -1, None
     T_map_world, drives = map_.first.T_map_world, tuple(placed.drives)
     folder.mkdir(parents=True, exist_ok=True)
@@ -101,22 +104,22 @@ def place_map_on(
         each(
             cut_submaps,
             [
-                SubmapTask(map_.store.path.resolve(), settings, halvings, share, file)
-                for share, file in zip(shares, parts, strict=True)
+                SubmapTask(file, settings, halvings, share, part)
+                for share, part in zip(shares, parts, strict=True)
             ],
         )
         tiles = Tiles.of_files(parts, settings, T_map_world, halvings=halvings, drives=drives)
     groups = _shares([tile.key for tile in tiles], workers)
     files = [folder / f"tiles-{n}" for n in range(len(groups))]
     each(
-        make_voxels,
+        make_tiles,
         [
-            TileTask(parts, settings, T_map_world, halvings, drives, tuple(keys), file)
-            for keys, file in zip(groups, files, strict=True)
+            TileTask(file, parts, settings, T_map_world, halvings, drives, tuple(keys), made)
+            for keys, made in zip(groups, files, strict=True)
         ],
     )
     tiles.adopt(files)
-    return with_path(map_, tiles)
+    return with_path(map_, tiles.with_looks(looks_in(map_, settings)))
 
 
 def cut_submaps(task: SubmapTask) -> None:
@@ -131,13 +134,12 @@ def cut_submaps(task: SubmapTask) -> None:
             parts,
             None if T is None else T[task.numbers.start : task.numbers.stop],
             first=task.numbers.start,
-            fuse=False,
         )
         parts.save(cut.to_tree())
 
 
-def make_voxels(task: TileTask) -> None:
-    """Make the voxels of some tiles, and find the floors in them."""
+def make_tiles(task: TileTask) -> None:
+    """Make the voxels and points of some tiles, and find the floors in them."""
     tiles = Tiles.of_files(
         task.parts,
         task.settings,
@@ -147,8 +149,11 @@ def make_voxels(task: TileTask) -> None:
         path=task.file,
     )
     if tiles is not None:  # as known when the task was made
-        for key in task.keys:
-            tiles.make_voxels(key)
+        with closing(Map.open(task.map)) as map_:
+            tiles.with_looks(looks_in(map_, task.settings))
+            for key in task.keys:
+                tiles.make_voxels(key)
+                tiles.cloud(key)
         tiles.save()
 
 

@@ -1,4 +1,4 @@
-"""Occupancy of a finished drive made again, from the rays that its map kept."""
+"""Occupancy of a drive, made again from the rays that its map kept."""
 
 from __future__ import annotations
 
@@ -13,16 +13,13 @@ from recon.core.values.arrays import Float64
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy.looks import Looks
 from recon.map.settings import DriveSettings
-from recon.map.store.records import Store
 from recon.map.store.session import Session
-from recon.map.store.submaps import Submaps
 from recon.map.submaps import Submap
-from recon.run.lookahead import side_by_side
 
 
 @dataclass(frozen=True, eq=False)
 class CastSubmaps:
-    """The submaps of a finished drive, each with occupancy made from its rays when it is read.
+    """The submaps of a drive, each with occupancy made from its rays when it is read.
 
     Attributes:
         session: The drive.
@@ -52,7 +49,7 @@ class CastSubmaps:
             FormatError: The map is damaged.
             MappingError: A ray would spoil the map.
         """
-        session, kept = self.session, self.session.submaps.get(number)
+        session, kept = self.session, self.session.submaps[number]
         T_map_world = session.T_map_world if self.T_map_world is None else self.T_map_world
         poses = self.T_world_camera
         poses = session.odometry.T_world_camera if poses is None else poses
@@ -89,28 +86,6 @@ def looks_of(
         return session.rays(frame)[0]
 
     return Looks(settings, np.concatenate(poses), read)
-
-
-def with_occupancy(session: Session, settings: DriveSettings, *, threads: int = 1) -> Submaps:
-    """Return the submaps of a finished drive in a temporary store, with occupancy from its rays.
-
-    Args:
-        session: The drive.
-        settings: How to make it.
-        threads: Submaps made at a time. Changes no result.
-
-    Raises:
-        FormatError: The map is damaged.
-        MappingError: A ray would spoil the map.
-    """
-    made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-    cast = CastSubmaps(session, settings)
-    read, numbers = cast.__getitem__, range(len(cast))
-    for submap in (
-        map(read, numbers) if threads == 1 else side_by_side(read, numbers, threads=threads)
-    ):
-        made.add(submap)
-    return made
 
 
 def check_rays(session: Session, settings: DriveSettings) -> None:

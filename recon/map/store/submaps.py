@@ -101,7 +101,7 @@ class Submaps:
         self.store.put(ENTRY, key, asdict(entry))
         self._entries.append(entry)
 
-    def get(self, index: int) -> Submap:
+    def __getitem__(self, index: int) -> Submap:
         """Return a submap, read from the map: it is large, and used once.
 
         Raises:
@@ -114,4 +114,4 @@ class Submaps:
 
     def __iter__(self) -> Iterator[Submap]:
         """Return the submaps in order, read one at a time."""
-        return map(self.get, range(len(self)))
+        return map(self.__getitem__, range(len(self)))

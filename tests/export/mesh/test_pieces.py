@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
-import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.mesh import run_mesh
-from recon.core.errors import FormatError, MeshingError, OutputError, SettingsError
+from recon.core.errors import MeshingError, OutputError
 from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
 from recon.export.mesh.cut import Plane
 from recon.export.mesh.pieces import export_mesh
@@ -23,7 +18,6 @@ from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
-from tests.scenery.octomaps import write_octomap
 
 STEP_M = 0.1
 CONFIG = load_config(None, ["submaps.tile_m=6.4"])
@@ -175,91 +169,6 @@ def test_a_store_without_a_surface_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(MeshingError, match="no part of the map gives a surface"):
         written(Tiles(CONFIG, np.eye(4)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    return mapped_street(tmp_path / "run")
-
-
-def mapped_street(folder: Path) -> Path:
-    """The folder of a run with a map of the street, and its OctoMap."""
-    write_ply(folder / "map" / "cloud.ply", street())
-    keys = np.unique(np.floor(street().xyz / 0.2).astype(np.int32), axis=0)
-    voxels = OccupancyVoxels(keys, np.full(len(keys), 2, np.float32), 0.2)
-    write_octomap(folder / "map" / "octomap", voxels)
-    (folder / "config.yaml").write_text("mesh: {tile_m: 8.0}\n")
-    record = {"command": "map", "T_map_world": np.eye(4).tolist()}
-    (folder / "run.json").write_text(json.dumps(record))
-    return folder
-
-
-def mesh_of(run: Path, *settings: str) -> dict[str, Any]:
-    # What is written is asked, not how fine it is.
-    config = load_config(None, ["mesh.tile_m=8", "mesh.max_depth=5", *settings])
-    return run_mesh(run, config, out=run.parent / "mesh", formats=("ply", "glb"))
-
-
-@pytest.fixture(scope="module")
-def meshed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """A run, beside it what `recon mesh` made of it, and its summary; not to be changed."""
-    run = mapped_street(tmp_path_factory.mktemp("meshed") / "run")
-    return run, mesh_of(run)
-
-
-def test_the_map_of_a_run_is_meshed_with_its_free_space(
-    meshed: tuple[Path, dict[str, Any]],
-) -> None:
-    run, summary = meshed
-    assert summary["tiles"] == 2
-    assert summary["warnings"] == []
-    folder = run.parent / "mesh" / "mesh"
-    assert len(read_mesh(folder / "mesh.glb").faces) == summary["faces"]
-    layers = re.findall(r'filename="(.*?)"', (folder / "mesh.mlp").read_text())
-    assert layers == ["tiles/tile_0_0.ply", "tiles/tile_1_0.ply", "cloud.ply"]
-    assert all((folder / str(layer)).is_file() for layer in layers)
-
-
-def test_one_tile_is_the_mesh_itself(run: Path) -> None:
-    summary = mesh_of(run, "mesh.tile_m=100")
-    assert summary["tiles"] == 1
-    folder = run.parent / "mesh" / "mesh"
-    layers = re.findall(r'filename="(.*?)"', (folder / "mesh.mlp").read_text())
-    assert layers == ["mesh.ply", "cloud.ply"]
-    assert sorted(p.name for p in folder.iterdir() if p.is_file()) == [
-        "cloud.ply", "mesh.glb", "mesh.mlp", "mesh.ply",
-    ]  # fmt: skip
-
-
-def test_a_run_without_octomap_is_meshed_with_a_warning(run: Path) -> None:
-    (run / "map" / "octomap.ot").unlink()
-    assert "free space is not known" in mesh_of(run)["warnings"][0]
-
-
-def test_the_cloud_of_a_run_is_taken_as_it_is(meshed: tuple[Path, dict[str, Any]]) -> None:
-    run, summary = meshed
-    assert summary["points"] == len(street())
-    copied = run.parent / "mesh" / "mesh" / "cloud.ply"
-    assert copied.read_bytes() == (run / "map" / "cloud.ply").read_bytes()
-
-
-def test_a_damaged_map_leaves_the_earlier_mesh(
-    meshed: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
-    shutil.copytree(meshed[0].parent, tmp_path, dirs_exist_ok=True)
-    run, out = tmp_path / "run", tmp_path / "mesh"
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    whole = (run / "map" / "octomap.ot").read_bytes()
-    (run / "map" / "octomap.ot").write_bytes(whole[:-5])
-    with pytest.raises(FormatError, match=r"octomap\.ot: the OctoMap is truncated"):
-        mesh_of(run)
-    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-
-
-def test_the_run_itself_is_never_replaced(run: Path) -> None:
-    with pytest.raises(SettingsError, match="replace the run"):
-        run_mesh(run, load_config(None, []), out=run)
-    assert (run / "map" / "cloud.ply").is_file()
 
 
 def test_a_folder_that_cannot_be_written_is_reported(store: Tiles, tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ from recon.map.drive import drive_loops
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
-from recon.map.store.submaps import SubmapEntry
 from recon.places import drift
 from recon.places.closure import close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
@@ -123,16 +122,6 @@ def test_figures_say_what_was_closed(closed):
     assert closed.warnings() == []
 
 
-def test_submaps_move_with_their_middle_frames(closed):
-    entries = [SubmapEntry(0, 0, 30, 0, 0), SubmapEntry(1, 30, 38, 0, 0)]
-
-    corrections = closed.submap_corrections(entries)
-    assert corrections is not None
-    for T, middle in zip(corrections, (15, 49), strict=True):
-        old = closed.odometry.T_world_camera[middle]
-        assert np.allclose(T @ old, closed.closure.trajectory.T_world_camera[middle], atol=1e-9)
-
-
 def test_a_drive_without_loops_stays_as_it_is(frames):
     path = _circle(0.01)
 
@@ -140,7 +129,6 @@ def test_a_drive_without_loops_stays_as_it_is(frames):
         Trajectory(path.T_world_camera[:40], path.timestamps_s[:40])
     )
     assert loops.closure.trajectory is loops.odometry
-    assert loops.submap_corrections([SubmapEntry(0, 0, 40, 0, 0)]) is None
 
 
 @pytest.mark.parametrize(("checkpoint", "killed"), [(30, 30), (30, 35), (64, 67)])

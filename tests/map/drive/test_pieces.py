@@ -76,7 +76,7 @@ def test_the_path_has_every_frame_once_and_is_that_of_one_run(
     whole: MappedSequence, joined: MappedSequence
 ) -> None:
     np.testing.assert_array_equal(joined.trajectory.timestamps_s, whole.trajectory.timestamps_s)
-    assert joined.submaps.frames == len(joined.health) == STREET.frames
+    assert joined.session.submaps.frames == len(joined.health) == STREET.frames
     # The first piece is the drive itself; behind it only the odometry has begun elsewhere.
     poses = joined.trajectory.T_world_camera
     np.testing.assert_array_equal(poses[:10], whole.trajectory.T_world_camera[:10])

@@ -56,6 +56,7 @@ def assert_same(made: PlacedMap, expected: PlacedMap) -> None:
         ):
             np.testing.assert_array_equal(one.keys, other.keys)
             np.testing.assert_array_equal(one.log_odds, other.log_odds)
+        np.testing.assert_array_equal(tile.cloud.xyz, others.cloud(tile.key).xyz)
         bounds = tiles.bounds(tile.key)
         np.testing.assert_array_equal(tiles.floors_in(bounds), others.floors_in(bounds))
 
@@ -67,7 +68,7 @@ def test_tiles_are_the_same_however_many_processes_make_them(
     config = load_config(None, SETTINGS)
     with Map.open(file) as map_:
         made = place_map_on(map_, config, tmp_path / "tiles", shuffled, workers)
-        assert_same(made, place_map(map_, config, fuse=False))
+        assert_same(made, place_map(map_, config))
 
 
 def test_tiles_are_halved_for_all_where_one_is_too_large(file: Path, tmp_path: Path) -> None:
@@ -77,8 +78,8 @@ def test_tiles_are_halved_for_all_where_one_is_too_large(file: Path, tmp_path: P
     with Map.open(file) as map_, pytest.MonkeyPatch.context() as patch:
         patch.setattr(type(memory), "check", lambda self, where: None)
         made = place_map_on(map_, tight, tmp_path / "tiles", shuffled, 2)
-        assert made.tiles.edge_cells < place_map(map_, config, fuse=False).tiles.edge_cells
-        assert_same(made, place_map(map_, tight, fuse=False))
+        assert made.tiles.edge_cells < place_map(map_, config).tiles.edge_cells
+        assert_same(made, place_map(map_, tight))
 
 
 def test_a_temporary_map_is_refused(tmp_path: Path) -> None:

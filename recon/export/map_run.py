@@ -14,9 +14,12 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
+<<<<<<< HEAD:recon/map/drive/map_run.py
 from recon.core.words import counted
+=======
+from recon.export.make import Products
+>>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share):recon/export/map_run.py
 from recon.map.drive.sequence import MappedSequence
-from recon.map.ground.axes import base_axes
 from recon.map.settings import DriveSettings
 from recon.run.summary import plain
 
@@ -29,11 +32,7 @@ class MapRun:
         name: Display name of the source.
         config: The configuration.
         mapped: Trajectory, health, fused cloud, voxels.
-        cloud: Even sample of the fused cloud; all points of a small one. Frame ``map``.
-        grid: The flat grid.
-        camera_height_m: Height of the camera above the ground; None = unknown, or not steady.
-        mesh: The surface in map axes, or None if none was requested, none could be made, or it
-            does not fit in memory.
+        made: What was made of the map.
         truth: Ground truth of path and surface, as far as the source knows it.
         metrics: Errors against the true path, or None without one.
         map_metrics: Errors against the true surface, or None without one.
@@ -45,16 +44,28 @@ class MapRun:
     name: str
     config: DriveSettings
     mapped: MappedSequence
-    cloud: PointCloud
-    grid: OccupancyGrid
-    camera_height_m: float | None
-    mesh: TriangleMesh | None
+    made: Products
     truth: SequenceTruth | None
     metrics: TrajectoryMetrics | None
     map_metrics: MapMetrics | None
     occupancy_metrics: OccupancyMetrics | None
     warnings: tuple[str, ...]
     summary: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def cloud(self) -> PointCloud:
+        """Even sample of the fused cloud; all points of a small one. Frame ``map``."""
+        return self.made.cloud
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The flat grid."""
+        return self.made.grid
+
+    @property
+    def mesh(self) -> TriangleMesh | None:
+        """The surface in map axes; None = not wanted, not possible, or too large for memory."""
+        return self.made.mesh
 
     def __repr__(self) -> str:
         made = f"{self.mapped}, {self.grid}, {self.mesh}"
@@ -81,8 +92,8 @@ class MapRun:
             "focal_px": mapped.camera.focal_px,
             "field_of_view_deg": mapped.camera.field_of_view_deg,
             "T_map_world": mapped.T_map_world.tolist(),
-            "camera_height_m": self.camera_height_m,
-            "T_base_camera": base_axes(mapped.T_map_world, self.camera_height_m).tolist(),
+            "faces": 0,
+            **self.made.figures,
             "warnings": list(self.warnings),
             **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
             **{name: plain(known) for name, known in errors.items() if known is not None},

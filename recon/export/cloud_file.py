@@ -1,0 +1,67 @@
+"""A cloud in a file, such as that of a pair: copied, and meshed in one piece."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from shutil import copyfile
+from typing import Any
+
+from recon.core.values import RectifiedCamera
+from recon.core.values.cloud import Frame
+from recon.export.mesh.pieces import LAYER, WHOLE, in_other_formats
+from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
+from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
+from recon.io.atomic import atomic_path
+from recon.io.files import reading
+from recon.io.models.mesh import write_mesh
+from recon.io.models.mlp import write_mlp
+from recon.io.models.ply import read_ply, write_ply
+from recon.run.run import Run
+
+
+def mesh_cloud(
+    path: Path,
+    camera: RectifiedCamera | None,
+    settings: MeshSettings,
+    run: Run,
+    formats: Sequence[str] = ("ply",),
+) -> dict[str, Any]:
+    """Mesh a cloud file in one piece, as its camera saw it if it is that of a pair.
+
+    Returns:
+        The figures of the mesh.
+
+    Raises:
+        ReconError: The cloud cannot be read or gives no surface, or a file cannot be written.
+    """
+    with run.stage("read"):
+        cloud = read_ply(path)
+        write_ply(run.path(LAYER), cloud)
+    with run.stage("mesh"):
+        if camera is None:
+            mesh, coverage = reconstruct_mesh(cloud, settings), None
+        else:
+            mesh = reconstruct_view(cloud, camera, settings)
+            coverage = mesh_coverage(mesh, cloud)
+    write_mesh(run.path(WHOLE), mesh)
+    frame: Frame | None = None if camera is None else "camera"
+    write_mlp(run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": run.path(LAYER)}, frame)
+    in_other_formats(run, formats, frame)
+    figures = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    if coverage is None:
+        return {**figures, "warnings": []}
+    return {**figures, "mesh_coverage": coverage, "warnings": list(check_coverage(coverage))}
+
+
+def copy_file(file: Path, target: Path) -> None:
+    """Copy a file, atomically.
+
+    Raises:
+        FormatError: It cannot be read.
+        OutputError: The copy cannot be written.
+    """
+    with reading(file):
+        file.stat()
+    with atomic_path(target) as temporary:
+        copyfile(file, temporary)

@@ -1,0 +1,132 @@
+"""All that leaves a map: the table of its products, and the loop that makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from recon.core.errors import MeshingError, SettingsError
+from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
+from recon.export.cloud import cloud_product
+from recon.export.grid import grid_product
+from recon.export.mesh.pieces import mesh_product
+from recon.export.octomap import octomap_product
+from recon.export.product import Made, Order, Product
+from recon.export.survey import survey_product
+from recon.map.sessions.placed import has_occupancy
+from recon.map.store.cast_submaps import check_rays
+
+PRODUCTS: Final[Mapping[str, Product]] = {
+    "cloud": Product(cloud_product),
+    "octomap": Product(octomap_product, needs_occupancy=True),
+    "grid": Product(grid_product, needs_occupancy=True),
+    "mesh": Product(mesh_product),
+    "las": Product(survey_product("las")),
+    "laz": Product(survey_product("laz")),
+}
+"""In the order in which they are made."""
+USUAL: Final = ("cloud", "octomap", "grid", "mesh")
+"""What is made of a map unless something else is asked for."""
+OF_A_PAIR: Final = ("cloud", "mesh")
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """What is left in memory of products whose files are written.
+
+    Attributes:
+        made: By name, those that could be made.
+        warnings: What could not be written, and what their users should know.
+    """
+
+    made: Mapping[str, Made]
+    warnings: tuple[str, ...]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Their figures for ``summary.json``."""
+        return {name: value for one in self.made.values() for name, value in one.figures.items()}
+
+    @property
+    def cloud(self) -> PointCloud:
+        """Even sample of the fused cloud, all points of a small one; frame ``map``."""
+        found: PointCloud = self.made["cloud"].value
+        return found
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The flat grid."""
+        found: OccupancyGrid = self.made["grid"].value
+        return found
+
+    @property
+    def camera_height_m(self) -> float | None:
+        """Height of the camera above the ground; None = unknown, or not steady."""
+        found: float | None = self.made["grid"].figures["camera_height_m"]
+        return found
+
+    @property
+    def mesh(self) -> TriangleMesh | None:
+        """The surface in map axes; None = not made, or too large for memory."""
+        return self.made["mesh"].value if "mesh" in self.made else None
+
+
+def make(order: Order, products: Sequence[str] = USUAL) -> Products:
+    """Make products of a map, and write them into the folder of a run.
+
+    A surface that cannot be made is a warning where something else is asked for.
+
+    Args:
+        order: The map.
+        products: Any of `PRODUCTS`.
+
+    Raises:
+        FormatError: The map kept no rays that a product is made from, or is damaged.
+        MappingError: Nothing was observed, or the height band of the grid is empty.
+        MeshingError: There is no surface, and nothing else was asked for.
+        OutputError: A file cannot be written.
+    """
+    made: dict[str, Made] = {}
+    warnings: list[str] = []
+    for name in (name for name in PRODUCTS if name in products):
+        product, run, settings = PRODUCTS[name], order.run, order.placed.tiles.config
+        if product.needs_occupancy and not has_occupancy(order.map):
+            check_rays(order.map.first, settings)
+        run.progress.on_stage(name)
+        try:
+            with run.stage(name):
+                made[name] = product.write(order)
+        except MeshingError as error:
+            if len(products) == 1:
+                raise
+            warnings.append(f"no mesh: {error}")
+        else:
+            warnings += made[name].warnings
+        settings.memory.check(name)
+    return Products(made, tuple(warnings))
+
+
+def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:
+    """Return the requested products, or the usual ones.
+
+    Raises:
+        SettingsError: One is unknown, or not possible for a run of `recon pair`.
+    """
+    possible = OF_A_PAIR if pair else (*PRODUCTS,)
+    for product in products:
+        if product not in possible:
+            unknown = product not in PRODUCTS
+            raise SettingsError(
+                "unknown product" if unknown else "a pair has no such product",
+                where="--to",
+                got=product,
+                expected=", ".join(possible),
+                hint=None if unknown else "recon map makes it of a drive",
+            )
+    return list(dict.fromkeys(products)) or (OF_A_PAIR if pair else USUAL)
+
+
+def need_rays(products: Sequence[str]) -> bool:
+    """Return whether products are made of rays, so that their cells can be others."""
+    return any(PRODUCTS[name].needs_occupancy for name in products)
