@@ -23,10 +23,10 @@ from typing import Any
 
 import checkout  # noqa: F401 - what is measured
 import psutil
-from recon.export.make import make
-from recon.export.product import Order
 
 from recon.commands.config import load_config
+from recon.export.make import make
+from recon.export.product import Order
 from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
 from recon.map.store.map import MAP_FILE, Map

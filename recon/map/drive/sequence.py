@@ -39,6 +39,8 @@ from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 class MappedSequence:
     """A drive whose map is made: the map itself, and what it cost and looked like.
 
+    What was asked for once is known after the map is closed, too.
+
     Attributes:
         map: The map, in which the drive is the only session.
         config: The configuration.
@@ -61,17 +63,17 @@ class MappedSequence:
         trusted = int(self.trusted.sum())
         return f"MappedSequence({self.trajectory}, {trusted} of them trusted, {self.seconds:.4g} s)"
 
-    @property
+    @cached_property
     def session(self) -> Session:
         """What the map keeps of the drive."""
         return self.map.first
 
-    @property
+    @cached_property
     def camera(self) -> RectifiedCamera:
         """The rectified camera."""
         return self.session.camera
 
-    @property
+    @cached_property
     def T_map_world(self) -> Float64:
         """float64 (4, 4), from world to map axes."""
         return self.session.T_map_world
