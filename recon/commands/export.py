@@ -18,13 +18,8 @@ from recon.io.models.mesh import check_mesh_formats
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.sessions.spread import place_map_on
-<<<<<<< HEAD
-from recon.run.batch.cluster import BatchOptions
-=======
 from recon.map.store.map import MAP_FILE, Map
-from recon.run.batch.cluster import connect
-from recon.run.batch.work import BatchOptions
->>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
+from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,
     MAPPED_BY,
@@ -90,18 +85,6 @@ def run_export(
     mapped = None if pair else open_run(source)
     ran = run_settings(source)
     settings = config or ran
-<<<<<<< HEAD
-    check_changes(ran, settings, (*(REMADE if from_rays(wanted) else ()), "mesh"))
-    with Run("export", out, settings, threads=threads) as run:
-        if workers is None:
-            what = Wanted(wanted, settings.mesh, formats, survey=survey)
-            return remake_map(mapped, settings, what, run)
-        with workers.connect() as cluster:
-            folder = run.state("tiles").resolve()
-            place = partial(place_map_on, folder=folder, each=cluster.each, workers=cluster.at_once)
-            what = Wanted(wanted, settings.mesh, formats, place, survey)
-            return remake_map(mapped, settings, what, run)
-=======
     if mapped is None:
         with Run(command, out, settings, threads=threads) as run:
             return _export_pair(source, settings, wanted, run, formats)
@@ -199,10 +182,9 @@ def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | 
     """Cut a map into tiles, here or on workers."""
     if workers is None:
         return place_map(map_, settings, run.threads)
-    with connect(workers.scheduler, workers.workers_here) as cluster:
+    with workers.connect() as cluster:
         folder = run.state("tiles").resolve()
         return place_map_on(map_, settings, folder, cluster.each, cluster.at_once)
->>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
 
 
 def _export_pair(

@@ -13,7 +13,7 @@ from recon.export.mesh.pieces import LAYER, WHOLE, in_other_formats
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
 from recon.io.atomic import atomic_path
-from recon.io.files import reading
+from recon.io.files import naming, reading
 from recon.io.models.mesh import write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import read_ply, write_ply
@@ -38,7 +38,7 @@ def mesh_cloud(
     with run.stage("read"):
         cloud = read_ply(path)
         write_ply(run.path(LAYER), cloud)
-    with run.stage("mesh"):
+    with run.stage("mesh"), naming(path):
         if camera is None:
             mesh, coverage = reconstruct_mesh(cloud, settings), None
         else:

@@ -14,11 +14,8 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
-<<<<<<< HEAD:recon/map/drive/map_run.py
 from recon.core.words import counted
-=======
 from recon.export.make import Products
->>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share):recon/export/map_run.py
 from recon.map.drive.sequence import MappedSequence
 from recon.map.settings import DriveSettings
 from recon.run.summary import plain

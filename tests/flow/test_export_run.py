@@ -20,13 +20,8 @@ from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.trajectory import read_tum
-<<<<<<< HEAD
-from recon.run.batch.cluster import BatchOptions, Cluster
-=======
 from recon.map.store.records import Store
-from recon.run.batch.cluster import Cluster
-from recon.run.batch.work import BatchOptions
->>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
+from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.sources.pair_input import PairInput
 from tests.hostile.refusals import assert_refused, run
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from recon.export.products import write_products
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import ReconError, SettingsError
-from recon.export.products import write_products
 from recon.map.drive.sequence import map_sequence
 from recon.map.settings import DriveSettings
 from recon.run.run import Run

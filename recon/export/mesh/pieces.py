@@ -15,12 +15,9 @@ from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32
-<<<<<<< HEAD
-from recon.core.words import counted
-=======
 from recon.core.values.cloud import Frame
+from recon.core.words import counted
 from recon.export.cloud import export_cloud
->>>>>>> c5780bc (Make every product of the map itself, by one table that all commands share)
 from recon.export.mesh.cut import Plane, cut_mesh
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.seams import close_seam, open_edges
