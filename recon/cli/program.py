@@ -40,11 +40,11 @@ def plan_jobs(listed: JobList) -> list[Job]:
     Raises:
         SettingsError: A command, an option, a setting or a name is none, or would write elsewhere.
     """
-    sets = {tuple(entry.set): entry.name for entry in reversed(listed.jobs)}
+    sets = {tuple(entry.set): entry.name for entry in reversed(listed.job)}
     for texts, name in sets.items():
         _check_settings(texts, name, listed)
-    folder = listed.folder.resolve()
-    plain = [_job(entry, folder, sets=bool(entry.set or listed.sweep)) for entry in listed.jobs]
+    folder = Path(listed.folder)
+    plain = [_job(entry, folder, sets=bool(entry.set or listed.sweep)) for entry in listed.job]
     jobs = [job for one in plain for job in _swept(one, listed)]
     check_names(job.name for job in jobs)
     return jobs

@@ -16,7 +16,7 @@ from recon.commands.piece import piece_job
 from recon.core.errors import SettingsError
 from recon.map.drive.pieces import Piece
 from recon.run.batch.job import Job
-from recon.run.batch.job_file import Entry, JobList
+from recon.run.batch.job_file import JobList
 from tests.docs.blocks import ROOT
 
 DRIVE = {"name": "a", "command": "map", "source": ["drive"]}
@@ -24,7 +24,9 @@ DRIVE = {"name": "a", "command": "map", "source": ["drive"]}
 
 def plan(*jobs: Mapping[str, Any], folder: Path = ROOT, **sweep: Sequence[Any]) -> list[Job]:
     names = {key.replace("__", "."): values for key, values in sweep.items()}
-    return plan_jobs(JobList([Entry.model_validate(job) for job in jobs], names, folder))
+    return plan_jobs(
+        JobList.model_validate({"job": [*jobs], "sweep": names, "folder": str(folder)})
+    )
 
 
 def line(folder: Path = ROOT, /, **changes: Any) -> list[str]:

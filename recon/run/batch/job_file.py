@@ -1,40 +1,19 @@
-"""The file that lists the jobs of a batch, in TOML or YAML.
-
-::
-
-    [sweep]                                  optional: every job with each of these values
-    "matching.sad.window_px" = [9, 11, 13]
-
-    [[job]]
-    name = "monday"                          the folder of its result
-    command = "map"                          any command that writes results
-    source = "drives/monday"                 or several: ["left.png", "right.png"]; none for demo
-    options = ["--no-mesh"]                  optional, like all below
-    set = ["odometry.method=visual"]
-    threads = 2
-    memory = "4G"                            of `recon map`: its --memory-limit
-    timeout_s = 3600
-    retries = 2
-
-Relative paths begin in the folder of the file.
-"""
+"""The file that lists the jobs of a batch, in TOML or YAML; docs/many-drives.md has one."""
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.settings import Settings
+from recon.core.settings import Settings, settings_error
 from recon.io.atomic import write_text
 from recon.io.files import read_text, reading
 from recon.io.toml_file import read_toml
@@ -52,6 +31,7 @@ _FILES: Final = frozenset(
 )  # fmt: skip
 """What a batch writes beside the folders of its jobs."""
 _MOST_JOBS: Final = 1_000_000
+_Value = str | bool | int | Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Entry(Settings):
@@ -75,19 +55,17 @@ class Entry(Settings):
         return [value] if isinstance(value, str) else value
 
 
-@dataclass(frozen=True)
-class JobList:
-    """What a batch is asked for.
+class JobList(Settings):
+    """What a batch is asked for: jobs, each with all combinations of the values of a sweep.
 
-    Attributes:
-        jobs: Its jobs, each with all combinations of the sweep.
-        sweep: Values by the name of the setting.
-        folder: Where relative paths begin.
+    Relative paths begin in the folder.
     """
 
-    jobs: Sequence[Entry]
-    sweep: Mapping[str, Sequence[Any]] = field(default_factory=dict)
-    folder: Path = field(default_factory=Path.cwd)
+    model_config = ConfigDict(strict=True)
+
+    job: list[Entry] = Field(min_length=1)
+    sweep: dict[str, Annotated[list[_Value], Field(min_length=1)]] = Field({})
+    folder: str = Field("")
 
     def combinations(self) -> Iterator[dict[str, Any]]:
         """Yield the settings of each combination of the sweep; one without any if there is none."""
@@ -104,7 +82,7 @@ class JobList:
             lists = {"set": [*settings, *one.set], "options": [*options, *one.options]}
             return one.model_copy(update={**lists, **missing})
 
-        return replace(self, jobs=[limited(one) for one in self.jobs])
+        return self.model_copy(update={"job": [limited(one) for one in self.job]})
 
     def write(self, folder: Path) -> None:
         """Write it into the folder of its batch.
@@ -112,9 +90,7 @@ class JobList:
         Raises:
             OutputError: The folder cannot be written.
         """
-        jobs = [one.model_dump(exclude_defaults=True) for one in self.jobs]
-        plan = {"folder": str(self.folder.resolve()), "sweep": self.sweep, "job": jobs}
-        write_text(folder / PLAN, json.dumps(plan))
+        write_text(folder / PLAN, self.model_dump_json(exclude_defaults=True))
 
 
 def read_jobs(path: Path) -> JobList:
@@ -125,18 +101,8 @@ def read_jobs(path: Path) -> JobList:
         SettingsError: A key is unknown or missing, or a value is of a wrong kind.
     """
     content = read_toml(path) if path.suffix.lower() == ".toml" else read_yaml(path)
-    return _job_list(content, path)
-
-
-def _job_list(content: Mapping[str, Any], path: Path) -> JobList:
-    _check_keys(content, ("job", "sweep", *(("folder",) if path.name == PLAN else ())), str(path))
-    listed, sweep = content.get("job"), content.get("sweep", {})
-    if not isinstance(listed, list) or not listed:
-        expected = "[[job]] with name, command, source"
-        raise SettingsError("there is no job", where=path, expected=expected)
-    _check_sweep(sweep, len(listed), str(path))
-    jobs = [_entry(one, f"{path}: job {n}") for n, one in enumerate(listed, start=1)]
-    return JobList(jobs, sweep, Path(str(content.get("folder", path.parent))))
+    folder = path.parent / str(content.get("folder", ""))
+    return _job_list({**content, "folder": str(folder.resolve())}, path)
 
 
 def read_plan(folder: Path) -> JobList:
@@ -156,6 +122,18 @@ def read_plan(folder: Path) -> JobList:
         return _job_list(content, path)
 
 
+def _job_list(content: Any, path: Path) -> JobList:
+    try:
+        listed = JobList.model_validate(content)
+    except ValidationError as error:
+        hint = f"a file has job and sweep, a job has {', '.join(Entry.model_fields)}"
+        raise settings_error(error, where=str(path)).but(hint=hint) from error
+    count = len(listed.job) * math.prod(map(len, listed.sweep.values()))
+    if count > _MOST_JOBS:
+        raise SettingsError("too many jobs", where=path, got=count)
+    return listed
+
+
 def jobs_of_sources(command: str, sources: Sequence[str]) -> JobList:
     """Return one job for each source, named by its last part.
 
@@ -167,7 +145,8 @@ def jobs_of_sources(command: str, sources: Sequence[str]) -> JobList:
     if not sources:
         raise SettingsError("there is no source", where=f"recon batch {command}")
     names = zip(_names_of(sources), sources, strict=True)
-    return JobList([Entry(name=name, command=command, source=[one]) for name, one in names])
+    jobs = [Entry(name=name, command=command, source=[one]) for name, one in names]
+    return JobList(job=jobs, folder=str(Path.cwd()))
 
 
 def check_names(names: Iterable[str]) -> None:
@@ -194,36 +173,6 @@ def name_of_swept(name: str, swept: Mapping[str, Any]) -> str:
     """Return the name of a job with swept settings."""
     ends = (f"_{key.rpartition('.')[2]}={_plain(str(value))}" for key, value in swept.items())
     return name + "".join(ends)
-
-
-def _entry(content: Any, where: str) -> Entry:
-    if not isinstance(content, Mapping):
-        raise SettingsError("job is not a table", where=where, got=type(content).__name__)
-    _check_keys(content, tuple(Entry.model_fields), where)
-    return Entry.parse(content, where=where)
-
-
-def _check_sweep(sweep: Any, jobs: int, where: str) -> None:
-    if not isinstance(sweep, Mapping) or not all(
-        isinstance(values, list) and values and all(map(_is_plain, values))
-        for values in sweep.values()
-    ):
-        expected = '"matching.sad.window_px" = [9, 11, 13]'
-        raise SettingsError("sweep is not a table of lists", where=where, expected=expected)
-    if (count := jobs * math.prod(map(len, sweep.values()))) > _MOST_JOBS:
-        raise SettingsError("too many jobs", where=where, got=count)
-
-
-def _is_plain(value: Any) -> bool:
-    return isinstance(value, str) or (isinstance(value, int | float) and math.isfinite(value))
-
-
-def _check_keys(content: Mapping[str, Any], known: Sequence[str], where: str) -> None:
-    for key in content:
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            hint, expected = f"did you mean {near[0]}?" if near else None, ", ".join(known)
-            raise SettingsError("unknown key", where=where, got=key, expected=expected, hint=hint)
 
 
 def _plain(text: str) -> str:

@@ -46,15 +46,13 @@ class JobResult:
         last: How its last try ended; None = it was not run.
         figures: Numbers of its summary by dotted name; none if it has none.
         warnings: Warnings of its summary.
-        unusual: By how many standard deviations drift or trust are worse than usual; 0 = not.
-        remark: That figure with its usual value; "" = there is none.
+        remark: The figure of drift or trust that is most unusual, if any is.
     """
 
     job: Job
     last: Outcome | None
     figures: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
-    unusual: float = 0.0
     remark: str = ""
 
     @property
@@ -158,17 +156,13 @@ def compare(results: Sequence[JobResult]) -> list[JobResult]:
     for one in results:
         key = json.dumps([one.job.command, dict(one.job.swept)], sort_keys=True, default=str)
         groups.setdefault(key, []).append(one)
-    found = {name: worst for group in groups.values() for name, worst in _worst(group)}
-    return [
-        replace(one, unusual=far, remark=remark)
-        for one in results
-        for far, remark in [found.get(one.job.name, (0.0, ""))]
-    ]
+    remarks = dict(found for group in groups.values() for found in _remarks(group))
+    return [replace(one, remark=remarks.get(one.job.name, "")) for one in results]
 
 
 def outliers_first(results: Iterable[JobResult]) -> list[JobResult]:
-    """Return failed jobs first, then the most unusual ones."""
-    return sorted(results, key=lambda one: (not one.failed, -one.unusual, one.job.name))
+    """Return failed jobs first, then unusual ones."""
+    return sorted(results, key=lambda one: (not one.failed, not one.remark, one.job.name))
 
 
 def accuracies(figures: Iterable[Mapping[str, float]]) -> list[str]:
@@ -186,8 +180,8 @@ def _flat(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, f
             yield f"{prefix}{key}", value
 
 
-def _worst(group: Sequence[JobResult]) -> Iterator[tuple[str, tuple[float, str]]]:
-    """Yield names of jobs with an unusual figure, how far it is from the usual one, and which."""
+def _remarks(group: Sequence[JobResult]) -> Iterator[tuple[str, str]]:
+    """Yield the names of jobs with an unusual figure, and which it is."""
     done = [one for one in group if one.figures]
     names = sorted(set.intersection(*(set(one.figures) for one in done))) if done else []
     compared = [name for name in names if name.rpartition(".")[2] in _LEAST_SPREAD]
@@ -198,7 +192,7 @@ def _worst(group: Sequence[JobResult]) -> Iterator[tuple[str, tuple[float, str]]
         most, name = max((far[name][number], name) for name in compared)
         if most >= _UNUSUAL:
             usual = statistics.median(each.figures[name] for each in done)
-            yield one.job.name, (most, f"{name} {one.figures[name]:.4g} (usually {usual:.4g})")
+            yield one.job.name, f"{name} {one.figures[name]:.4g} (usually {usual:.4g})"
 
 
 def _far(name: str, values: Sequence[float]) -> list[float]:

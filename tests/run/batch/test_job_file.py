@@ -37,8 +37,8 @@ def write(folder: Path, text: str, suffix: str = "toml") -> Path:
 
 def test_a_job_has_all_that_it_says(tmp_path: Path) -> None:
     listed = read_jobs(write(tmp_path, FULL))
-    assert listed.folder == tmp_path
-    monday, pair = listed.jobs
+    assert listed.folder == str(tmp_path)
+    monday, pair = listed.job
     assert (monday.name, monday.command, monday.source) == ("monday", "map", ["drives/monday"])
     assert (monday.options, monday.set) == (["--no-mesh"], ["odometry.method=visual"])
     assert (monday.threads, monday.memory, monday.timeout_s, monday.retries) == (2, "4G", 60, 0)
@@ -47,14 +47,14 @@ def test_a_job_has_all_that_it_says(tmp_path: Path) -> None:
 
 def test_yaml_says_the_same(tmp_path: Path) -> None:
     text = "job:\n- {name: monday, command: map, source: drives/monday, set: [a=1]}\n"
-    (entry,) = read_jobs(write(tmp_path, text, "yaml")).jobs
+    (entry,) = read_jobs(write(tmp_path, text, "yaml")).job
     assert (entry.name, entry.source, entry.set) == ("monday", ["drives/monday"], ["a=1"])
 
 
 def test_what_a_batch_says_stands_before_what_a_job_says(tmp_path: Path) -> None:
     limits = {"threads": 1, "memory": "2G", "timeout_s": 5.0, "retries": 4}
     listed = read_jobs(write(tmp_path, FULL)).with_limits(["x=1"], ["--poses=p"], **limits)
-    monday, pair = listed.jobs
+    monday, pair = listed.job
     assert monday.set == ["x=1", "odometry.method=visual"]
     assert monday.options == ["--poses=p", "--no-mesh"]
     assert (monday.threads, monday.memory, monday.timeout_s, monday.retries) == (2, "4G", 60, 0)
@@ -82,17 +82,17 @@ def test_a_batch_of_an_earlier_version_is_one_line(tmp_path: Path) -> None:
 
 
 def test_sources_are_named_by_their_last_part() -> None:
-    entries = jobs_of_sources("map", ["a/2011_09 x", "b/.c/"]).jobs
+    entries = jobs_of_sources("map", ["a/2011_09 x", "b/.c/"]).job
     assert [entry.name for entry in entries] == ["2011_09-x", "c"]
 
 
 def test_sources_with_one_last_part_are_named_by_more_of_their_paths() -> None:
-    entries = jobs_of_sources("map", ["robot1/monday", "Robot2/monday", "robot2/friday"]).jobs
+    entries = jobs_of_sources("map", ["robot1/monday", "Robot2/monday", "robot2/friday"]).job
     assert [entry.name for entry in entries] == ["robot1_monday", "Robot2_monday", "robot2_friday"]
     for same in (["a/x", "b/../a/x"], ["/", "/"]):
         listed = jobs_of_sources("map", same)
         with pytest.raises(SettingsError, match=r"two jobs have one name.*in a file"):
-            check_names(one.name for one in listed.jobs)
+            check_names(one.name for one in listed.job)
 
 
 def one_job(**changes: str) -> str:
@@ -108,29 +108,28 @@ NAMES = ["../a", "/a", "a/b", "..", ".hidden", "", "a\\\\b", "a b", "é", "-a", 
     [
         ("", "empty"),
         ("[[job]]\n[[job", "not a TOML"),
-        ("jobs = 3", "unknown key .*got jobs.*did you mean job"),
-        ("job = 3", "there is no job"),
-        ("job = []", "there is no job"),
-        ("job = [3]", "job 1: job is not a table"),
-        (one_job(sorce='"x"'), r"job 1: unknown key \(got sorce.*did you mean source"),
-        (one_job(swept="{}"), "unknown key .*got swept"),
-        (one_job(command=""), "job 1: setting 'command'.*required"),
-        (one_job(name=""), "job 1: setting 'name'.*required"),
-        (one_job(source="3"), "job 1: setting 'source'.*got 3"),
-        (one_job(name="3"), "'name'.*got 3"),
-        (one_job(set='"a=1"'), "'set'.*got 'a=1'"),
-        (one_job(options="[1]"), r"'options\.0'.*got 1"),
-        (one_job(threads="0"), "'threads'.*got 0"),
-        (one_job(threads="true"), "'threads'.*got True"),
-        (one_job(timeout_s='"1 h"'), "'timeout_s'.*got '1 h'"),
-        (one_job(timeout_s="nan"), "'timeout_s'.*got nan"),
-        (one_job(retries="-1"), "'retries'.*got -1"),
-        ("sweep = 3\n" + one_job(), "sweep is not a table of lists"),
-        ("[sweep]\na = 3\n" + one_job(), "sweep is not a table of lists"),
-        ("[sweep]\na = []\n" + one_job(), "sweep is not a table of lists"),
-        ("[sweep]\na = [[1]]\n" + one_job(), "sweep is not a table of lists"),
-        ("[sweep]\na = [nan]\n" + one_job(), "sweep is not a table of lists"),
-        ('folder = "/"\n' + one_job(), "unknown key .*got folder"),
+        ("jobs = 3", "'job'.*required"),
+        ("job = 3", "'job'.*got 3"),
+        ("job = []", "'job'.*at least 1"),
+        ("job = [3]", r"'job\.0'.*got 3"),
+        (one_job(sorce='"x"'), r"unknown setting 'job\.0\.sorce'; .*source"),
+        (one_job(swept="{}"), r"unknown setting 'job\.0\.swept'"),
+        (one_job(command=""), r"'job\.0\.command'.*required"),
+        (one_job(name=""), r"'job\.0\.name'.*required"),
+        (one_job(source="3"), r"'job\.0\.source'.*got 3"),
+        (one_job(name="3"), "name'.*got 3"),
+        (one_job(set='"a=1"'), "set'.*got 'a=1'"),
+        (one_job(options="[1]"), r"options\.0'.*got 1"),
+        (one_job(threads="0"), "threads'.*got 0"),
+        (one_job(threads="true"), "threads'.*got True"),
+        (one_job(timeout_s='"1 h"'), "timeout_s'.*got '1 h'"),
+        (one_job(timeout_s="nan"), "timeout_s'.*got nan"),
+        (one_job(retries="-1"), "retries'.*got -1"),
+        ("sweep = 3\n" + one_job(), "setting 'sweep"),
+        ("[sweep]\na = 3\n" + one_job(), "setting 'sweep"),
+        ("[sweep]\na = []\n" + one_job(), "setting 'sweep"),
+        ("[sweep]\na = [[1]]\n" + one_job(), "setting 'sweep"),
+        ("[sweep]\na = [nan]\n" + one_job(), "setting 'sweep"),
         (f"[sweep]\na = {[*range(1001)]}\nb = {[*range(1001)]}\n" + one_job(), "too many jobs"),
         ("job = " + "[" * 5000, "deep|not a TOML"),
     ],

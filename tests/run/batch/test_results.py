@@ -62,7 +62,7 @@ def test_jobs_of_other_commands_or_settings_are_not_compared() -> None:
         JobResult(job(f"j{n}", swept={"w": w}), DONE, {"ate_m": 10.0**w})
         for n, w in enumerate([0, 0, 0, 0, 1, 1, 1, 1])
     ]
-    assert [one.unusual for one in compare(results)] == [0.0] * 8
+    assert [one.remark for one in compare(results)] == [""] * 8
 
 
 def test_of_drives_that_differ_in_length_alone_none_is_unusual() -> None:
