@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import RectifiedCamera
+from recon.io.occupancy.octomap import read_octomap
 from recon.map.store.map import Map
 from recon.map.store.records import Store
 from tests.hostile.refusals import refusal
@@ -113,3 +115,15 @@ def test_a_record_of_very_many_rows_is_refused(kind: str, neighbours: str, map_f
         line = refusal(lambda: read_all(map_file))
     assert line is not None
     assert "claims more than it can hold" in line
+
+
+def test_an_octomap_of_few_nodes_that_cover_very_many_cells_is_refused(here: Path) -> None:
+    """Eight levels of one child each, then eight leaves of 256 cells along each side."""
+    inner = struct.pack("<fB", 0.5, 1) * 7 + struct.pack("<fB", 0.5, 255)
+    nodes = inner + struct.pack("<fB", 0.5, 0) * 8
+    header = f"# Octomap OcTree file\nid OcTree\nsize {len(nodes) // 5}\nres 0.1\ndata\n"
+    Path("claims.ot").write_bytes(header.encode() + nodes)
+    with little_memory():
+        line = refusal(lambda: read_octomap("claims.ot"))
+    assert line is not None
+    assert line.startswith("claims.ot: the OctoMap claims far more cells than it has nodes")

@@ -41,6 +41,9 @@ _NODE: Final = np.dtype([("log_odds", "<f4"), ("children", "u1")])
 _LONGEST_HEADER_LINES: Final = 100
 #: Level of the largest leaf accepted; a larger one would expand to too many cells for memory.
 _COARSEST: Final = DEPTH - 8
+_FEW_CELLS: Final = 1 << 22
+_MOST_GROWTH: Final = 64
+"""Cells for each node of a piece that is larger: a leaf of five bytes can claim 16 million."""
 
 
 def write_octomap_tiles(
@@ -216,6 +219,11 @@ def _cells(nodes: NDArray[np.void], walk: TreeWalk, resolution_m: float) -> Occu
     coarse = (leaves.levels < _COARSEST).any()
     if seen < len(nodes) or coarse or not np.isfinite(log_odds).all():
         return None
+    cells = int((1 << 3 * (DEPTH - leaves.levels.astype(np.int64))).sum())
+    if cells > max(_FEW_CELLS, _MOST_GROWTH * len(nodes)):
+        raise FormatError(
+            "the OctoMap claims far more cells than it has nodes", got=f"{cells} of {len(nodes)}"
+        )
     keys, leaf = _expand(leaves)
     return OccupancyVoxels(keys, log_odds[leaf], resolution_m)
 
