@@ -7,9 +7,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from recon.core.errors import ShapeError
 from recon.core.values import Disparity, RectifiedPair
-from recon.core.values.arrays import Float64, freeze, frozen_array
+from recon.core.values.arrays import Float64, array_in, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,16 +116,4 @@ def pose_in(state: dict[str, Any], name: str) -> Float64:
     Raises:
         ShapeError: It is something else.
     """
-    return finite_in(state, name, (4, 4))
-
-
-def finite_in(state: dict[str, Any], name: str, shape: tuple[int | None, ...]) -> Float64:
-    """Return numbers of a state: float64 of some shape, finite, writable.
-
-    Raises:
-        ShapeError: They are something else.
-    """
-    values: Float64 = state[name]
-    if not np.isfinite(frozen_array(name, values, np.float64, shape)).all():
-        raise ShapeError(f"{name} is not finite")
-    return values
+    return array_in(state, name, np.float64, (4, 4))

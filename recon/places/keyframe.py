@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.errors import ShapeError
 from recon.core.geometry.projection import depth_from_disparity, unproject
 from recon.core.keys import distinct_keys
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
@@ -76,6 +77,9 @@ class Keyframe:
         freeze(self, "uvd", np.float32, (None, 3))
         freeze(self, "descriptors", np.uint8, (len(self.uvd), _DESCRIPTOR_BYTES))
         freeze(self, "coarse", np.float32, (None, None))
+        nowhere = np.isnan(self.uvd[:, :2]).any() or np.isinf(self.uvd).any()
+        if nowhere or not self.coarse.size or np.isinf(self.coarse).any():
+            raise ShapeError("a keyframe has no disparities, infinite ones, or features nowhere")
 
     def xyz(self, camera: RectifiedCamera) -> Float64:
         """Return float64 (N, 3), the features in camera axes; NaN where the depth is unknown."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,20 @@ def freeze(instance: object, name: str, dtype: DTypeLike, shape: tuple[int | Non
     if value is not None:
         label = f"{type(instance).__name__}.{name}"
         object.__setattr__(instance, name, frozen_array(label, value, dtype, shape))
+
+
+def array_in(
+    tree: Mapping[str, Any], name: str, dtype: DTypeLike, shape: tuple[int | None, ...]
+) -> NDArray[Any]:
+    """Return an array of a tree that was read, which may be written: finite, where it is of floats.
+
+    Raises:
+        ShapeError: It is something else.
+    """
+    values: NDArray[Any] = tree[name]
+    if not np.isfinite(frozen_array(name, values, dtype, shape)).all():
+        raise ShapeError(f"{name} is not finite")
+    return values
 
 
 def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Float32:

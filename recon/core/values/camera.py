@@ -17,6 +17,16 @@ LensModel = Literal["pinhole", "fisheye"]
 LARGEST_CENTRE_OFFSET: Final = 0.25
 """Offset of a principal point from the image centre, relative to the image size, above which the
 calibration is hardly of these images: at half the calibrated size it is 0.5."""
+_FOCAL_SIZES: Final = (0.01, 1000.0)
+"""Focal lengths in sizes of an image: it sees 179 degrees with the shortest, 0.06 with the longest.
+"""
+_MOST_SIZES: Final = 100.0
+"""Distance of a principal point from the image centre, in sizes of the image, that no crop has."""
+_LARGEST_PX: Final = 1_000_000
+_BASELINE_M: Final = (1e-6, 1e4)
+"""Shorter and longer baselines than any, also in units that are not metres."""
+_MOST_DISTORTION: Final = 1e6
+"""Larger than any coefficient; those of the rational model reach hundreds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +54,12 @@ class CameraIntrinsics:
         freeze(self, "distortion", np.float64, (None,))
         if not (np.isfinite(self.matrix).all() and np.isfinite(self.distortion).all()):
             raise CalibrationError("camera matrix or distortion is not finite")
-        if min(self.matrix[0, 0], self.matrix[1, 1]) <= 0:
-            raise CalibrationError("focal length is not positive", got=f"{self.matrix[0, 0]:g} px")
+        (fx, skew, cx), (zero, fy, cy), last = self.matrix.tolist()
+        _check_view((fx, fy), (cx, cy), (self.width_px, self.height_px))
+        if abs(skew) > fx or zero != 0 or last != [0, 0, 1]:
+            raise CalibrationError("camera matrix is none of a lens", got=self.matrix.tolist())
+        if np.abs(self.distortion).max(initial=0.0) > _MOST_DISTORTION:
+            raise CalibrationError("distortion is implausible", got=self.distortion.tolist())
         if self.model == "fisheye" and self.distortion.size != 4:
             raise CalibrationError(
                 "a fisheye camera has four distortion coefficients", got=self.distortion.size
@@ -83,8 +97,7 @@ class StereoCalibration:
         # 1e-3: calibration files often print no more than six digits.
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
             raise CalibrationError("rotation of the right camera is not orthonormal")
-        if self.baseline_m <= 0:
-            raise CalibrationError("baseline is zero", got="0 m", expected="> 0 m")
+        _check_baseline(self.baseline_m)
 
     def __repr__(self) -> str:
         return f"StereoCalibration(baseline {self.baseline_m:.6g} m, {self.left}, {self.right})"
@@ -123,17 +136,10 @@ class RectifiedCamera:
         numbers = (self.focal_px, self.cx_px, self.cy_px, self.cx_right_px, self.baseline_m)
         if not all(math.isfinite(number) for number in numbers):
             raise CalibrationError("calibration holds a number that is not finite", got=numbers)
-        if self.focal_px <= 0:
-            raise CalibrationError("focal length is not positive", got=f"{self.focal_px:g} px")
-        if self.baseline_m <= 0:
-            raise CalibrationError(
-                "baseline is not positive",
-                got=f"{self.baseline_m:g} m",
-                expected="> 0 m",
-                hint="check that left and right are not swapped",
-            )
-        if min(self.width_px, self.height_px) < 1:
-            raise CalibrationError("image size is empty", got=f"{self.width_px}x{self.height_px}")
+        size_px, focal_px = (self.width_px, self.height_px), (self.focal_px, self.focal_px)
+        for cx_px in (self.cx_px, self.cx_right_px):
+            _check_view(focal_px, (cx_px, self.cy_px), size_px)
+        _check_baseline(self.baseline_m)
 
     @classmethod
     def from_matrices(
@@ -192,6 +198,47 @@ class RectifiedCamera:
             height_px=height_px,
             ndisp=None if self.ndisp is None else math.ceil(self.ndisp * s),
         )
+
+
+def _check_view(
+    focal_px: tuple[float, float], centre_px: tuple[float, float], size_px: tuple[int, int]
+) -> None:
+    """Refuse numbers that no camera has, along rows and columns.
+
+    Raises:
+        CalibrationError: There is one.
+    """
+    size = f"{size_px[0]}x{size_px[1]}"
+    if min(size_px) < 1:
+        raise CalibrationError("image size is empty", got=size)
+    if max(size_px) > _LARGEST_PX:
+        raise CalibrationError("image size is implausible", got=size)
+    for f, c, n in zip(focal_px, centre_px, size_px, strict=True):
+        if f <= 0:
+            raise CalibrationError("focal length is not positive", got=f"{f:g} px")
+        if not _FOCAL_SIZES[0] <= f / max(size_px) <= _FOCAL_SIZES[1]:
+            got = f"{f:g} px for images of {size} pixels"
+            raise CalibrationError("focal length is implausible", got=got)
+        if abs(c / n - 0.5) > _MOST_SIZES:
+            got = f"at {c:g} of {n} pixels"
+            raise CalibrationError("principal point is far outside of the image", got=got)
+
+
+def _check_baseline(baseline_m: float) -> None:
+    """Refuse a distance that no two cameras have.
+
+    Raises:
+        CalibrationError: It is one.
+    """
+    if baseline_m <= 0:
+        raise CalibrationError(
+            "baseline is zero" if baseline_m == 0 else "baseline is negative",
+            got=f"{baseline_m:g} m",
+            expected="> 0 m",
+            hint="check that left and right are not swapped",
+        )
+    if not _BASELINE_M[0] <= baseline_m <= _BASELINE_M[1]:
+        raise CalibrationError("baseline is implausible", got=f"{baseline_m:g} m")
 
 
 Rig = RectifiedCamera | StereoCalibration

@@ -62,14 +62,6 @@ def read_kitti_calib(
         )
     check_unsized((float(left[0, 2]), float(left[1, 2])), width_px, height_px, path)
     baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
-    if baseline_m <= 0:
-        raise CalibrationError(
-            "baseline is zero" if baseline_m == 0 else "baseline is negative",
-            where=path,
-            got=f"{baseline_m:g} m",
-            expected="> 0 m",
-            hint="check that left and right are not swapped",
-        )
     return RectifiedCamera.from_matrices(left, right, baseline_m, width_px, height_px)
 
 

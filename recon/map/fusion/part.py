@@ -9,10 +9,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.errors import FormatError
 from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud
-from recon.core.values.arrays import Bool, Float32, Float64, Int32
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, array_in
 
 RGB: Final = slice(0, 3)
 NORMAL: Final = slice(3, 6)
@@ -23,6 +24,12 @@ PRECISE_SIGMA_M: Final = 0.08
 """Voxels at least this precise need one frame less."""
 
 _PLACED: Final = slice(0, 4)
+_MOST: Final = 1e20
+"""Larger than any sum of weights, or of values by weight; sums of much larger ones overflow."""
+_LARGEST_M: Final = 1e3
+"""Larger than any voxel."""
+_FARTHEST_CELL: Final = voxels.KEY_LIMIT - (voxels.KEY_LIMIT >> 4)
+"""Voxels that are moved by loops still have a key."""
 _OFFSET: Final = slice(1, 4)
 _TURNED: Final = slice(4 + NORMAL.start, 4 + NORMAL.stop)
 _PLACE_BITS: Final = 12
@@ -84,8 +91,25 @@ class FusedPart:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> FusedPart:
-        """Return what `to_tree` gave."""
-        return cls(**{**tree, "known": tuple(tree["known"])})
+        """Return what `to_tree` gave.
+
+        Raises:
+            FormatError: It is none; other exceptions where it is no such tree.
+        """
+        keys = array_in(tree, "keys", np.int64, (None,))
+        sums = array_in(tree, "sums", np.float32, (len(keys), 4 + VALUES))
+        information = array_in(tree, "information", np.float32, (len(keys),))
+        frames = array_in(tree, "frames", np.int32, (len(keys),))
+        least = [each.min(initial=1) for each in (sums[:, 0], information, frames)]
+        beside = np.abs(sums[:, _OFFSET]) > _LARGEST_M * sums[:, :1]
+        far = np.abs(voxels.unpack_keys(keys)).max(initial=0) > _FARTHEST_CELL
+        wrong = (
+            keys.min(initial=0) < 0 or far or min(least) <= 0 or np.abs(sums).max(initial=0) > _MOST
+        )
+        known = tuple(tree["known"])
+        if wrong or beside.any() or not all(name in KNOWABLE for name in known):
+            raise FormatError("a submap of the map has an impossible voxel")
+        return cls(keys, sums, information, frames, known)
 
     def moved(self, T_new_world: Float64, voxel_m: float) -> FusedPart:
         """Return the part after a rigid motion: sums of a voxel go to that of its moved mean point.

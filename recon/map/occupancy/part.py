@@ -9,10 +9,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.errors import FormatError
 from recon.core.kernels import voxels
 from recon.core.keys import are_among
 from recon.core.values import OccupancyVoxels
-from recon.core.values.arrays import Float32, Float64, Int32
+from recon.core.values.arrays import Float32, Float64, Int32, array_in, frozen_array
 from recon.map.kernels import clamped, raycast
 from recon.map.occupancy.surface_points import SurfacePoints, join_points
 
@@ -69,11 +70,14 @@ class OccupancyPart:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OccupancyPart:
-        """Return what `to_tree` gave."""
+        """Return what `to_tree` gave.
+
+        Raises:
+            FormatError: It is none; other exceptions where it is no such tree.
+        """
         points = tree["points"]
-        return cls(
-            clamped.CellRows(**tree["rows"]), None if points is None else SurfacePoints(**points)
-        )
+        rows = _rows_in(tree["rows"])
+        return cls(rows, None if points is None else SurfacePoints.from_tree(points))
 
     def moved(self, T_new_map: Float64, resolution_m: float) -> OccupancyPart:
         """Return the part after a rigid motion: a cell gets the values that were at its centre."""
@@ -105,6 +109,19 @@ class OccupancyPart:
         if self.points is not None:
             log_odds = _thinned(cells, log_odds, self.points)
         return OccupancyVoxels(keys=cells, log_odds=log_odds, resolution_m=resolution_m)
+
+
+def _rows_in(tree: Mapping[str, Any]) -> clamped.CellRows:
+    """Return rows of cells, which compiled loops will trust."""
+    blocks = array_in(tree, "blocks", np.int64, (None,))
+    starts = array_in(tree, "starts", np.int64, (len(blocks) + 1,))
+    cells = array_in(tree, "cells", np.uint16, (None,))
+    values = frozen_array("values", tree["values"], np.float32, (len(cells), 3))
+    whole = (starts[0], starts[-1]) == (0, len(cells)) and (np.diff(starts) >= 0).all()
+    inside = blocks.min(initial=0) >= 0 and cells.max(initial=0) < raycast.BLOCK_CELLS
+    if not (whole and inside) or np.isnan(values).any():
+        raise FormatError("a submap of the map has an impossible cell")
+    return clamped.CellRows(blocks, starts, cells, tree["values"])
 
 
 def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:

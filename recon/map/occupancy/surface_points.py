@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.errors import FormatError
 from recon.core.geometry.se3 import apply
 from recon.core.kernels import voxels
 from recon.core.keys import are_among
-from recon.core.values.arrays import Bool, Float32, Float64, Int32
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, array_in
 from recon.map.kernels import facets
 from recon.map.kernels.raycast import BLOCK_BITS
 
@@ -32,6 +33,19 @@ class SurfacePoints:
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> SurfacePoints:
+        """Return the points in a tree of their arrays.
+
+        Raises:
+            FormatError: They are none; other exceptions where it is no such tree.
+        """
+        keys = array_in(tree, "keys", np.int64, (None,))
+        sums = array_in(tree, "sums", np.float32, (len(keys), 4))
+        if keys.min(initial=0) < 0 or sums[:, 0].min(initial=1) <= 0:
+            raise FormatError("a submap of the map has an impossible hit")
+        return cls(keys, sums)
 
     def select(self, which: NDArray[Any]) -> SurfacePoints:
         """Return the rows of a boolean mask or of an index array, in that order."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
@@ -16,13 +15,10 @@ from recon.core.values.arrays import Float64
 from recon.map.sessions.linking import find_links, path_up_to
 from recon.map.store.links import Link
 from recon.map.store.map import Map
-from recon.map.store.session import NO_LOOPS, Session
+from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
 from recon.places.closure import DrivePath, Tie, join_drives
 from recon.places.fixes import Held
 from recon.places.loop import Loop
-
-_ALONE: Final = "T_alone_camera"
-"""The path of a drive before links to others bent it; None = that of odometry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +66,8 @@ def join_sessions(map_: Map, links: Sequence[Link]) -> None:
     for session in map_.sessions:
         if session.number in joined.paths:
             _place(map_, session, joined.paths[session.number])
-        elif _ALONE in session.loops:
-            session.set_loops({**session.loops, "T_world_camera": session.loops[_ALONE]})
+        elif ALONE in session.loops:
+            session.set_loops({**session.loops, BENT: session.loops[ALONE]})
     kept = set(map(id, joined.links))
     linked = joined.paths or [map_.sessions[0].number]
     map_.set_links([replace(link, kept=id(link) in kept) for link in links], [*linked])
@@ -196,8 +192,8 @@ def _place(map_: Map, session: Session, path: Trajectory) -> None:
     T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
     bent = invert(T_world_session) @ path.T_world_camera
     loops = {**NO_LOOPS, **session.loops}
-    alone = loops.get(_ALONE, loops["T_world_camera"])
-    session.set_loops({**loops, _ALONE: alone, "T_world_camera": bent})
+    alone = loops.get(ALONE, loops[BENT])
+    session.set_loops({**loops, ALONE: alone, BENT: bent})
     first = map_.sessions[0]
     if session is not first:
         session.set_axes(first.T_map_world @ T_world_session, session.camera)

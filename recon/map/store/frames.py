@@ -10,7 +10,8 @@ import numpy as np
 
 from recon.core.errors import FormatError
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float64, array_in
+from recon.map.store.values import value_in
 from recon.odometry.protocol import OdometryHealth
 
 FRAMES: Final = "frames"
@@ -38,25 +39,27 @@ def frames_in(content: Mapping[str, Any]) -> Iterator[tuple[Float64, float, Odom
     Raises:
         FormatError: A pose is none of a drive; other exceptions where it is no such tree.
     """
-    path, columns = Trajectory(content["T_world_camera"], content["times_s"]), content["health"]
-    _check_rotations(path)
-    times_s = path.timestamps_s.tolist()
-    for number, (T, time_s) in enumerate(zip(path.T_world_camera, times_s, strict=True)):
+    times_s = array_in(content, "times_s", np.float64, (None,))
+    path, columns = path_of(content["T_world_camera"], times_s), content["health"]
+    for number, (T, time_s) in enumerate(zip(path.T_world_camera, times_s.tolist(), strict=True)):
         # Older versions measured more.
-        values = {name: columns[name][number] for name in columns if name in _HEALTH}
-        values.update({name: tuple(values[name]) for name in ("notes", "warnings")})
-        yield T, time_s, OdometryHealth(**values)
+        values = {name: columns[name][number] for name in _HEALTH}
+        yield T, time_s, value_in(OdometryHealth, values)
 
 
-def _check_rotations(path: Trajectory) -> None:
-    """Check poses, which may come from a file with few digits, or be far off.
+def path_of(poses: Float64, times_s: Float64) -> Trajectory:
+    """Return a path of poses that were read, maybe from a file with few digits.
 
     Raises:
         FormatError: One is no pose of a drive.
+        ShapeError: They are no poses, or not as many as times.
     """
+    path = Trajectory(array_in({"poses": poses}, "poses", np.float64, (None, 4, 4)), times_s)
     R = path.T_world_camera[:, :3, :3]
     skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     far_m = np.abs(path.positions_m).max(axis=1)
     wrong = (skew > _SKEW) | (far_m > FARTHEST_M) | (np.linalg.det(R) <= 0)
+    wrong |= (path.T_world_camera[:, 3] != (0, 0, 0, 1)).any(axis=1)
     if wrong.any():
         raise FormatError("the path of the map has an impossible pose", got=int(np.argmax(wrong)))
+    return path

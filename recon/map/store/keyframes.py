@@ -6,11 +6,15 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any, Final
 
+import numpy as np
+
+from recon.core.values.arrays import array_in
 from recon.io.files import reading
+from recon.map.store.links import loop_in
 from recon.map.store.records import Store
+from recon.map.store.values import value_in
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
-from recon.places.loop import Loop
 
 KEYFRAME: Final = "keyframe"
 _MOST_BYTES: Final = 1 << 24
@@ -73,9 +77,9 @@ class Keyframes:
                 KEYFRAME, (self._session, frame), most_bytes=_MOST_BYTES
             )
             return StoredKeyframe(
-                Keyframe(**content["keyframe"]),
-                content["T_world_camera"],
-                content["path_m"],
-                tuple(Loop(**loop) for loop in content["loops"]),
+                value_in(Keyframe, {**content["keyframe"], "frame": frame}),
+                array_in(content, "T_world_camera", np.float64, (4, 4)),
+                float(content["path_m"]),
+                tuple(loop_in(loop) for loop in content["loops"]),
                 tuple(content["refused"]),
             )

@@ -6,10 +6,27 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
+import numpy as np
+
 from recon.core.errors import FormatError
+from recon.core.geometry.se3 import check_rigid
+from recon.map.store.values import value_in
 from recon.places.loop import Loop
 
 LINKS: Final = "links"
+
+
+def loop_in(tree: Mapping[str, Any]) -> Loop:
+    """Return a loop of a tree of its fields.
+
+    Raises:
+        FormatError: It is none; other exceptions where it is no such tree.
+    """
+    loop = value_in(Loop, tree)
+    check_rigid("T_first_last", loop.T_first_last)
+    if not np.isfinite(loop.information).all() or np.linalg.eigvalsh(loop.information)[0] < 0:
+        raise FormatError("a loop of the map has an impossible information")
+    return loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,4 +61,4 @@ class Link:
         one, other = tree["sessions"]
         if not (isinstance(one, int) and isinstance(other, int) and one != other):
             raise FormatError("a link of the map is not between two drives", got=tree["sessions"])
-        return cls((one, other), Loop(**tree["loop"]), bool(tree["kept"]))
+        return cls((one, other), loop_in(tree["loop"]), bool(tree["kept"]))

@@ -120,7 +120,12 @@ class Map:
         if not self.store.has(LINKS, 0):
             return []
         with reading(self.store.name):
-            return [Link.from_tree(tree) for tree in self.store.get(LINKS, 0)["links"]]
+            links = [Link.from_tree(tree) for tree in self.store.get(LINKS, 0)["links"]]
+            for link in links:
+                (one, other), loop = map(self.session, link.sessions), link.loop
+                if not (0 <= loop.first < len(one) and 0 <= loop.last < len(other)):
+                    raise FormatError("a link of the map is not between two frames", got=loop)
+            return links
 
     @property
     def linked(self) -> list[Session]:

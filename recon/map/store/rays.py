@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
 from recon.core.values import RayCloud, RayGrain
-from recon.core.values.arrays import frozen_array
+from recon.core.values.arrays import array_in, frozen_array
 from recon.map.store.frames import FARTHEST_M
+from recon.map.store.values import value_in
 
 RAYS: Final = "rays"
 RAY_BYTES: Final = 10
@@ -37,11 +38,13 @@ def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
     Raises:
         FormatError: Their resolution is impossible; other exceptions where it is no such tree.
     """
-    grain = _checked(RayGrain(**content["grain"]))
+    grain = _checked(value_in(RayGrain, content["grain"]))
     steps = frozen_array("steps", content["steps"], np.uint16, (None, 3))
     places = np.cumsum(_unzigzag(steps), axis=0, dtype=np.int16)
-    sigma_m, confidence, count = (content[name] for name in ("sigma_m", "confidence", "count"))
-    return RayCloud(places, sigma_m, confidence, count, grain.unit_m), grain
+    if array_in(content, "sigma_m", np.float16, (len(places),)).min(initial=0.0) < 0:
+        raise FormatError("a ray of the map has a negative deviation")
+    parts = {name: content[name] for name in ("sigma_m", "confidence", "count")}
+    return value_in(RayCloud, {"places": places, **parts, "unit_m": grain.unit_m}), grain
 
 
 def _checked(grain: RayGrain) -> RayGrain:
@@ -51,8 +54,8 @@ def _checked(grain: RayGrain) -> RayGrain:
         FormatError: It is impossible.
     """
     sizes_m = (grain.cell_m, grain.unit_m, grain.max_range_m)
-    # Not above the range; this is false for NaN as well.
-    if not (min(sizes_m) > 0 and max(sizes_m) <= grain.max_range_m <= FARTHEST_M):
+    ordered = 0 < min(sizes_m) <= max(sizes_m) <= grain.max_range_m <= FARTHEST_M
+    if not (ordered and np.isfinite(sizes_m).all()):
         raise FormatError("sizes of the rays are impossible", got=sizes_m)
     return grain
 

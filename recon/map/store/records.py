@@ -310,7 +310,10 @@ def _name(key: Key) -> str:
 
 def _key(name: str) -> Key:
     numbers = tuple(map(int, name.split(",")))
-    return numbers if len(numbers) > 1 else numbers[0]
+    key = numbers if len(numbers) > 1 else numbers[0]
+    if _name(key) != name:  # as 00 and 1_0, which are other names of a number
+        raise FormatError("a record of the map has no valid key", got=name)
+    return key
 
 
 def _checksum(kind: str, name: str, text: str, *content: Bytes) -> int:

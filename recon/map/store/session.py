@@ -11,14 +11,16 @@ import numpy as np
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, array_in
 from recon.core.words import counted
 from recon.io.files import reading
-from recon.map.store.frames import FRAMES, frames_in, frames_record
+from recon.map.store.frames import FRAMES, frames_in, frames_record, path_of
 from recon.map.store.keyframes import Keyframes
+from recon.map.store.links import loop_in
 from recon.map.store.rays import RAY_BYTES, RAYS, rays_in, rays_record
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
+from recon.map.store.values import value_in
 from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
@@ -27,7 +29,11 @@ from recon.places.fixes import NO_FIXES, Fixes
 SESSION: Final = "session"
 AXES: Final = "axes"
 LOOPS: Final = "loops"
-NO_LOOPS: Final[Mapping[str, Any]] = {"closed": [], "refused": [], "T_world_camera": None}
+BENT: Final = "T_world_camera"
+"""The path of a drive after loops, links and measured positions; None = that of odometry."""
+ALONE: Final = "T_alone_camera"
+"""The same before links to other drives bent it."""
+NO_LOOPS: Final[Mapping[str, Any]] = {"closed": [], "refused": [], BENT: None}
 """What a map keeps of a drive without loops, if it keeps anything else with them."""
 _STATE: Final = "state"
 
@@ -51,15 +57,6 @@ class SessionInfo:
     config: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     start: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        texts, trees = (self.source, self.description), (self.config, self.versions, self.start)
-        if not (
-            all(isinstance(text, str) for text in texts)
-            and all(isinstance(tree, Mapping) for tree in trees)
-            and isinstance(self.frames, int)
-        ):
-            raise FormatError("the map does not describe its session")
 
 
 class Session:
@@ -86,12 +83,15 @@ class Session:
         self._health: list[OdometryHealth] = []
         self._flushed = 0
         with reading(store.name):
-            self.info = SessionInfo(**store.read(SESSION, number))
+            self.info = value_in(SessionInfo, store.read(SESSION, number))
             self._read_frames()
+            self._check_loops()
         self.submaps = Submaps(store, number)
         if self.submaps.frames > len(self):
             raise FormatError("the map has submaps of frames without a pose", where=store.name)
         self.keyframes = Keyframes(store, number)
+        if max(self.keyframes.frames, default=-1) >= len(self):
+            raise FormatError("the map has keyframes of frames without a pose", where=store.name)
 
     @staticmethod
     def begin(store: Store, number: int, info: SessionInfo) -> Session:
@@ -129,7 +129,7 @@ class Session:
     @property
     def trajectory(self) -> Trajectory:
         """The path after loop closure; that of odometry if no loop was closed."""
-        closed = self.loops.get("T_world_camera")
+        closed = self.loops.get(BENT)
         return self.odometry if closed is None else Trajectory(closed, np.array(self._times_s))
 
     @property
@@ -150,7 +150,7 @@ class Session:
             FormatError: It is not known, or none.
         """
         with reading(self._store.name):
-            T = np.array(self._axes["T_map_world"])
+            T: Float64 = array_in(self._axes, "T_map_world", np.float64, (4, 4)).copy()
             check_rigid("T_map_world", T)
         return T
 
@@ -162,7 +162,7 @@ class Session:
             FormatError: It is not known, or none.
         """
         with reading(self._store.name):
-            return RectifiedCamera(**self._axes["camera"])
+            return value_in(RectifiedCamera, self._axes["camera"])
 
     @property
     def loops(self) -> dict[str, Any]:
@@ -179,7 +179,7 @@ class Session:
         """
         with reading(self._store.name):
             closure, odometry = Closure(self.trajectory, (), ()), self.odometry
-            if self.loops.get("T_world_camera") is None:
+            if self.loops.get(BENT) is None:
                 return None
             entries = self.submaps.entries
             return np.stack([closure.correction(odometry, one.middle) for one in entries])
@@ -250,7 +250,7 @@ class Session:
         """
         with reading(self._store.name):
             found = self.loops.get("fixes")
-            fixes = NO_FIXES if found is None else Fixes(**found)
+            fixes = NO_FIXES if found is None else value_in(Fixes, found)
         if not np.isin(fixes.frames, np.arange(len(self))).all():
             what = "the map has measured positions of frames without a pose"
             raise FormatError(what, where=self._store.name)
@@ -262,15 +262,7 @@ class Session:
         Raises:
             OutputError: They cannot be written.
         """
-        self.set_loops(
-            {
-                "closed": [],
-                "refused": [],
-                "T_world_camera": None,
-                **self.loops,
-                "fixes": asdict(fixes),
-            }
-        )
+        self.set_loops({**NO_LOOPS, **self.loops, "fixes": asdict(fixes)})
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Keep what the rest of the drive depends on, beside all that was added.
@@ -313,3 +305,15 @@ class Session:
             for T, time_s, health in frames_in(self._store.read(FRAMES, (self.number, first))):
                 self.add_frame(T, time_s, health)
         self._flushed = len(self)
+        if sorted(self._times_s) != self._times_s:
+            raise FormatError("frames of the drive are not in order")
+
+    def _check_loops(self) -> None:
+        """Refuse paths and loops that are none of these frames."""
+        for name in (BENT, ALONE):
+            if (poses := self.loops.get(name)) is not None:
+                path_of(poses, np.array(self._times_s))
+        for tree in self.loops.get("closed", ()):
+            loop = loop_in(tree)
+            if not 0 <= loop.first < loop.last < len(self):
+                raise FormatError("a loop of the map is not between two frames", got=f"{loop}")

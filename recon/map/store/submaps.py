@@ -9,6 +9,7 @@ from typing import Final
 from recon.core.errors import FormatError
 from recon.io.files import reading
 from recon.map.store.records import Store
+from recon.map.store.values import value_in
 from recon.map.submaps import Submap
 
 SUBMAP: Final = "submap"
@@ -63,7 +64,7 @@ class Submaps:
         self.store = store
         with reading(store.name):
             found = store.numbers(ENTRY, session)
-            self._entries = [SubmapEntry(**store.read(ENTRY, (session, n))) for n in found]
+            self._entries = [value_in(SubmapEntry, store.read(ENTRY, (session, n))) for n in found]
             frames = 0
             for index, entry in enumerate(self._entries):
                 if (entry.index, entry.first_frame) != (index, frames) or entry.frames < 1:
@@ -89,13 +90,7 @@ class Submaps:
         Raises:
             OutputError: It cannot be written.
         """
-        entry = SubmapEntry(
-            submap.index,
-            submap.first_frame,
-            submap.frames,
-            len(submap.fused),
-            len(submap.occupancy),
-        )
+        entry = _entry_of(submap)
         key = (self._session, submap.index)
         self.store.put(SUBMAP, key, submap.to_tree(), compress=compress)
         self.store.put(ENTRY, key, asdict(entry))
@@ -110,8 +105,16 @@ class Submaps:
         with reading(self.store.name):
             most_bytes = self._entries[index].nbytes
             record = self.store.read(SUBMAP, (self._session, index), most_bytes=most_bytes)
-            return Submap.from_tree(record)
+            submap = Submap.from_tree(record)
+            if _entry_of(submap) != self._entries[index]:
+                raise FormatError("a submap of the map is another one", got=f"submap {index}")
+            return submap
 
     def __iter__(self) -> Iterator[Submap]:
         """Return the submaps in order, read one at a time."""
         return map(self.__getitem__, range(len(self)))
+
+
+def _entry_of(submap: Submap) -> SubmapEntry:
+    fused, cells = len(submap.fused), len(submap.occupancy)
+    return SubmapEntry(submap.index, submap.first_frame, submap.frames, fused, cells)

@@ -169,8 +169,8 @@ def test_cameras_without_metric_depth_are_refused(
     ("change", "message"),
     [
         ({"focal_px": 0.0}, "focal length is not positive"),
-        ({"baseline_m": 0.0}, "baseline is not positive"),
-        ({"baseline_m": -0.5}, "baseline is not positive.*swapped"),
+        ({"baseline_m": 0.0}, "baseline is zero"),
+        ({"baseline_m": -0.5}, "baseline is negative.*swapped"),
         ({"cx_px": NAN}, "not finite"),
         ({"width_px": 0}, "image size is empty"),
     ],

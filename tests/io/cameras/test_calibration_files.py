@@ -245,7 +245,7 @@ def test_an_opencv_file_says_that_it_is_of_a_fisheye_and_refuses_two_models(tmp_
 
 def test_a_fisheye_needs_four_coefficients() -> None:
     with pytest.raises(CalibrationError, match=r"four distortion coefficients.*got 5"):
-        CameraIntrinsics(np.eye(3), np.zeros(5), 640, 480, "fisheye")
+        CameraIntrinsics(np.diag([300.0, 300.0, 1.0]), np.zeros(5), 640, 480, "fisheye")
 
 
 def test_homographies_are_distinguished_from_a_calibration(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_calib_txt_gives_metres_and_doffs(tmp_path: Path) -> None:
     [
         ({"cam1": ""}, FormatError, "calibration has no 'cam1'"),
         ({"baseline": ""}, FormatError, "calibration has no 'baseline'"),
-        ({"baseline": "0"}, CalibrationError, "baseline is not positive"),
+        ({"baseline": "0"}, CalibrationError, "baseline is zero"),
         ({"baseline": "wide"}, FormatError, r"'baseline' is wrong \(got wide, expected numbers"),
         ({"width": "nan"}, FormatError, "'width' is wrong .*finite numbers"),
         ({"cam0": "[1 2 3]"}, FormatError, "'cam0' is wrong .*expected 9 numbers"),

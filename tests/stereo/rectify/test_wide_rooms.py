@@ -77,8 +77,8 @@ def test_the_field_of_view_can_be_set(field_deg: float) -> None:
 
 
 def test_a_focal_length_out_of_all_proportion_is_never_used() -> None:
-    view = RectifiedCamera(1.02e9, 511.5, 511.5, 511.5, 0.1, 1024, 1024)
-    with pytest.raises(CalibrationError, match=r"out of all proportion \(got 1.02e\+09 px"):
+    view = RectifiedCamera(1.02e6, 511.5, 511.5, 511.5, 0.1, 1024, 1024)
+    with pytest.raises(CalibrationError, match=r"out of all proportion \(got 1.02e\+06 px"):
         _check_focal(view, tum_vi().left)
 
 

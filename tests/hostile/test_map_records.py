@@ -1,0 +1,253 @@
+"""Records of a map with a valid checksum, and nonsense in any one place of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+from recon.core.kernels.voxels import pack_keys
+from recon.core.values import RayCloud, RectifiedCamera
+from recon.map.fusion.part import FusedPart, join_fused
+from recon.map.kernels.clamped import CellRows
+from recon.map.occupancy.builder import OccupancySettings
+from recon.map.occupancy.part import OccupancyPart, join_occupancy
+from recon.map.occupancy.rays import ray_grain
+from recon.map.occupancy.surface_points import SurfacePoints
+from recon.map.store.links import Link
+from recon.map.store.map import Map
+from recon.map.store.map_views import MapViews
+from recon.map.store.records import Key, Store
+from recon.map.store.session import ALONE, BENT, SessionInfo
+from recon.map.submaps import Submap
+from recon.odometry.protocol import OdometryHealth
+from recon.places.detector import StoredKeyframe
+from recon.places.fixes import Fixes
+from recon.places.keyframe import Keyframe
+from recon.places.loop import Loop
+from tests.hostile.refusals import refusal
+
+FRAMES: Final = 3
+KEYS: Final = pack_keys(np.array([[0, 0, 0], [1, 2, 3]]))
+LOOP: Final = Loop(0, 2, np.eye(4), np.eye(6), 30, 0.5)
+
+
+def write_map(path: Path) -> None:
+    """Write two linked drives with one record of every kind, and every field in it."""
+    with Map.create(path) as map_:
+        for _ in range(2):
+            _add_drive(map_)
+        map_.set_links([Link((0, 1), LOOP)], [0, 1])
+        map_.commit()
+
+
+def _add_drive(map_: Map) -> None:
+    session = map_.begin(SessionInfo("drive", "of a test", FRAMES))
+    session.set_axes(np.eye(4), RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12, 8))
+    grain, ones = ray_grain(OccupancySettings()), np.ones(4, np.uint8)
+    for frame in range(FRAMES):
+        places = np.ones((4, 3), np.int16)
+        rays = RayCloud(places, ones.astype(np.float16), ones, ones, grain.unit_m)
+        session.add_frame(np.eye(4), float(frame), OdometryHealth(notes=("note",)))
+        session.add_rays(frame, rays, grain)
+    seen = Keyframe(
+        1, np.ones((4, 3), np.float32), np.ones((4, 32), np.uint8), np.ones((2, 2), np.float32)
+    )
+    session.keyframes.put(StoredKeyframe(seen, np.eye(4), 1.0, (LOOP,), ("few inliers",)))
+    session.submaps.add(Submap(0, 0, FRAMES, _fused(), _occupancy()))
+    path = np.stack([np.eye(4)] * FRAMES)
+    session.set_loops({"closed": [asdict(LOOP)], "refused": [], BENT: path, ALONE: path})
+    frames, places_m = np.arange(3, dtype=np.int32), np.zeros((3, 3))
+    session.set_fixes(Fixes(frames, places_m, places_m, 0.1))
+
+
+def _fused() -> FusedPart:
+    ones = np.ones(2, np.float32)
+    return FusedPart(KEYS, np.ones((2, 11), np.float32), ones, np.ones(2, np.int32))
+
+
+def _occupancy() -> OccupancyPart:
+    starts, cells = np.array([0, 1, 2], np.int64), np.array([0, 511], np.uint16)
+    rows = CellRows(KEYS, starts, cells, np.ones((2, 3), np.float32))
+    return OccupancyPart(rows, SurfacePoints(KEYS, np.ones((2, 4), np.float32)))
+
+
+def read_map(path: Path) -> None:
+    """Read all that a map keeps, and give it to the loops that trust it."""
+    with Map.open(path) as map_:
+        _ = map_.doubts, map_.links, list(MapViews(map_))
+        for session in map_.sessions:
+            _ = session.camera, session.fixes, session.trajectory, session.corrections()
+            _ = [session.rays(frame)[0].cloud() for frame in range(session.ray_frames)]
+            _ = [stored.keyframe.xyz(session.camera) for stored in session.keyframes]
+            join_fused(submap.fused for submap in session.submaps).cloud(0.1, 1)
+            join_occupancy(submap.occupancy for submap in session.submaps).voxels(0.1)
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Store, Path]]:
+    path = tmp_path_factory.mktemp("records") / "map.recon"
+    write_map(path)
+    read_map(path)
+    with Store.open(path) as store:
+        store._database.execute("COMMIT")
+        store._database.execute("PRAGMA synchronous = OFF")
+        store._database.execute("BEGIN")
+        yield store, path
+
+
+#: What has no type: settings are checked when they are used, and why loops were refused is shown.
+FREE: Final = ("config", "versions", "start", "refused")
+NOTHING: Final[dict[str, Callable[[Any], Any]]] = {
+    "null": lambda value: None,
+    "a word": lambda value: "word",
+    "a tree": lambda value: {},
+    "an array of another type": lambda value: np.zeros((3, 2, 1), np.complex64).view("f2"),
+    "a list of null": lambda value: [None],
+}
+ARRAYS: Final[dict[str, Callable[[Any], Any]]] = {
+    "no axis": lambda value: value.ravel()[:1].reshape(()),
+    "no row": lambda value: value[:0],
+    "one row more": lambda value: np.concatenate([value, value[:1]]),
+    "one row less": lambda value: value[:-1],
+    "of float64": lambda value: value.astype(np.float64),
+    "of int64": lambda value: value.astype(np.int64),
+    "negative": lambda value: -np.ones_like(value),
+    "NaN": lambda value: value * np.nan if value.dtype.kind == "f" else value * 0,
+    "infinite": lambda value: np.full_like(value, np.inf) if value.dtype.kind == "f" else value * 0,
+    "largest": lambda value: np.full_like(value, _info(value).max),
+    "smallest": lambda value: np.full_like(value, _info(value).min),
+}
+NUMBERS: Final = (-1, 0, 0.5, 1e300, -1e300, 2**63, 10**400, float("nan"))
+
+
+def _info(value: np.ndarray[Any, Any]) -> Any:
+    return np.finfo(value.dtype) if value.dtype.kind == "f" else np.iinfo(value.dtype)
+
+
+def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Yield every part of a tree with its path, but the tree itself."""
+    parts = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    for name, part in parts:
+        if name not in FREE:
+            yield (*path, name), part
+            if isinstance(part, dict | list):
+                yield from leaves(part, (*path, name))
+
+
+def changed(tree: Any, path: tuple[Any, ...], value: Any) -> Any:
+    """Return a tree with another part."""
+    if not path:
+        return value
+    copy = tree.copy()
+    copy[path[0]] = changed(tree[path[0]], path[1:], value)
+    return copy
+
+
+def accepted(records: tuple[Store, Path], kind: str, key: Key, spoiled: Any) -> bool:
+    """Whether a map with such a record is read; else it must be refused by its name."""
+    store, path = records
+    before = store.read(kind, key)
+    store.put(kind, key, spoiled)
+    store.commit()
+    line = refusal(lambda: read_map(path))
+    store.put(kind, key, before)
+    assert line is None or "map.recon" in line, line
+    return line is None
+
+
+KINDS: Final = (
+    "session", "axes", "frames", "loops", "keyframe", "rays", "submap", "submap_entry", "links",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_nothing_is_refused_in_any_place(kind: str, records: tuple[Store, Path]) -> None:
+    key = records[0].keys(kind)[-1]
+    tree = records[0].read(kind, key)
+    optional = {"T_world_camera", "T_alone_camera", "fixes", "ndisp", "points"}
+    for path, part in leaves(tree):
+        for name, make in NOTHING.items():
+            harmless = (
+                (make(part) is None and path[-1] in optional)
+                or (isinstance(part, str) and name == "a word")
+                or (isinstance(part, list | dict) and name == "a tree")
+                or path[-1] in {"frame", "kept"}
+                or "linked" in path
+            )
+            fine = accepted(records, kind, key, changed(tree, path, make(part)))
+            assert harmless or not fine, (path, name)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_impossible_arrays_and_numbers_are_harmless(kind: str, records: tuple[Store, Path]) -> None:
+    """Refused by name, or read to the end without an error: loops that trust them may crash."""
+    key = records[0].keys(kind)[-1]
+    tree = records[0].read(kind, key)
+    for path, part in leaves(tree):
+        if isinstance(part, np.ndarray):
+            for make in ARRAYS.values():
+                accepted(records, kind, key, changed(tree, path, make(part)))
+        elif isinstance(part, int | float):
+            for number in NUMBERS:
+                accepted(records, kind, key, changed(tree, path, number))
+
+
+REFUSED: Final[dict[str, tuple[str, tuple[Any, ...], Any]]] = {
+    "scalar information": ("loops", ("closed", 0, "information"), 1.0),
+    "information of NaN": ("loops", ("closed", 0, "information"), np.full((6, 6), np.nan)),
+    "a loop beyond the drive": ("loops", ("closed", 0, "last"), FRAMES),
+    "a loop back": ("loops", ("closed", 0, "first"), 2),
+    "a link beyond the drive": ("links", ("links", 0, "loop", "last"), FRAMES),
+    "a link to nobody": ("links", ("links", 0, "sessions"), [0, 7]),
+    "times back": ("frames", ("times_s",), np.array([0.0, 2.0, 1.0])),
+    "times of NaN": ("frames", ("times_s",), np.full(3, np.nan)),
+    "a projective pose": ("frames", ("T_world_camera",), np.ones((3, 4, 4))),
+    "float keys": ("submap", ("fused", "keys"), np.array([0.0, 1.0])),
+    "negative keys": ("submap", ("fused", "keys"), -KEYS),
+    "no keys": ("submap", ("fused", "keys"), KEYS[:0]),
+    "voxels of no weight": ("submap", ("fused", "sums"), np.zeros((2, 11), np.float32)),
+    "cells beyond a block": (
+        "submap", ("occupancy", "rows", "cells"), np.array([0, 512], np.uint16),
+    ),
+    "blocks beyond the cells": (
+        "submap", ("occupancy", "rows", "starts"), np.array([0, 1, 3], np.int64),
+    ),
+    "blocks backwards": ("submap", ("occupancy", "rows", "starts"), np.array([0, 5, 2], np.int64)),
+    "another submap": ("submap", ("frames",), 1),
+    "a unit of NaN": ("rays", ("grain", "unit_m"), float("nan")),
+    "a focal length of 1e9": ("axes", ("camera", "focal_px"), 1e9),
+    "a baseline of 1e300": ("axes", ("camera", "baseline_m"), 1e300),
+    "no coarse disparity": ("keyframe", ("keyframe", "coarse"), np.zeros((0, 2), np.float32)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_record_that_fits_no_drive_is_refused(name: str, records: tuple[Store, Path]) -> None:
+    kind, path, value = REFUSED[name]
+    key = records[0].keys(kind)[-1]
+    tree = records[0].read(kind, key)
+    assert not accepted(records, kind, key, changed(tree, path, value))
+
+
+@pytest.mark.parametrize("key", ["", "1.0", "00", "+1", "1_0", "\u0661", " 1", "0,", "word"])
+@pytest.mark.parametrize("kind", ["session", "frames", "keyframe", "submap_entry"])
+def test_a_key_that_is_no_number_is_refused(
+    kind: str, key: str, records: tuple[Store, Path]
+) -> None:
+    store, path = records
+    database = store._database
+    database.execute("UPDATE record SET kind = 'kept' WHERE kind = ? AND key LIKE '1%'", (kind,))
+    row = "SELECT ?, ?, tree, checksum, content FROM record WHERE kind = 'kept' LIMIT 1"
+    database.execute(f"INSERT INTO record {row}", (kind, key))
+    store.commit()
+    line = refusal(lambda: read_map(path))
+    database.execute("DELETE FROM record WHERE kind = ? AND key = ?", (kind, key))
+    database.execute("UPDATE record SET kind = ? WHERE kind = 'kept'", (kind,))
+    store.commit()
+    assert line is not None
+    assert "map.recon" in line
