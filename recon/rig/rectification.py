@@ -174,7 +174,7 @@ def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
         "model": result.model,
         "up_to_scale": True,
         "matches": result.matches,
-        "inliers": len(result.features),
+        "inliers": result.inliers,
         "row_error_before_px": result.before_px,
         "row_error_after_px": result.after_px,
         "row_error_held_out_px": plain(result.held_out_px),

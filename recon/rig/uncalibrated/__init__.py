@@ -1,5 +1,5 @@
 """Rectification from the images alone, where no calibration is known.
 
-- `rectify.py`: all of it; `fundamental.py`: the geometry of the two views, from matched features;
-- `shaping.py`: what aligned rows leave open: scale, shear, and the smallest disparity.
+- `rectify.py`: the simplest change that aligns rows; `fundamental.py`: the geometry of two views;
+- `homographies.py`: what aligns its rows, in the size and shape of the images.
 """
