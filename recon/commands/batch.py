@@ -58,7 +58,7 @@ def run_batch(
                         ended[result.job.name] = result
                         if options.fail_fast and result.failed:
                             break
-        results = compare([ended.get(job.name) or JobResult(job, None) for job in jobs])
+        results = compare([ended.get(job.name) or JobResult(job) for job in jobs])
         summary = _summary(results, len(ended) - len(done), run.watch.seconds["jobs"])
         with run.report(summary):
             write_batch_page(results, summary, run)
@@ -74,7 +74,7 @@ def _summary(results: Sequence[JobResult], run_now: int, seconds: float) -> dict
         ],
         "succeeded": sum(one.ok for one in results),
         "failed": sum(one.failed for one in results),
-        "not_run": sum(one.last is None for one in results),
+        "not_run": sum(not one.ok and not one.failed for one in results),
         "jobs_per_hour": 3600.0 * run_now / seconds if run_now else None,
         "warnings": [f"{one.job.name}: {text}" for one in results for text in one.warnings],
     }

@@ -108,10 +108,9 @@ def _checked(one: JobResult) -> dict[str, Any]:
         RegistrationError: It cannot be mapped.
         ClusterError: It broke too often.
     """
-    if one.last is None or not one.ok:
-        failed = one.last is not None and one.last.state == "failed"
-        kind = RegistrationError if failed else ClusterError
-        raise kind(f"frames {one.job.source} cannot be mapped", got=one.error)
+    if not one.ok:
+        kind = RegistrationError if one.last.state == "failed" else ClusterError
+        raise kind(f"frames {one.job.source} cannot be mapped", got=one.last.error)
     taken = {name: one.figures[name] for name in ("seconds", "peak_memory_mb")}
     return {"tries": one.last.tries, "worker": one.last.worker, **taken}
 

@@ -47,7 +47,7 @@ def write_batch_page(
         write_bytes(run.path("sweep.png"), sweep)
     first = outliers_first(results)
     pages = {one.job.name: _page(one, run.folder) for one in first}
-    failed = [f"{one.job.name}: {one.error}" for one in first if one.failed]
+    failed = [f"{one.job.name}: {one.last.error}" for one in first if one.failed]
     write_page(
         "batch",
         run,
@@ -74,7 +74,7 @@ def _table(command: str, jobs: Sequence[JobResult]) -> Table:
     for one in jobs:
         facts, figures = one.facts, (one.figures.get(name) for name in columns)
         shown = (facts["state"], str(facts["tries"]), f"{one.seconds:.1f}")
-        rows.append((one.job.name, one.error or one.remark, *shown, *map(_cell, figures)))
+        rows.append((one.job.name, one.last.error or one.remark, *shown, *map(_cell, figures)))
     return Table(command, ("job", "remark", "state", "tries", "seconds", *columns), rows)
 
 

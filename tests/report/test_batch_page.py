@@ -30,7 +30,7 @@ def results() -> list[JobResult]:
     odd = {"frames": 40, "trajectory.t_rel_percent": 99.0, "seconds": 10.0}
     done[6] = replace(done[6], figures=odd)
     failed = JobResult(job("bad"), Outcome("failed", "<b>no images</b> | none", 1.0, tries=3))
-    return compare([*done, failed, JobResult(job("later"), None)])
+    return compare([*done, failed, JobResult(job("later"))])
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from recon.io.files import reading
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.run import SUMMARY
 
-State = Literal["succeeded", "failed", "broken"]
+State = Literal["not run", "succeeded", "failed", "broken"]
 """``failed``: by its input, so that another try would fail too. ``broken``: by anything else."""
 LOGS: Final = "logs"
 _TAIL_BYTES: Final = 1 << 16
@@ -85,7 +85,7 @@ class Outcome:
         stale: Whether what it left is of no use: it went on with that, and failed.
     """
 
-    state: State
+    state: State = "not run"
     error: str = ""
     seconds: float = 0.0
     worker: str = ""
@@ -113,7 +113,7 @@ def last_outcome(folder: Path, name: str) -> Outcome:
     Raises:
         FormatError: The log is damaged.
     """
-    path, last = log_file(folder, name), Outcome("broken", "was not begun")
+    path, last = log_file(folder, name), Outcome("not run")
     if path.exists():
         with reading(path), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from recon.io.files import read_text, reading
 from recon.run.batch.cluster import BatchOptions, Cluster
-from recon.run.batch.job import Job, Outcome
+from recon.run.batch.job import Job, Outcome, log_file
 from recon.run.run import SUMMARY
 
 ACCURACY: Final = (
@@ -43,42 +43,37 @@ class JobResult:
 
     Attributes:
         job: The job.
-        last: How its last try ended; None = it was not run.
+        last: How its last try ended.
         figures: Numbers of its summary by dotted name; none if it has none.
         warnings: Warnings of its summary.
         remark: The figure of drift or trust that is most unusual, if any is.
     """
 
     job: Job
-    last: Outcome | None
+    last: Outcome = field(default_factory=Outcome)
     figures: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     remark: str = ""
 
     @property
-    def seconds(self) -> float:
-        """Time of its last try."""
-        return self.last.seconds if self.last else 0.0
-
-    @property
     def ok(self) -> bool:
         """Whether it succeeded."""
-        return self.last is not None and self.last.state == "succeeded"
+        return self.last.state == "succeeded"
 
     @property
     def failed(self) -> bool:
         """Whether it was run and did not succeed."""
-        return self.last is not None and not self.ok
+        return self.last.state in ("failed", "broken")
+
+    @property
+    def seconds(self) -> float:
+        """Time of its last try."""
+        return self.last.seconds
 
     @property
     def state(self) -> str:
         """Its name, for people."""
         return self.job.name
-
-    @property
-    def error(self) -> str:
-        """Why it failed; "" if it did not."""
-        return self.last.error if self.last else ""
 
     @property
     def event(self) -> dict[str, Any]:
@@ -88,16 +83,17 @@ class JobResult:
     @property
     def facts(self) -> dict[str, Any]:
         """How it ended, as the summary has it, without figures and warnings."""
+        job, last = self.job, self.last
         return {
-            "name": self.job.name,
-            "command": self.job.command,
-            "source": self.job.source,
-            "state": "succeeded" if self.ok else "failed" if self.failed else "not run",
-            "tries": self.last.tries if self.last else 0,
-            "seconds": self.seconds,
-            "worker": self.last.worker if self.last else "",
-            **({"error": self.error} if self.failed else {}),
-            **({"swept": dict(self.job.swept)} if self.job.swept else {}),
+            "name": job.name,
+            "command": job.command,
+            "source": job.source,
+            "state": "failed" if self.failed else last.state,
+            "tries": last.tries,
+            "seconds": last.seconds,
+            "worker": last.worker,
+            **({"error": last.error} if self.failed else {}),
+            **({"swept": dict(job.swept)} if job.swept else {}),
             **({"remark": self.remark} if self.remark else {}),
         }
 
@@ -118,6 +114,7 @@ def work_off(
         ClusterError: The scheduler or all workers are gone.
     """
     progress = options.progress
+    log_file(folder, "").parent.mkdir(parents=True, exist_ok=True)
     progress.on_stage(f"{len(cluster.workers)} workers, dashboard {cluster.dashboard}")
     progress.on_start(folder.name, len(jobs), unit)
     try:

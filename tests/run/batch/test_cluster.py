@@ -17,8 +17,9 @@ from recon.core.errors import (
     MissingDependencyError,
     SettingsError,
 )
-from recon.run.batch.cluster import Cluster, _outcome, join_cluster, local_cluster
+from recon.run.batch.cluster import BatchOptions, Cluster, _outcome, join_cluster, local_cluster
 from recon.run.batch.job import Job, Outcome, log_file
+from recon.run.batch.results import work_off
 from tests.run.batch.jobs import job, stand_in, tries
 
 distributed = pytest.importorskip("distributed")
@@ -125,6 +126,13 @@ def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path: Path) 
     log_file(tmp_path, "a").parent.mkdir()
     log_file(tmp_path, "a").write_bytes(begun.line())
     assert _outcome(Lost(), None, job("a"), tmp_path) == begun
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_the_folder_of_a_batch_is_made_for_its_workers(cluster: Cluster, tmp_path: Path) -> None:
+    folder = tmp_path / "state" / "pieces"
+    (result,) = work_off([job("a")], folder, cluster, BatchOptions())
+    assert (result.ok, result.figures["points"]) == (True, 7)
 
 
 def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path: Path) -> None:
