@@ -36,7 +36,7 @@ def mesh(
     """
     with shared.one_line_errors():
         from recon.commands.config import PAIR_DEFAULTS, load_config
-        from recon.commands.export import run_mesh
+        from recon.commands.mesh import run_mesh
         from recon.run.finished import is_pair_run
 
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None

@@ -42,7 +42,7 @@ def occupancy(
     """
     with shared.one_line_errors():
         from recon.commands.config import run_settings
-        from recon.commands.export import run_occupancy
+        from recon.commands.occupancy import run_occupancy
 
         given = {
             "occupancy.resolution_m": resolution,

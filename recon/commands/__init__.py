@@ -1,7 +1,7 @@
 """One story per command of the program, as functions of the library.
 
-`map.py` is `recon map`, and so on (`export.py`: also `recon occupancy` and `mesh`); each reads like
-the paragraph that explains it. What several of them share:
+`map.py` is `recon map`, and so on; each reads like the paragraph that explains it. What several of
+them share:
 
 - `config.py`: settings of all stages; `settings_list.py`: the same, described;
 - `map_options.py`: what is mapped with what; `resume.py`, `identity.py`: interrupted runs;

@@ -1,4 +1,4 @@
-"""`recon export`, `recon occupancy`, `recon mesh`: products of a finished run, made again."""
+"""`recon export`: products of a finished run, with other settings or formats."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
-from recon.core.errors import FormatError, SettingsError
-from recon.export.cloud_file import copy_file, mesh_cloud
+from recon.core.errors import SettingsError
+from recon.export.cloud_file import export_pair
 from recon.export.make import known_products, make, need_rays
 from recon.export.product import Order
 from recon.io.files import StrPath
@@ -23,8 +23,6 @@ from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,
     MAPPED_BY,
-    PAIR_CLOUD,
-    camera_of_pair,
     is_pair_run,
     open_run,
     refuse_as_target,
@@ -87,7 +85,7 @@ def run_export(
     settings = config or ran
     if mapped is None:
         with Run(command, out, settings, threads=threads) as run:
-            return _export_pair(source, settings, wanted, run, formats)
+            return export_pair(source, settings.mesh, wanted, run, formats)
     check_changes(ran, settings, (*(REMADE if need_rays(wanted) else ()), "mesh"))
     with Map.open(source) as map_, Run(command, out, settings, threads=threads) as run:
         with run.stage("map"):
@@ -106,78 +104,6 @@ def run_export(
     return figures
 
 
-def run_occupancy(
-    run: StrPath,
-    config: ReconConfig | None = None,
-    *,
-    out: StrPath | None = None,
-    threads: int | None = None,
-) -> dict[str, Any]:
-    """Make voxels and grid of a run with other settings: what `recon occupancy` does.
-
-    Args:
-        run: Folder of the run that mapped the drive.
-        config: As for `run_export`, like all that follows.
-        out: As before.
-        threads: As before.
-
-    Raises:
-        ReconError: As for `run_export`.
-    """
-    if is_pair_run(Path(run)):
-        raise FormatError("the run made no map: it is one of recon pair", where=run)
-    products = ("octomap", "grid")
-    return run_export(run, config, products=products, out=out, threads=threads, command="occupancy")
-
-
-def run_mesh(
-    source: Path,
-    config: ReconConfig,
-    *,
-    formats: Sequence[str] = ("ply",),
-    out: Path | None = None,
-    threads: int | None = None,
-) -> dict[str, Any]:
-    """Reconstruct the surface of a cloud file or of a run's map, and write a MeshLab project.
-
-    A cloud file is meshed in one piece, since its scale is unknown; the cloud of a pair as
-    `recon pair` does. The map of a run is meshed in pieces, and faces in observed free space are
-    removed.
-
-    Args:
-        source: A PLY file, or the folder of a run of map, demo or pair.
-        config: Settings of the mesh; the rest is that of the run.
-        formats: File suffixes without the dot, such as ``("ply", "glb")``.
-        out: Result folder; None = a new one below ``outputs/``.
-        threads: Threads to use; None = all cores.
-
-    Returns:
-        The figures of ``summary.json``.
-
-    Raises:
-        ReconError: The cloud cannot be read or gives no surface, a format is unknown, or the
-            folder cannot be written; nothing is left behind.
-    """
-    check_mesh_formats(formats)
-    cloud, camera = source, None
-    if source.is_dir():
-        refuse_as_target(source, out)
-        if not is_pair_run(source):
-            settings = run_settings(source).model_copy(update={"mesh": config.mesh})
-            return run_export(
-                source,
-                settings,
-                products=["mesh"],
-                formats=formats,
-                out=out,
-                threads=threads,
-                command="mesh",
-            )
-        cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
-    with Run("mesh", out, config, threads=threads) as run:
-        return _finished(source, cloud, run, mesh_cloud(cloud, camera, config.mesh, run, formats))
-
-
 def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | None) -> PlacedMap:
     """Cut a map into tiles, here or on workers."""
     if workers is None:
@@ -185,26 +111,6 @@ def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | 
     with workers.connect() as cluster:
         folder = run.state("tiles").resolve()
         return place_map_on(map_, settings, folder, cluster.each, cluster.at_once)
-
-
-def _export_pair(
-    source: Path, config: ReconConfig, products: Sequence[str], run: Run, formats: Sequence[str]
-) -> dict[str, Any]:
-    """Return products of a run of `recon pair`."""
-    cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
-    figures: dict[str, Any] = {"run": str(source), "warnings": []}
-    if "cloud" in products:
-        copy_file(cloud, run.path(PAIR_CLOUD))
-    if "mesh" in products:
-        figures |= mesh_cloud(cloud, camera, config.mesh, run, formats)
-    return _finished(source, cloud, run, figures)
-
-
-def _finished(source: Path, cloud: Path, run: Run, figures: dict[str, Any]) -> dict[str, Any]:
-    """Complete a run that made something of a cloud file."""
-    figures = {"cloud": str(cloud), **figures}
-    run.finish(figures, source=str(source), inputs=[cloud])
-    return figures
 
 
 def _check_survey(survey: Survey, products: Sequence[str]) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.demo import demo_source
-from recon.commands.export import run_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.commands.occupancy import run_occupancy
 from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling

@@ -17,6 +17,7 @@ from recon.io.files import naming, reading
 from recon.io.models.mesh import write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import read_ply, write_ply
+from recon.run.finished import PAIR_CLOUD, camera_of_pair
 from recon.run.run import Run
 
 
@@ -65,3 +66,39 @@ def copy_file(file: Path, target: Path) -> None:
         file.stat()
     with atomic_path(target) as temporary:
         copyfile(file, temporary)
+
+
+def export_pair(
+    source: Path, settings: MeshSettings, products: Sequence[str], run: Run, formats: Sequence[str]
+) -> dict[str, Any]:
+    """Write products of a run of `recon pair`: its cloud, and a mesh of it.
+
+    Args:
+        source: Folder of that run.
+        settings: Settings of the mesh.
+        products: Which of ``cloud`` and ``mesh``.
+        run: The run that makes them.
+        formats: Formats of the mesh.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: As for `mesh_cloud`.
+    """
+    cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
+    figures: dict[str, Any] = {"run": str(source), "warnings": []}
+    if "cloud" in products:
+        copy_file(cloud, run.path(PAIR_CLOUD))
+    if "mesh" in products:
+        figures |= mesh_cloud(cloud, camera, settings, run, formats)
+    return finish_cloud_run(source, cloud, run, figures)
+
+
+def finish_cloud_run(
+    source: Path, cloud: Path, run: Run, figures: dict[str, Any]
+) -> dict[str, Any]:
+    """Complete a run that made something of a cloud file."""
+    figures = {"cloud": str(cloud), **figures}
+    run.finish(figures, source=str(source), inputs=[cloud])
+    return figures
