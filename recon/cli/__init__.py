@@ -2,7 +2,8 @@
 
 One file per command. What several of them take is in `options.py`, and for drives in
 `drive_options.py`: a dataclass is a group of options, which `takes_groups` spreads. `errors.py`
-says what an error looks like, and `show/` has the tables and the progress.
+says what an error looks like, `commands.py` what is a number, and `show/` has the tables and the
+progress.
 
 Nothing heavy is imported before a command runs, so ``recon --help`` answers at once.
 """
@@ -23,9 +24,10 @@ from recon.cli.batch import batch
 from recon.cli.board import board
 from recon.cli.calibrate import calibrate
 from recon.cli.capture import capture
+from recon.cli.commands import Commands
 from recon.cli.demo import demo
 from recon.cli.doctor import doctor
-from recon.cli.errors import BUG, report_bug
+from recon.cli.errors import report_unforeseen
 from recon.cli.export import export
 from recon.cli.live import live
 from recon.cli.localize import localize
@@ -39,7 +41,7 @@ from recon.cli.piece import piece
 from recon.cli.rectify import rectify
 from recon.cli.settings import settings
 
-app = typer.Typer(
+app = Commands(
     name="recon",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -110,8 +112,7 @@ def main() -> None:
             typer.echo(f"error: the output cannot be written ({error.strerror})", err=True)
         sys.exit(1)
     except Exception as error:  # noqa: BLE001 - outside of `one_line_errors`, as while printing a table
-        report_bug(error)
-        sys.exit(BUG)
+        sys.exit(report_unforeseen(error))
 
 
 def _open_standard_streams() -> None:

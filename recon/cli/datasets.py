@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
+from recon.cli.commands import Commands
 from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_datasets, print_json
 
-app = typer.Typer(
+app = Commands(
     no_args_is_help=True,
     help="Public data that recon reads: Middlebury, KITTI, EuRoC, TUM VI.",
 )

@@ -18,11 +18,11 @@ from typing import NoReturn, TextIO
 
 import typer
 
-from recon.core.errors import ReconError, SettingsError
+from recon.core.errors import MissingDependencyError, ReconError, SettingsError
 from recon.core.kernels.cache import when_compiling
 
 INTERRUPTED = 130
-BUG = 3
+_BUG = 3
 _ADDRESS_BYTES = 2_500_000_000
 """What the libraries of a command reserve, most of it never used: 1.8 to 2.2 GB were seen."""
 
@@ -52,7 +52,7 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     except ImportError as error:
         # Ctrl-C while a native library initialises surfaces as an import failure.
         if not _interrupted(error):
-            _fail_by_bug(error)
+            _fail_unforeseen(error)
         typer.echo("interrupted", err=True)
         raise typer.Exit(INTERRUPTED) from None
     except OSError as error:
@@ -60,13 +60,13 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
         _fail(f"{name}{error.strerror or error}")
     except RuntimeError as error:
         if not str(error).startswith("Symlink loop"):  # of Path.resolve, before Python 3.13
-            _fail_by_bug(error)
+            _fail_unforeseen(error)
         _fail(str(error))
     except KeyboardInterrupt as interrupt:
         typer.echo("; ".join(["interrupted", *map(str, interrupt.args)]), err=True)
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:  # noqa: BLE001 - whatever it is, it is a bug
-        _fail_by_bug(error)
+        _fail_unforeseen(error)
 
 
 def _check_surroundings() -> None:
@@ -90,11 +90,16 @@ def _check_surroundings() -> None:
         )
 
 
-def report_bug(error: BaseException) -> None:
-    """Print one line for an exception that should not have happened.
+def report_unforeseen(error: BaseException) -> int:
+    """Print one line for an exception that nothing has caught, and return the exit code.
 
-    Its traceback goes to a new file in the folder for temporary files.
+    A package of others that cannot be imported is a fault of the installation. All else should not
+    have happened: its traceback goes to a new file in the folder for temporary files.
     """
+    if isinstance(error, ImportError) and (error.name or "").partition(".")[0] != "recon":
+        what, hint = "a package cannot be imported", "recon doctor says what is missing"
+        typer.echo(f"error: {MissingDependencyError(what, got=error, hint=hint)}", err=True)
+        return 1
     try:
         with tempfile.NamedTemporaryFile(
             "w", prefix="recon-error-", suffix=".txt", delete=False, errors="backslashreplace"
@@ -106,6 +111,7 @@ def report_bug(error: BaseException) -> None:
         where = "(no folder for temporary files can be written; set TMPDIR for the traceback)"
     what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
     typer.echo(f"error: internal error ({what}), please report: {where}", err=True)
+    return _BUG
 
 
 class _CompilingNotice:
@@ -151,9 +157,8 @@ def _interrupted(error: BaseException) -> bool:
     return isinstance(error, KeyboardInterrupt) or _interrupted(earlier)
 
 
-def _fail_by_bug(error: BaseException) -> NoReturn:
-    report_bug(error)
-    raise typer.Exit(BUG) from None
+def _fail_unforeseen(error: BaseException) -> NoReturn:
+    raise typer.Exit(report_unforeseen(error)) from None
 
 
 def _fail(line: str) -> None:

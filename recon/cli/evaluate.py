@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
+from recon.cli.commands import Commands
 from recon.cli.errors import one_line_errors
 from recon.cli.evaluate_middlebury import middlebury
 from recon.cli.show.tables import print_evaluation, print_figures, print_json
 
-app = typer.Typer(no_args_is_help=True, help="Compare results with ground truth.")
+app = Commands(no_args_is_help=True, help="Compare results with ground truth.")
 app.command()(middlebury)
 
 

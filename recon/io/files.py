@@ -64,7 +64,7 @@ def reading(path: StrPath) -> Iterator[None]:
         _refuse_special(path)
         with naming(path), np.errstate(all="ignore"):
             yield
-    except ReconError:
+    except (ReconError, ImportError):  # a package that is missing is no fault of the file
         raise
     except FileNotFoundError as error:
         raise FormatError("file does not exist", where=error.filename or path) from error

@@ -236,4 +236,4 @@ def test_ctrl_c_while_a_native_library_starts_is_an_interruption(
 def test_a_library_that_is_missing_is_no_interruption() -> None:
     with pytest.raises(typer.Exit) as ended, one_line_errors():
         raise ImportError("nothing of that name")
-    assert ended.value.exit_code == 3
+    assert ended.value.exit_code == 1

@@ -105,3 +105,26 @@ def test_a_hostile_memory_limit_is_refused(limit: str, here: Path) -> None:
     assert ended.code in {1, 2}
     assert len(ended.lines[-1]) < 6000
     assert list(here.iterdir()) == []
+
+
+NUMBERS_OF_OPTIONS: Final = {
+    "a whole number": ("pair", "left.png", "right.png", "--threads"),
+    "a number": ("pair", "left.png", "right.png", "--focal"),
+    "a number of a group": ("map", "drive", "--focal"),
+    "a number of a part": ("evaluate", "disparity", "a.pfm", "b.pfm", "--scale"),
+    "an argument": ("piece", "plan"),
+}
+
+
+@pytest.mark.parametrize("option", NUMBERS_OF_OPTIONS)
+@pytest.mark.parametrize("number", ["1_0", "\u0661\u0662"])
+def test_an_option_takes_decimals_alone_for_numbers(option: str, number: str, here: Path) -> None:
+    """Wrong usage, as is any other text that is no number."""
+    ended = run(*NUMBERS_OF_OPTIONS[option], number)
+    assert ended.code == 2
+    assert "Invalid value for" in ended.err
+    assert not list(here.iterdir())
+
+
+def test_a_file_may_be_named_as_a_number_is_not(here: Path) -> None:
+    assert_refused(run("map", "1_0"), "1_0", "exist")
