@@ -1,7 +1,7 @@
 """Shared by all commands: clean standard output, one-line errors, exit codes.
 
 0 = success, 1 = an error reported in one line, 2 = wrong usage (typer), 3 = a bug of recon, also in
-one line, 130 = interrupted.
+one line, 130 = interrupted (Ctrl-C, SIGTERM, SIGHUP).
 """
 
 from __future__ import annotations

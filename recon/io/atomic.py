@@ -96,7 +96,11 @@ def exchange(new: Path, old: Path) -> None:
     if done != 0:
         aside = old.with_name(f".{secrets.token_hex(6)}-{old.name}")
         old.replace(aside)
-        new.replace(old)
+        try:
+            new.replace(old)
+        except BaseException:
+            aside.replace(old)
+            raise
         aside.replace(new)
     _sync(old.parent)
 

@@ -223,16 +223,21 @@ class RunDirectory:
 
     def _swap(self) -> None:
         """Put the new folder in the place of the old one, with files in it that are of no run."""
-        shutil.rmtree(self._content / _STATE, ignore_errors=True)
+        try:
+            shutil.rmtree(self._content / _STATE, ignore_errors=True)
+            self._keep_others()
+            exchange(self._content, self.folder.resolve())
+        finally:  # the old folder, or a new one that was interrupted before it took its place
+            self._withdraw()
+
+    def _keep_others(self) -> None:
+        """Copy files that are of no run into the new folder."""
         ours = {self.folder / name for name in self._earlier}
         for path in self.folder.rglob("*"):
             target = self._content / path.relative_to(self.folder)
             if path.is_file() and path not in ours and self._partial not in path.parents:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(path, target, follow_symlinks=False)
-        new = self._content
-        exchange(new, self.folder.resolve())
-        shutil.rmtree(new, ignore_errors=True)
 
     def _withdraw(self) -> None:
         for partial in {self._partial, self._content}:

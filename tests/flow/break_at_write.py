@@ -1,10 +1,11 @@
 """`recon` in a process that ends, is interrupted, or meets a full disk, at its n-th write.
 
-``python break_at_write.py (kill|interrupt|full|count) N ARGUMENTS…``: a write is what makes a file
-appear whole under its name, or a commit of the map. ``kill`` ends the process by SIGKILL before it
-(even N) or after it (odd N), ``interrupt`` does what Ctrl-C does, ``full`` lets the disk be full
-from there on, ``count`` writes how many writes there were to ``$COUNT``. A live drive leaves no
-frame out here and is committed after each, so that its writes, too, are the same every time.
+``python break_at_write.py (kill|interrupt|terminate|full|count) N ARGUMENTS…``: a write is what
+makes a file appear whole under its name, or a commit of the map. ``kill`` ends the process by
+SIGKILL before it (even N) or after it (odd N), ``interrupt`` does what Ctrl-C does, ``terminate``
+what a batch system does, ``full`` lets the disk be full from there on, ``count`` writes how many
+writes there were to ``$COUNT``. A live drive leaves no frame out here and is committed after each,
+so that its writes, too, are the same every time.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from recon.map.store.records import Store
 from tests.scenery.patience import be_patient
 
 MODE, LAST = sys.argv[1], int(sys.argv[2])
+SIGNALS = {"interrupt": signal.SIGINT, "terminate": signal.SIGTERM}
 _replace, _fsync, _commit = Path.replace, os.fsync, Store.commit
 _writes = 0
 
@@ -37,8 +39,8 @@ def write() -> Iterator[None]:
     broken = MODE == "kill" and _writes == LAST
     if broken and LAST % 2 == 0:
         os.kill(os.getpid(), signal.SIGKILL)
-    if MODE == "interrupt" and _writes == LAST:
-        os.kill(os.getpid(), signal.SIGINT)
+    if MODE in SIGNALS and _writes == LAST:
+        os.kill(os.getpid(), SIGNALS[MODE])
     yield
     if broken:
         os.kill(os.getpid(), signal.SIGKILL)

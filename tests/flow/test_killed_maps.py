@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from tests.scenery.kitti import write_kitti
 
 STREET = StreetScene(frames=40, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
 ROOT = Path(__file__).parents[2]
+INTERRUPTED = 130
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
@@ -52,10 +54,15 @@ def _frames(file: Path) -> int:
 
 def _broken(mode: str, at: int, out: Path, *words: object) -> int:
     """Run a command that ends at its n-th write, or count its writes; the exit code."""
-    command = [sys.executable, str(BREAKER), mode, str(at), *map(str, words)]
+    target = () if "--into" in words else ("--out", out)
+    command = [sys.executable, str(BREAKER), mode, at, *words, *target, "--quiet"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COUNT": f"{out}.count"}
-    ended = subprocess.run([*command, "--quiet", "--out", str(out)], env=environment, check=False)
-    return ended.returncode
+    return subprocess.run([*map(str, command)], env=environment, check=False).returncode
+
+
+def _files(folder: Path) -> dict[Path, bytes]:
+    """All files below a folder, hidden ones too."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_live_drive_that_is_killed_leaves_a_map_that_opens(drive: Path, tmp_path: Path) -> None:
@@ -94,3 +101,21 @@ def test_a_merge_that_is_killed_leaves_a_whole_folder_or_none(drive: Path, tmp_p
         record = json.loads((out / "run.json").read_text())
         assert all((out / name).is_file() for name in record["files"])
         assert _frames(out / "map" / "map.recon") == 28
+
+
+def test_a_run_whose_change_is_ended_by_a_signal_stays_as_it_was(
+    drive: Path, tmp_path: Path
+) -> None:
+    run, changed = tmp_path / "before" / "run", tmp_path / "changed" / "run"
+    assert _broken("count", 0, run, "map", drive, "--no-mesh", "--end", 14) == 0
+    drive_after = ("map", drive, "--start", 6, "--end", 20)
+    for words in (drive_after, ("map", "--remove", 1)):
+        shutil.copytree(run, changed)
+        into = (*words, "--no-mesh", "--into")
+        assert _broken("count", 0, changed, *into, changed) == 0
+        writes, before = int(Path(f"{changed}.count").read_text()), _files(run.parent)
+        for mode, at in (("terminate", 2), ("interrupt", writes // 2), ("terminate", writes)):
+            assert _broken(mode, at, run, *into, run) == INTERRUPTED
+            assert _files(run.parent) == before
+        shutil.rmtree(run)
+        changed.rename(run)

@@ -156,10 +156,10 @@ def test_a_drive_is_taken_out_of_a_map_that_began_with_chosen_frames(
 
 @pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.joined.place_map"])
 def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) -> None:
-    before, short = content(run), part(FIRST, frames=4)
+    before, short = content(run.parent), part(FIRST, frames=4)
     with patch(at, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
         run_map_into(run, short, None, OPTIONS)
-    assert {n: c for n, c in content(run).items() if not n.startswith(".partial")} == before
+    assert content(run.parent) == before
     run_map_into(run, short, None, OPTIONS)  # and it can be tried again
     assert len(summary_of(run)["sessions"]) == 2
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import FormatError, OutputError, SettingsError
-from recon.io.atomic import atomic_path, check_targets, write_bytes, write_text
+from recon.io import atomic
+from recon.io.atomic import atomic_path, check_targets, exchange, write_bytes, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -107,6 +108,22 @@ def test_a_new_file_and_one_that_is_not_read_may_be_written(tmp_path: Path) -> N
 def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="No such file"), atomic_path(tmp_path / "a.txt"):
         pass
+
+
+@pytest.mark.parametrize("system", ["linux", "another"])
+def test_two_folders_are_exchanged_or_the_old_one_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
+) -> None:
+    new, old = tmp_path / "new", tmp_path / "old"
+    for folder in (new, old):
+        folder.mkdir()
+        (folder / folder.name).touch()
+    monkeypatch.setattr(atomic.sys, "platform", system)
+    exchange(new, old)
+    assert (names(new), names(old)) == (["old"], ["new"])
+    with pytest.raises(FileNotFoundError):
+        exchange(tmp_path / "none", old)
+    assert names(tmp_path) == ["new", "old"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")

@@ -8,12 +8,14 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import OutputError
+from recon.io.atomic import exchange
+from recon.run import directory
 from recon.run.directory import RunDirectory
-from recon.run.run import Run
+from recon.run.run import Run, WholeRun
 
 
-def write_run(folder: Path, *names: str) -> None:
-    with RunDirectory(folder) as run:
+def write_run(folder: Path, *names: str, whole: bool = False) -> None:
+    with WholeRun("merge", folder) if whole else RunDirectory(folder) as run:
         for name in names:
             run.path(name).write_text(name)
         run.write_json("run.json", {"files": [*run.files(), "run.json"]})
@@ -52,6 +54,23 @@ def test_a_failed_run_leaves_an_earlier_run_as_it_was(tmp_path: Path) -> None:
         fail_halfway(tmp_path / "run")
     assert (tmp_path / "run" / "map" / "cloud.ply").read_text() == "map/cloud.ply"
     assert files_in(tmp_path / "run") == {"map/cloud.ply", "run.json"}
+
+
+@pytest.mark.parametrize(("exchanges", "left"), [(False, "old"), (True, "new")])
+def test_a_run_that_is_interrupted_as_it_takes_the_place_of_another_leaves_one_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: bool, left: str
+) -> None:
+    def interrupted(new: Path, old: Path) -> None:
+        if exchanges:
+            exchange(new, old)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(directory, "exchange", interrupted)
+    write_run(tmp_path / "run", "old")
+    with pytest.raises(KeyboardInterrupt):
+        write_run(tmp_path / "run", "new", whole=True)
+    assert files_in(tmp_path) == {f"run/{left}", "run/run.json"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 @pytest.mark.parametrize("resume", [False, True])
