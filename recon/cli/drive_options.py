@@ -154,11 +154,7 @@ class DriveOptions(SourceOptions):
         return [*matching_overrides(self.matcher), *super().overrides(start)]
 
     def settings(self, shared: opt.Shared, start: int | None) -> ReconConfig:
-        """Return the configuration of a command.
-
-        Raises:
-            SettingsError: An option or a setting is invalid.
-        """
+        """Return the configuration of a command."""
         from recon.commands.config import load_config
         from recon.run.memory import memory_overrides
 
@@ -169,11 +165,7 @@ class DriveOptions(SourceOptions):
 def open_drive(
     request: MapRequest, settings: ReconConfig, shared: opt.Shared
 ) -> tuple[StereoSource, MapOptions]:
-    """Open a drive, say how it is read, and return it with the options of its run.
-
-    Raises:
-        ReconError: It cannot be opened.
-    """
+    """Open a drive, say how it is read, and return it with the options of its run."""
     drive, options = request.open(settings)
     return drive, announced(drive, options, shared)
 
@@ -200,11 +192,7 @@ def open_workers(
 
 
 def read_start(text: str | None) -> tuple[StartPose | None, int | None]:
-    """Read where a drive begins: a pose ``x,y,yaw``, or the number of its first frame.
-
-    Raises:
-        SettingsError: It is neither.
-    """
+    """Read where a drive begins: a pose ``x,y,yaw``, or the number of its first frame."""
     numbers = opt.parse_numbers(text, "--start") or ()
     if not numbers:
         return None, None

@@ -70,11 +70,7 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
 
 
 def _check_surroundings() -> None:
-    """Refuse limits under which libraries would fail, or crash, while they are loaded.
-
-    Raises:
-        SettingsError: There is such a limit.
-    """
+    """Refuse limits under which libraries would fail, or crash, while they are loaded."""
     threads = os.environ.get("NUMBA_NUM_THREADS", "1")
     if not (threads.isdecimal() and threads.isascii() and int(threads) > 0):
         where, expected = "NUMBA_NUM_THREADS", "a positive number"

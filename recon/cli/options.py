@@ -114,11 +114,7 @@ SOURCES_HELP = (
 
 
 def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
-    """Parse an option that takes several numbers, separated by commas.
-
-    Raises:
-        SettingsError: One of them is not a number.
-    """
+    """Parse an option that takes several numbers, separated by commas."""
     if text is None:
         return None
     try:
@@ -130,11 +126,7 @@ def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
 
 
 def survey_of(positions: Path | None, antenna: str | None, crs: str | None = None) -> Survey | None:
-    """Return what the options say of a survey.
-
-    Raises:
-        SettingsError: The offset is not three numbers, or there are no positions.
-    """
+    """Return what the options say of a survey."""
     from recon.map.sessions.measured import Survey
 
     if positions is None:

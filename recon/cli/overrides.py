@@ -27,11 +27,7 @@ def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> 
 def pair_config(
     path: Path | None, overrides: Sequence[str], matcher: str | None, ndisp: int | None
 ) -> ReconConfig:
-    """Return the configuration of one pair, with its matcher and disparity range; None = unchanged.
-
-    Raises:
-        SettingsError: As for `load_config`, or the matcher searches no range.
-    """
+    """Return the configuration of one pair with its matcher and disparity range; None = kept."""
     config = load_config(path, [*overrides, *matching_overrides(matcher, ndisp)], PAIR_DEFAULTS)
     used = config.matching.matcher
     if ndisp is not None and not hasattr(settings_of(used, config.matching), "ndisp"):
@@ -42,11 +38,7 @@ def pair_config(
 
 
 def capture_overrides(size: str | None, rate_hz: float | None) -> list[str]:
-    """Return overrides for a recording; None = unchanged.
-
-    Raises:
-        SettingsError: The size is not of the form 1280x720.
-    """
+    """Return overrides for a recording; None = unchanged."""
     width, cross, height = (size or "").partition("x")
     if size is not None and not (cross and is_count(width) and is_count(height)):
         raise SettingsError("cannot read this size", got=size, expected="WIDTHxHEIGHT: 1280x720")

@@ -35,11 +35,7 @@ _USAGE_ERROR: Any = typer.BadParameter.__base__
 
 
 def plan_jobs(listed: JobList) -> list[Job]:
-    """Turn what is asked for into jobs; of a sweep, each value is checked once.
-
-    Raises:
-        SettingsError: A command, an option, a setting or a name is none, or would write elsewhere.
-    """
+    """Turn what is asked for into jobs; of a sweep, each value is checked once."""
     sets = {tuple(entry.set): entry.name for entry in reversed(listed.job)}
     for texts, name in sets.items():
         _check_settings(texts, name, listed)

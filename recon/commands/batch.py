@@ -34,12 +34,6 @@ def run_batch(
 
     Returns:
         The summary: ``jobs`` with the figures of each, ``succeeded``, ``failed`` and more.
-
-    Raises:
-        SettingsError: The scheduler cannot be reached.
-        OutputError: The folder is not empty, cannot be written, or another batch is writing to it.
-        MissingDependencyError: Dask is not installed.
-        ClusterError: The scheduler or all workers are gone.
     """
     folder = (options.out or default_folder("batch")).resolve()
     if listed is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

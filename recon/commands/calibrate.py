@@ -53,10 +53,6 @@ def run_calibrate(
         form: Its format.
         out: Folder for report, images and figures; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Does not change results.
-
-    Raises:
-        ReconError: The images do not pair up, do not show the board, or fit no rig, or a file
-            cannot be written; then no output is left behind.
     """
     _check_file(file)
     videos = _videos(left, right)

@@ -35,11 +35,6 @@ def run_capture(
 
     Returns:
         The figures, as written to ``capture.json`` in the folder.
-
-    Raises:
-        SourceError: A camera cannot be opened, or stops; what was recorded before stays.
-        OutputError: The folder cannot be written; what was written before stays.
-        FormatError: There is no such calibration file.
     """
     if calibration is not None and not calibration.is_file():
         raise FormatError("file does not exist", where=calibration)

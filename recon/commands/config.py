@@ -141,10 +141,6 @@ def run_settings(
         file: YAML file of settings, applied before the overrides; None = none.
         overrides: ``key=value`` settings.
         without: Sections that are the defaults again, since they are of its source.
-
-    Raises:
-        FormatError: The folder does not contain such a run.
-        SettingsError: A setting is invalid, or one of the run's is not known in this version.
     """
     if is_pair_run(folder):
         return load_config(file, overrides, PAIR_DEFAULTS)
@@ -167,9 +163,6 @@ def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[st
         ran: The settings of the run.
         config: Those to make something of it with.
         sections: Where they may differ.
-
-    Raises:
-        SettingsError: They differ elsewhere.
     """
     for name in type(config).model_fields:
         if name not in sections and getattr(config, name) != getattr(ran, name):

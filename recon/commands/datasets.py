@@ -40,25 +40,13 @@ def run_fetch(
         folder: Where to.
         address: A mirror: a folder on a server that has the archives by their names.
         progress: Shown each megabyte.
-
-    Raises:
-        SettingsError: There is no such data set.
-        DownloadError: An archive cannot be downloaded, or is not what was promised.
-        FormatError: An archive is damaged or hostile.
-        OutputError: There is no room, the folder is of something else, or another process is
-            fetching it.
     """
     parts = {part.name: part for name in names for part in find_parts(name)}
     return {"datasets": [fetch_part(one, folder, address, progress) for one in parts.values()]}
 
 
 def run_verify(names: Sequence[str], folder: Path = FOLDER) -> dict[str, Any]:
-    """Compare the files of data sets, or of the parts that were fetched, with what was unpacked.
-
-    Raises:
-        SettingsError: There is no such data set.
-        FormatError: It was not fetched, or a file is missing or changed; the first is named.
-    """
+    """Compare the files of data sets, or of the parts that were fetched, with what was unpacked."""
     there: dict[str, Path] = {}
     for name in names:
         places = {part.name: folder / part.name for part in find_parts(name)}

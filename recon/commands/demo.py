@@ -33,9 +33,6 @@ def run_demo(
         mesh: As for `run_map`.
         threads: As for `run_map`.
         progress: As for `run_map`.
-
-    Raises:
-        ReconError: As for `run_map`.
     """
     options = MapOptions(
         command="demo",

@@ -37,10 +37,6 @@ def run_evaluate_disparity(
         scale: Pixels of the size that figures are given in per pixel here.
         confidence: PFM of the map's confidence, in [0, 1]; a pixel is correct if its error is at
             most one pixel of the map.
-
-    Raises:
-        FormatError: A file cannot be read.
-        EvaluationError: The maps cannot be compared.
     """
     values, true = read_disparity(estimate), read_disparity(truth)
     counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == _COUNTED

@@ -58,10 +58,6 @@ def run_evaluate_map(
     Returns:
         The figures of the first threshold, those of each in ``by_threshold``, and how far the
         alignment moved the cloud.
-
-    Raises:
-        ReconError: A file cannot be read, the two cannot be compared, or the folder cannot be
-            written; then no output is left behind.
     """
     if not thresholds_m:
         raise SettingsError("there is no threshold", where="--threshold")

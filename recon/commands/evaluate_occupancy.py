@@ -50,12 +50,6 @@ def run_evaluate_occupancy(
         folder: A run of a rendered street: of ``recon demo``, or of ``recon occupancy`` on one.
         least_frames: Number of frames that must have seen a cell for it to be compared.
         image: PNG for the grid with its errors in colour; None = none is drawn.
-
-    Raises:
-        FormatError: The folder does not contain a finished run, or a map is missing or damaged.
-        EvaluationError: The run has no ground truth, or no cell was seen often enough.
-        OutputError: The image cannot be written.
-        SettingsError: It would replace a file of the run.
     """
     if image is not None:
         check_targets([image], (folder / name for name in recorded_files(folder)))

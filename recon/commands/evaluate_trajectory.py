@@ -41,10 +41,6 @@ def run_evaluate_trajectory(
         times: Timestamps of the poses of a KITTI file in seconds, one per line; None = unknown.
         tolerance_s: Largest time difference of two associated poses.
         out: Result folder; None = nothing is written.
-
-    Raises:
-        ReconError: A file cannot be read, the two cannot be compared, or the folder cannot be
-            written; then no output is left behind.
     """
     ours, true, by_time = _read_paths(estimate, truth, times)
     poses = {"estimate_poses": len(ours), "true_poses": len(true)}

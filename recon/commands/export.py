@@ -114,11 +114,7 @@ def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | 
 
 
 def _check_survey(survey: Survey, products: Sequence[str]) -> None:
-    """Refuse an unknown coordinate system, and one of which no product would make use.
-
-    Raises:
-        SettingsError: So it is.
-    """
+    """Refuse an unknown coordinate system, and one of which no product would make use."""
     if not set(products) & set(SURVEYED):
         raise SettingsError(
             "only LAS and LAZ have the coordinates of a survey",

@@ -47,11 +47,7 @@ def identity_of(
 
 
 def read_started(folder: Path) -> dict[str, Any]:
-    """Read what an unfinished run was started with: its ``identity`` and ``arguments``.
-
-    Raises:
-        OutputError: The folder holds no unfinished run.
-    """
+    """Read what an unfinished run was started with: its ``identity`` and ``arguments``."""
     path = state_folder(folder) / STARTED
     try:
         with Map.open(path) as map_:
@@ -69,11 +65,7 @@ def read_started(folder: Path) -> dict[str, Any]:
 
 
 def _checked(started: Any) -> dict[str, Any]:
-    """Check that it has the form that `begin_or_resume` writes.
-
-    Raises:
-        TypeError: A part has another type; a `LookupError` if it is missing.
-    """
+    """Check that it has the form that `begin_or_resume` writes."""
     parts = (started["identity"], started["identity"]["config"], started["arguments"])
     plain = all(isinstance(part, dict) for part in parts)
     if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
@@ -88,9 +80,6 @@ def refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path)
         now: What a run is to be resumed with; parts of an identity.
         then: The identity that it was started with.
         folder: Folder of the run.
-
-    Raises:
-        SettingsError: They differ in more than the memory limit; the first difference is named.
     """
     # Through JSON, like the stored values, so that tuples equal lists.
     for part, value in json.loads(json.dumps(dict(now))).items():

@@ -51,9 +51,6 @@ def make_joined(
 
     Returns:
         The figures of ``summary.json``.
-
-    Raises:
-        ReconError: A drive is damaged or does not fit, or the folder cannot be written.
     """
     with (
         WholeRun(
@@ -90,11 +87,7 @@ def make_joined(
 
 
 def copied(file: Path, map_: Map, settings: ReconConfig) -> list[int]:
-    """Copy the drives of a finished map into another; their numbers.
-
-    Raises:
-        ReconError: A drive is damaged, does not fit, or is there already.
-    """
+    """Copy the drives of a finished map into another; their numbers."""
     with closing(Map.open(file)) as other:
         for session in other.sessions:
             check_session(session, settings)
@@ -102,11 +95,7 @@ def copied(file: Path, map_: Map, settings: ReconConfig) -> list[int]:
 
 
 def joined_settings(folder: Path, config: ReconConfig | None) -> ReconConfig:
-    """Return the settings of a finished run, or those with changes where they have an effect.
-
-    Raises:
-        ReconError: There is no such run, or the changes have no effect.
-    """
+    """Return the settings of a finished run, or those with changes where they have an effect."""
     open_run(folder)
     ran = run_settings(folder)
     if config is not None:

@@ -112,11 +112,7 @@ def _warm_up(source: LiveSource, config: ReconConfig, map_path: StrPath | None) 
 
 
 def _check_pose_first(config: ReconConfig) -> None:
-    """Refuse an odometry that needs exact disparities.
-
-    Raises:
-        SettingsError: It is asked for.
-    """
+    """Refuse an odometry that needs exact disparities."""
     if config.odometry.method == "kiss":
         raise SettingsError(
             "while images arrive, poses come before the points that kiss-icp needs",

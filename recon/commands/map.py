@@ -99,11 +99,7 @@ def run_map(
 def map_whole(
     source: StereoSource, config: ReconConfig, options: MapOptions, run: Run, map_: Map
 ) -> MappedSequence:
-    """Map a drive in one piece, in this process, into the map of a run.
-
-    Raises:
-        ReconError: As for `run_map`.
-    """
+    """Map a drive in one piece, in this process, into the map of a run."""
     return map_sequence(
         source,
         config,

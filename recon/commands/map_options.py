@@ -117,11 +117,7 @@ class MapRequest:
         )
 
     def over(self, earlier: Self) -> Self:
-        """Return this request, with what it leaves open as in an earlier one.
-
-        Raises:
-            SettingsError: It wants no mesh, and the earlier one does.
-        """
+        """Return this request, with what it leaves open as in an earlier one."""
         if earlier.mesh and not self.mesh:
             raise SettingsError("the run was started with a mesh", hint="drop --no-mesh")
         return replace(
@@ -133,12 +129,7 @@ class MapRequest:
         )
 
     def open(self, config: ReconConfig) -> tuple[StereoSource, MapOptions]:
-        """Open the source, and read the poses and the prior.
-
-        Raises:
-            SettingsError: The request names no source.
-            ReconError: The source cannot give pairs, or a file cannot be read.
-        """
+        """Open the source, and read the poses and the prior."""
         if self.source is None:
             raise SettingsError("there is no source to map", hint="name SOURCE")
         settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})

@@ -42,9 +42,6 @@ def map_in_pieces(
         options: Those of the run; ``workers`` says where pieces are mapped.
         run: The run.
         map_: Its map, which a drive that is resumed is in already.
-
-    Raises:
-        ReconError: As for `run_map`.
     """
     work, plan = Workspace(map_, run.watch, run.threads), run.state(_PLAN)
     spread = options.workers or BatchOptions(progress=options.progress)
@@ -74,11 +71,7 @@ def pieces_of(run: Run, map_: Map) -> dict[str, Any]:
 
 
 def _refuse_what_does_not_combine(config: ReconConfig, options: MapOptions) -> None:
-    """Refuse to cut a drive that cannot be cut.
-
-    Raises:
-        SettingsError: It cannot.
-    """
+    """Refuse to cut a drive that cannot be cut."""
     if options.known_poses is not None or options.prior is not None:
         what = "a drive with --poses or --prior is mapped in one piece"
         raise SettingsError(what, hint="drop --workers and --scheduler")
@@ -102,12 +95,7 @@ def _planned(
 
 
 def _checked(one: JobResult) -> dict[str, Any]:
-    """Return where a piece was mapped, and what it took.
-
-    Raises:
-        RegistrationError: It cannot be mapped.
-        ClusterError: It broke too often.
-    """
+    """Return where a piece was mapped, and what it took."""
     if not one.ok:
         kind = RegistrationError if one.last.state == "failed" else ClusterError
         raise kind(f"frames {one.job.source} cannot be mapped", got=one.last.error)

@@ -81,9 +81,6 @@ def run_map_into(
         source: The drive.
         config: Settings of the run with changes; None = its own.
         options: Options of the mapping, as for `run_map`; None = the defaults.
-
-    Raises:
-        ReconError: The run cannot be extended, or the drive cannot be mapped; the run stays.
     """
     options = options or MapOptions()
     settings = config or run_settings(folder)
@@ -106,9 +103,6 @@ def run_remove(
         number: Number of the drive, as ``sessions`` of the summary lists them.
         config: Settings of the run with changes; None = its own.
         options: Threads, mesh and progress of the run; None = the defaults.
-
-    Raises:
-        ReconError: There is no such drive, or no other one, or the run is damaged; the run stays.
     """
     options = options or MapOptions()
     settings = joined_settings(folder, config)

@@ -37,10 +37,6 @@ def run_mesh(
 
     Returns:
         The figures of ``summary.json``.
-
-    Raises:
-        ReconError: The cloud cannot be read or gives no surface, a format is unknown, or the
-            folder cannot be written; nothing is left behind.
     """
     check_mesh_formats(formats)
     cloud, camera = source, None

@@ -46,10 +46,6 @@ def run_paper(
 
     Returns:
         The figures of ``summary.json``.
-
-    Raises:
-        ReconError: A scene is missing or damaged, or the folder cannot be written; nothing is left
-            behind.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
     experiments = read_experiments(folder)

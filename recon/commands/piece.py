@@ -42,20 +42,12 @@ class PiecePlan:
 
 
 def write_plan(path: Path, plan: PiecePlan) -> None:
-    """Write a plan as JSON.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a plan as JSON."""
     write_text(path, json.dumps(asdict(plan), indent=1))
 
 
 def read_plan(path: Path) -> PiecePlan:
-    """Read a plan.
-
-    Raises:
-        FormatError: The file is missing or damaged.
-    """
+    """Read a plan."""
     with reading(path):
         content = json.loads(read_text(path, _PLAN_BYTES))
         pieces = [Piece(**piece) for piece in content["pieces"]]
@@ -96,9 +88,6 @@ def run_piece(
 
     Returns:
         The figures of ``summary.json``.
-
-    Raises:
-        ReconError: The plan or the source cannot be read, or the folder cannot be written.
     """
     planned = read_plan(plan)
     config = ReconConfig.parse(planned.config, where=str(plan))

@@ -47,10 +47,6 @@ def run_rectify(
         metres_per_unit: Unit of the translation in an OpenCV file.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores.
-
-    Raises:
-        ReconError: The images do not pair up or cannot be rectified, or the folder cannot be
-            written; nothing is left behind.
     """
     images = pair_images(left, right)
     with Run("rectify", out, config, threads=threads) as run, serial_algebra():

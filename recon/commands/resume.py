@@ -39,10 +39,6 @@ def resumed(
         config: YAML file of settings; None = those of the run.
         overrides: ``key=value`` settings; they and the file must not differ from the run's.
         memory_limit: Another memory limit, such as ``2G``; None = that of the run.
-
-    Raises:
-        SettingsError: A setting is invalid, or contradicts the run.
-        OutputError: There is no run to resume.
     """
     started = read_started(folder)
     request = request.over(MapRequest.of(started["arguments"]))
@@ -62,13 +58,7 @@ def begin_or_resume(
     identity: Mapping[str, Any],
     arguments: Mapping[str, Any],
 ) -> Map:
-    """Begin the map of a run; for a resumed one, check that nothing has changed, and open it.
-
-    Raises:
-        SettingsError: The run was started with other inputs or settings, or would replace an input.
-        FormatError: The map is damaged.
-        OutputError: The map cannot be written, or there is no run to resume.
-    """
+    """Begin the map of a run; for a resumed one, check that nothing has changed, and open it."""
     named = (arguments.get(name) for name in ("poses", "prior"))
     run.check_targets([*source.files, *(Path(name) for name in named if name is not None)])
     path, memory = run.state(STARTED), config.memory.cache_bytes
@@ -90,11 +80,6 @@ def with_resume_hint(run: RunDirectory, source: StereoSource) -> Iterator[None]:
     """Add a hint on how to resume to errors after which the run can be resumed.
 
     Of a live source, whose drive is over then, it says where the map is that was made so far.
-
-    Raises:
-        OutputError: The disk is full, or the folder can no longer be written.
-        MemoryLimitError: Memory is exhausted.
-        ClusterError: Workers or their scheduler are gone.
     """
     passing = (OutputError, MemoryLimitError, ClusterError, OSError, MemoryError)
     try:

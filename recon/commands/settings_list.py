@@ -67,9 +67,6 @@ def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
 
     Args:
         name: Dotted name of a setting or a group, or any part of one; None = all.
-
-    Raises:
-        SettingsError: No setting has such a name.
     """
     every = tuple(_groups(ReconConfig(), ReconConfig.parse(PAIR_DEFAULTS)))
     names = [entry.name for group in every for entry in group.settings]

@@ -56,9 +56,6 @@ def compile_kernels() -> WarmUp:
     They run once on small rendered images.
 
     The real stages run, so that a kernel that is added to one needs no mention here.
-
-    Raises:
-        OutputError: The temporary folder cannot be written.
     """
     begun, compiled = time.perf_counter(), set[str]()
     with when_compiling(compiled.add), tempfile.TemporaryDirectory() as name:

@@ -10,11 +10,7 @@ from collections.abc import Iterable
 
 
 def parse_number(text: str | bytes) -> float:
-    """Return the number that a text is; it may be ``nan`` or ``inf``.
-
-    Raises:
-        ValueError: It is none, as by ``float``.
-    """
+    """Return the number that a text is; it may be ``nan`` or ``inf``."""
     _check(text)
     return float(text)
 
@@ -25,11 +21,7 @@ def parse_numbers(words: Iterable[str | bytes]) -> list[float]:
 
 
 def parse_integer(text: str | bytes) -> int:
-    """Return the whole number that a text is.
-
-    Raises:
-        ValueError: It is none, as by ``int``.
-    """
+    """Return the whole number that a text is."""
     _check(text)
     return int(text)
 
@@ -40,11 +32,7 @@ def is_count(text: str) -> bool:
 
 
 def refuse_other_numbers(text: str) -> None:
-    """Refuse what is a number for Python alone; text that is none at all is not looked at.
-
-    Raises:
-        ValueError: So it is.
-    """
+    """Refuse what is a number for Python alone; text that is none at all is not looked at."""
     try:
         float(text)
     except ValueError:

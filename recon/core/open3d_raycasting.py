@@ -23,9 +23,6 @@ class RayScene:
     Args:
         triangles: (F, 3, 3) corners, metres.
         threads: Number of threads; 0 = one per core. The result does not depend on it.
-
-    Raises:
-        ShapeError: There is no triangle, or a corner is not finite.
     """
 
     def __init__(self, triangles: NDArray[Any], threads: int = 0) -> None:

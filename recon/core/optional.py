@@ -13,9 +13,6 @@ def require(module: str, *, extra: str) -> ModuleType:
 
     Returns:
         The imported module.
-
-    Raises:
-        MissingDependencyError: The package is not installed; the message has the pip command.
     """
     try:
         return import_module(module)

@@ -71,9 +71,6 @@ class Settings(BaseModel):
         Args:
             values: Nested mapping, as read from YAML.
             where: The file or option that the values came from, for the error message.
-
-        Raises:
-            SettingsError: A key is unknown or a value out of range; the first one is named.
         """
         try:
             return cls.model_validate(values)

@@ -26,9 +26,6 @@ def associate(
 
     Returns:
         Two trajectories of equal length, pose by pose, each with its own timestamps.
-
-    Raises:
-        EvaluationError: No poses match.
     """
     there = nearest_sorted(estimate.timestamps_s, truth.timestamps_s)
     back = nearest_sorted(truth.timestamps_s, estimate.timestamps_s)

@@ -81,9 +81,6 @@ def measure_reliability(
         truth: Ground truth at the same size; occluded pixels count too.
         limit_px: Largest error of a correct pixel.
 
-    Raises:
-        EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
-
     Ref: C. Guo et al., "On calibration of modern neural networks", ICML 2017, section 2.
     """
     confidence, error_px = _pixels(estimate, truth)
@@ -106,9 +103,6 @@ def measure_sparsification(
 
     Among pixels of equal confidence, correct and wrong ones are removed in proportion.
 
-    Raises:
-        EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
-
     Ref: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow",
     ECCV 2018, section 4 (sparsification, AUSE).
     """
@@ -127,9 +121,6 @@ def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float
     """Return the share of the pixels, in [0, 1], whose error is within some standard deviations.
 
     For a normal distribution, it is 0.683 within one and 0.954 within two.
-
-    Raises:
-        EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
     """
     both = _compared(estimate, truth)
     error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])

@@ -105,20 +105,12 @@ def evaluate_depth(
 
 
 def values_of(estimate: Disparity | ArrayLike) -> Float32:
-    """Return the values of an estimate: float32 (H, W), pixels.
-
-    Raises:
-        ShapeError: It is no map of real numbers.
-    """
+    """Return the values of an estimate: float32 (H, W), pixels."""
     return estimate.values if isinstance(estimate, Disparity) else float_map("estimate", estimate)
 
 
 def truth_of(truth: DisparityTruth | ArrayLike) -> DisparityTruth:
-    """Return a ground truth, made from its values if need be.
-
-    Raises:
-        ShapeError: It is no map of real numbers.
-    """
+    """Return a ground truth, made from its values if need be."""
     return truth if isinstance(truth, DisparityTruth) else DisparityTruth.from_values(truth)
 
 
@@ -132,11 +124,7 @@ def _compared(
 
 
 def compared_pixels(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
-    """Return bool (H, W), the pixels that are compared: those whose truth is known.
-
-    Raises:
-        EvaluationError: The sizes differ, or there are none.
-    """
+    """Return bool (H, W), the pixels that are compared: those whose truth is known."""
     if values.shape != truth.values.shape:
         raise EvaluationError(
             "disparity and truth differ in size",

@@ -10,22 +10,14 @@ from recon.run.finished import FinishedRun
 
 
 def doubts_of(run: FinishedRun) -> list[str]:
-    """Return lines of what is not to be trusted in the map of a run, or that it was made from.
-
-    Raises:
-        FormatError: The map is damaged.
-    """
+    """Return lines of what is not to be trusted in the map of a run, or that it was made from."""
     if not (run.folder / MAP_FILE).is_file():
         return list(run.doubts)
     return doubts_of_file(run.folder / MAP_FILE)
 
 
 def doubts_of_file(file: Path) -> list[str]:
-    """Return lines of what is not to be trusted in the map of the run that a file belongs to.
-
-    Raises:
-        FormatError: The map is damaged.
-    """
+    """Return lines of what is not to be trusted in the map of the run that a file belongs to."""
     folder = next((one for one in file.absolute().parents[:3] if (one / MAP_FILE).is_file()), None)
     if folder is None:
         return []

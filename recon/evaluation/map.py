@@ -99,10 +99,6 @@ def register_cloud(
 
     Returns:
         float64 (4, 4), ``T_reference_cloud``, and the share of the points with a correspondence.
-
-    Raises:
-        EvaluationError: A cloud is empty or the frames differ.
-        RegistrationError: The clouds are too far apart.
     """
     _check(cloud, reference, reach_m)
     thinned = [_thinned(one, reach_m / 2) for one in (cloud, reference)]
@@ -118,9 +114,6 @@ def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
 
     Returns:
         float32 (N,), metres.
-
-    Raises:
-        EvaluationError: There is no reference point.
     """
     if len(reference_xyz) == 0:
         raise EvaluationError("the reference cloud is empty")

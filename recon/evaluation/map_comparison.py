@@ -71,9 +71,6 @@ def read_mapped_cloud(run: Path) -> MappedCloud:
 
     Args:
         run: A run's folder, or a PLY file. A PLY inside a run's folder is in that run's map axes.
-
-    Raises:
-        FormatError: A file cannot be read, or the folder does not contain a finished run.
     """
     folder = run if run.is_dir() else run.parent.parent
     if not run.is_dir() and (run.parent.name != "map" or not (folder / RECORD).is_file()):
@@ -97,10 +94,6 @@ def place_cloud(
 
     Returns:
         The map, and how it was aligned.
-
-    Raises:
-        SettingsError: The poses are not in the axes of the reference.
-        EvaluationError: There is no path to align, or it has another length.
     """
     if frame == "map" and align_to is not None:
         raise SettingsError(
@@ -154,10 +147,6 @@ def place_by_icp(
 
     Returns:
         The map, how it was aligned, and the axes.
-
-    Raises:
-        RegistrationError: The two overlap in none of the axes.
-        EvaluationError: As for `place_cloud`.
     """
     found: list[tuple[MappedCloud, dict[str, Any], ReferenceFrame]] = []
     for frame in frames:

@@ -50,9 +50,6 @@ def evaluate_occupancy(
         Results with a tolerance of one cell (26 neighbours in 3-D, 8 in the grid), and without.
         With the tolerance, a true cell is found if an estimated cell of its state is that near,
         and an estimated cell is wrong if no true one is: IoU = found / (true + wrong).
-
-    Raises:
-        EvaluationError: The resolutions differ, or there is nothing to compare.
     """
     _check(voxels, grid, truth)
     occupied = voxels.keys[voxels.log_odds > 0]

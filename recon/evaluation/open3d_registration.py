@@ -30,9 +30,6 @@ def icp(
         float64 (4, 4), ``T_reference_points``, and the share of the points that have a
         correspondence in the last pass.
 
-    Raises:
-        RegistrationError: No point has a correspondence, or Open3D finds no transform.
-
     Ref: Chen & Medioni, "Object modelling by registration of multiple range images", 1992;
     robust weights: Babin et al., "Analysis of robust functions for registration algorithms", 2019.
     """

@@ -186,13 +186,7 @@ def _patch_sums(compared: Int32, n: int) -> NDArray[Any]:
 
 
 def read_experiments(folder: Path | None = None) -> list[Experiment]:
-    """Read the three scenes; None = those of MiddEval3 in the folder that ``RECON_DATA`` names.
-
-    Raises:
-        SourceError: A scene is missing, or no folder is named.
-        FormatError: A file of a scene is damaged.
-        CalibrationError: A scene's geometry cannot give depth.
-    """
+    """Read the three scenes; None = those of MiddEval3 in the folder that ``RECON_DATA`` names."""
     if folder is None:
         if not os.environ.get("RECON_DATA"):
             what = "no folder of scenes is given, and RECON_DATA is not set"
@@ -216,11 +210,7 @@ def _read_experiment(number: int, folder: Path) -> Experiment:
 
 
 def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
-    """Return the camera of Table 1: ``doffs`` taken as the focal length, and no offset added to d.
-
-    Raises:
-        CalibrationError: ``doffs`` is not positive, so it cannot be used as a focal length.
-    """
+    """Return the camera of Table 1: ``doffs`` is the focal length, and no offset is added to d."""
     if camera.doffs_px <= 0:
         what, got = "doffs cannot be used as a focal length", f"{camera.doffs_px:g} px"
         raise CalibrationError(what, got=got, expected="> 0 px")

@@ -46,9 +46,6 @@ def choose_segments(
         distances_m: float64 (N,), true path length from the first pose to each pose.
         lengths_m: Segment lengths; None = those of the benchmark that fit, or shorter ones.
         step_frames: Frames between starts; None = 10, or 1 for shorter lengths.
-
-    Raises:
-        EvaluationError: Lengths are given, and the path has room for none of them.
     """
     if lengths_m is not None:
         segments = segments_of(distances_m, lengths_m, step_frames or KITTI_STEP_FRAMES)

@@ -171,11 +171,6 @@ def compare_paths(
         rules: Alignment and segments; None = the defaults. The scale of the alignment affects all
             errors, its rigid part only the ATE.
 
-    Raises:
-        EvaluationError: The lengths differ, there are too few poses, the true path is shorter
-            than `MIN_PATH_M`, it has no room for a requested segment, or it is the estimate in
-            another unit, unless the alignment scales it.
-
     Ref:
         Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012;
         Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.

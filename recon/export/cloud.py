@@ -49,11 +49,7 @@ def cloud_product(order: Order) -> Made:
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path | None) -> WrittenCloud:
-    """Write the points of all tiles into one PLY file, and perhaps what was removed into another.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
+    """Write the points of all tiles into a PLY file, and perhaps what was removed into another."""
     sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
 
     def clouds() -> Iterator[PointCloud]:

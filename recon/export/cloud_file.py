@@ -32,9 +32,6 @@ def mesh_cloud(
 
     Returns:
         The figures of the mesh.
-
-    Raises:
-        ReconError: The cloud cannot be read or gives no surface, or a file cannot be written.
     """
     with run.stage("read"):
         cloud = read_ply(path)
@@ -56,12 +53,7 @@ def mesh_cloud(
 
 
 def copy_file(file: Path, target: Path) -> None:
-    """Copy a file, atomically.
-
-    Raises:
-        FormatError: It cannot be read.
-        OutputError: The copy cannot be written.
-    """
+    """Copy a file, atomically."""
     with reading(file):
         file.stat()
     with atomic_path(target) as temporary:
@@ -82,9 +74,6 @@ def export_pair(
 
     Returns:
         The figures of ``summary.json``.
-
-    Raises:
-        ReconError: As for `mesh_cloud`.
     """
     cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
     figures: dict[str, Any] = {"run": str(source), "warnings": []}

@@ -83,10 +83,6 @@ def export_grid(tiles: Tiles, path_m: Float64, trusted: Bool, stem: Path) -> Wri
         path_m: float64 (N, 3), camera positions in map axes; a row of NaN between two drives.
         trusted: bool (N,), which of them are to be trusted.
         stem: The common path without suffix.
-
-    Raises:
-        MappingError: Nothing was observed, or the height band of the grid is empty.
-        OutputError: A file cannot be written.
     """
     if tiles.extent[0] == tiles.extent[1]:
         raise MappingError("nothing was observed: there is no map to flatten")

@@ -89,11 +89,7 @@ def joined_warnings(joined: JoinedMap) -> list[str]:
 
 
 def export_sessions(joined: JoinedMap, run: RunDirectory) -> None:
-    """Write ``sessions/<number>/trajectory_*.txt`` of the linked drives, in the map's world.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write ``sessions/<number>/trajectory_*.txt`` of the linked drives, in the map's world."""
     for number, path in joined.paths.items():
         write_kitti_poses(run.path(f"sessions/{number}/trajectory_kitti.txt"), path)
         write_tum(run.path(f"sessions/{number}/trajectory_tum.txt"), path)

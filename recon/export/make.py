@@ -80,12 +80,6 @@ def make(order: Order, products: Sequence[str] = USUAL) -> Products:
     Args:
         order: The map.
         products: Any of `PRODUCTS`.
-
-    Raises:
-        FormatError: The map kept no rays that a product is made from, or is damaged.
-        MappingError: Nothing was observed, or the height band of the grid is empty.
-        MeshingError: There is no surface, and nothing else was asked for.
-        OutputError: A file cannot be written.
     """
     made: dict[str, Made] = {}
     warnings: list[str] = []
@@ -108,11 +102,7 @@ def make(order: Order, products: Sequence[str] = USUAL) -> Products:
 
 
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:
-    """Return the requested products, or the usual ones.
-
-    Raises:
-        SettingsError: One is unknown, or not possible for a run of `recon pair`.
-    """
+    """Return the requested products, or the usual ones."""
     possible = OF_A_PAIR if pair else (*PRODUCTS,)
     for product in products:
         if product not in possible:

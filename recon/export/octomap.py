@@ -23,9 +23,6 @@ def export_octomap(tiles: Tiles, stem: Path) -> tuple[int, list[str]]:
     Returns:
         The number of observed voxels, undecided ones included, and warnings: a map may be too large
         for an OctoMap.
-
-    Raises:
-        OutputError: A file cannot be written.
     """
     known = (drop_undecided(tile.voxels, tiles.config.grid) for tile in tiles)
     warnings = []

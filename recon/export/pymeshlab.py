@@ -48,10 +48,6 @@ def screened_poisson(
     Returns:
         float32 (V, 3) vertices, int32 (F, 3) faces, and float32 (V,) point density around each
         vertex, in octree levels (one level more = four times as dense).
-
-    Raises:
-        MeshingError: A point or normal is not finite, or MeshLab failed, ran out of memory or
-            found no surface.
     """
     # A single NaN can make MeshLab return nothing, or a surface that is wrong everywhere.
     if not (np.isfinite(xyz).all() and np.isfinite(normals).all()):

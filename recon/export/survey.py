@@ -104,11 +104,6 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
     Between frames that are trusted, the path is interpolated at their times. The map stays rigid,
     and upright where the positions do not say otherwise (`fit_upright`); positions that contradict
     most others are left out.
-
-    Raises:
-        FormatError: A file is missing or damaged.
-        EvaluationError: No position was measured during the drive, all at one place, they lie
-            outside their coordinate system, or neither drift nor noise explains where they are.
     """
     session = map_.first
     path, drift_m = trusted_path(session), drift_of(session)

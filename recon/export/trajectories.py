@@ -36,9 +36,6 @@ def export_paths(mapped: MappedSequence, camera_height_m: float | None, run: Run
         mapped: The mapped drive.
         camera_height_m: Height of the camera above the ground; None = unknown.
         run: The run.
-
-    Raises:
-        OutputError: A file cannot be written.
     """
     path, T_map_world = mapped.trajectory, mapped.T_map_world
     write_kitti_poses(run.path("trajectory_kitti.txt"), path)
@@ -59,9 +56,6 @@ def export_localized(
         drive: The drive in the map.
         camera_height_m: Height of the map's camera above the ground; None = unknown.
         run: The run.
-
-    Raises:
-        OutputError: A file cannot be written.
     """
     path, T_map_world = drive.trajectory, drive.T_map_world
     write_tum(run.path("trajectory_tum.txt"), path)

@@ -56,10 +56,6 @@ def unpack(
         below: Folder of the archive whose content is unpacked; "" = everything.
         without: Suffixes of files that are left out.
         zips: Whether archives in the archive are unpacked beside themselves, and left out.
-
-    Raises:
-        FormatError: It is damaged or hostile, or holds nothing of what was chosen.
-        OutputError: A file cannot be written.
     """
     most_bytes = _SMALL_BYTES + _MOST_GROWTH * archive.stat().st_size
     with naming(archive):

@@ -29,10 +29,6 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
 
     Yields:
         The temporary path, which does not exist yet.
-
-    Raises:
-        OutputError: The folder or file cannot be written, ``path`` is a device, a pipe or a folder,
-            or the block wrote nothing.
     """
     target = Path(path)
     check_targets([target])
@@ -55,10 +51,6 @@ def check_targets(targets: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
     Args:
         targets: Files to be written, which need not exist.
         inputs: Files that are read; links to them are the same files.
-
-    Raises:
-        OutputError: There is a device, a pipe, a socket or a folder.
-        SettingsError: There is an input.
     """
     read = {file for path in inputs if (file := _file_of(path)) is not None}
     for target in targets:
@@ -83,9 +75,6 @@ def exchange(new: Path, old: Path) -> None:
     """Exchange two folders in one step, so that ``old`` is at no moment missing or half new.
 
     Where the system cannot, the old one is moved aside first.
-
-    Raises:
-        OSError: A folder is missing, or cannot be moved.
     """
     done = -1
     if sys.platform == "linux":
@@ -106,21 +95,13 @@ def exchange(new: Path, old: Path) -> None:
 
 
 def write_text(path: str | PathLike[str], text: str) -> None:
-    """Write UTF-8 text atomically, without converting line endings.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write UTF-8 text atomically, without converting line endings."""
     # A name of a file that is not UTF-8 is written as \\udcXX, which JSON and YAML read back.
     write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_bytes(path: str | PathLike[str], content: bytes) -> None:
-    """Write bytes atomically.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write bytes atomically."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 

@@ -42,11 +42,6 @@ def download(
     What is there is kept beside ``path`` with its version at the server, and continued if the
     server still has that one. A connection that breaks off is opened again, up to five times in a
     row without a byte. ``size`` is what the file must have, in bytes, if that is known.
-
-    Raises:
-        DownloadError: The server does not have the file or another one, sends more than it said,
-            or cannot be reached.
-        OutputError: There is no room for it, or it cannot be written.
     """
     part, tries = path.with_name(path.name + ".part"), 0
     while True:

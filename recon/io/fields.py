@@ -15,11 +15,7 @@ from recon.io.files import StrPath
 
 
 def numbers_of(value: Any) -> Float64:
-    """Return a number or text, or lists of them, as float64 of that shape.
-
-    Raises:
-        ValueError: One of them is not a number, or lists differ in length.
-    """
+    """Return a number or text, or lists of them, as float64 of that shape."""
     words = np.array(value, dtype=np.str_)
     return np.array(parse_numbers(words.ravel().tolist())).reshape(words.shape)
 
@@ -40,11 +36,7 @@ class Fields:
         return name in self._values
 
     def get(self, name: str) -> Any:
-        """Return the value of a field, of any type.
-
-        Raises:
-            FormatError: The field is missing; all methods raise this.
-        """
+        """Return the value of a field, of any type."""
         if name not in self._values:
             got = ", ".join(str(key) for key in self._values) or "nothing"
             raise FormatError(

@@ -29,9 +29,6 @@ def read_file_storage(path: StrPath) -> dict[str, Float64 | str]:
     Returns:
         float64 () for a number, (N,) for a list of numbers or the data of a matrix, row by row, and
         text. Anything else is left out.
-
-    Raises:
-        FormatError: The file is missing, or is none of the three.
     """
     text = read_text(path, SMALL_FILE_BYTES)
     try:

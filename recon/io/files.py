@@ -56,9 +56,6 @@ def reading(path: StrPath) -> Iterator[None]:
     Args:
         path: The file, or another name of the content. Pipes and devices, whose reading may never
             end, are refused.
-
-    Raises:
-        FormatError: The content cannot be parsed. Other errors of this project stay what they are.
     """
     try:
         _refuse_special(path)
@@ -113,9 +110,6 @@ def read_bytes(path: StrPath, at_most: int | None = None) -> bytes:
     Args:
         path: The file.
         at_most: Largest size in bytes; None = any.
-
-    Raises:
-        FormatError: The file does not exist, cannot be read, is empty or too large.
     """
     with Path(path).open("rb") as file:
         if at_most is not None and os.fstat(file.fileno()).st_size > at_most:
@@ -133,9 +127,6 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
     Args:
         path: The file.
         at_most: Largest size in bytes; None = any.
-
-    Raises:
-        FormatError: The file does not exist, cannot be read, is empty, too large or not text.
     """
     try:
         return read_bytes(path, at_most).decode("utf-8-sig")
@@ -155,10 +146,6 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
 
     Returns:
         float64 (N, C), finite, N ≥ 1, and the line number of each row, counted from 1.
-
-    Raises:
-        FormatError: A row has the wrong number of columns or a value that is not a finite number;
-            the line is named.
     """
     rows: list[list[float]] = []
     lines: list[int] = []

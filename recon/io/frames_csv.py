@@ -40,11 +40,7 @@ class CapturedFrame:
 
 @reader
 def read_frames(path: StrPath) -> list[CapturedFrame]:
-    """Read the list.
-
-    Raises:
-        FormatError: The file is missing or empty, or a line is damaged.
-    """
+    """Read the list."""
     lines = enumerate(read_text(path).splitlines(), start=1)
     frames = [_parse(line, f"{path}:{n}") for n, line in lines if line and line[0] != "#"]
     if not frames:

@@ -35,9 +35,6 @@ def take_lock(path: Path, what: str, *, where: Path, hint: str) -> int:
 
     Returns:
         The handle of the file.
-
-    Raises:
-        OutputError: Another process holds the lock.
     """
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,11 +15,7 @@ else:
 
 
 def read_toml(path: StrPath) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises:
-        FormatError: The file is missing, too large or not TOML.
-    """
+    """Read a TOML file."""
     text = read_text(path, SMALL_FILE_BYTES)
     with reading(path):
         try:

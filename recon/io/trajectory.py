@@ -43,11 +43,7 @@ def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Traje
 
 @reader
 def holds_times(path: StrPath) -> bool:
-    """Return whether a trajectory file has timestamps: TUM files do, KITTI files do not.
-
-    Raises:
-        FormatError: The file is missing or in neither format.
-    """
+    """Return whether a trajectory file has timestamps: TUM files do, KITTI files do not."""
     return bool(read_table(path, (12, 8))[0].shape[1] == 8)
 
 
@@ -60,41 +56,24 @@ def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Traj
     Args:
         path: The text file.
         timestamps_s: float64 (N,), one time per pose; without it pose ``i`` gets ``i`` seconds.
-
-    Raises:
-        FormatError: The file is missing, a line is not 12 finite numbers or not a rigid
-            transform, or the numbers of poses and timestamps differ.
     """
     return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
 
 
 @reader
 def read_tum(path: StrPath) -> Trajectory:
-    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line.
-
-    Raises:
-        FormatError: The file is missing, a line is not 8 finite numbers, a quaternion is not of
-            unit length, or time runs backwards.
-    """
+    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line."""
     return _from_tum(*read_table(path, (8,)), path)
 
 
 def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
-    """Write poses in KITTI's format, 13 digits, atomically; it has no timestamps.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write poses in KITTI's format, 13 digits, atomically; it has no timestamps."""
     rows = trajectory.T_world_camera[:, :3, :].reshape(-1, 12)
     write_text(path, "".join(" ".join(f"{value:.12e}" for value in row) + "\n" for row in rows))
 
 
 def write_tum(path: StrPath, trajectory: Trajectory) -> None:
-    """Write poses in TUM's format, 12 decimals (9 for the time), ``qw ≥ 0``, atomically.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write poses in TUM's format, 12 decimals (9 for the time), ``qw ≥ 0``, atomically."""
     write_text(
         path,
         "".join(
@@ -146,11 +125,7 @@ def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
 
 
 def check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
-    """Refuse positions (N, 3) that are nowhere on Earth; ``lines`` are theirs in the file.
-
-    Raises:
-        FormatError: One is such.
-    """
+    """Refuse positions (N, 3) that are nowhere on Earth; ``lines`` are theirs in the file."""
     far_m = np.abs(xyz_m).max(axis=1)
     worst = int(np.argmax(far_m))
     if far_m[worst] > _FARTHEST_M:

@@ -40,11 +40,7 @@ for _kind in ("int", "float"):
 
 
 def parse_yaml(text: str, where: StrPath) -> Any:
-    """Parse YAML into plain values.
-
-    Raises:
-        FormatError: The text is not YAML, or has aliases that expand without bound.
-    """
+    """Parse YAML into plain values."""
     with reading(where):
         if _depth(text) > _DEEPEST:
             raise FormatError("content is nested too deeply", where=where)
@@ -80,11 +76,7 @@ _OPENCV_TAG: Final = re.compile(r"!!opencv-[a-z-]+")
 
 
 def read_yaml(path: StrPath) -> dict[str, Any]:
-    """Read a YAML file whose top level is a mapping; OpenCV's header and tags are permitted.
-
-    Raises:
-        FormatError: The file is missing, not YAML, or not a mapping.
-    """
+    """Read a YAML file whose top level is a mapping; OpenCV's header and tags are permitted."""
     content = parse_yaml(plain_yaml(read_text(path, SMALL_FILE_BYTES)), path)
     if not isinstance(content, dict):
         raise FormatError("YAML file is not a mapping", where=path, got=type(content).__name__)
@@ -92,11 +84,7 @@ def read_yaml(path: StrPath) -> dict[str, Any]:
 
 
 def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:
-    """Write plain values as YAML, in their order, atomically.
-
-    Raises:
-        OutputError: A value cannot be written as YAML, or the file cannot be written.
-    """
+    """Write plain values as YAML, in their order, atomically."""
     try:
         text = yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
     except yaml.YAMLError as error:

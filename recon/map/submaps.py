@@ -154,9 +154,6 @@ class SubmapBuilder:
             cloud_world: What is fused, world axes.
             cloud_camera: What occupies and frees space, camera axes.
             T_world_camera: float64 (4, 4).
-
-        Raises:
-            MappingError: A point or the pose would spoil the map.
         """
         self._fused.integrate(cloud_world)
         self._occupancy.integrate(cloud_camera, T_world_camera)

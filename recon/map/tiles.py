@@ -125,10 +125,6 @@ class Tiles:
                 corrected.
             drives: Number of submaps of each drive, in the order of the drives: what a later one
                 saw counts more. Empty = all are of one.
-
-        Raises:
-            FormatError: A submap is damaged.
-            OutputError: There is no room for the tiles.
         """
         halvings, tiles = 0, cls(config, T_map_world)
         while not tiles._take(tiles._cutter.cut(submaps, tiles._parts, T_corrected_world), drives):

@@ -71,9 +71,6 @@ class KissIcp:
 
     Args:
         options: Range, voxels, and when to stop.
-
-    Raises:
-        RegistrationError: kiss-icp rejects the options.
     """
 
     def __init__(self, options: KissIcpOptions) -> None:
@@ -85,9 +82,6 @@ class KissIcp:
 
         Args:
             xyz_camera: (N, 3), metres, finite; not empty.
-
-        Raises:
-            RegistrationError: There are no points, or kiss-icp fails.
         """
         points = _points(xyz_camera)
         with _our_errors():
@@ -106,9 +100,6 @@ class KissIcp:
             xyz_camera: (N, 3), metres, finite; not empty.
             T_world_guess: (4, 4), initial guess of the camera's pose.
             threshold_m: Scale of the robust kernel; correspondences are at most three times as far.
-
-        Raises:
-            RegistrationError: There are no points, or kiss-icp fails.
         """
         points = _points(xyz_camera)
         guess, icp = _pose(T_world_guess), self._icp
@@ -127,11 +118,7 @@ class KissIcp:
         return IcpAlignment(_pose(pose), np.array(source))
 
     def set_map(self, xyz_world: NDArray[np.floating]) -> None:
-        """Replace the map by points (M, 3), of which there may be none.
-
-        Raises:
-            RegistrationError: kiss-icp fails.
-        """
+        """Replace the map by points (M, 3), of which there may be none."""
         with _our_errors():
             self._icp.local_map.clear()
             if len(xyz_world):
@@ -148,11 +135,7 @@ class KissIcp:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state` of the same options.
-
-        Raises:
-            RegistrationError: The state is damaged.
-        """
+        """Continue from a `state` of the same options."""
         poses = [state[name] for name in ("last_pose", "last_delta")]
         for pose in poses:
             _pose(pose)

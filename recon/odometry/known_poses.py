@@ -27,11 +27,7 @@ class KnownPoses:
         self._begun = False
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Return the known pose of the frame.
-
-        Raises:
-            RegistrationError: There is no pose for the frame.
-        """
+        """Return the known pose of the frame."""
         index = frame.pair.index
         if not 0 <= index < len(self._poses):
             raise RegistrationError(

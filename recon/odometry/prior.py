@@ -46,9 +46,6 @@ class MotionPrior:
 
         Args:
             stamps_s: float64 (N,), times of its frames.
-
-        Raises:
-            RegistrationError: No two frames that follow one another lie within the path.
         """
         known = np.array([self.knows(float(t)) for t in stamps_s])
         if len(stamps_s) < 2 or (known[1:] & known[:-1]).any():

@@ -57,9 +57,6 @@ def find_axes(
 
     Returns:
         The axes; None if the cameras do not see enough motion to decide.
-
-    Raises:
-        RegistrationError: The prior contradicts the visual motion in these axes.
     """
     tried: Sequence[Axes] = get_args(Axes) if settings.axes == "auto" else (settings.axes,)
     priors = {axes: MotionPrior(prior, _in_axes(settings, axes)) for axes in tried}

@@ -97,11 +97,7 @@ class Odometry(Protocol):
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state` of an odometry with the same settings.
-
-        Raises:
-            ReconError: The state is damaged; so may any `LookupError`, `TypeError` or `ValueError`.
-        """
+        """Continue from a `state` of an odometry with the same settings."""
         ...
 
 
@@ -111,9 +107,5 @@ def tree_of(value: Any) -> dict[str, Any]:
 
 
 def pose_in(state: dict[str, Any], name: str) -> Float64:
-    """Return a pose of a state: float64 (4, 4), finite.
-
-    Raises:
-        ShapeError: It is something else.
-    """
+    """Return a pose of a state: float64 (4, 4), finite."""
     return array_in(state, name, np.float64, (4, 4))

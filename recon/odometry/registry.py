@@ -29,10 +29,6 @@ def make_odometry(
         name: A key of `ODOMETRIES`.
         settings: The settings of all odometries; each uses its own part.
         prior: Path of the rig by other sensors, on the clock of the frames; None = not known.
-
-    Raises:
-        SettingsError: There is no such odometry, or it takes no prior.
-        RegistrationError: The prior has no motion.
     """
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))

@@ -50,9 +50,6 @@ def optimise_poses(
     Returns:
         The poses, float64 (N, 4, 4), and the weight of each edge, float64, in [0, 1].
 
-    Raises:
-        RegistrationError: Open3D returns a pose that is not finite.
-
     Ref:
         Choi, Zhou, Koltun, "Robust reconstruction of indoor scenes", CVPR 2015.
     """

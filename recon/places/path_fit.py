@@ -57,11 +57,7 @@ class PathFit:
         return self.stretched and self.scaled_m <= self.most_m and apart > math.log(_OTHER_UNIT)
 
     def check(self, where: str | PathLike[str], hint: str) -> None:
-        """Refuse positions that neither drift nor noise explains.
-
-        Raises:
-            EvaluationError: They are such.
-        """
+        """Refuse positions that neither drift nor noise explains."""
         if self.rms_m <= self.most_m and not self.stretched:
             return
         least, most = max(0.0, 1.0 - self.most_stretch), 1.0 + self.most_stretch

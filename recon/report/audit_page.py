@@ -30,11 +30,7 @@ _SHOWN_ROWS_PX: Final = 5.0  # farther apart are wrong matches
 def write_audit_page(
     audit: Audit, source: StereoSource, matcher: Matcher, run: RunDirectory
 ) -> None:
-    """Write ``report.html`` of an audit; ``matcher`` finds the disparities of its sample pairs.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write ``report.html`` of an audit; ``matcher`` finds the disparities of its sample pairs."""
     write_page(
         "audit",
         run,

@@ -36,9 +36,6 @@ def write_batch_page(
         results: The jobs, in the order of the batch.
         summary: The content of ``summary.json``.
         run: The run of the batch.
-
-    Raises:
-        OutputError: A file cannot be written.
     """
     write_text(run.path("table.csv"), batch_csv(results))
     write_text(run.path("table.md"), join(table.markdown() for table in batch_tables(results)))

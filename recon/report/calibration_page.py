@@ -26,11 +26,7 @@ _CELLS: Final = (8, 6)
 
 
 def write_calibration_page(result: CalibrationRun, run: RunDirectory) -> None:
-    """Write ``report.html`` of a calibration, and its images.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write ``report.html`` of a calibration, and its images."""
     before, after = epipolar_images(result)
     figures = {
         "coverage": coverage_figure(result),

@@ -92,11 +92,7 @@ def colour_error(error: NDArray[Any], limit: float) -> UInt8:
 
 
 def colour_reasons(reason: UInt8) -> UInt8:
-    """Colour a map of `Reason` codes (H, W) by `REASON_COLOURS`.
-
-    Raises:
-        ShapeError: A code is not a `Reason`.
-    """
+    """Colour a map of `Reason` codes (H, W) by `REASON_COLOURS`."""
     table = np.zeros((len(Reason), 3), dtype=np.uint8)
     for code, colour in REASON_COLOURS.items():
         table[code] = colour

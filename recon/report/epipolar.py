@@ -35,11 +35,7 @@ class EpipolarImage:
 
 
 def write_epipolar_images(result: RectifyRun, run: RunDirectory) -> None:
-    """Write ``pictures/epipolar_raw.png`` and ``pictures/epipolar_rectified.png``.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write ``pictures/epipolar_raw.png`` and ``pictures/epipolar_rectified.png``."""
     chosen = spread_points(result.raw_px[0], 12)
     rows = level_lines(result.rectified_px[0][chosen], result.rectified[0].shape[1])
     raw = (result.pair.left, result.pair.right)

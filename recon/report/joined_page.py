@@ -15,11 +15,7 @@ from recon.run.directory import RunDirectory
 
 
 def write_joined_page(joined: JoinedMap, summary: dict[str, Any], run: RunDirectory) -> None:
-    """Write ``report.html`` of a map of several drives: all paths on one grid.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write ``report.html`` of a map of several drives: all paths on one grid."""
     T_map_world, made = joined.map.first.T_map_world, joined.made
     named = {f"session {number}": path for number, path in joined.paths.items()}
     from_above = {name: seen_from_above(path, T_map_world) for name, path in named.items()}

@@ -21,11 +21,7 @@ _SHADES: Final = {State.SEARCHING: FAINT, State.COASTING: TRUTH, State.LOST: BAD
 
 
 def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
-    """Write ``report.html`` of a drive in a map.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write ``report.html`` of a drive in a map."""
     figures = {"path": _path(result), "certainty": certainty_figure(result.drive)}
     write_page("localize", run, run=result, figures=figures, warnings=result.summary["warnings"])
 

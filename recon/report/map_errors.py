@@ -21,9 +21,6 @@ def write_map_errors(comparison: MapComparison, run: RunDirectory) -> None:
 
     The first is the map, coloured by the distance of each point to the reference; the second is
     the reference, coloured by the distance to the map. ``quality`` is the distance in metres.
-
-    Raises:
-        OutputError: A file cannot be written.
     """
     limit_m = _SCALE_THRESHOLDS * max(comparison.thresholds_m)
     cloud, reference = comparison.cloud, comparison.reference

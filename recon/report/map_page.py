@@ -21,11 +21,7 @@ from recon.run.directory import RunDirectory
 
 
 def write_map_page(result: MapRun, run: RunDirectory) -> None:
-    """Write ``report.html`` of a drive.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write ``report.html`` of a drive."""
     write_page("map", run, **map_content(result))
 
 

@@ -36,9 +36,6 @@ def draw_result(result: SceneResult, run: RunDirectory) -> None:
 
     In the error, blue is correct, red is wrong by `ERROR_LIMIT_PX` full-size pixels or more, and
     dark is unknown ground truth; holes are filled. Disparity colours span the range of the truth.
-
-    Raises:
-        OutputError: A file cannot be written.
     """
     scene, values = result.scene, result.values
     scale = round(4 * values.shape[1] / scene.truth.values.shape[1]) / 4
@@ -51,11 +48,7 @@ def draw_result(result: SceneResult, run: RunDirectory) -> None:
 
 
 def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None:
-    """Write the tables as text, Markdown, LaTeX and CSV, and ``report.html``.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write the tables as text, Markdown, LaTeX and CSV, and ``report.html``."""
     tables = middlebury_tables(summary)
     for suffix, form in (("txt", Table.text), ("md", Table.markdown), ("tex", Table.latex)):
         write_text(run.path(f"tables.{suffix}"), join(map(form, tables)))

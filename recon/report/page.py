@@ -37,9 +37,6 @@ def write_page(name: str, run: RunDirectory, /, **content: Any) -> None:
         name: The template, such as ``map``.
         run: The run.
         content: What the template shows, see `render_page`.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     path = run.path("config.yaml")
     config = path.read_text(encoding="utf-8") if path.is_file() else ""

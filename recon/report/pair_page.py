@@ -15,21 +15,13 @@ from recon.stereo.pair_run import PairRun
 
 
 def write_pair_page(result: PairRun, run: RunDirectory) -> None:
-    """Write ``report.html`` of a pair, and its results as colour images.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write ``report.html`` of a pair, and its results as colour images."""
     write_disparity_images(result, run)
     write_page("pair", run, **pair_content(result))
 
 
 def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
-    """Write disparity, confidence and reasons of a pair as colour images.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write disparity, confidence and reasons of a pair as colour images."""
     images = {
         "disparity_colour.png": colour_disparity(result.disparity.values),
         "confidence_colour.png": colour_confidence(result.disparity.confidence),

@@ -71,9 +71,6 @@ def write_paper_page(
         results: The experiments, and what each method gave.
         summary: The figures of the run.
         run: The run.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     write_page(
         "paper",

@@ -14,11 +14,7 @@ from recon.run.directory import RunDirectory
 
 
 def write_trajectory_page(result: TrajectoryRun, run: RunDirectory) -> None:
-    """Write ``report.html`` of a comparison, and its figures as PNG files.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write ``report.html`` of a comparison, and its figures as PNG files."""
     figures = {
         "path": compared_paths_figure(result.comparison),
         "error_along_path": pose_errors_figure(result.comparison),

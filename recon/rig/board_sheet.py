@@ -68,10 +68,6 @@ def write_board(
 
     Returns:
         A description of the sheet as plain values.
-
-    Raises:
-        SettingsError: The board has no size, or does not fit on the paper.
-        OutputError: The suffix is neither, or the file cannot be written.
     """
     kind = path.suffix.lower()
     if kind not in _KINDS:
@@ -107,11 +103,7 @@ def write_board(
 
 
 def choose_sheet(board: CalibrationBoard, paper: str | None = None) -> Sheet:
-    """Return the paper for a board, in portrait or landscape orientation.
-
-    Raises:
-        SettingsError: The paper is unknown, or the board does not fit.
-    """
+    """Return the paper for a board, in portrait or landscape orientation."""
     names = _AUTO if paper is None else (paper.strip().lower(),)
     sheets = [_turned(name, board) for name in names]
     fitting = [sheet for sheet in sheets if _scale_to_fit(board, sheet) >= 1]

@@ -66,11 +66,7 @@ class CameraSource:
         return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Yield the pairs from now on, numbered from 0; the first ``start`` are left out.
-
-        Raises:
-            SourceError: A camera gives no more frames, or the two differ in frame size.
-        """
+        """Yield the pairs from now on, numbered from 0; the first ``start`` are left out."""
         taken = capture_pairs(self._cameras, self._settings, self._stopped)
         for index, pair in islice(enumerate(taken), start, None):
             yield StereoPair(pair.left, pair.right, pair.left_s, index, f"frame {index}")
@@ -96,12 +92,6 @@ def open_camera_source(
         settings: Image size, frame rate, arrangement of the views.
         source: Names the calibration; its ``end`` is the number of pairs.
         stopped: Called before each pair; True ends the drive.
-
-    Raises:
-        SourceError: A camera cannot be opened or gives no pair, or no calibration is named.
-        SettingsError: The right images are to be those of later frames.
-        FormatError: The calibration is damaged.
-        CalibrationError: It cannot give depth, or is of another image size.
     """
     if source.shift_frames:
         raise SettingsError(

@@ -102,9 +102,6 @@ def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[
     Args:
         devices: Numbers, paths, addresses of streams, or video files.
         settings: Image size and frame rate to ask for.
-
-    Raises:
-        SourceError: A camera cannot be opened, or does not support that size.
     """
     width, height = settings.width_px, settings.height_px
     size = None if width is None or height is None else (width, height)
@@ -122,9 +119,6 @@ def capture_pairs(
     """Yield pairs until the limit is reached, a file ends, or ``stopped`` returns True.
 
     If one camera loses a frame, the other drops its frame too, so that pairs are nearest in time.
-
-    Raises:
-        SourceError: A live camera gives no more frames, or the cameras differ in frame size.
     """
     period_s = 1 / _rate_hz(cameras, settings)
     first_s: float | None = None

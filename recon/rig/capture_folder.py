@@ -26,11 +26,7 @@ _GAP_PERIODS: Final = 1.5
 
 
 class CaptureFolder:
-    """Appends pairs; a pair that cannot be written completely is removed again.
-
-    Raises:
-        OutputError: The folder is not empty, or cannot be written.
-    """
+    """Appends pairs; a pair that cannot be written completely is removed again."""
 
     def __init__(self, folder: Path, suffix: str) -> None:
         self.folder, self._suffix = folder, suffix
@@ -60,11 +56,7 @@ class CaptureFolder:
                 self.folder.rmdir()
 
     def add(self, pair: CapturedPair) -> None:
-        """Write both images, then their line in the list.
-
-        Raises:
-            OutputError: A file cannot be written, for instance because the disk is full.
-        """
+        """Write both images, then their line in the list."""
         name = f"{self.frames:06d}.{self._suffix}"
         frame = CapturedFrame(f"left/{name}", f"right/{name}", pair.left_s, pair.right_s)
         try:
@@ -78,11 +70,7 @@ class CaptureFolder:
         self.frames += 1
 
     def preview(self, pair: CapturedPair) -> None:
-        """Replace ``preview.jpg`` by both images side by side.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Replace ``preview.jpg`` by both images side by side."""
         write_image(self.folder / "preview.jpg", np.hstack([pair.left, pair.right]))
 
     def _append(self, line: bytes) -> None:
@@ -137,11 +125,7 @@ def write_pairs(
     settings: RecordingSettings,
     log: CaptureLog,
 ) -> None:
-    """Write in a second thread, so that the disk does not block the cameras.
-
-    Raises:
-        OutputError: A pair cannot be written; those before it stay.
-    """
+    """Write in a second thread, so that the disk does not block the cameras."""
     waiting: queue.Queue[CapturedPair | None] = queue.Queue(_WAITING)
     failed: list[Exception] = []
 

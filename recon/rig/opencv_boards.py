@@ -24,9 +24,6 @@ def dark_rectangles(board: CalibrationBoard) -> Float64:
     """Return float64 (M, 4), the dark rectangles of a board: x0, y0, x1, y1 in metres.
 
     The origin is the first inner corner, as in `CalibrationBoard.corners_m`.
-
-    Raises:
-        SettingsError: The dictionary is unknown, or too small for the board.
     """
     if board.kind == "chess":
         columns, rows = board.squares
@@ -51,9 +48,6 @@ def find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]:
     Returns:
         int32 (N,), indices into `CalibrationBoard.corners_m`, and float64 (N, 2), pixels before
         refinement.
-
-    Raises:
-        SettingsError: The dictionary is unknown, or too small for the board.
     """
     corners, numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
     if numbers is None or len(numbers) == 0:

@@ -82,12 +82,7 @@ class RectifyRun:
 def plan_by_calibration(
     path: Path, images: ImagePairs, settings: RectificationSettings, *, metres_per_unit: float
 ) -> RectifyPlan:
-    """Return the rectification by a calibration file; depth is metric.
-
-    Raises:
-        CalibrationError: The calibration does not fit the images, or they are rectified already.
-        FormatError: The file cannot be read.
-    """
+    """Return the rectification by a calibration file; depth is metric."""
     files = images.pairs[0]
     height, width = read_pair(*files).left.shape[:2]
     rig = read_calibration(
@@ -121,11 +116,7 @@ def plan_by_calibration(
 
 
 def plan_by_features(images: ImagePairs) -> RectifyPlan:
-    """Return the rectification by homographies from feature matches; depth has no scale.
-
-    Raises:
-        CalibrationError: The features of the images fix no homographies.
-    """
+    """Return the rectification by homographies from feature matches; depth has no scale."""
     even = np.linspace(0, len(images.pairs) - 1, min(len(images.pairs), _UNCALIBRATED_PAIRS))
     some = replace(images, pairs=tuple(images.pairs[int(at)] for at in even))
     greys = [(to_grey(pair.left), to_grey(pair.right)) for pair, _ in read_pairs(some)]
@@ -187,12 +178,7 @@ def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
 
 
 def read_pairs(images: ImagePairs) -> Iterator[tuple[StereoPair, tuple[Path, Path]]]:
-    """Yield the pairs with their files, one in memory at a time.
-
-    Raises:
-        CalibrationError: They differ in size.
-        ReconError: An image cannot be read.
-    """
+    """Yield the pairs with their files, one in memory at a time."""
     shape: tuple[int, ...] | None = None
     for files in images.pairs:
         pair = read_pair(*files)

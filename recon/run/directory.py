@@ -60,11 +60,7 @@ def default_folder(command: str) -> Path:
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a result folder that has links in it, which may lead to files of anybody.
-
-    Raises:
-        FormatError: It has one; it is named.
-    """
+    """Refuse a result folder that has links in it, which may lead to files of anybody."""
     for place, folders, files in os.walk(folder):
         for name in sorted((*folders, *files)):
             path = Path(place, name)
@@ -86,11 +82,6 @@ class RunDirectory:
         begun: Whether there is a map from which the run can be resumed; who begins one says so.
         whole: Write beside the folder, and put the new one in its place in one step: there is
             the old run or the new one at any time, never some files of each.
-
-    Raises:
-        OutputError: The folder cannot be written, holds files that are not of a run, or another
-            run is writing to it.
-        FormatError: It has links in it, or its record cannot be read.
     """
 
     whole: ClassVar[bool] = False
@@ -178,12 +169,7 @@ class RunDirectory:
                 path.unlink()
 
     def check_targets(self, inputs: Iterable[Path]) -> None:
-        """Refuse to replace or remove what this run has read, or what is no regular file.
-
-        Raises:
-            OutputError: One is no regular file.
-            SettingsError: One was read.
-        """
+        """Refuse to replace or remove what this run has read, or what is no regular file."""
         if not self.whole:  # else the folder is replaced, and with it the run that was read
             changed = {*map(Path, self.files()), *self._earlier}
             check_targets((self.folder / name for name in sorted(changed)), inputs)
@@ -272,11 +258,7 @@ def _refuse_foreign(folder: Path) -> None:
 
 
 def recorded_files(folder: Path) -> list[Path]:
-    """Return the files that a folder has of a run, below it; none without a record.
-
-    Raises:
-        FormatError: Its record cannot be read.
-    """
+    """Return the files that a folder has of a run, below it; none without a record."""
     path = folder / RECORD
     if not path.is_file():
         return []

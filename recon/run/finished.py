@@ -63,11 +63,7 @@ def _session_of(path_file: Path) -> int:
 
 
 def open_run(folder: Path) -> FinishedRun:
-    """Read the record of a run with maps.
-
-    Raises:
-        FormatError: The folder does not contain a finished run, or one without maps.
-    """
+    """Read the record of a run with maps."""
     path = folder / RECORD
     record = _read_record(path)
     if "T_map_world" not in record:
@@ -83,21 +79,12 @@ def open_run(folder: Path) -> FinishedRun:
 
 
 def is_pair_run(folder: Path) -> bool:
-    """Return whether a folder holds a finished run of `recon pair`.
-
-    Raises:
-        FormatError: The folder does not contain a finished run.
-    """
+    """Return whether a folder holds a finished run of `recon pair`."""
     return _read_record(folder / RECORD).get("command") == "pair"
 
 
 def camera_of_pair(folder: Path) -> RectifiedCamera:
-    """Return the rectified camera of a run of `recon pair`, from its summary.
-
-    Raises:
-        FormatError: The summary cannot be read, or names no camera.
-        CalibrationError: It is none that could have measured anything.
-    """
+    """Return the rectified camera of a run of `recon pair`, from its summary."""
     summary = _read_record(folder / SUMMARY)
     names = ("focal_px", "cx_px", "cy_px", "doffs_px", "baseline_m", "width_px", "height_px")
     try:
@@ -113,11 +100,7 @@ def camera_of_pair(folder: Path) -> RectifiedCamera:
 
 
 def figure_of(folder: Path, name: str) -> float | None:
-    """Return a figure of a run, such as ``camera_height_m``, from its summary; None = unknown.
-
-    Raises:
-        FormatError: The folder does not contain a finished run, or its summary is damaged.
-    """
+    """Return a figure of a run, such as ``camera_height_m``, from its summary; None = unknown."""
     figure = _read_record(folder / SUMMARY).get(name)
     if figure is None or (type(figure) in (int, float) and math.isfinite(figure)):
         return figure
@@ -125,11 +108,7 @@ def figure_of(folder: Path, name: str) -> float | None:
 
 
 def refuse_as_target(run: Path, out: StrPath | None) -> None:
-    """Refuse to write derived results into the folder of the run, which would replace it.
-
-    Raises:
-        SettingsError: ``out`` is the folder of the run.
-    """
+    """Refuse to write derived results into the folder of the run, which would replace it."""
     if out is not None and Path(out).resolve() == run.resolve():
         raise SettingsError("the results would replace the run", where=out, hint="another --out")
 

@@ -50,11 +50,7 @@ class MemorySettings(Settings):
         return _CACHE_BYTES if self.limit_mb is None else int(1e6 * self.limit_mb * _CACHE_SHARE)
 
     def check(self, where: str) -> None:
-        """Stop a run that exceeds the limit; else return what is free, for what comes next.
-
-        Raises:
-            MemoryLimitError: The peak memory of the process is above the limit.
-        """
+        """Stop a run that exceeds the limit; else return what is free, for what comes next."""
         if self.limit_mb is None:
             return
         if peak_memory_mb() > self.limit_mb:
@@ -70,20 +66,12 @@ class MemorySettings(Settings):
 
 
 def memory_overrides(limit: str | None) -> list[str]:
-    """Return the override for a size such as ``2G`` or ``1500M``; None = no override.
-
-    Raises:
-        SettingsError: The text is not a size.
-    """
+    """Return the override for a size such as ``2G`` or ``1500M``; None = no override."""
     return [] if limit is None else [f"memory.limit_mb={parse_size_mb(limit):g}"]
 
 
 def parse_size_mb(text: str) -> float:
-    """Parse a size into 10⁶ bytes, which is also the unit if none is given.
-
-    Raises:
-        SettingsError: The text is not a size.
-    """
+    """Parse a size into 10⁶ bytes, which is also the unit if none is given."""
     found = _SIZE.fullmatch(text)
     unit = None if found is None else _UNITS_MB.get(found[2].upper())
     if found is None or unit is None or float(found[1]) == 0:

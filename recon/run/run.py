@@ -47,9 +47,6 @@ class Run(RunDirectory):
         threads: Threads to use; None = all cores. `threads` is their number.
         progress: Shown how far the run is.
         resume: Resume the unfinished run in the folder.
-
-    Raises:
-        OutputError: As for `RunDirectory`.
     """
 
     def __init__(
@@ -115,10 +112,6 @@ class Run(RunDirectory):
             source: What was processed.
             inputs: The files that were read, of which the record has a hash.
             record: What else the record has.
-
-        Raises:
-            OutputError: A file cannot be written.
-            SettingsError: The results would replace one of ``inputs``.
         """
         inputs = tuple(inputs)
         self.check_targets(inputs)

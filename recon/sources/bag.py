@@ -71,12 +71,7 @@ class BagSource(Recording):
         return self.left_s[[left for left, _ in self.pairs]]
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Read the pairs from number ``start`` on, without reading the messages before.
-
-        Raises:
-            FormatError: A message is damaged or has an unsupported encoding.
-            CalibrationError: An image has another size than the calibration.
-        """
+        """Read the pairs from number ``start`` on, without reading the messages before."""
         if start >= len(self):
             return
         # One reader per camera, so that pairs with messages far apart need no buffer.
@@ -108,15 +103,7 @@ class BagSource(Recording):
 
 
 def open_bag(path: Path, settings: SourceSettings) -> BagSource:
-    """Open a recording, and read all its timestamps to pair the messages.
-
-    Raises:
-        MissingDependencyError: The extra ``ros`` is not installed.
-        SourceError: The image topics of two cameras are missing, their timestamps are out of
-            order, no messages can be paired, or there is no calibration.
-        FormatError: The recording is truncated or damaged.
-        CalibrationError: The calibration cannot give depth.
-    """
+    """Open a recording, and read all its timestamps to pair the messages."""
     bag = Bag(_find_files(path))
     topics, also = choose_topics(bag, settings)
     times = bag.scan(topics)
@@ -153,11 +140,7 @@ def find_bags(folder: Path) -> list[Path]:
 
 
 def decode_message(message: BagImage, where: str) -> UInt8:
-    """Decode an image message.
-
-    Raises:
-        FormatError: The message is damaged or its encoding is not supported.
-    """
+    """Decode an image message."""
     if not message.step:
         return decode_image(message.data.tobytes(), where)
     return pixels_of_ros_image(

@@ -27,9 +27,6 @@ def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], 
 
     Returns:
         The topics, and a note on other candidate pairs.
-
-    Raises:
-        SourceError: A topic does not exist, or no two topics look like a left and a right camera.
     """
     if settings.left or settings.right:
         return _named(bag, settings), ""
@@ -125,10 +122,6 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
         right: Message of the right camera.
         where: The recording, for error messages.
         rectified: Whether the images are rectified, so that only ``P`` is used.
-
-    Raises:
-        FormatError: The lens model is not supported.
-        CalibrationError: The calibration cannot give depth, as with an uncalibrated camera.
     """
     for info in (left, right):
         if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:

@@ -46,12 +46,6 @@ def read_rig(
 
     Returns:
         The calibration, and the files it was read from.
-
-    Raises:
-        SourceError: No file is named and none is found.
-        SettingsError: The camera is given twice.
-        FormatError: The file is damaged.
-        CalibrationError: The calibration cannot give depth, or is of another image size.
     """
     check_given_once(settings.calibration, settings)
     if settings.numbers:
@@ -69,11 +63,7 @@ def read_rig(
 
 
 def check_given_once(calibration: object, settings: SourceSettings) -> None:
-    """Refuse a camera that is given both by a calibration file and in numbers.
-
-    Raises:
-        SettingsError: It is.
-    """
+    """Refuse a camera that is given both by a calibration file and in numbers."""
     if calibration is not None and settings.numbers:
         raise SettingsError(
             "--focal, --baseline, --cx and --cy replace a calibration file",
@@ -92,9 +82,6 @@ def camera_of_numbers(
         settings: Focal length and baseline; the principal point is else the middle.
         size: Image width and height.
         instead: Numbers to use where the settings have none.
-
-    Raises:
-        CalibrationError: Focal length or baseline is missing, or the former is implausible.
     """
     numbers = {**instead, **settings.numbers}
     focal_px, baseline_m = numbers.get("focal_px"), numbers.get("baseline_m")

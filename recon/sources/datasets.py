@@ -99,11 +99,7 @@ def parts_of(dataset: Dataset) -> list[Part]:
 
 
 def find_parts(name: str) -> list[Part]:
-    """Return the parts that a name means: those of a data set, or one.
-
-    Raises:
-        SettingsError: There is no such data set or part.
-    """
+    """Return the parts that a name means: those of a data set, or one."""
     whole = name.rstrip("/").partition("/")[0]
     every = [part for one in datasets().values() for part in parts_of(one)]
     parts = [part for part in every if part.dataset.name == whole]

@@ -37,11 +37,6 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open a drive; its images are paired by timestamp.
 
     The ground truth is interpolated to the timestamps; it is used only if it covers every frame.
-
-    Raises:
-        SourceError: A folder is missing, or no images can be paired.
-        FormatError: A file is damaged.
-        CalibrationError: The calibration cannot give depth.
     """
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]

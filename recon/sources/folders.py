@@ -61,14 +61,7 @@ class _Pairing:
 
 
 def open_folders(folder: Path, settings: SourceSettings) -> ImageSource:
-    """Open plain folders; the description says how the images are paired.
-
-    Raises:
-        SourceError: Two cameras are not found, the images cannot be paired, or the calibration
-            is missing.
-        FormatError: A file is damaged.
-        CalibrationError: The calibration cannot give depth.
-    """
+    """Open plain folders; the description says how the images are paired."""
     found = _pair(folder, settings)
     stamps_s, clock = _times(found, settings)
     first = found.pairs[0][0]

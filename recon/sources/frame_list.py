@@ -60,11 +60,7 @@ class FrameList:
         return list(of_pairs) if self.chosen is None else [of_pairs[k] for k in self.chosen]
 
     def choose(self, settings: SourceSettings, where: Path) -> FrameList:
-        """Return the same recording, of which the frames from ``start`` to ``end`` are used.
-
-        Raises:
-            SourceError: There are none.
-        """
+        """Return the same recording, of which the frames from ``start`` to ``end`` are used."""
         if (settings.start, settings.end, settings.stride) == (0, None, 1):
             return self
         chosen = range(len(self.paired))[settings.start : settings.end : settings.stride]
@@ -117,9 +113,6 @@ def pair_frames(
         settings: By how many frames the right images were taken later, and the frames to use.
         where: The source, for the error message.
         names: Names of the frames without suffix; None = they have none.
-
-    Raises:
-        SourceError: No pair is left.
     """
     alone_right = sum(left is None and right is not None for left, right in frames)
     # A listed frame without any image counts as one, on the left.
@@ -141,11 +134,7 @@ def pair_frames(
 def _shift_right(
     frames: Sequence[tuple[Left | None, Right | None]], by: int, where: Path
 ) -> Sequence[tuple[Left | None, Right | None]]:
-    """Return the frames with the right images of so many frames later.
-
-    Raises:
-        SourceError: No pair is left.
-    """
+    """Return the frames with the right images of so many frames later."""
     if not by:
         return frames
     whole = [k for k, (left, right) in enumerate(frames) if left is not None and right is not None]
@@ -172,9 +161,6 @@ def check_most(pairs: int, images: int, where: Path) -> None:
         pairs: Number of pairs.
         images: Number of images of one camera, found or listed.
         where: The source, for the error message.
-
-    Raises:
-        SourceError: Fewer than half of the images have a partner.
     """
     if 2 * pairs < images:
         raise SourceError(

@@ -46,9 +46,6 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     Args:
         left: A folder, an image, or a pattern with ``*``, ``?``, ``[]`` or ``**``.
         right: The same for the right camera.
-
-    Raises:
-        SourceError: A side has no images, most images have no partner, or the sides share files.
     """
     sides = (find_images(left), find_images(right))
     both = set(sides[0]) & set(sides[1])
@@ -73,11 +70,7 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
 
 
 def find_images(where: str | Path) -> list[Path]:
-    """Return the images of a folder or pattern in natural order: 2 before 10.
-
-    Raises:
-        SourceError: There are none.
-    """
+    """Return the images of a folder or pattern in natural order: 2 before 10."""
     folder = Path(where)
     found = (
         folder.iterdir()

@@ -68,12 +68,7 @@ class ImageSource(Recording):
         return np.array([frame.timestamp_s for frame in self.images])
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Read the pairs from number ``start`` on.
-
-        Raises:
-            FormatError: An image is missing or damaged.
-            CalibrationError: An image has another size than the calibration.
-        """
+        """Read the pairs from number ``start`` on."""
         for index in range(start, len(self.images)):
             frame = self.images[index]
             left, right = (self._read(path) for path in (frame.left, frame.right))
@@ -115,9 +110,6 @@ def pair_listed(
         lists: Time stamp and file of the left images, and of the right ones, in order of time.
         settings: Largest difference within a pair, and the frames to use.
         where: The source, for error messages.
-
-    Raises:
-        SourceError: No two images are close enough, or most have no partner.
     """
     for one in lists:
         check_most(sum(path.is_file() for _, path in one), len(one), where)
@@ -147,9 +139,6 @@ def pair_named(
         frames: Left and right image of each frame in order; None = missing.
         settings: The frames to use.
         where: The source, for the error message.
-
-    Raises:
-        SourceError: Most images have no partner, or no pair is left.
     """
     whole = sum(None not in frame for frame in frames)
     alone_right = sum(left is None and right is not None for left, right in frames)
@@ -166,21 +155,13 @@ def existing(path: Path) -> Path | None:
 
 
 def image_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
-    """Return width and height of an image file, which must not be larger than the settings allow.
-
-    Raises:
-        FormatError: The file is missing or damaged.
-    """
+    """Return width and height of an image file, at most as large as the settings allow."""
     height_px, width_px = read_levels(path, settings.max_megapixels).shape[:2]
     return width_px, height_px
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the images of a folder in natural order: 2 before 10.
-
-    Raises:
-        SourceError: The folder does not exist or contains no images.
-    """
+    """Return the images of a folder in natural order: 2 before 10."""
     if not folder.is_dir():
         raise SourceError("folder does not exist", where=folder)
     paths = [path for path in folder.iterdir() if is_image(path)]

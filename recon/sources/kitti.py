@@ -55,12 +55,6 @@ def open_kitti(
         folder: The folder of the drive.
         settings: May name another calibration, or a frame rate in place of times.
         cameras: (0, 1) for the grey pair, (2, 3) for the colour pair; None = grey if present.
-
-    Raises:
-        SourceError: A folder or most of the images are missing, or there are fewer times or
-            poses than images.
-        FormatError: A file is damaged.
-        CalibrationError: The calibration cannot give depth.
     """
     path = Path(folder)
     if not path.is_dir():
@@ -86,11 +80,7 @@ def open_kitti(
 
 
 def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
-    """Return the grey pair of cameras, or the colour pair if only that is complete.
-
-    Raises:
-        SourceError: There is no complete pair.
-    """
+    """Return the grey pair of cameras, or the colour pair if only that is complete."""
     pairs = (GREY_CAMERAS, COLOUR_CAMERAS)
     for pair in pairs:
         if all((folder / pattern.format(camera)).is_dir() for camera in pair):
@@ -115,11 +105,7 @@ def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
 def _list_pairs(
     left: Path, right: Path, *, settings: SourceSettings
 ) -> tuple[list[tuple[Path, Path]], FrameList]:
-    """Return the left and right image of each frame, paired by equal names.
-
-    Raises:
-        SourceError: Most images have no partner, or there are no images.
-    """
+    """Return the left and right image of each frame, paired by equal names."""
     names = [_names(folder) for folder in (left, right)]
     for folder, found in zip((left, right), names, strict=True):
         if not found:

@@ -31,14 +31,7 @@ _CALIBRATION: Final = "calib_cam_to_cam.txt"
 
 
 def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
-    """Open a raw drive; its images are paired by timestamp.
-
-    Raises:
-        SourceError: A folder, the times or the calibration are missing, or no images can be
-            paired.
-        FormatError: A file is damaged.
-        CalibrationError: The calibration cannot give depth.
-    """
+    """Open a raw drive; its images are paired by timestamp."""
     cameras = choose_cameras(folder, "image_{:02d}")
     views = [folder / f"image_{camera:02d}" for camera in cameras]
     frames, listing = pair_listed([_read_list(v) for v in views], settings, folder)

@@ -76,12 +76,7 @@ class LiveSource(DerivedSource):
         return len(self.source)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Yield the pairs as they arrive, those that are not dropped; once.
-
-        Raises:
-            ReconError: A pair cannot be read.
-            SourceError: The drive is stopped before the first one.
-        """
+        """Yield the pairs as they arrive, those that are not dropped; once."""
         Thread(target=self._play, args=(start,), name="live", daemon=True).start()
         try:
             while (arrived := self._take()) is not None:

@@ -60,13 +60,7 @@ class OnePair:
 
 
 def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
-    """Open a Middlebury scene of 2005 or 2006 (with ``dmin.txt``), 2014 or MiddEval3.
-
-    Raises:
-        SourceError: The settings choose no frame of the only one.
-        FormatError: The folder is not a Middlebury scene, or a file in it is damaged.
-        CalibrationError: No calibration is published for the scene, or it cannot give depth.
-    """
+    """Open a Middlebury scene of 2005 or 2006 (with ``dmin.txt``), 2014 or MiddEval3."""
     pair_frames([(0, 0)], settings, folder)
     scene = read_middlebury_scene(folder)
     rig: Rig | None = scene.camera
@@ -88,10 +82,6 @@ def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIX
     """Read the two images of a pair; if only one is in colour, the other is converted.
 
     16-bit images are scaled to 8 bits, both alike, by the brightest pixel.
-
-    Raises:
-        SourceError: The images differ in size.
-        FormatError: An image is missing or damaged.
     """
     levels = [read_levels(path, max_megapixels) for path in (left, right)]
     white = find_white(levels)
@@ -117,11 +107,7 @@ def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIX
 def join_pair(
     left: UInt8, right: UInt8, timestamp_s: float = 0.0, index: int = 0, name: str = ""
 ) -> StereoPair:
-    """Join two images of equal size; if only one is in colour, the other is converted.
-
-    Raises:
-        ShapeError: The images differ in size.
-    """
+    """Join two images of equal size; if only one is in colour, the other is converted."""
     if left.ndim != right.ndim:
         left, right = (p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in (left, right))
     return StereoPair(left, right, timestamp_s, index, name)

@@ -59,9 +59,6 @@ class OpenCvCamera:
     Attributes:
         name: The device as given.
         live: False for a file.
-
-    Raises:
-        SourceError: The device cannot be opened, or does not support that size.
     """
 
     def __init__(
@@ -108,11 +105,7 @@ class OpenCvCamera:
         return float(stamp_s) if believed else now_s
 
     def retrieve(self) -> UInt8:
-        """Decode the grabbed frame: uint8 (H, W, 3) RGB.
-
-        Raises:
-            SourceError: The frame cannot be decoded.
-        """
+        """Decode the grabbed frame: uint8 (H, W, 3) RGB."""
         done, image = self._capture.retrieve()
         if not done:
             raise SourceError("frame cannot be decoded", where=self.name)

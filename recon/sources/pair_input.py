@@ -64,12 +64,6 @@ def read_pair_input(
             is up to scale. The result has notes on both.
         metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
         max_megapixels: Refuse larger images, in 10⁶ pixels.
-
-    Raises:
-        FormatError: A file is missing, damaged or of the wrong size.
-        SourceError: The images differ in size.
-        SettingsError: The camera is given twice.
-        CalibrationError: The focal length is neither given nor in the image, or implausible.
     """
     if known is not None:
         check_given_once(calibration, known)
@@ -116,9 +110,6 @@ def with_truth(given: PairInput, path: Path | None) -> PairInput:
     Args:
         given: The pair.
         path: True disparity of the rectified left image, PFM or 16-bit PNG; None = none.
-
-    Raises:
-        FormatError: The file is missing, damaged or of another size.
     """
     if path is None:
         return given

@@ -47,10 +47,6 @@ def read_prior(source: StereoSource, name: str) -> ReadPrior:
         name: A TUM file, or, if the source is a recording, one of its topics with odometry, poses
             or transforms. Its static transforms, if they connect the two, turn the poses into
             those of the left camera.
-
-    Raises:
-        SourceError: The recording has no such topic, or one with several moving frames.
-        FormatError: The file or a message is damaged.
     """
     if isinstance(source, BagSource) and not Path(name).is_file():
         return _read_topic(source, name)

@@ -64,11 +64,7 @@ def open_source(
 
 
 def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> str:
-    """Recognise the kind of source (a key of `SOURCES`) of a path by its files.
-
-    Raises:
-        SourceError: The path is missing, empty or of an unknown kind.
-    """
+    """Recognise the kind of source (a key of `SOURCES`) of a path by its files."""
     place = Path(path)
     if place.is_file():
         return _recognise_file(place)

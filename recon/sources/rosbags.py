@@ -125,10 +125,6 @@ class Bag:
 
     Attributes:
         topics: All topics, by name.
-
-    Raises:
-        MissingDependencyError: rosbags is not installed.
-        FormatError: The recording is missing, truncated or damaged.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -151,9 +147,6 @@ class Bag:
         Returns:
             For each topic int64 (N, 2), nanoseconds: time of recording and header stamp, in the
             order of recording.
-
-        Raises:
-            FormatError: The recording is truncated or damaged.
         """
         times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
         for topic, recorded_ns, content in self._messages(topics):
@@ -168,9 +161,6 @@ class Bag:
         Args:
             topic: An image topic.
             start_ns: Skip messages recorded before this time.
-
-        Raises:
-            FormatError: The recording is truncated or damaged.
         """
         compressed = self.topics[topic].kind == COMPRESSED
         for _, _, content in self._messages([topic], start_ns):
@@ -188,11 +178,7 @@ class Bag:
                 )
 
     def camera_info(self, topic: str) -> BagCameraInfo:
-        """Read the first message of a ``CameraInfo`` topic.
-
-        Raises:
-            FormatError: There is no message, or the recording is damaged.
-        """
+        """Read the first message of a ``CameraInfo`` topic."""
         for _, _, content in self._messages([topic]):
             message = self._parse(content, topic)
             # ROS 1 has upper-case field names.
@@ -218,11 +204,7 @@ class Bag:
         return ""
 
     def poses(self, topic: str) -> Iterator[BagPose]:
-        """Yield the poses of a topic of one of the `POSES`, in the order of recording.
-
-        Raises:
-            FormatError: The recording is truncated or damaged.
-        """
+        """Yield the poses of a topic of one of the `POSES`, in the order of recording."""
         for _, recorded_ns, content in self._messages([topic]):
             message = self._parse(content, topic)
             for part in getattr(message, "transforms", [message]):

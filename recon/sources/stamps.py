@@ -84,9 +84,6 @@ def check_increasing(stamps_s: Float64, where: str, lines: Sequence[int] | None 
         stamps_s: float64 (N,), in the order of the frames.
         where: Their file or folder.
         lines: The line of each in the file; None = they are numbered.
-
-    Raises:
-        SourceError: They are not.
     """
     backwards = np.flatnonzero(np.diff(stamps_s) <= 0)
     if backwards.size:
@@ -106,9 +103,6 @@ def check_seconds(stamps_s: Float64, where: str | Path) -> None:
     Args:
         stamps_s: float64 (N,), in the order of the frames.
         where: Their file.
-
-    Raises:
-        SourceError: Half of the frames or more are at the same time, or more than a minute apart.
     """
     step_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 1.0
     if not 0.0 < step_s <= _LONGEST_STEP_S:
@@ -129,9 +123,6 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
         right_s: float64 (M,), seconds, increasing.
         tolerance_s: Largest difference within a pair.
         where: The source, for the error message.
-
-    Raises:
-        SourceError: No two are close enough.
     """
     to_right, to_left = nearest_sorted(left_s, right_s), nearest_sorted(right_s, left_s)
     mutual = to_left[to_right] == np.arange(len(left_s))

@@ -26,10 +26,6 @@ def read_times(path: Path, frames: int) -> Float64:
 
     Returns:
         float64 (frames,), increasing.
-
-    Raises:
-        SourceError: The file is missing or too short, or its times are no seconds.
-        FormatError: A line is not a number, or time runs backwards.
     """
     return read_times_of_pairs(path, FrameList([""] * frames, range(frames)))
 
@@ -41,10 +37,6 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
 
     Returns:
         float64, one time per pair, increasing.
-
-    Raises:
-        SourceError: The file is missing or too short, or its times are no seconds.
-        FormatError: A line is not a number, or time runs backwards.
     """
     if not path.exists():
         raise SourceError("file does not exist", where=path)
@@ -70,9 +62,6 @@ def read_dates(path: Path) -> Float64:
 
     Returns:
         float64 (N,), seconds since 1970, which a double resolves to 0.2 µs.
-
-    Raises:
-        FormatError: The file is missing, or a line is not a date.
     """
     stamps = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -104,9 +93,6 @@ def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, 
 
     Returns:
         (seconds, name) of each line.
-
-    Raises:
-        FormatError: The file is missing or empty, or a line is not a timestamp and a name.
     """
     entries = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -152,11 +138,7 @@ def truth_at(
 
 
 def read_tum_truth(folder: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
-    """Return ground truth from ``groundtruth.txt`` (TUM format, left camera), if a folder has one.
-
-    Raises:
-        FormatError: The file is damaged.
-    """
+    """Return the truth in ``groundtruth.txt`` (TUM format, left camera), if a folder has one."""
     path = folder / "groundtruth.txt"
     if not path.is_file():
         return None, ""

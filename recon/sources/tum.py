@@ -25,13 +25,7 @@ from recon.sources.times import read_stamped_names, read_tum_truth
 
 
 def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
-    """Open a drive with two lists; its images are paired by timestamp.
-
-    Raises:
-        SourceError: A list, an image or the calibration is missing, or no images can be paired.
-        FormatError: A file is damaged.
-        CalibrationError: The calibration cannot give depth.
-    """
+    """Open a drive with two lists; its images are paired by timestamp."""
     paths = _find_lists(folder, settings)
     lists = [_read_list(path) for path in paths]
     frames, listing = pair_listed(lists, settings, folder)

@@ -45,12 +45,7 @@ class VideoSource(Recording):
         return [*self.texts, *(video.path for video in self.videos)]
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Decode the pairs from number ``start`` on.
-
-        Raises:
-            SourceError: The times of the two files drift apart.
-            FormatError: A frame cannot be decoded, or its time does not increase.
-        """
+        """Decode the pairs from number ``start`` on."""
         last_s, numbers = -np.inf, self.numbers[start:]
         views = zip(numbers, self._views(numbers), strict=True) if numbers else ()
         for index, ((number, _), (stamp_s, left, right)) in enumerate(views, start=start):
@@ -98,14 +93,7 @@ class VideoSource(Recording):
 
 
 def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
-    """Open a file with both views, a left file (``settings.right`` is the other), or a folder.
-
-    Raises:
-        SourceError: A file is missing, the two differ much in number of frames, or in their rate or
-            size, or the calibration is missing.
-        FormatError: A file is not a video, or is damaged.
-        CalibrationError: The calibration cannot give depth.
-    """
+    """Open a file with both views, a left file (``settings.right`` is the other), or a folder."""
     videos = open_videos(_find_videos(path, settings))
     frames = zip_longest(range(videos[0].frames), range(videos[-1].frames))
     numbers, listing = pair_frames(list(frames), settings, path)
@@ -127,12 +115,7 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
 
 
 def open_videos(files: Sequence[Path]) -> tuple[VideoFile, ...]:
-    """Open one video, or a left and a right one that belong together.
-
-    Raises:
-        SourceError: The two differ much in number of frames, or in their rate or size.
-        FormatError: A file is missing, not a video, or damaged.
-    """
+    """Open one video, or a left and a right one that belong together."""
     videos = tuple(open_video(file) for file in files)
     if len(videos) == 2:
         _check_alike(*videos)
@@ -152,11 +135,7 @@ def list_videos(folder: Path) -> list[str]:
 
 
 def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
-    """Return the width and height of one of the two views in a video.
-
-    Raises:
-        SourceError: The frame size is odd.
-    """
+    """Return the width and height of one of the two views in a video."""
     stacked = settings.side_by_side in _STACKED
     whole = video.height_px if stacked else video.width_px
     if whole % 2:

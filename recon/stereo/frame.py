@@ -101,11 +101,7 @@ class FrameReconstructor:
             return rectified, self._rough_matcher.match(rectified)
 
     def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
-        """Return warnings about the geometry of a pair; every 50th frame is inspected.
-
-        Raises:
-            CalibrationError: Left and right are swapped.
-        """
+        """Return warnings about the geometry of a pair; every 50th frame is inspected."""
         if pair.index % _INSPECT_EVERY:
             return ()
         with self._stopwatch.stage("inspect"):
@@ -113,11 +109,7 @@ class FrameReconstructor:
         return check_inspection(found, where=f"frame {pair.index}")
 
     def reconstruct(self, pair: StereoPair) -> ReconstructedFrame:
-        """Reconstruct one pair.
-
-        Raises:
-            CalibrationError: Left and right are swapped.
-        """
+        """Reconstruct one pair."""
         return self.reconstruct_rectified(self.rectify(pair))
 
     def reconstruct_rectified(self, rectified: RectifiedPair) -> ReconstructedFrame:

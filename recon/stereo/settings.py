@@ -30,9 +30,6 @@ class StereoSettings(Settings):
 
         ``config.yaml`` has the name of an object only, so such a run is repeated from Python.
         `map_sequence` and `run_map` call it from one thread, one pair after the other.
-
-        Raises:
-            SettingsError: There is no matcher of this name, or the object is none.
         """
         if matcher is None:
             return self

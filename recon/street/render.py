@@ -36,11 +36,7 @@ class SyntheticFrame:
 
 
 class StreetCamera:
-    """The rig in a street; renders frames in any order.
-
-    Raises:
-        SettingsError: A frame is asked for that there is not.
-    """
+    """The rig in a street; renders frames in any order."""
 
     def __init__(self, world: StreetWorld) -> None:
         self.world = world

@@ -69,9 +69,6 @@ def true_occupancy(
         range_m: Largest distance from the camera that a frame sees.
         least_frames: Least number of frames that must have seen a cell of the grid.
         T_map_world: The map axes to use; by default those of the street world.
-
-    Raises:
-        EvaluationError: No surface is in view and in range.
     """
     world = camera.world
     T = world.T_map_world if T_map_world is None else T_map_world

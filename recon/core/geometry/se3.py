@@ -132,11 +132,7 @@ def orthonormalise(T: NDArray[Any]) -> Float64:
 
 
 def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
-    """Check a pose that is read from a run: one that is none would spoil or exhaust a map.
-
-    Raises:
-        FormatError: It is not a rigid transform, or implausibly far away.
-    """
+    """Check a pose that is read from a run: one that is none would spoil or exhaust a map."""
     if not (
         T.shape == (4, 4)
         and np.isfinite(T).all()

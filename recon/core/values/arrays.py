@@ -28,9 +28,6 @@ def frozen_array(
         value: Array to check; never converted, so float64 in place of float32 is an error.
         dtype: Required dtype.
         shape: Required shape; ``None`` stands for any length.
-
-    Raises:
-        ShapeError: ``value`` is not an array, or has the wrong dtype or shape.
     """
     if not isinstance(value, np.ndarray):
         got, expected = type(value).__name__, _field_text(dtype, shape)
@@ -60,11 +57,7 @@ def freeze(instance: object, name: str, dtype: DTypeLike, shape: tuple[int | Non
 def array_in(
     tree: Mapping[str, Any], name: str, dtype: DTypeLike, shape: tuple[int | None, ...]
 ) -> NDArray[Any]:
-    """Return an array of a tree that was read, which may be written: finite, where it is of floats.
-
-    Raises:
-        ShapeError: It is something else.
-    """
+    """Return an array of a tree that was read, which may be written; floats are finite."""
     values: NDArray[Any] = tree[name]
     if not np.isfinite(frozen_array(name, values, dtype, shape)).all():
         raise ShapeError(f"{name} is not finite")
@@ -82,9 +75,6 @@ def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None
 
     Returns:
         float32 (H, W), or () for a single number where ``shape`` is given.
-
-    Raises:
-        ShapeError: It is not an array of real numbers, or has another shape.
     """
     try:
         given = values if isinstance(values, np.ma.MaskedArray) else np.asarray(values)

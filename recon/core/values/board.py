@@ -109,9 +109,6 @@ def parse_board(text: str) -> CalibrationBoard:
     dictionary ``5x5_100`` (defaults: three quarters of a square, and that dictionary). A trailing
     ``:legacy`` selects the layout that OpenCV used before 4.6. Lengths are in mm, cm, m or in; a
     bare number is in metres. Without a square size, see `CalibrationBoard.metric`.
-
-    Raises:
-        SettingsError: The text does not have this form, or describes an impossible board.
     """
     kind, *parts = [part.strip() for part in text.strip().split(":")]
     if kind.lower() not in ("chess", "charuco") or not parts:

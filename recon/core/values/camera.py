@@ -203,11 +203,7 @@ class RectifiedCamera:
 def _check_view(
     focal_px: tuple[float, float], centre_px: tuple[float, float], size_px: tuple[int, int]
 ) -> None:
-    """Refuse numbers that no camera has, along rows and columns.
-
-    Raises:
-        CalibrationError: There is one.
-    """
+    """Refuse numbers that no camera has, along rows and columns."""
     size = f"{size_px[0]}x{size_px[1]}"
     if min(size_px) < 1:
         raise CalibrationError("image size is empty", got=size)
@@ -225,11 +221,7 @@ def _check_view(
 
 
 def _check_baseline(baseline_m: float) -> None:
-    """Refuse a distance that no two cameras have.
-
-    Raises:
-        CalibrationError: It is one.
-    """
+    """Refuse a distance that no two cameras have."""
     if baseline_m <= 0:
         raise CalibrationError(
             "baseline is zero" if baseline_m == 0 else "baseline is negative",
@@ -251,11 +243,7 @@ def check_size(
     height_px: int,
     where: str | PathLike[str] | None,
 ) -> None:
-    """Check that images have the size of their calibration; every use of a calibration does.
-
-    Raises:
-        CalibrationError: They have another size.
-    """
+    """Check that images have the size of their calibration; every use of a calibration does."""
     camera = calibration if isinstance(calibration, RectifiedCamera) else calibration.left
     if (width_px, height_px) != (camera.width_px, camera.height_px):
         raise other_size(width_px, height_px, f"{camera.width_px}x{camera.height_px}", where)
@@ -278,12 +266,7 @@ def other_size(
 def check_unsized(
     centre_px: tuple[float, float], width_px: int, height_px: int, where: str | PathLike[str]
 ) -> None:
-    """Check a calibration from a file that does not state its image size against the images.
-
-    Raises:
-        CalibrationError: The principal point is so far off their centre that the calibration must
-            be of another size.
-    """
+    """Check a calibration from a file that does not state its image size against the images."""
     offsets = (centre_px[0] / width_px - 0.5, centre_px[1] / height_px - 0.5)
     if max(map(abs, offsets)) > LARGEST_CENTRE_OFFSET:
         raise CalibrationError(

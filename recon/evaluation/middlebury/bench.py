@@ -72,11 +72,7 @@ class Bench:
         self._own = threading.local()
 
     def results(self, scene: ScoredScene) -> Iterator[SceneResult]:
-        """Yield one result for each matcher, in the order given.
-
-        Raises:
-            ReconError: A matcher cannot match the scene; the message names it.
-        """
+        """Yield one result for each matcher, in the order given."""
         camera = replace(scene.camera, ndisp=None) if self._auto_range else scene.camera
         pair = Rectifier(camera, self._config.rectification).rectify(scene.pair)
         with naming(scene.name):
@@ -100,12 +96,7 @@ class Bench:
 
 
 def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
-    """Read and score what another program found for a scene; None if there is nothing.
-
-    Raises:
-        FormatError: A file is damaged.
-        EvaluationError: The size of the result does not fit that of the truth.
-    """
+    """Read and score what another program found for a scene; None if there is nothing."""
     file = given.files.get(scene.name)
     if file is None:
         return None
@@ -116,11 +107,7 @@ def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
 
 
 def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
-    """Return the names of the matchers, which are also those of their folders.
-
-    Raises:
-        SettingsError: A matcher is unknown or named twice, or has no name for a folder.
-    """
+    """Return the names of the matchers, which are also those of their folders."""
     for matcher in matchers:
         check_matcher(matcher)
     names = [name_of(matcher) for matcher in matchers]

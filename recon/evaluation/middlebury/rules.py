@@ -73,9 +73,6 @@ def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
     """Return float32 (H, W), a result at the size of the truth, in pixels of that size.
 
     Pixels are repeated or skipped, never interpolated.
-
-    Raises:
-        EvaluationError: Neither size is 1, 2 or 4 times the other, up to rounding.
     """
     step = _step(values.shape, shape)
     return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)

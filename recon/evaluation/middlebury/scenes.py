@@ -55,22 +55,14 @@ class ResultFolder:
 
 
 def check_folder(folder: Path) -> None:
-    """Check that a path is an existing folder.
-
-    Raises:
-        SourceError: It is not.
-    """
+    """Check that a path is an existing folder."""
     if not folder.is_dir():
         what = "not a folder" if folder.exists() else "folder does not exist"
         raise SourceError(what, where=folder)
 
 
 def find_scenes(folder: Path) -> dict[str, Path]:
-    """Return folders of all scenes at or below a folder, by scene name.
-
-    Raises:
-        SourceError: The folder is missing or contains no scene.
-    """
+    """Return folders of all scenes at or below a folder, by scene name."""
     check_folder(folder)
     paths = sorted(_scenes_below(folder))
     if not paths:
@@ -101,10 +93,6 @@ def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene 
 
     A scene without its own gets that of the folder ``truth``, possibly at another size: it holds
     a scene of the same name, or is that scene.
-
-    Raises:
-        FormatError: A file is missing, damaged or of the wrong size.
-        CalibrationError: A calibration file cannot give depth.
     """
     scene = read_middlebury_scene(path)
     judge = scene if scene.truth is not None else _judge(name, truth)
@@ -155,10 +143,6 @@ def find_results(
     A scene's result is ``Teddy.pfm``, or the only ``disp0*.pfm`` in a folder ``Teddy``, as the
     benchmark's kit names them; the scene's name may be preceded by that of its folder
     (``trainingQ/Teddy``). No program gets a name that is ``taken``.
-
-    Raises:
-        SourceError: A folder is missing or has no result, or several for one scene.
-        SettingsError: A folder is given twice.
     """
     found = []
     for name, folder in zip(_names(folders, taken), folders, strict=True):
@@ -215,11 +199,7 @@ def _submitted(folder: Path) -> Path | None:
 
 
 def read_seconds(file: Path) -> float | None:
-    """Return what ``timeX.txt`` beside a result ``disp0X.pfm`` says; None if there is none.
-
-    Raises:
-        FormatError: It holds no time.
-    """
+    """Return what ``timeX.txt`` beside a result ``disp0X.pfm`` says; None if there is none."""
     beside = file.with_name(f"time{file.stem.removeprefix(_DISPARITY)}.txt")
     if not file.stem.startswith(_DISPARITY) or not beside.is_file():
         return None

@@ -34,11 +34,7 @@ _KEPT: Final = 5  # every fifth point of a sparsification curve: 20 of 100
 
 
 def score_result(scene: ScoredScene, values: Float32) -> Figures:
-    """Return the figures of a result, float32 (h, w) in pixels, by mask.
-
-    Raises:
-        EvaluationError: The size of the result does not match the ground truth.
-    """
+    """Return the figures of a result, float32 (h, w) in pixels, by mask."""
     maps = {"dense": dense_map(values), "sparse": values}
     return {mask: _of_mask(scene, maps, occluded=occluded) for mask, occluded in MASKS.items()}
 
@@ -78,9 +74,6 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
 
     Returns:
         The figures, or None if no pixel can be compared.
-
-    Raises:
-        EvaluationError: The sizes do not match.
     """
     sized, step = estimate_at_truth_size(estimate, truth.values.shape)
     if not (sized.valid & np.isfinite(truth.values)).any():
@@ -90,11 +83,7 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
 
 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
-    """Return the same for the confidence alone, of maps of equal size.
-
-    Raises:
-        EvaluationError: The sizes differ, or no pixel can be compared.
-    """
+    """Return the same for the confidence alone, of maps of equal size."""
     bins = measure_reliability(estimate, truth, limit_px)
     steps = measure_sparsification(estimate, truth, limit_px)
     return {
@@ -141,9 +130,6 @@ def fill_holes(values: Float32) -> Float32:
     value is copied from the nearest row with some, the upper one of two. Known values stay.
 
     Takes and returns float32 (H, W), in pixels; NaN = none.
-
-    Raises:
-        ShapeError: The array has another dtype or shape.
 
     Ref: the background interpolation of A. Geiger et al., KITTI stereo development kit.
     """

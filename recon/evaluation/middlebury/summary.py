@@ -60,9 +60,6 @@ def summarise_scenes(
         names: Names of the matchers and of the folders of results.
         results: Folders of results of other programs.
         folder: The folder of the scenes.
-
-    Raises:
-        SourceError: There is no scene with ground truth, or none that all have a result for.
     """
     skipped = [name for name, figures in found.items() if figures is None]
     scenes = {name: figures for name, figures in found.items() if figures is not None}

@@ -128,10 +128,6 @@ def export_mesh(
         cloud: A PLY file in it, for the MeshLab project.
         threads: Pieces reconstructed at a time, each in its own process, but at most four, since
             each needs memory; None = one per core. Does not change results.
-
-    Raises:
-        MeshingError: No piece has a surface.
-        OutputError: A file cannot be written.
     """
     at_once = min(threads or available_cores(), _MOST_AT_ONCE)
     found = _Mesher(tiles, settings, run, at_once, _count(tiles, settings)).written()

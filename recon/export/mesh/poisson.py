@@ -169,9 +169,6 @@ def trimmed_surface(
         settings: Settings of the reconstruction.
         octree: Resolution of the surface.
         wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
-
-    Raises:
-        MeshingError: Poisson failed, or trimming left no face.
     """
     vertices, faces, density = screened_poisson(
         cloud.xyz,
@@ -199,11 +196,7 @@ def trimmed_surface(
 
 
 def usable(cloud: PointCloud) -> PointCloud:
-    """Return the finite points of a cloud, if they can span a surface.
-
-    Raises:
-        MeshingError: The points are too few, coincident or collinear, or one is far off.
-    """
+    """Return the finite points of a cloud, if they can span a surface."""
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     if finite.sum() < _MIN_POINTS:
         raise MeshingError(

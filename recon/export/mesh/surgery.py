@@ -19,19 +19,12 @@ def keep_vertices(vertices: Float32, faces: Int32, keep: Bool) -> tuple[Float32,
 
     Returns:
         The remaining vertices that a face uses, and the faces, renumbered.
-
-    Raises:
-        MeshingError: No face is left.
     """
     return _compact(vertices, faces[keep[faces].all(axis=1)])
 
 
 def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tuple[Float32, Int32]:
-    """Return the connected pieces of a mesh that have at least ``min_faces`` faces.
-
-    Raises:
-        MeshingError: No piece is large enough.
-    """
+    """Return the connected pieces of a mesh that have at least ``min_faces`` faces."""
     labels, sizes = open3d_meshes.component_labels(vertices, faces)
     return _compact(vertices, faces[sizes[labels] >= min_faces])
 

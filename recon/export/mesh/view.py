@@ -56,9 +56,6 @@ def reconstruct_view(
         The mesh in camera axes, with unit normals towards the camera, and colours if the cloud
         has any.
 
-    Raises:
-        MeshingError: The points give no surface; see `reconstruct_mesh`.
-
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
     cloud = usable(cloud.select(cloud.xyz[:, 2] > 0))

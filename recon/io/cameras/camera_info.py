@@ -40,10 +40,6 @@ def read_camera_info(path: StrPath) -> StereoCalibration:
 
     The pose of the right camera follows from the two rectifying rotations and
     ``P[0, 3] = -fx · baseline``.
-
-    Raises:
-        FormatError: A file is missing or damaged, or a lens model is not supported.
-        CalibrationError: The calibration cannot give depth.
     """
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
@@ -71,9 +67,6 @@ def rig_of_camera_infos(
         right: The right camera, likewise.
         P_right: float64 (3, 4), projection matrix of the rectified right camera.
         where: File or topic, for error messages.
-
-    Raises:
-        CalibrationError: The calibration cannot give depth.
     """
     check_shift(P_right, 0.0, where)
     offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
@@ -89,9 +82,6 @@ def check_shift(P_right: Float64, left_shift: float, where: StrPath) -> None:
         P_right: float64 (3, 4).
         left_shift: ``P[0, 3]`` of the left camera, usually 0.
         where: File or topic, for the error message.
-
-    Raises:
-        CalibrationError: The baseline is zero, or the cameras are swapped.
     """
     shift = float(P_right[0, 3]) - left_shift
     if shift < 0:
@@ -131,10 +121,6 @@ def write_camera_info(
 
     Returns:
         The two files.
-
-    Raises:
-        CalibrationError: ROS cannot represent a lens model.
-        OutputError: A file cannot be written.
     """
     paths = camera_info_paths(path)
     cameras = (calibration.left, calibration.right)

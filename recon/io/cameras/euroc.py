@@ -30,10 +30,6 @@ def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
 
     Returns:
         The camera, and float64 (4, 4) ``T_body_camera``, metres.
-
-    Raises:
-        FormatError: The file is missing or incomplete, or the lens model is not supported.
-        CalibrationError: The values do not make a valid camera.
     """
     fields = Fields(read_yaml(path), path)
     width_px, height_px = fields.numbers("resolution", (2,)).astype(int)
@@ -56,9 +52,6 @@ def read_euroc_truth(path: StrPath) -> Trajectory:
 
     Returns:
         ``T_world_body``, in the frame of the motion capture.
-
-    Raises:
-        FormatError: The file is missing or damaged.
     """
     # Position and quaternion, with or without velocity and biases.
     table, _ = read_table(path, (17, 8))

@@ -20,11 +20,6 @@ from recon.io.yaml_file import read_yaml
 def read_kalibr(path: StrPath) -> StereoCalibration:
     """Read ``cam0`` as the left and ``cam1`` as the right camera of a camera chain.
 
-    Raises:
-        FormatError: The file is damaged, or a lens model is not supported (``omni``, ``ds``,
-            ``eucm``, ``fov``).
-        CalibrationError: The calibration cannot give depth.
-
     Ref: Kalibr's wiki, "Yaml formats": ``T_cn_cnm1`` maps points of camera n-1 to camera n.
     """
     fields = Fields(read_yaml(path), path)
@@ -36,12 +31,7 @@ def read_kalibr(path: StrPath) -> StereoCalibration:
 
 
 def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:
-    """Write a camera chain atomically.
-
-    Raises:
-        CalibrationError: Kalibr cannot represent a lens: it has two radial terms, or a fisheye.
-        OutputError: The file cannot be written.
-    """
+    """Write a camera chain atomically."""
     chain: dict[str, Any] = {}
     for number, camera in enumerate((calibration.left, calibration.right)):
         name, coefficients = name_lens(KALIBR_MODELS, camera, "kalibr")

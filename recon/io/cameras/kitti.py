@@ -47,11 +47,6 @@ def read_kitti_calib(
         width_px: Image width; the first kind of file does not contain it.
         height_px: Image height.
         cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
-
-    Raises:
-        FormatError: The file is missing or lacks a camera, or a matrix is not 12 numbers.
-        CalibrationError: The cameras differ in focal length or principal row, the baseline is
-            not positive, or the principal point cannot be that of images of this size.
     """
     left, right = (_projection(path, camera) for camera in cameras)
     if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
@@ -70,9 +65,6 @@ def read_kitti_offset(path: StrPath, camera: int) -> Float64:
     """Return the pose of a camera: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
 
     KITTI's trajectories are those of camera 0.
-
-    Raises:
-        FormatError: As in `read_kitti_calib`.
     """
     T = np.eye(4)
     T[:3, 3] = _centre_m(_projection(path, camera))
@@ -90,11 +82,7 @@ def kitti_cameras_of(left: Path) -> tuple[int, int] | None:
 
 @reader
 def list_kitti_cameras(path: StrPath) -> frozenset[int]:
-    """Return numbers of the cameras that have a matrix in a calibration file.
-
-    Raises:
-        FormatError: The file is missing or not text.
-    """
+    """Return numbers of the cameras that have a matrix in a calibration file."""
     return frozenset(int(number) for number, _ in _LINE.findall(read_text(path)))
 
 
@@ -138,11 +126,6 @@ def read_kitti_rig(path: StrPath, width_px: int, height_px: int, cameras: tuple[
         width_px: Image width.
         height_px: Image height.
         cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
-
-    Raises:
-        FormatError: The file is missing or lacks a line.
-        CalibrationError: The calibration cannot give depth, or the image size is neither of the
-            two.
 
     Ref: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, section 4.
     """

@@ -37,11 +37,7 @@ def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
 def lens_of(
     models: Models, name: str, coefficients: Float64, path: StrPath
 ) -> tuple[LensModel, Float64]:
-    """Return our lens model for a format's name, and its coefficients.
-
-    Raises:
-        FormatError: The model is not supported, or the number of coefficients is wrong.
-    """
+    """Return our lens model for a format's name, and its coefficients."""
     if name not in models:
         raise FormatError(
             "lens model is not supported", where=path, got=name, expected=", ".join(models)
@@ -64,9 +60,6 @@ def name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str,
         models: The models of the format.
         camera: The camera.
         form: Name of the format, for the error message.
-
-    Raises:
-        CalibrationError: The format cannot represent the lens.
     """
     most = int(np.flatnonzero(camera.distortion).max(initial=-1)) + 1
     for name, (model, counts) in models.items():

@@ -56,10 +56,6 @@ def read_opencv_calibration(
             ``image_height``.
         metres_per_unit: Unit of ``T`` in metres: 0.001 for millimetres, or the square size if the
             board was calibrated with squares of size 1.
-
-    Raises:
-        FormatError: A file or matrix is missing, or the image size is unknown.
-        CalibrationError: The calibration cannot give depth, or cannot be of images of ``size_px``.
     """
     nodes = read_file_storage(path)
     outer = _find_extrinsics(path, nodes)
@@ -97,10 +93,6 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
     """Write one YAML file for OpenCV's ``FileStorage``, ``T`` in metres, atomically.
 
     OpenCV defines no key for the lens model; fisheye cameras are marked by ``distortion_model``.
-
-    Raises:
-        CalibrationError: One camera is a fisheye and the other is not.
-        OutputError: The file cannot be written.
     """
     models = {calibration.left.model, calibration.right.model}
     if len(models) > 1:

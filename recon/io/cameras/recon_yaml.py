@@ -42,9 +42,6 @@ def write_recon_calibration(
         path: The file.
         calibration: A raw stereo calibration or a rectified camera.
         quality: Quality figures to store with it, as plain values; not read back.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     content = {"format": MARK, "version": _VERSION, **_content(calibration)}
     if quality:
@@ -55,12 +52,7 @@ def write_recon_calibration(
 
 @reader
 def read_recon_calibration(path: StrPath) -> Rig:
-    """Read what `write_recon_calibration` wrote.
-
-    Raises:
-        FormatError: The file is damaged, or of an unknown version or kind.
-        CalibrationError: The calibration cannot give depth.
-    """
+    """Read what `write_recon_calibration` wrote."""
     fields = Fields(read_yaml(path), path)
     if fields.text("format") != MARK or fields.number("version") != _VERSION:
         raise FormatError(

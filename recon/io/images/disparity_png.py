@@ -15,11 +15,7 @@ from recon.io.images.pfm import read_pfm
 
 
 def read_disparity(path: StrPath) -> Float32:
-    """Return a disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown.
-
-    Raises:
-        FormatError: The file is missing or damaged.
-    """
+    """Return a disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown."""
     return read_pfm(path) if Path(path).suffix.lower() == ".pfm" else read_disparity_png(path)
 
 
@@ -33,10 +29,6 @@ def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
 
     Returns:
         float32 (H, W), pixels; NaN where the level is 0.
-
-    Raises:
-        FormatError: The file is missing, truncated, not a grey image, or has 8 bits where the
-            scale needs 16.
     """
     levels = read_grey_levels(path)
     if levels.dtype == np.uint8 and scale > 255:
@@ -56,11 +48,6 @@ def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0)
         path: Ends in .png.
         values: float32 (H, W), pixels; NaN = unknown.
         scale: Grey levels per pixel; see `fitting_scale`.
-
-    Raises:
-        ShapeError: The array has another dtype or shape.
-        OutputError: A disparity is negative or too large for 16 bits, or the file cannot be
-            written.
     """
     frozen_array("values", values, np.float32, (None, None))
     known = np.isfinite(values)

@@ -77,31 +77,20 @@ def read_levels(path: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> NDArra
 
     Returns:
         uint8 or uint16, (H, W) or (H, W, 3) RGB.
-
-    Raises:
-        FormatError: As in `read_image`.
     """
     content = read_bytes(path, int(max_megapixels * 1e6 * _PIXEL_BYTES) + SMALL_FILE_BYTES)
     return decode_levels(content, path, max_megapixels)
 
 
 def decode_image(content: bytes, where: StrPath) -> UInt8:
-    """Read an image like `read_image`, from bytes in memory.
-
-    Raises:
-        FormatError: As in `read_image`.
-    """
+    """Read an image like `read_image`, from bytes in memory."""
     return eight_bits(decode_levels(content, where))
 
 
 def decode_levels(
     content: bytes, path: StrPath, max_megapixels: float = MAX_MEGAPIXELS
 ) -> NDArray[Any]:
-    """Read an image like `read_levels`, from the bytes of a file.
-
-    Raises:
-        FormatError: As in `read_image`.
-    """
+    """Read an image like `read_levels`, from the bytes of a file."""
     with reading(path):
         _check_size(stated_size(content), path, max_megapixels)
         check_image_bytes(content, path)
@@ -135,11 +124,7 @@ def _check_size(size: tuple[int, int] | None, path: StrPath, max_megapixels: flo
 
 
 def read_grey_levels(path: StrPath) -> NDArray[Any]:
-    """Read an image like `read_levels`, but always (H, W); three equal channels count as grey.
-
-    Raises:
-        FormatError: As in `read_image`, or the image is in colour.
-    """
+    """Read an image like `read_levels`, but always (H, W); three equal channels count as grey."""
     levels = read_levels(path)
     if levels.ndim == 2:
         return levels
@@ -154,10 +139,6 @@ def write_image(path: StrPath, image: NDArray[Any]) -> None:
     Args:
         path: Ends in .png, .tif, .tiff, .jpg, .jpeg, .pgm (grey) or .ppm (colour).
         image: uint8 or uint16 (not JPEG), (H, W) grey or (H, W, 3) RGB.
-
-    Raises:
-        ShapeError: The array is not an image.
-        OutputError: The format is unknown or cannot hold this image, or the file cannot be written.
     """
     _check_pixels(image)
     suffix = Path(path).suffix.lower()

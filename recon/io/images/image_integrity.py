@@ -45,9 +45,6 @@ def check_image_bytes(content: bytes, path: StrPath) -> None:
     """Check that the content of a file is a complete image of a supported format.
 
     For TIFF only the format is checked: its decoder does reject truncated files.
-
-    Raises:
-        FormatError: The file is not an image, or is truncated or damaged.
     """
     if content.startswith(_PNG_START):
         _check_png(content, path)

@@ -60,9 +60,6 @@ def pixels_of_ros_image(
     Returns:
         uint8 (H, W) if the encoding is grey, else (H, W, 3) RGB.
 
-    Raises:
-        FormatError: The encoding is not supported, or there are too few bytes.
-
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """
     name = encoding.lower()

@@ -47,9 +47,6 @@ class VideoFile:
 
         Yields:
             Seconds from the start of the file, and uint8 (H, W, 3) RGB.
-
-        Raises:
-            FormatError: The file cannot be opened, or a frame cannot be decoded.
         """
         with _opened(self.path) as capture:
             after = 0
@@ -76,11 +73,7 @@ class VideoFile:
 
 @reader
 def open_video(path: StrPath) -> VideoFile:
-    """Open a video file and count its frames without decoding them.
-
-    Raises:
-        FormatError: The file is missing, truncated, not a video, or its codec is not supported.
-    """
+    """Open a video file and count its frames without decoding them."""
     file = Path(path)
     if not file.is_file():
         raise FormatError("file does not exist", where=file)

@@ -39,13 +39,7 @@ class MiddleburyCalib:
 
 @reader
 def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
-    """Read a ``calib.txt`` of the 2014 data or of MiddEval3.
-
-    Raises:
-        FormatError: The file is missing, lacks a key, or a value is not a number.
-        CalibrationError: The cameras differ in focal length or principal row, the baseline is
-            not positive, or ``doffs`` is not ``cx1 - cx0``.
-    """
+    """Read a ``calib.txt`` of the 2014 data or of MiddEval3."""
     fields = Fields(dict(_LINE.findall(read_text(path))), path)
     cam0, cam1 = (fields.numbers(key, (3, 3)) for key in ("cam0", "cam1"))
     doffs_px = fields.number("doffs")

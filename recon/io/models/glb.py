@@ -34,9 +34,6 @@ def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> 
 
     Vertex colours of glTF are linear, so sRGB colours are converted, to 16 bits to keep dark tones
     distinct.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     vertices: dict[str, NDArray[Any]] = {"POSITION": mesh.vertices}
     if mesh.normals is not None:

@@ -46,11 +46,6 @@ def write_las(
     Returns:
         The number of points.
 
-    Raises:
-        MissingDependencyError: laspy is not installed.
-        SettingsError: There is no such coordinate system.
-        OutputError: The file cannot be written.
-
     Ref:
         ASPRS, "LAS specification 1.4 - R15", 2019.
     """
@@ -75,13 +70,7 @@ def write_las(
 
 
 def check_crs(crs: str) -> Any:
-    """Return the coordinate system of a name such as ``EPSG:25832``.
-
-    Raises:
-        MissingDependencyError: pyproj is not installed.
-        SettingsError: There is none of that name, or its coordinates are not metres to the east,
-            to the north (and up).
-    """
+    """Return the coordinate system of a name such as ``EPSG:25832``."""
     pyproj = require("pyproj", extra=_EXTRA)
     try:
         found = pyproj.CRS.from_user_input(crs)
@@ -101,14 +90,7 @@ def check_crs(crs: str) -> Any:
 
 
 def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
-    """Check that a position (east, north, up) lies where its coordinate system is used.
-
-    Raises:
-        EvaluationError: It does not: axes swapped, another system, local coordinates or degrees; or
-            a metre of the system is none on the ground there.
-        MissingDependencyError: pyproj is not installed.
-        SettingsError: There is no such coordinate system, see `check_crs`.
-    """
+    """Check that a position (east, north, up) lies where its coordinate system is used."""
     system = check_crs(crs)
     area = system.area_of_use
     pyproj = require("pyproj", extra=_EXTRA)

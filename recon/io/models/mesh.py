@@ -62,11 +62,7 @@ def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) ->
 
 
 def check_mesh_formats(formats: Sequence[str]) -> None:
-    """Refuse unknown formats, given as suffixes without the dot, before the work is done.
-
-    Raises:
-        SettingsError: One is not a suffix that `write_mesh` knows.
-    """
+    """Refuse unknown formats, given as suffixes without the dot, before the work is done."""
     unknown = [name for name in formats if f".{name}" not in MESH_SUFFIXES]
     if unknown:
         raise SettingsError(
@@ -84,10 +80,6 @@ def join_meshes(path: StrPath, parts: Sequence[tuple[Path, int, int]]) -> None:
         path: The file, written atomically.
         parts: File, number of vertices and number of faces of each part, at least one; all with
             the same fields.
-
-    Raises:
-        FormatError: A part cannot be read.
-        OutputError: The file cannot be written.
     """
     files, vertices, faces = zip(*parts, strict=True)
     starts = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)

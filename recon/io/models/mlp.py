@@ -54,9 +54,6 @@ def write_mlp(
             must exist.
         frame: Axes of the layers; None = unknown, not rotated.
         photo: Image of a camera at the origin of the frame ``camera``; None = no raster layer.
-
-    Raises:
-        OutputError: A layer's file does not exist, or the project cannot be written.
     """
     T = _IDENTITY if frame is None else T_YUP_FRAME[frame]
     project = ET.Element("MeshLabProject")

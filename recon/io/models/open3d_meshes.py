@@ -66,9 +66,6 @@ def decimate(
 ) -> tuple[Float32, Int32]:
     """Collapse edges until about ``target_faces`` are left, preserving shape and border.
 
-    Raises:
-        MeshingError: No face is left.
-
     Ref: Garland & Heckbert, "Surface simplification using quadric error metrics", 1997.
     """
     with _quiet():

@@ -74,9 +74,6 @@ def write_ply_tiles(path: StrPath, clouds: Iterable[PointCloud], *, frame: Frame
 
     Returns:
         The number of points.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
     return write_table_stream(path, "vertex", map(_table, clouds), [_FRAME + frame], nothing)
@@ -116,9 +113,6 @@ def read_ply_pieces(
     """Read positions, normals, colours and perhaps sigma like `read_ply`, one piece at a time.
 
     Other fields are left out, as the meaning of ``quality`` depends on all its values.
-
-    Raises:
-        FormatError: As in `read_ply`, at the piece where the fault is found.
     """
     vertex: Table | None = None
     points, kept = 0, 0

@@ -66,10 +66,6 @@ def read_tables(path: StrPath, wanted: Sequence[str]) -> tuple[PlyHeader, dict[s
 
     Returns:
         The header, and a table for each wanted element that the file has.
-
-    Raises:
-        FormatError: The file is missing, truncated, not a PLY, or has lists of a length other
-            than three.
     """
     with Path(path).open("rb") as stream:
         header = _read_header(stream, path)
@@ -85,9 +81,6 @@ def read_table_pieces(
         path: The file.
         wanted: Name of the element; nothing is yielded if the file lacks it.
         rows_each: Largest number of rows per piece.
-
-    Raises:
-        FormatError: As in `read_tables`.
     """
     with reading(path), Path(path).open("rb") as stream:
         header = _read_header(stream, path)
@@ -106,11 +99,7 @@ def write_tables(
     *,
     ascii: bool = False,  # noqa: A002 - what the format calls it
 ) -> None:
-    """Write tables as a PLY file, binary little endian unless ``ascii``, atomically.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write tables as a PLY file, binary little endian unless ``ascii``, atomically."""
     elements = [(name, len(table), table.dtype) for name, table in tables.items()]
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         stream.write(_header(elements, comments, "ascii" if ascii else _BINARY))
@@ -128,9 +117,6 @@ def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[
         path: The file.
         elements: For each element the total number of rows, and its tables, all of one dtype;
             one is held at a time. The first of each is taken before the header is written.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     begun = {name: iter(tables) for name, (_, tables) in elements.items()}
     first = {name: next(tables) for name, tables in begun.items()}
@@ -157,9 +143,6 @@ def write_table_stream(
 
     Returns:
         The number of rows, which is filled into the header at the end.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     dtype: np.dtype[Any] | None = None
     rows = 0

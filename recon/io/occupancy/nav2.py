@@ -41,9 +41,6 @@ def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
 
     Returns:
         Two of the paths: image, YAML.
-
-    Raises:
-        OutputError: A file cannot be written.
     """
     stem = Path(path)
     image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
@@ -59,12 +56,7 @@ def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
 
 @reader
 def read_nav2(path: StrPath) -> OccupancyGrid:
-    """Read a map, given by its YAML file, as Nav2 does in mode ``trinary``.
-
-    Raises:
-        FormatError: A file is missing or damaged, the mode is not ``trinary``, or the map is
-            rotated.
-    """
+    """Read a map, given by its YAML file, as Nav2 does in mode ``trinary``."""
     path = Path(path)
     fields = _fields(path)
     image = path.parent / str(fields["image"])

@@ -59,10 +59,6 @@ def write_octomap_tiles(
 
     Returns:
         The two paths written: ``.bt``, ``.ot``.
-
-    Raises:
-        MappingError: The map is too large for an OctoMap.
-        OutputError: A file cannot be written.
     """
     stem = Path(path)
     binary, full = (stem.with_name(f"{stem.name}.{end}") for end in ("bt", "ot"))
@@ -174,11 +170,7 @@ def _check(voxels: OccupancyVoxels) -> None:
 
 @reader
 def read_octomap(path: StrPath) -> OccupancyVoxels:
-    """Read an ``.ot`` file; pruned leaves are expanded.
-
-    Raises:
-        FormatError: The file is missing, damaged or not an ``.ot`` file.
-    """
+    """Read an ``.ot`` file; pruned leaves are expanded."""
     pieces = list(octomap_pieces(Path(path)))
     return join_voxels(pieces, pieces[0].resolution_m)
 
@@ -187,9 +179,6 @@ def octomap_pieces(path: Path, nodes_each: int = 1 << 19) -> Iterator[OccupancyV
     """Read the cells of an ``.ot`` file in file order, in at least one piece.
 
     Leaves that cover several cells are expanded.
-
-    Raises:
-        FormatError: The file is missing, truncated, damaged or not an ``.ot`` file.
     """
     with reading(path), path.open("rb") as file:
         yield from _pieces(file, path, nodes_each)

@@ -105,11 +105,7 @@ class Drive:
         self._loops.stop()
 
     def finish(self) -> None:
-        """Save what is left of the drive.
-
-        Raises:
-            RegistrationError: There was no frame.
-        """
+        """Save what is left of the drive."""
         if not len(self.mapper):
             raise RegistrationError("the source has no frame")
         if len(self.mapper) > self._saved:

@@ -130,11 +130,7 @@ class LoopWatch:
         self._last: Float64 = np.eye(4)
 
     def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, trusted: bool) -> None:
-        """Add the next frame; earlier ones may still be in progress.
-
-        Raises:
-            OutputError: A keyframe cannot be written.
-        """
+        """Add the next frame; earlier ones may still be in progress."""
         path_m, number = self._advance(T_world_camera, trusted=trusted), len(self._path_m) - 1
 
         def look() -> None:
@@ -152,11 +148,7 @@ class LoopWatch:
         self._waiting.append(self._pool.submit(look))
 
     def wait(self) -> None:
-        """Wait until all frames so far have been processed.
-
-        Raises:
-            OutputError: A keyframe cannot be written.
-        """
+        """Wait until all frames so far have been processed."""
         self._wait(0)
 
     def stop(self) -> None:
@@ -164,22 +156,14 @@ class LoopWatch:
         self._pool.shutdown(cancel_futures=True)
 
     def restore(self, T_world_camera: Iterable[Float64], trusted: Iterable[bool]) -> None:
-        """Resume after frames with these poses, whose keyframes are kept.
-
-        Raises:
-            FormatError: A keyframe is damaged.
-        """
+        """Resume after frames with these poses, whose keyframes are kept."""
         for T, good in zip(T_world_camera, trusted, strict=True):
             self._advance(T, trusted=good)
         for stored in self._keyframes:
             self._detector.restore(stored)
 
     def close(self, trajectory: Trajectory) -> DriveLoops:
-        """Close the loops of a path.
-
-        Raises:
-            OutputError: A keyframe cannot be written.
-        """
+        """Close the loops of a path."""
         self.wait()
         path_m = np.array(self._path_m)
         loops = self._detector.agreeing()

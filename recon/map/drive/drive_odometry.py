@@ -53,11 +53,7 @@ def axes_of(
     reconstructor: FrameReconstructor,
     settings: PriorSettings,
 ) -> UsedPrior:
-    """Return the axes of a prior: those set, else those that explain the first motions.
-
-    Raises:
-        RegistrationError: It contradicts the first motions, or does not cover the drive.
-    """
+    """Return the axes of a prior: those set, else those that explain the first motions."""
     start = 0
     if isinstance(source, StampedSource):
         MotionPrior(prior, settings).check_covers(source.stamps_s)
@@ -86,10 +82,6 @@ def odometry_of(
         known_poses: Poses to use instead of an odometry, one per frame of the source.
         prior: Motion of the camera by other sensors.
         used: The axes of the prior, once they are known.
-
-    Raises:
-        RegistrationError: There are fewer known poses than frames.
-        SettingsError: The odometry takes no prior.
     """
     if known_poses is None:
         settings = config.odometry
@@ -106,9 +98,6 @@ def doubt_poses(
     """Return a line for the user if known poses contradict what the cameras see.
 
     They are compared with the first motions, in camera axes and in those of a body.
-
-    Raises:
-        RegistrationError: There are fewer known poses than frames.
     """
     poses = _of_frames(known_poses, source).T_world_camera
     by_number = Trajectory(poses, np.arange(len(poses), dtype=np.float64))

@@ -48,9 +48,6 @@ def poses_first(
         reconstructor: Rectifies and matches them.
         register: Finds the pose of the next frame.
         map_frame: Puts a frame into the map, matched or not; called in another thread, in order.
-
-    Raises:
-        ReconError: A frame cannot be read, registered or mapped.
     """
     behind = MapBehind(source, map_frame)
     try:
@@ -89,11 +86,7 @@ class MapBehind:
         self._thread.start()
 
     def add(self, registered: Registered) -> None:
-        """Add the next frame.
-
-        Raises:
-            ReconError: An earlier one cannot be mapped.
-        """
+        """Add the next frame."""
         with self._news:
             self._news.wait_for(lambda: len(self._waiting) < _MOST_WAITING or self._error)
             self._waiting.append(registered)
@@ -101,11 +94,7 @@ class MapBehind:
         self._raise()
 
     def wait(self) -> None:
-        """Wait until all frames are mapped, the newest of them matched.
-
-        Raises:
-            ReconError: One cannot be mapped.
-        """
+        """Wait until all frames are mapped, the newest of them matched."""
         with self._news:
             self._news.wait_for(lambda: not (self._waiting or self._busy) or self._error)
         self._raise()

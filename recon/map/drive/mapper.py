@@ -112,11 +112,7 @@ class Mapper:
                 self.session.submaps.add(builder.close())
 
     def wait(self) -> None:
-        """Wait until all frames are integrated.
-
-        Raises:
-            ReconError: A frame cannot be integrated.
-        """
+        """Wait until all frames are integrated."""
         self._behind.wait()
 
     def abandon(self) -> None:
@@ -138,11 +134,7 @@ class Mapper:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`.
-
-        Raises:
-            FormatError: It is not that of the session's frames and submaps.
-        """
+        """Continue from a `state`."""
         self._odometry.restore(state["odometry"])
         if state["builder"] is not None:
             self._builder = self._new_builder()

@@ -84,10 +84,6 @@ def join_pieces(
         pieces: The pieces in order.
         mapped: Their maps, one after the other.
         settings: Those of the drive.
-
-    Raises:
-        FormatError: A map is damaged.
-        OutputError: The map cannot be written.
     """
     session = map_.session()
     detector = LoopDetector(session.keyframes, search=settings.loops.enabled)
@@ -111,10 +107,6 @@ def joined_drive(source: StereoSource, settings: DriveSettings, work: Workspace)
     """Return a drive that was joined from pieces, as if it had been mapped in one.
 
     Its occupancy is made from its rays, as where each was seen is known only now.
-
-    Raises:
-        FormatError: The map is damaged.
-        OutputError: The map cannot be written.
     """
     session = work.map.session()
     reconstructor = FrameReconstructor(source.calibration, settings, threads=work.threads)

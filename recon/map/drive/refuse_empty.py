@@ -20,11 +20,7 @@ from recon.stereo.frame import ReconstructedFrame
 
 
 def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) -> None:
-    """Refuse a pair whose matches give no point.
-
-    Raises:
-        MappingError: There is no point.
-    """
+    """Refuse a pair whose matches give no point."""
     if not len(frame.cloud):
         raise MappingError(
             "the cloud is empty",
@@ -43,9 +39,6 @@ def check_map(mapped: MappedSequence, where: str, findings: Sequence[str] = ()) 
         mapped: The drive.
         where: Its name.
         findings: What an audit found, the worst first.
-
-    Raises:
-        MappingError: There is no point.
     """
     if any(len(tile.cloud) for tile in mapped.tiles):
         return

@@ -43,11 +43,7 @@ class Workspace:
 
 @contextmanager
 def resuming(where: str | Path) -> Iterator[None]:
-    """Say in errors about an unfinished map that the run has to start anew.
-
-    Raises:
-        FormatError: The map is damaged.
-    """
+    """Say in errors about an unfinished map that the run has to start anew."""
     try:
         with reading(where):
             yield

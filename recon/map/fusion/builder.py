@@ -103,10 +103,6 @@ class CloudBuilder:
         Args:
             cloud: Points in world axes. ``confidence`` None = 1, ``sigma_m`` None = all equally
                 precise. What one of the clouds does not have, the map does not have.
-
-        Raises:
-            MappingError: The cloud is not in world axes, or a point is not finite or too far
-                away for the voxel size.
         """
         self._check(cloud)
         for name in self._known:

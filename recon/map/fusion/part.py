@@ -91,11 +91,7 @@ class FusedPart:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> FusedPart:
-        """Return what `to_tree` gave.
-
-        Raises:
-            FormatError: It is none; other exceptions where it is no such tree.
-        """
+        """Return what `to_tree` gave."""
         keys = array_in(tree, "keys", np.int64, (None,))
         sums = array_in(tree, "sums", np.float32, (len(keys), 4 + VALUES))
         information = array_in(tree, "information", np.float32, (len(keys),))

@@ -87,9 +87,6 @@ def map_axes(
         float64 (4, 4). Without a ground, or with a tilt below the limit, exactly
         x_map = z_world, y_map = -x_world, z_map = -y_world; else also turned the short way so
         that the ground's normal is z_map. With its origin on the ground, also moved up along z.
-
-    Raises:
-        MappingError: The origin is to be on the ground, and there is none.
     """
     turn = AXES_MAP_WORLD
     if ground is not None and ground.tilt_deg > _MIN_TILT_DEG:

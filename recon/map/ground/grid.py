@@ -111,9 +111,6 @@ def flatten(
 
     Returns:
         A grid with the resolution of the voxels that spans all of them.
-
-    Raises:
-        MappingError: There are no voxels, or the band is empty.
     """
     if len(voxels) == 0:
         raise MappingError("nothing was observed: there is no map to flatten")

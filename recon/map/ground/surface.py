@@ -136,9 +136,6 @@ def estimate_ground_surface(
 
     Returns:
         The surface; unknown everywhere when no ground was found below the path.
-
-    Raises:
-        MappingError: The cloud is not in map axes, or there is no path.
     """
     field = _field(cloud, positions_m, settings)
     camera_height = settings.camera_height_m or field.camera_height()

@@ -183,10 +183,6 @@ def open_localizer(
         map_: The map.
         config: The settings of the drive.
         start: Where it begins, roughly; None = anywhere.
-
-    Raises:
-        FormatError: The map is damaged.
-        MappingError: It has no keyframes, or none near the start.
     """
     known = known_places(map_)
     among = None
@@ -228,9 +224,6 @@ def localize_sequence(
         config: The settings of the drive.
         start: Where it begins, roughly; None = anywhere.
         progress: Shown each frame.
-
-    Raises:
-        ReconError: The map cannot be used, or a frame cannot be read or matched.
     """
     map_, watch = workspace.map, workspace.stopwatch
     localizer = open_localizer(map_, config, start=start)

@@ -82,9 +82,6 @@ class Surroundings:
     Args:
         map_: The map.
         max_range_m: Farther points are not used.
-
-    Raises:
-        FormatError: The map is damaged.
     """
 
     def __init__(self, map_: Map, max_range_m: float) -> None:

@@ -106,10 +106,6 @@ class OccupancyBuilder:
             cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1;
                 ``count`` is the number of points that each stands for, None = 1.
             T_world_camera: float64 (4, 4), pose of the camera.
-
-        Raises:
-            MappingError: The cloud is not in camera axes, or a point or pose is not finite or
-                too far away.
         """
         check_camera_cloud(cloud)
         _check_pose(T_world_camera, self._settings.resolution_m)
@@ -204,11 +200,7 @@ def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
 
 
 def check_camera_cloud(cloud: PointCloud) -> None:
-    """Refuse a cloud that would silently spoil the map.
-
-    Raises:
-        MappingError: It is not in camera axes, or a number is not finite.
-    """
+    """Refuse a cloud that would silently spoil the map."""
     if cloud.frame != "camera":
         raise MappingError(
             "the occupancy map takes clouds in camera axes", got=cloud.frame, expected="camera"

@@ -70,11 +70,7 @@ class OccupancyPart:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OccupancyPart:
-        """Return what `to_tree` gave.
-
-        Raises:
-            FormatError: It is none; other exceptions where it is no such tree.
-        """
+        """Return what `to_tree` gave."""
         points = tree["points"]
         rows = _rows_in(tree["rows"])
         return cls(rows, None if points is None else SurfacePoints.from_tree(points))

@@ -42,9 +42,6 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
     Args:
         cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1.
         settings: Of the map.
-
-    Raises:
-        MappingError: The cloud is not in camera axes, or a number is not finite.
     """
     check_camera_cloud(cloud)
     grain = ray_grain(settings)

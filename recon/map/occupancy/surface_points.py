@@ -36,11 +36,7 @@ class SurfacePoints:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> SurfacePoints:
-        """Return the points in a tree of their arrays.
-
-        Raises:
-            FormatError: They are none; other exceptions where it is no such tree.
-        """
+        """Return the points in a tree of their arrays."""
         keys = array_in(tree, "keys", np.int64, (None,))
         sums = array_in(tree, "sums", np.float32, (len(keys), 4))
         if keys.min(initial=0) < 0 or sums[:, 0].min(initial=1) <= 0:

@@ -33,10 +33,6 @@ def copy_sessions(source: Map, target: Map, without: Collection[int] = ()) -> li
 
     Returns:
         Their numbers in the other map.
-
-    Raises:
-        FormatError: A drive is damaged, or the other map has it already.
-        OutputError: The map cannot be written.
     """
     chosen = [session for session in source.sessions if session.number not in without]
     for session in chosen:
@@ -59,12 +55,7 @@ def copy_sessions(source: Map, target: Map, without: Collection[int] = ()) -> li
 
 
 def check_session(session: Session, settings: DriveSettings) -> None:
-    """Refuse a drive that cannot become part of a map with these settings.
-
-    Raises:
-        SettingsError: Its cloud has other voxels, or its rays are too coarse or too short.
-        FormatError: It kept no rays, or is damaged.
-    """
+    """Refuse a drive that cannot become part of a map with these settings."""
     voxel_m = session.info.config.get("fusion", {}).get("voxel_m")
     if voxel_m != settings.fusion.voxel_m:
         raise SettingsError(

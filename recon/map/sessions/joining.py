@@ -40,10 +40,6 @@ def join_new(map_: Map, new: Collection[int]) -> None:
     Args:
         map_: The map, which is written.
         new: Numbers of the drives that are new in it.
-
-    Raises:
-        FormatError: The map is damaged.
-        OutputError: The map cannot be written.
     """
     join_sessions(map_, [*map_.links, *find_links(map_, new)])
 
@@ -57,10 +53,6 @@ def join_sessions(map_: Map, links: Sequence[Link]) -> None:
     Args:
         map_: The map, which is written.
         links: All links between its drives.
-
-    Raises:
-        FormatError: The map is damaged.
-        OutputError: The map cannot be written.
     """
     joined = _held_together(map_, links)
     for session in map_.sessions:

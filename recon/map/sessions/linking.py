@@ -31,9 +31,6 @@ def find_links(map_: Map, new: Collection[int]) -> list[Link]:
     Args:
         map_: The map, with the drives that share its axes marked as linked.
         new: Numbers of the drives that are new in it.
-
-    Raises:
-        FormatError: A keyframe is damaged.
     """
     links = []
     before = [session.number for session in map_.sessions if session.number not in new]

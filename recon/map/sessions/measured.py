@@ -130,11 +130,7 @@ class Measured:
         return float(_SIGMA_OF_BEND * bend_m)
 
     def check(self, drift_m: float, where: Path) -> None:
-        """Refuse positions that neither the drift of the path nor their noise explains.
-
-        Raises:
-            EvaluationError: They are such.
-        """
+        """Refuse positions that neither the drift of the path nor their noise explains."""
         swapped = "; ".join(self._swapped())
         hint = swapped or "have they its clock, metres, and the offset of the antenna?"
         sigma_m = RECEIVER_M if self.stated_m is None else self.stated_m
@@ -194,11 +190,6 @@ def measure_along(
         T_map_world: float64 (4, 4), from its world to map axes.
         survey: What was measured.
         drift_m: By how much the path may be off at its end, standard deviation.
-
-    Raises:
-        FormatError: The file is missing or damaged.
-        EvaluationError: No position was measured during the drive, all are at one place, or
-            neither drift nor noise explains where they are.
     """
     rows = survey.rows
     here = rows[_during(path, rows[:, 0])]
@@ -239,12 +230,6 @@ def hold(map_: Map, survey: Survey) -> list[str]:
 
     Returns:
         Warnings of positions that are left out.
-
-    Raises:
-        FormatError: The file is missing or damaged.
-        EvaluationError: No position was measured during any drive, all of one are at one place, or
-            neither drift nor noise explains where they are.
-        OutputError: The map cannot be written.
     """
     times_s, lines = survey.rows[:, 0], list[str]()
     sessions = [each for each in map_.sessions if _during(trusted_path(each), times_s).any()]

@@ -38,11 +38,7 @@ class PlacedMap:
 
 
 def settings_of(session: Session) -> DriveSettings:
-    """Return the settings that a drive was mapped with.
-
-    Raises:
-        SettingsError: One is not known in this version.
-    """
+    """Return the settings that a drive was mapped with."""
     known = DriveSettings.model_fields
     config = {name: part for name, part in session.info.config.items() if name in known}
     return DriveSettings.parse(config, where=session.where)
@@ -58,11 +54,6 @@ def place_map(map_: Map, settings: DriveSettings, threads: int = 1) -> PlacedMap
         map_: The map.
         settings: The settings of its products.
         threads: Submaps whose rays are cast at a time. Changes no result.
-
-    Raises:
-        FormatError: The map is damaged, or some of its drives kept no rays.
-        SettingsError: The settings need finer or longer rays than were kept.
-        OutputError: There is no room for the tiles.
     """
     placed = PlacedSubmaps(map_, settings)
     tiles = Tiles.of_submaps(
@@ -85,10 +76,6 @@ class PlacedSubmaps:
     Args:
         map_: The map.
         settings: How occupancy is made.
-
-    Raises:
-        FormatError: The map is damaged, or some of its drives kept no rays.
-        SettingsError: The settings need finer or longer rays than were kept.
 
     Attributes:
         drives: Number of submaps of each drive.
@@ -120,11 +107,7 @@ class PlacedSubmaps:
         return map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, number: int) -> Submap:
-        """Return a submap by its number among those of all drives.
-
-        Raises:
-            FormatError: The map is damaged.
-        """
+        """Return a submap by its number among those of all drives."""
         drive = int(np.searchsorted(np.cumsum(self.drives), number, side="right"))
         own = number - sum(self.drives[:drive])
         submaps, T = self._parts[drive]

@@ -20,11 +20,7 @@ _INFORMATION: Final = 1e8
 
 
 def shared_frames(one: Session, other: Session) -> NDArray[np.intp]:
-    """Return int (K, 2), the frames that two drives of one map share, by number in either.
-
-    Raises:
-        FormatError: The map is damaged.
-    """
+    """Return int (K, 2), the frames that two drives of one map share, by number in either."""
     times_s, others_s = one.odometry.timestamps_s, other.odometry.timestamps_s
     _, firsts, lasts = np.intersect1d(times_s, others_s, return_indices=True)
     pairs = zip(firsts.tolist(), lasts.tolist(), strict=True)
@@ -39,11 +35,7 @@ def link_by_frame(one: Session, first: int, last: int) -> Loop:
 
 
 def seen_before(map_: Map, session: Session) -> frozenset[int]:
-    """Return the frames of a drive that an earlier one has in the map: no evidence of its own.
-
-    Raises:
-        FormatError: The map is damaged.
-    """
+    """Return the frames of a drive that an earlier one has in the map: no evidence of its own."""
     linked = map_.linked
     earlier, placed = linked[: linked.index(session)], map_.placed
     return frozenset(

@@ -84,12 +84,6 @@ def place_map_on(
         folder: For files that all processes see; they are read as long as the tiles are used.
         each: The processes.
         workers: How many there are.
-
-    Raises:
-        MappingError: The map is not in a file.
-        FormatError: A drive kept no rays, or the map is damaged.
-        SettingsError: The settings need finer or longer rays than were kept.
-        OutputError: There is no room for the tiles.
     """
     if map_.store.path is None:
         raise MappingError("other processes cannot read a temporary map")

@@ -35,10 +35,6 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Byte
     Compressed, the bytes of equal significance lie together: first of column 0 all lowest bytes,
     then all second ones and so on, then of column 1 (arrays with more than two axes or 16 columns
     count as one column). That makes measurements smaller by a fifth.
-
-    Raises:
-        TypeError: The tree holds something else than mappings with names, sequences, arrays of
-            numbers, numbers, texts and None.
     """
     content: list[Bytes] = []
     size = 0
@@ -70,9 +66,6 @@ def from_bytes(text: str, read: Callable[[int], bytearray], most: int) -> dict[s
             that a tree takes no more memory than its arrays.
         most: Bytes that its compressed arrays may take together, beside what the length of the
             JSON explains.
-
-    Raises:
-        FormatError: The bytes are no such arrays; other exceptions where the text is no tree.
     """
     position, left = 0, most + _INFLATED_PER_CHARACTER * len(text)
 
@@ -110,11 +103,7 @@ class _Claim(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the array.
-
-        Raises:
-            FormatError: There is no such array.
-        """
+        """Bytes of the array."""
         if self.dtype.kind not in _KINDS or min(self.shape, default=0) < 0:
             raise FormatError("an array of the map has an impossible type or shape")
         return math.prod(self.shape) * self.dtype.itemsize
@@ -140,11 +129,7 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | me
 
 
 def _unpack(claim: _Claim, packed: bytearray) -> NDArray[Any]:
-    """Return the array of these bytes, which it takes over where they are not compressed.
-
-    Raises:
-        FormatError: They are no such array.
-    """
+    """Return the array of these bytes, which it takes over where they are not compressed."""
     dtype, shape, layout, codec = claim
     axes = shape[::-1] if layout == "F" else shape
     content: bytes | bytearray = packed  # compiled kernels take only arrays that can be written

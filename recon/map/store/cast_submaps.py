@@ -43,12 +43,7 @@ class CastSubmaps:
         return len(self.session.submaps)
 
     def __getitem__(self, number: int) -> Submap:
-        """Return a submap.
-
-        Raises:
-            FormatError: The map is damaged.
-            MappingError: A ray would spoil the map.
-        """
+        """Return a submap."""
         session, kept = self.session, self.session.submaps[number]
         T_map_world = session.T_map_world if self.T_map_world is None else self.T_map_world
         poses = self.T_world_camera
@@ -89,12 +84,7 @@ def looks_of(
 
 
 def check_rays(session: Session, settings: DriveSettings) -> None:
-    """Refuse a cell size or range that the kept rays of a session do not support.
-
-    Raises:
-        FormatError: It kept no rays, or is damaged.
-        SettingsError: The settings need finer or longer rays than it kept.
-    """
+    """Refuse a cell size or range that the kept rays of a session do not support."""
     if not session.ray_frames:
         raise FormatError(
             "the run kept no rays to build occupancy from",

@@ -107,11 +107,7 @@ class Content:
             self._file = BytesIO(database.execute(query, (row,)).fetchone()[0])
 
     def read(self, size: int) -> bytearray:
-        """Return the next bytes, exactly as many.
-
-        Raises:
-            FormatError: There are not so many.
-        """
+        """Return the next bytes, exactly as many."""
         if not 0 <= size <= self.left:
             raise FormatError("a record of the map is truncated")
         self.left -= size
@@ -144,11 +140,7 @@ def begin_to_read(database: sqlite3.Connection) -> None:
 
 
 def check_format(database: sqlite3.Connection, path: Path) -> None:
-    """Refuse files of other programs, of newer versions, and with tables of another make.
-
-    Raises:
-        FormatError: It is one of these.
-    """
+    """Refuse files of other programs, of newer versions, and with tables of another make."""
     try:
         (ours,) = database.execute("PRAGMA application_id").fetchone()
         (number,) = database.execute("PRAGMA user_version").fetchone()
@@ -171,11 +163,7 @@ def check_format(database: sqlite3.Connection, path: Path) -> None:
 
 @contextmanager
 def writing(path: Path | None) -> Iterator[None]:
-    """Turn errors of the database into ours.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Turn errors of the database into ours."""
     where = "temporary map" if path is None else path
     try:
         yield

@@ -34,11 +34,7 @@ def frames_record(
 
 
 def frames_in(content: Mapping[str, Any]) -> Iterator[tuple[Float64, float, OdometryHealth]]:
-    """Yield pose, time and health of each frame in what `frames_record` gave.
-
-    Raises:
-        FormatError: A pose is none of a drive; other exceptions where it is no such tree.
-    """
+    """Yield pose, time and health of each frame in what `frames_record` gave."""
     times_s = array_in(content, "times_s", np.float64, (None,))
     path, columns = path_of(content["T_world_camera"], times_s), content["health"]
     for number, (T, time_s) in enumerate(zip(path.T_world_camera, times_s.tolist(), strict=True)):
@@ -48,12 +44,7 @@ def frames_in(content: Mapping[str, Any]) -> Iterator[tuple[Float64, float, Odom
 
 
 def path_of(poses: Float64, times_s: Float64) -> Trajectory:
-    """Return a path of poses that were read, maybe from a file with few digits.
-
-    Raises:
-        FormatError: One is no pose of a drive.
-        ShapeError: They are no poses, or not as many as times.
-    """
+    """Return a path of poses that were read, maybe from a file with few digits."""
     path = Trajectory(array_in({"poses": poses}, "poses", np.float64, (None, 4, 4)), times_s)
     R = path.T_world_camera[:, :3, :3]
     skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))

@@ -23,9 +23,6 @@ def keep_map(mapped: Map, path: Path) -> None:
     Args:
         mapped: The map as it was made.
         path: The new file.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     with Map.create(path) as kept:
         for session in mapped.sessions:

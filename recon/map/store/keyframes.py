@@ -34,11 +34,7 @@ class Keyframes:
         self._session = session
 
     def put(self, stored: StoredKeyframe) -> None:
-        """Keep a keyframe.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Keep a keyframe."""
         content = {
             "keyframe": asdict(stored.keyframe),
             "T_world_camera": stored.T_world_camera,
@@ -50,21 +46,13 @@ class Keyframes:
         self._store.put(KEYFRAME, key, content, compress=True)
 
     def get(self, frame: int) -> StoredKeyframe:
-        """Return the keyframe of a frame, read unless it was read lately.
-
-        Raises:
-            FormatError: It is missing or damaged.
-        """
+        """Return the keyframe of a frame, read unless it was read lately."""
         key = (KEYFRAME, self._session, frame, "keyframe")
         return self._store.cache.get(key, lambda: self._read(frame))
 
     @property
     def frames(self) -> list[int]:
-        """The numbers of the frames that are keyframes, in order.
-
-        Raises:
-            FormatError: The file is damaged.
-        """
+        """The numbers of the frames that are keyframes, in order."""
         return self._store.numbers(KEYFRAME, self._session)
 
     def __iter__(self) -> Iterator[StoredKeyframe]:

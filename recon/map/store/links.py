@@ -17,11 +17,7 @@ LINKS: Final = "links"
 
 
 def loop_in(tree: Mapping[str, Any]) -> Loop:
-    """Return a loop of a tree of its fields.
-
-    Raises:
-        FormatError: It is none; other exceptions where it is no such tree.
-    """
+    """Return a loop of a tree of its fields."""
     loop = value_in(Loop, tree)
     check_rigid("T_first_last", loop.T_first_last)
     if not np.isfinite(loop.information).all() or np.linalg.eigvalsh(loop.information)[0] < 0:
@@ -53,11 +49,7 @@ class Link:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> Link:
-        """Return what `to_tree` gave.
-
-        Raises:
-            FormatError: It is not between two drives; other exceptions where it is no such tree.
-        """
+        """Return what `to_tree` gave."""
         one, other = tree["sessions"]
         if not (isinstance(one, int) and isinstance(other, int) and one != other):
             raise FormatError("a link of the map is not between two drives", got=tree["sessions"])

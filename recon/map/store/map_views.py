@@ -13,12 +13,7 @@ from recon.places.known_places import KnownPlaces, KnownView
 
 
 def known_places(map_: Map) -> KnownPlaces:
-    """Return all places of a map, to recognise them.
-
-    Raises:
-        FormatError: The map is damaged.
-        MappingError: It has no keyframes.
-    """
+    """Return all places of a map, to recognise them."""
     views = MapViews(map_)
     if not views:
         raise MappingError(
@@ -36,9 +31,6 @@ class MapViews(Sequence[KnownView]):
         map_: The map.
         sessions: Numbers of the drives to take; None = those that share the axes of the map, as
             far as they have a place in it.
-
-    Raises:
-        FormatError: The map is damaged.
     """
 
     def __init__(self, map_: Map, sessions: Collection[int] | None = None) -> None:
@@ -66,11 +58,7 @@ class MapViews(Sequence[KnownView]):
     @overload
     def __getitem__(self, number: slice) -> list[KnownView]: ...
     def __getitem__(self, number: int | slice) -> KnownView | list[KnownView]:
-        """Return a view.
-
-        Raises:
-            FormatError: It is damaged.
-        """
+        """Return a view."""
         if isinstance(number, slice):
             return [self[n] for n in range(*number.indices(len(self)))]
         session, frame = self._keys[number]

@@ -33,11 +33,7 @@ def rays_record(rays: RayCloud, grain: RayGrain) -> dict[str, Any]:
 
 
 def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
-    """Return the rays in what `rays_record` gave.
-
-    Raises:
-        FormatError: Their resolution is impossible; other exceptions where it is no such tree.
-    """
+    """Return the rays in what `rays_record` gave."""
     grain = _checked(value_in(RayGrain, content["grain"]))
     steps = frozen_array("steps", content["steps"], np.uint16, (None, 3))
     places = np.cumsum(_unzigzag(steps), axis=0, dtype=np.int16)
@@ -48,11 +44,7 @@ def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
 
 
 def _checked(grain: RayGrain) -> RayGrain:
-    """Return the resolution of rays.
-
-    Raises:
-        FormatError: It is impossible.
-    """
+    """Return the resolution of rays."""
     sizes_m = (grain.cell_m, grain.unit_m, grain.max_range_m)
     ordered = 0 < min(sizes_m) <= max(sizes_m) <= grain.max_range_m <= FARTHEST_M
     if not (ordered and np.isfinite(sizes_m).all()):

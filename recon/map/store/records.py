@@ -62,11 +62,7 @@ class Store:
 
     @classmethod
     def create(cls, path: Path, *, cache_bytes: int = CACHE_BYTES) -> Self:
-        """Begin a store; a file at ``path`` is replaced.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Begin a store; a file at ``path`` is replaced."""
         check_targets([path])
         with writing(path):
             for stale in (path, *beside(path)):
@@ -79,12 +75,7 @@ class Store:
 
     @classmethod
     def open(cls, path: Path, *, read_only: bool = False, cache_bytes: int = CACHE_BYTES) -> Self:
-        """Open a store at its last commit.
-
-        Raises:
-            FormatError: The file is missing, no store, of a newer format, or damaged.
-            OutputError: Another program writes to it, or it cannot be written.
-        """
+        """Open a store at its last commit."""
         with reading(path):
             with path.open("rb"):  # a missing file, a folder, no permission
                 pass
@@ -122,9 +113,6 @@ class Store:
             tree: Mappings and lists of arrays, numbers (also NaN), texts and None. Tuples are read
                 back as lists.
             compress: Whether its arrays are worth compressing.
-
-        Raises:
-            OutputError: It cannot be written.
         """
         text, content = to_bytes(tree, compress=compress)
         self._insert(kind, _name(key), text, content)
@@ -133,9 +121,6 @@ class Store:
         """Return a record, which others may hold as well: copy it before changing it.
 
         It has no large compressed arrays: see `read`.
-
-        Raises:
-            FormatError: It is missing or damaged.
         """
         return self.cache.get((kind, key), lambda: self.read(kind, key))
 
@@ -147,9 +132,6 @@ class Store:
             key: Its number, or several.
             most_bytes: What its compressed arrays can take together, as far as the rest of the
                 map says. A small file can claim very large ones.
-
-        Raises:
-            FormatError: It is missing or damaged, or claims more than it can hold.
         """
         name = _name(key)
         with self._lock, self._reading():
@@ -163,11 +145,7 @@ class Store:
                     raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
 
     def delete(self, kind: str, key: Key | None = None) -> None:
-        """Delete a record, or all of a kind; it need not exist.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Delete a record, or all of a kind; it need not exist."""
         with self._lock, writing(self.path):
             for each in self.keys(kind) if key is None else [key]:
                 where = (kind, _name(each))
@@ -175,31 +153,19 @@ class Store:
                 self.cache.drop((kind, each))
 
     def keys(self, kind: str) -> list[Key]:
-        """Return the keys of a kind, in order.
-
-        Raises:
-            FormatError: The file is damaged.
-        """
+        """Return the keys of a kind, in order."""
         with self._lock, self._reading():
             rows = self._database.execute("SELECT key FROM record WHERE kind = ?", (kind,))
             found = [_key(name) for (name,) in rows]
         return sorted(found, key=lambda key: key if isinstance(key, tuple) else (key,))
 
     def numbers(self, kind: str, session: int) -> list[int]:
-        """Return the second numbers of the keys of a kind that begin with the number of a session.
-
-        Raises:
-            FormatError: The file is damaged.
-        """
+        """Return the second numbers of the keys of a kind that begin with that of a session."""
         keys = (key for key in self.keys(kind) if isinstance(key, tuple))
         return [key[1] for key in keys if key[0] == session]
 
     def kinds(self) -> list[str]:
-        """Return the kinds of which there are records, in order.
-
-        Raises:
-            FormatError: The file is damaged.
-        """
+        """Return the kinds of which there are records, in order."""
         with self._lock, self._reading():
             rows = self._database.execute("SELECT DISTINCT kind FROM record ORDER BY kind")
             return [str(kind) for (kind,) in rows]
@@ -211,11 +177,7 @@ class Store:
             return self._database.execute(query, (kind, _name(key))).fetchone() is not None
 
     def alike(self, kind: str, one: Key, other: Key) -> bool:
-        """Return whether two records of a kind are there and equal to the last bit.
-
-        Raises:
-            FormatError: The file is damaged.
-        """
+        """Return whether two records of a kind are there and equal to the last bit."""
         query = (
             "SELECT one.tree = other.tree AND one.content = other.content"
             " FROM record AS one, record AS other"
@@ -226,11 +188,7 @@ class Store:
         return found is not None and bool(found[0])
 
     def items(self, kind: str) -> Iterator[tuple[Key, dict[str, Any]]]:
-        """Read the records of a kind in the order of their keys, one at a time, past the cache.
-
-        Raises:
-            FormatError: One is damaged.
-        """
+        """Read the records of a kind in the order of their keys, one at a time, past the cache."""
         return ((key, self.read(kind, key)) for key in self.keys(kind))
 
     def copy(self, kind: str, other: Store, keys: Mapping[Key, Key] | None = None) -> None:
@@ -240,10 +198,6 @@ class Store:
             kind: The kind.
             other: The other store.
             keys: Which ones, and their keys in the other store; None = all, under their own.
-
-        Raises:
-            FormatError: One is damaged.
-            OutputError: The other one cannot be written.
         """
         for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
             with self._lock, self._reading():
@@ -255,11 +209,7 @@ class Store:
             other._insert(kind, _name(new), text, [whole])
 
     def commit(self) -> None:
-        """Make everything so far permanent, all of it or, after an error, nothing.
-
-        Raises:
-            OutputError: The disk is full, or cannot be written; the file keeps the last commit.
-        """
+        """Make everything so far permanent, all of it or, after an error, nothing."""
         with self._lock, writing(self.path):
             self._database.execute("COMMIT")
             self._database.execute("BEGIN IMMEDIATE")

@@ -66,9 +66,6 @@ class Session:
         store: The records of the map.
         number: Number of the session in the map.
 
-    Raises:
-        FormatError: The map has no such session, or its records are damaged.
-
     Attributes:
         info: What it is a drive of.
         submaps: Its submaps.
@@ -95,11 +92,7 @@ class Session:
 
     @staticmethod
     def begin(store: Store, number: int, info: SessionInfo) -> Session:
-        """Add a session to a map.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Add a session to a map."""
         store.put(SESSION, number, asdict(info))
         return Session(store, number)
 
@@ -117,11 +110,7 @@ class Session:
 
     @property
     def odometry(self) -> Trajectory:
-        """The path by odometry.
-
-        Raises:
-            FormatError: There is no frame yet.
-        """
+        """The path by odometry."""
         if not self._poses:
             raise FormatError("the session has no frame", where=self._store.name)
         return Trajectory(np.stack(self._poses), np.array(self._times_s))
@@ -144,11 +133,7 @@ class Session:
 
     @property
     def T_map_world(self) -> Float64:
-        """float64 (4, 4), from the world of the session to map axes; known after the first frame.
-
-        Raises:
-            FormatError: It is not known, or none.
-        """
+        """float64 (4, 4), from the world of the session to map axes; known after one frame."""
         with reading(self._store.name):
             T: Float64 = array_in(self._axes, "T_map_world", np.float64, (4, 4)).copy()
             check_rigid("T_map_world", T)
@@ -156,11 +141,7 @@ class Session:
 
     @property
     def camera(self) -> RectifiedCamera:
-        """The rectified camera; known after the first frame.
-
-        Raises:
-            FormatError: It is not known, or none.
-        """
+        """The rectified camera; known after the first frame."""
         with reading(self._store.name):
             return value_in(RectifiedCamera, self._axes["camera"])
 
@@ -172,11 +153,7 @@ class Session:
         return self._store.get(LOOPS, self.number)
 
     def corrections(self) -> Float64 | None:
-        """Return float64 (S, 4, 4), what loop closure moves each submap by; None = nothing moves.
-
-        Raises:
-            FormatError: The record of the loops is damaged.
-        """
+        """Return float64 (S, 4, 4), by what loops move each submap; None = nothing moves."""
         with reading(self._store.name):
             closure, odometry = Closure(self.trajectory, (), ()), self.odometry
             if self.loops.get(BENT) is None:
@@ -190,11 +167,7 @@ class Session:
         return len(self._store.numbers(RAYS, self.number))
 
     def set_axes(self, T_map_world: Float64, camera: RectifiedCamera) -> None:
-        """Keep the axes of the map, and the camera.
-
-        Raises:
-            OutputError: They cannot be written.
-        """
+        """Keep the axes of the map, and the camera."""
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
         self._store.put(AXES, self.number, content)
 
@@ -205,49 +178,29 @@ class Session:
         self._health.append(health)
 
     def add_rays(self, frame: int, rays: RayCloud, grain: RayGrain) -> None:
-        """Keep the rays of a frame.
-
-        Raises:
-            OutputError: They cannot be written.
-        """
+        """Keep the rays of a frame."""
         key = (self.number, frame)
         self._store.put(RAYS, key, rays_record(rays, grain), compress=True)
 
     def rays(self, frame: int) -> tuple[RayCloud, RayGrain]:
-        """Return the rays of a frame, as they were kept.
-
-        Raises:
-            FormatError: They are missing or damaged.
-        """
+        """Return the rays of a frame, as they were kept."""
         with reading(self._store.name):
             camera = self.camera
             most_bytes = RAY_BYTES * camera.width_px * camera.height_px
             return rays_in(self._store.read(RAYS, (self.number, frame), most_bytes=most_bytes))
 
     def same_rays(self, frame: int, other: Session, other_frame: int) -> bool:
-        """Return whether this drive and another of the map kept the same rays, and any at all.
-
-        Raises:
-            FormatError: The map is damaged.
-        """
+        """Return whether this drive and another of the map kept the same rays, and any at all."""
         keys = (self.number, frame), (other.number, other_frame)
         return self._store.alike(RAYS, *keys) and len(self.rays(frame)[0].sigma_m) > 0
 
     def set_loops(self, content: Mapping[str, Any]) -> None:
-        """Keep the result of loop closure.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Keep the result of loop closure."""
         self._store.put(LOOPS, self.number, content)
 
     @property
     def fixes(self) -> Fixes:
-        """Positions that were measured during the drive; usually none.
-
-        Raises:
-            FormatError: Their record is damaged.
-        """
+        """Positions that were measured during the drive; usually none."""
         with reading(self._store.name):
             found = self.loops.get("fixes")
             fixes = NO_FIXES if found is None else value_in(Fixes, found)
@@ -257,37 +210,21 @@ class Session:
         return fixes
 
     def set_fixes(self, fixes: Fixes) -> None:
-        """Keep positions that were measured during the drive, in place of earlier ones.
-
-        Raises:
-            OutputError: They cannot be written.
-        """
+        """Keep positions that were measured during the drive, in place of earlier ones."""
         self.set_loops({**NO_LOOPS, **self.loops, "fixes": asdict(fixes)})
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Keep what the rest of the drive depends on, beside all that was added.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Keep what the rest of the drive depends on, beside all that was added."""
         self._store.put(_STATE, self.number, state)
 
     def state(self) -> dict[str, Any] | None:
-        """Return the state of an unfinished drive, to go on from; None = nothing is known.
-
-        Raises:
-            FormatError: It is damaged.
-        """
+        """Return the state of an unfinished drive, to go on from; None = nothing is known."""
         if not self._store.has(_STATE, self.number):
             return None
         return self._store.read(_STATE, self.number)
 
     def flush(self) -> None:
-        """Write the frames since the last time, so that a commit keeps them.
-
-        Raises:
-            OutputError: They cannot be written.
-        """
+        """Write the frames since the last time, so that a commit keeps them."""
         first, self._flushed = self._flushed, len(self)
         if first == len(self):
             return

@@ -54,9 +54,6 @@ class Submaps:
     Args:
         store: The records of the map.
         session: Number of the session.
-
-    Raises:
-        FormatError: The records are damaged.
     """
 
     def __init__(self, store: Store, session: int = 0) -> None:
@@ -85,11 +82,7 @@ class Submaps:
         return sum(entry.frames for entry in self._entries)
 
     def add(self, submap: Submap, *, compress: bool = False) -> None:
-        """Store the next submap.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Store the next submap."""
         entry = _entry_of(submap)
         key = (self._session, submap.index)
         self.store.put(SUBMAP, key, submap.to_tree(), compress=compress)
@@ -97,11 +90,7 @@ class Submaps:
         self._entries.append(entry)
 
     def __getitem__(self, index: int) -> Submap:
-        """Return a submap, read from the map: it is large, and used once.
-
-        Raises:
-            FormatError: It is missing or damaged.
-        """
+        """Return a submap, read from the map: it is large, and used once."""
         with reading(self.store.name):
             most_bytes = self._entries[index].nbytes
             record = self.store.read(SUBMAP, (self._session, index), most_bytes=most_bytes)

@@ -80,22 +80,14 @@ class TileParts:
     def put(
         self, kind: str, key: TileKey, tree: Mapping[str, Any], number: int | None = None
     ) -> None:
-        """Keep a part, by default under the next number.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Keep a part, by default under the next number."""
         numbers = self._numbers[kind].setdefault(key, [])
         numbers.append(len(numbers) if number is None else number)
         self._store.put(kind, (*key, numbers[-1]), tree)
         self._keys[key] = None
 
     def read(self, kind: str, key: TileKey) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Yield the parts of a kind in a tile with their numbers; arrays are read-only.
-
-        Raises:
-            FormatError: One is damaged.
-        """
+        """Yield the parts of a kind in a tile with their numbers; arrays are read-only."""
         # Past the cache: reading a tile again is faster than making it, and it may be large.
         return (
             (n, self._homes.get((kind, key, n), self._store).read(kind, (*key, n)))
@@ -109,21 +101,13 @@ class TileParts:
                 self._store.delete(kind, (*key, number))
 
     def save(self, note: Mapping[str, Any]) -> None:
-        """Make the file readable for `adopt`, with a note, and close it.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Make the file readable for `adopt`, with a note, and close it."""
         self._store.put(_NOTE, 0, {"keys": self.keys, "note": note})
         self._store.commit()
         self._store.close()
 
     def adopt(self, path: Path) -> dict[str, Any]:
-        """Add the parts in a file that was saved, which is read but not copied; returns its note.
-
-        Raises:
-            FormatError: It is missing or damaged.
-        """
+        """Add the parts in a file that was saved, which is not copied; return its note."""
         store = Store.open(path, read_only=True)
         saved = store.read(_NOTE, 0)
         self._keys.update(dict.fromkeys((x, y) for x, y in saved["keys"]))

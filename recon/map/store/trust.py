@@ -31,9 +31,6 @@ def placed_frames(sessions: Sequence[Session], links: Sequence[Link]) -> dict[in
     Args:
         sessions: The drives that share axes.
         links: The links between them.
-
-    Raises:
-        FormatError: The map is damaged.
     """
     of = {session.number: stretches(session.health) for session in sessions}
     if len(sessions) < 2:

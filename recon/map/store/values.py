@@ -16,11 +16,7 @@ Value = TypeVar("Value")
 
 
 def value_in(kind: type[Value], tree: Mapping[str, Any]) -> Value:
-    """Return a dataclass of a tree of its fields; shapes and ranges of arrays are its own to check.
-
-    Raises:
-        ShapeError: A part is of another type; other exceptions where names are missing or unknown.
-    """
+    """Return a dataclass of a tree of its fields; it checks shapes and ranges of arrays itself."""
     return kind(**{name: _part(kind, name, part) for name, part in tree.items()})
 
 

@@ -93,9 +93,6 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
         source: The drive.
         config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
         quick: A short check of a second or two, as in `recon map`.
-
-    Raises:
-        CalibrationError: The calibration cannot rectify anything.
     """
     settings = config.audit
     rectifier = Rectifier(source.calibration, config.rectification)
@@ -154,10 +151,6 @@ def correct_calibration(
     Returns:
         The turn of the right camera in degrees, the change of its focal length in per cent, what
         the lenses moved (None: they are as they were), and the row error before.
-
-    Raises:
-        CalibrationError: There are too few features to measure the row error.
-        OutputError: The file cannot be written.
     """
     if audit.alignment is None:
         raise CalibrationError(

@@ -34,9 +34,6 @@ def find_pair_faults(
         given: The pair.
         config: The configuration; its ``audit`` and ``rectification`` sections are used.
         metric: Whether depth is wanted, so that the calibration matters.
-
-    Raises:
-        MatchingError: Both images are the same one.
     """
     _check_two(given.pair)
     if not config.audit.quick:
@@ -52,11 +49,7 @@ def find_pair_faults(
 def check_found(
     disparity: Disparity, pair: StereoPair, faults: tuple[Finding, ...] = ()
 ) -> tuple[str, ...]:
-    """Return warnings about the share of pixels with a disparity.
-
-    Raises:
-        MatchingError: No pixel has a disparity.
-    """
+    """Return warnings about the share of pixels with a disparity."""
     share = float(disparity.valid.mean())
     if share >= FEW_VALID_SHARE:
         return ()

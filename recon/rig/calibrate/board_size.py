@@ -40,9 +40,6 @@ def check_chessboard(
         sizes: `grown_size` of the board found in each image, None if none was found.
         read: Returns the image of a given number, uint8 (H, W).
         board: The board that the user gave.
-
-    Raises:
-        CalibrationError: Most images show a board of another size, which the message gives.
     """
     claimed = _sorted(board.inner)
     seen = Counter(_sorted(size) for size in sizes if size is not None)
@@ -72,10 +69,6 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
         count: Number of images.
         read: Returns the image of a given number, uint8 (H, W).
         board: The board that the user gave.
-
-    Raises:
-        CalibrationError: The markers belong to another dictionary or another layout, or the board
-            is a plain chessboard.
     """
     probed = [read(number) for number in _spread(range(count), _PROBED_MARKERS)]
     best, votes = _marker_votes(probed)

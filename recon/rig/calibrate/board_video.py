@@ -46,11 +46,6 @@ def pick_views(
         files: A left and a right video, or one with both views.
         settings: Arrangement of the two views in one video.
         path: Gives the path to write the file of a name to.
-
-    Raises:
-        SourceError: The videos do not belong together, or nothing stands still.
-        FormatError: A video is damaged.
-        OutputError: A file cannot be written.
     """
     videos = open_videos(files)
     if len(videos) == 1:

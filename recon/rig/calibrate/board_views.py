@@ -50,13 +50,7 @@ class _Look:
 
 
 def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> BoardViews:
-    """Find a board in all images of a rig.
-
-    Raises:
-        FormatError: An image is missing or damaged.
-        SourceError: Images differ in size.
-        CalibrationError: No pair shows the board, or it is of another size, which is named.
-    """
+    """Find a board in all images of a rig."""
     files = [path for pair in images.pairs for path in pair]
     board, looks = _look_at_all(files, board, threads)
     size = _one_size(files, looks)

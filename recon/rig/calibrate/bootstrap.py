@@ -76,11 +76,7 @@ class Spread:
 
 
 def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibration]:
-    """Return rigs calibrated from bootstrap resamples of the views; failed resamples are left out.
-
-    Raises:
-        CalibrationError: More than half of the resamples fail.
-    """
+    """Return rigs calibrated from bootstrap resamples of the views; failed ones are left out."""
     rng = np.random.default_rng(0)
     count, info = len(fit.views), fit.information
     vectors = _jackknife_vectors(fit)
@@ -103,11 +99,7 @@ def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibr
 
 
 def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
-    """Return bootstrap intervals of focal length, baseline, rotation and depth.
-
-    Raises:
-        CalibrationError: The views do not determine the rig.
-    """
+    """Return bootstrap intervals of focal length, baseline, rotation and depth."""
     rigs = resample(fit, settings)
     turns = [rig.T_right_left[:3, :3] @ fit.calibration.T_right_left[:3, :3].T for rig in rigs]
     cosines = np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)

@@ -127,9 +127,6 @@ def solve(
         views: The views.
         start: Initial guess, with every point in front of every camera.
         weights: float64 (V,), weight of each view's squared errors; None = 1.
-
-    Raises:
-        CalibrationError: The initial guess has points behind a camera.
     """
     w = np.ones(len(views)) if weights is None else weights
     corners = _gather(views)
@@ -169,11 +166,7 @@ def shared_size(state: RigState) -> int:
 
 
 def moved(state: RigState, step: Float64) -> RigState:
-    """Return the state with ``step`` (P,) added to its shared parameters; board poses stay.
-
-    Raises:
-        CalibrationError: A focal length would not be positive.
-    """
+    """Return the state with ``step`` (P,) added to its shared parameters; board poses stay."""
     cameras, at = [], 0
     for camera in state.cameras:
         size = _camera_size(camera)

@@ -36,9 +36,6 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 
     Returns:
         None if the board is not found, or too little of it (fewer than 8 corners, or collinear).
-
-    Raises:
-        SettingsError: The dictionary of a ChArUco board is unknown or too small.
     """
     if board.kind == "charuco":
         numbers, pixels = find_charuco(grey, board)

@@ -30,11 +30,7 @@ _REWEIGHTED: Final = 4
 def calibrate_one(
     sightings: Sequence[Sighting], size: Size, settings: CalibrationSettings
 ) -> RigState:
-    """Return the lens and board poses of one camera, with views that do not fit down-weighted.
-
-    Raises:
-        CalibrationError: The views do not determine a camera.
-    """
+    """Return the lens and board poses of one camera, with views that do not fit down-weighted."""
     views = [View(str(number), (seen,)) for number, seen in enumerate(sightings)]
     if settings.model == "fisheye":
         state = _guess_fisheye(sightings, size)
@@ -78,11 +74,7 @@ def join_cameras(left: RigState, right: RigState) -> RigState:
 
 
 def locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
-    """Return float64 (4, 4), T_camera_board of one sighting.
-
-    Raises:
-        CalibrationError: The corners are collinear, or no pose fits.
-    """
+    """Return float64 (4, 4), T_camera_board of one sighting."""
     rays = rays_of(camera, seen.pixels)
     known = np.isfinite(rays).all(axis=1)
     try:

@@ -72,10 +72,6 @@ def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) ->
 
     Returns:
         The files: two for ROS, else one.
-
-    Raises:
-        CalibrationError: The format cannot represent the lens model.
-        OutputError: A file cannot be written.
     """
     rig = run.fit.calibration
     if form == "ros":

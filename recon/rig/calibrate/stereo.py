@@ -86,9 +86,6 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
     repeat each other, one is used. Views whose error exceeds three
     times the median are dropped.
 
-    Raises:
-        CalibrationError: There are too few views, or no rig fits them.
-
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
     groups = group_views(views)
@@ -120,11 +117,7 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
 
 
 def stereo_of(state: RigState) -> StereoCalibration:
-    """Return the rig of a state.
-
-    Raises:
-        CalibrationError: Its parameters are invalid, such as a zero baseline.
-    """
+    """Return the rig of a state."""
     left, right = state.cameras
     return StereoCalibration(left, right, state.T_camera_rig[1])
 

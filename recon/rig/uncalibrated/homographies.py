@@ -30,9 +30,6 @@ def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> H
         features: Correct matches, raw pixels.
         size: (width, height) of the images.
 
-    Raises:
-        CalibrationError: An epipole is in an image, or close to it.
-
     Ref: Hartley 1999, "Theory and practice of projective rectification", as OpenCV has it.
     """
     left_px, right_px = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)

@@ -79,9 +79,6 @@ def rectify_images(
     Args:
         pairs: uint8 (H, W) left and right, of one pair or of several pairs of one rig.
         count: Maximum number of features per image.
-
-    Raises:
-        CalibrationError: See `rectify_features`.
     """
     height, width = pairs[0][0].shape
     matched = [match_exactly(left, right, count) for left, right in pairs]
@@ -106,10 +103,6 @@ def rectify_features(
         matched: The matches of each pair.
         size: (width, height) of the images.
         min_features: How many must agree on homographies.
-
-    Raises:
-        CalibrationError: Too few matches agree, the scene is flat, one camera is in the view of
-            the other, or a row error remains.
     """
     features = pool_features(matched)
     several = sum(len(each) > 0 for each in matched) >= _HELD_OUT

@@ -111,9 +111,6 @@ class Cluster:
         Args:
             jobs: The jobs.
             folder: Folder of the batch, seen by all workers.
-
-        Raises:
-            ClusterError: The scheduler or all workers are gone.
         """
         dask, waiting = require("distributed", extra=EXTRA), iter(jobs)
         ended, tries = dask.as_completed(with_results=True, raise_errors=False), dict[str, _Try]()
@@ -140,10 +137,6 @@ class Cluster:
 
         What it makes it leaves in files. One whose worker dies is called again on another, at most
         as often as Dask allows.
-
-        Raises:
-            ReconError: As the function.
-            ClusterError: The scheduler or too many workers are gone.
         """
         futures = self._client.map(function, items, key=f"{function.__name__}-{uuid4().hex[:12]}")
         for future in require("distributed", extra=EXTRA).as_completed(futures):
@@ -183,12 +176,7 @@ class Cluster:
 
 @contextmanager
 def local_cluster(workers: int) -> Iterator[Cluster]:
-    """Start workers on this machine, each of which runs one job at a time.
-
-    Raises:
-        MissingDependencyError: Dask is not installed.
-        ClusterError: The workers do not start.
-    """
+    """Start workers on this machine, each of which runs one job at a time."""
     distributed = require("distributed", extra=EXTRA)
     _be_quiet()
     require("dask", extra=EXTRA).config.set(_LOCAL)
@@ -214,10 +202,6 @@ def join_cluster(address: str) -> Iterator[Cluster]:
 
     Args:
         address: Its address, or the file that it was told to write it to.
-
-    Raises:
-        MissingDependencyError: Dask is not installed.
-        SettingsError: The scheduler cannot be reached, or has no workers: nothing was begun.
     """
     distributed = require("distributed", extra=EXTRA)
     _be_quiet()
@@ -271,11 +255,7 @@ def _work(job: Job, folder: str) -> Outcome:
 
 
 def _outcome(future: Any, result: Any, job: Job, folder: Path) -> Outcome:
-    """Return how a try ended.
-
-    Raises:
-        ClusterError: The scheduler or all workers are gone.
-    """
+    """Return how a try ended."""
     if future.status == "finished":
         return result  # type: ignore[no-any-return]
     if future.status != "error":

@@ -108,11 +108,7 @@ def log_file(folder: Path, name: str) -> Path:
 
 
 def last_outcome(folder: Path, name: str) -> Outcome:
-    """Return how a job stands: by its folder whether it succeeded, all else by its log.
-
-    Raises:
-        FormatError: The log is damaged.
-    """
+    """Return how a job stands: by its folder whether it succeeded, all else by its log."""
     path, last = log_file(folder, name), Outcome("not run")
     if path.exists():
         with reading(path), path.open("rb") as file:

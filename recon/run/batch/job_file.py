@@ -85,32 +85,19 @@ class JobList(Settings):
         return self.model_copy(update={"job": [limited(one) for one in self.job]})
 
     def write(self, folder: Path) -> None:
-        """Write it into the folder of its batch.
-
-        Raises:
-            OutputError: The folder cannot be written.
-        """
+        """Write it into the folder of its batch."""
         write_text(folder / PLAN, self.model_dump_json(exclude_defaults=True))
 
 
 def read_jobs(path: Path) -> JobList:
-    """Read a job file.
-
-    Raises:
-        FormatError: The file cannot be read.
-        SettingsError: A key is unknown or missing, or a value is of a wrong kind.
-    """
+    """Read a job file."""
     content = read_toml(path) if path.suffix.lower() == ".toml" else read_yaml(path)
     folder = path.parent / str(content.get("folder", ""))
     return _job_list({**content, "folder": str(folder.resolve())}, path)
 
 
 def read_plan(folder: Path) -> JobList:
-    """Read the jobs of a batch that was begun.
-
-    Raises:
-        FormatError: The folder is not one of a batch, or its jobs cannot be read.
-    """
+    """Read the jobs of a batch that was begun."""
     path = folder / PLAN
     if not path.is_file():
         raise FormatError("folder holds no batch", where=folder, expected=f"a {PLAN}")
@@ -138,9 +125,6 @@ def jobs_of_sources(command: str, sources: Sequence[str]) -> JobList:
     """Return one job for each source, named by its last part.
 
     Where two would have one name, each is named by as many of the last parts as tell all apart.
-
-    Raises:
-        SettingsError: There is no source.
     """
     if not sources:
         raise SettingsError("there is no source", where=f"recon batch {command}")
@@ -150,11 +134,7 @@ def jobs_of_sources(command: str, sources: Sequence[str]) -> JobList:
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Check that each job has a folder of its own, below that of the batch.
-
-    Raises:
-        SettingsError: A name is none, or stands there twice.
-    """
+    """Check that each job has a folder of its own, below that of the batch."""
     seen = set[str]()
     for name in names:
         where, small = f"job {name}", name.lower()  # on some file systems they are the same

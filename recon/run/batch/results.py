@@ -109,9 +109,6 @@ def work_off(
         cluster: The workers.
         options: How they are run.
         unit: What they are called.
-
-    Raises:
-        ClusterError: The scheduler or all workers are gone.
     """
     progress = options.progress
     log_file(folder, "").parent.mkdir(parents=True, exist_ok=True)
@@ -127,11 +124,7 @@ def work_off(
 
 
 def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
-    """Return the result of a job, with the figures of its summary.
-
-    Raises:
-        FormatError: Its summary cannot be read.
-    """
+    """Return the result of a job, with the figures of its summary."""
     if outcome.state != "succeeded":
         return JobResult(job, outcome)
     path = folder / job.name / SUMMARY

@@ -75,9 +75,6 @@ def back_project(
         A cloud in camera axes with colours, ``sigma_m`` (``sigma_z = Z²·sigma_d / (f·b)``),
         confidence and, if asked for, normals towards the camera; points in row order. It may
         be empty.
-
-    Raises:
-        ShapeError: The disparity and the pair differ in size.
     """
     if disparity.values.shape != pair.left.shape:
         raise ShapeError(

@@ -59,9 +59,6 @@ def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
     Returns:
         A cloud in the same frame. In a voxel every attribute is averaged (``sigma_m`` too: the
         errors of neighbouring pixels are not independent), and normals are renormalised.
-
-    Raises:
-        SettingsError: The voxel is too small for the extent of the cloud.
     """
     if settings.voxel_m is not None and len(cloud):
         cloud = voxel_downsample(cloud, settings.voxel_m)
@@ -77,11 +74,7 @@ def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
 
 
 def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
-    """Return one point per voxel, the mean of its points in every attribute.
-
-    Raises:
-        SettingsError: The voxel is too small for the extent of the cloud.
-    """
+    """Return one point per voxel, the mean of its points in every attribute."""
     names = [name for name in _ATTRIBUTES if getattr(cloud, name) is not None]
     columns = [np.reshape(getattr(cloud, name), (len(cloud), -1)) for name in names]
     packed = np.concatenate(columns, axis=1) if columns else np.zeros((len(cloud), 0))

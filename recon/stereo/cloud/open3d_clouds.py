@@ -27,10 +27,6 @@ def voxel_downsample(
 
     Returns:
         float32 (M, 3) and float32 (M, K).
-
-    Raises:
-        SettingsError: The voxel is too small for Open3D's voxel index.
-        ShapeError: A point is not finite.
     """
     # Open3D averages three attributes per point (as colours), so they are passed in groups of
     # three; the order of its voxels depends only on positions and is the same for each group.
@@ -148,10 +144,6 @@ def nearest(
     Returns:
         int32 (N, neighbours), rows of ``reference``, and float32 (N, neighbours), distances in
         metres, nearest first.
-
-    Raises:
-        ShapeError: There are fewer reference points than neighbours, a point is not finite, or
-            points lie so far apart that float32 cannot hold squared distances.
     """
     if len(reference) < neighbours:
         raise ShapeError(

@@ -27,11 +27,7 @@ class CheckedMatcher:
         self._name = name
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            MatchingError: The matcher fails, or what it returns is not a disparity of the pair.
-        """
+        """Match one rectified pair."""
         try:
             found = self._matcher.match(pair)
         except (ReconError, MemoryError):
@@ -45,11 +41,7 @@ class CheckedMatcher:
 
 
 def check_object(matcher: object) -> Matcher:
-    """Check that an object can be used as a matcher.
-
-    Raises:
-        SettingsError: It has no method ``match``, or is the class and not an object of it.
-    """
+    """Check that an object can be used as a matcher."""
     if inspect.isclass(matcher):
         name = matcher.__name__
         raise SettingsError("matcher is a class", got=name, expected=f"an object: {name}()")
@@ -76,12 +68,7 @@ def registered_names() -> set[str]:
 
 
 def load_registered(name: str) -> Matcher:
-    """Make a matcher that a package registers.
-
-    Raises:
-        SettingsError: The package does not load, or what it registers makes no matcher; or two
-            packages register the name.
-    """
+    """Make a matcher that a package registers."""
     point, *others = sorted(entry_points(group=GROUP, name=name), key=_origin)
     origin = f"matcher {name!r} ({_origin(point)})"
     if others:

@@ -42,11 +42,7 @@ class HalfSizeMatcher:
         self._matcher = make_matcher("sad", MatchingSettings(sad=half), threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            MatchingError: No disparity of the range lies within the image.
-        """
+        """Match one rectified pair."""
         return _enlarged(self._matcher.match(_half(pair)), pair.left.shape)
 
 

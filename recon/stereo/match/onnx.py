@@ -85,14 +85,7 @@ class OnnxMatcher:
         self._network: OnnxNetwork | None = None
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            SettingsError: No network is given.
-            MissingDependencyError: onnxruntime is not installed.
-            FormatError: The network cannot be loaded.
-            MatchingError: It does not fit the images, or gives no disparity map.
-        """
+        """Match one rectified pair."""
         s, network = self._settings, self._loaded()
         declared = network.input_shapes
         # One input takes both images, one behind the other: (1, 2·C, H, W).
@@ -169,11 +162,7 @@ def _unfitted(values: Float32, shape: tuple[int, ...], size: tuple[int, int] | N
 
 
 def _tensor(image: UInt8, channels: int, s: OnnxSettings) -> Float32:
-    """Return float32 (1, C, H, W), normalised.
-
-    Raises:
-        SettingsError: Mean or std have more numbers than the network has channels.
-    """
+    """Return float32 (1, C, H, W), normalised."""
     if max(len(s.mean), len(s.std)) > channels:
         raise SettingsError(
             "mean and std have more numbers than the network has channels",

@@ -19,10 +19,6 @@ class OnnxNetwork:
     Args:
         path: An ``.onnx`` file.
         threads: Threads per operator; None = onnxruntime's default.
-
-    Raises:
-        MissingDependencyError: onnxruntime is not installed.
-        FormatError: The file is missing, or onnxruntime cannot load it.
     """
 
     def __init__(self, path: Path, threads: int | None = None) -> None:
@@ -59,9 +55,6 @@ class OnnxNetwork:
 
         Returns:
             The outputs, in the order of the network.
-
-        Raises:
-            MatchingError: The network has a different number or shape of inputs.
         """
         wanted = self._session.get_inputs()
         if len(wanted) != len(inputs):

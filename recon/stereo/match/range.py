@@ -42,11 +42,7 @@ class AutoRangeMatcher:
         self._minimum_px = minimum_px
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            MatchingError: As of the matcher inside.
-        """
+        """Match one rectified pair."""
         if pair.camera.ndisp is None:
             ndisp = estimate_ndisp(pair, self._minimum_px)
             pair = replace(pair, camera=replace(pair.camera, ndisp=ndisp))

@@ -62,9 +62,6 @@ def make_matcher(
             with the methods of `Matcher`. What a matcher returns that is not ours is checked.
         settings: The settings of all matchers; it takes its own part.
         threads: Threads that a matcher of ours may use; all cores by default.
-
-    Raises:
-        SettingsError: There is no such matcher, or it is not one.
     """
     settings = settings or MatchingSettings()
     if not isinstance(matcher, str) or matcher not in MATCHERS:
@@ -81,11 +78,7 @@ def make_matcher(
 
 
 def check_matcher(matcher: str | Matcher) -> None:
-    """Check that a matcher exists, without making it.
-
-    Raises:
-        SettingsError: There is no matcher of this name, or the object is none.
-    """
+    """Check that a matcher exists, without making it."""
     if not isinstance(matcher, str):
         check_object(matcher)
     elif matcher not in MATCHERS and matcher not in (others := registered_names()):

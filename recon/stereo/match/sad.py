@@ -116,11 +116,7 @@ class SadMatcher:
         self._half = _StripSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            MatchingError: No disparity of the range lies within the image.
-        """
+        """Match one rectified pair."""
         search, rules = self._plan(pair.camera)
         s = self._settings
         with ThreadPoolExecutor(self._threads) as pool:

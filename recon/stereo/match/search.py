@@ -82,11 +82,7 @@ class SearchSettings(Settings):
         return self.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
 
     def ndisp_within(self, camera: RectifiedCamera) -> int:
-        """Return the number of disparities to search, some of which lie within the image.
-
-        Raises:
-            MatchingError: None does.
-        """
+        """Return the number of disparities to search, some of which lie within the image."""
         ndisp = self.ndisp_for(camera)
         last = self.min_disparity_px + ndisp - 1
         if self.min_disparity_px >= camera.width_px or last <= -camera.width_px:

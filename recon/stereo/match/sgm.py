@@ -132,11 +132,7 @@ class SgmMatcher:
         self._results = ResultPool(2)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            MatchingError: No disparity of the range lies within the image.
-        """
+        """Match one rectified pair."""
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
         window, size = _window(s), pair.left.shape

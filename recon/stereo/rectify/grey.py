@@ -28,9 +28,6 @@ def to_grey(image: UInt8, mode: GreyMode = "bt601") -> UInt8:
     Returns:
         uint8 (H, W), rounded to nearest.
 
-    Raises:
-        ShapeError: The array is not an image.
-
     Ref: ITU-R BT.601, section 2.5.1.
     """
     if isinstance(image, np.ndarray) and image.ndim == 2:

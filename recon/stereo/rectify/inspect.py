@@ -86,11 +86,7 @@ def inspect_features(
 
 
 def check_inspection(inspection: PairInspection, where: str | None = None) -> tuple[str, ...]:
-    """Return warnings about a pair; none if it is good or has too few features.
-
-    Raises:
-        CalibrationError: Left and right are swapped, so no depth is possible.
-    """
+    """Return warnings about a pair; none if it is good or has too few features."""
     if inspection.negative_share >= _SWAPPED_SHARE:
         raise CalibrationError(
             "left and right images are swapped",

@@ -95,11 +95,6 @@ class Rectifier:
     Attributes:
         camera: Geometry of the rectified views.
         valid: bool (H, W), where the rectified left view has a source; None = everywhere.
-
-    Raises:
-        CalibrationError: The rig is vertical, left and right are swapped, the cameras diverge by
-            more than 60 degrees or differ in image size, or a rectified view would be empty or of
-            a focal length out of all proportion.
     """
 
     def __init__(
@@ -123,11 +118,7 @@ class Rectifier:
             )
 
     def rectify(self, pair: StereoPair) -> RectifiedPair:
-        """Rectify one pair.
-
-        Raises:
-            CalibrationError: The image size differs from that of the calibration.
-        """
+        """Rectify one pair."""
         left, right = self.warp(pair)
         return RectifiedPair(
             left=to_grey(left),
@@ -141,11 +132,7 @@ class Rectifier:
         )
 
     def warp(self, pair: StereoPair) -> tuple[UInt8, UInt8]:
-        """Rectify both images of a pair, without grey conversion.
-
-        Raises:
-            CalibrationError: The image size differs from that of the calibration.
-        """
+        """Rectify both images of a pair, without grey conversion."""
         height_px, width_px = pair.left.shape[:2]
         check_size(self.camera, width_px, height_px, pair.name or f"frame {pair.index}")
         if self._views is None:
@@ -186,9 +173,6 @@ class RectifyingTurns:
 def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) -> RectifyingTurns:
     """Compute the rectifying rotations of a rig, and the rectified camera.
 
-    Raises:
-        CalibrationError: See `Rectifier`.
-
     Ref: Bouguet's method, as in OpenCV's ``stereoRectify``.
     """
     _check_rig(calibration)
@@ -209,11 +193,7 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
 def plan_rectification(
     calibration: StereoCalibration, settings: RectificationSettings
 ) -> tuple[RectifiedCamera, tuple[RemapTables, RemapTables]]:
-    """Compute the rectified camera and the remap tables of its left and right view.
-
-    Raises:
-        CalibrationError: See `Rectifier`.
-    """
+    """Compute the rectified camera and the remap tables of its left and right view."""
     turns = plan_turns(calibration, settings)
     size = (turns.camera.width_px, turns.camera.height_px)
     cameras, rotations = (calibration.left, calibration.right), (turns.R_left, turns.R_right)
