@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.export import REMADE
 from recon.commands.map_options import MapOptions
+from recon.core.errors import ReconError
 from recon.export.joined import JoinedMap, export_sessions, joined_figures, joined_warnings
 from recon.export.make import make
 from recon.export.product import Order
-from recon.map.sessions.copying import check_session, copy_sessions
+from recon.map.sessions.copying import check_session, copy_sessions, read_all
 from recon.map.sessions.joining import join_new
 from recon.map.sessions.measured import Survey, hold
 from recon.map.sessions.placed import place_map
@@ -61,6 +62,7 @@ def make_joined(
             progress=options.progress,
         ) as run,
         Map.create(run.path(MAP_FILE), cache_bytes=settings.memory.cache_bytes) as map_,
+        _damage_named(map_, inputs),
     ):
         new = fill(run, map_)
         left_out = [] if survey is None else hold(map_, survey)
@@ -84,6 +86,20 @@ def make_joined(
             record={"T_map_world": T_map_world},
         )
     return summary
+
+
+@contextmanager
+def _damage_named(map_: Map, inputs: Sequence[Path]) -> Iterator[None]:
+    """Name the map that a damaged record came from, not the new one, which does not stay."""
+    try:
+        yield
+    except ReconError as error:
+        if str(error.where) == map_.store.name:
+            for file in inputs:
+                if file.match(MAP_FILE):
+                    with closing(Map.open(file)) as read:
+                        read_all(read)
+        raise
 
 
 def copied(file: Path, map_: Map, settings: ReconConfig) -> list[int]:

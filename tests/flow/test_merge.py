@@ -182,6 +182,8 @@ def _refused(*arguments: object) -> str:
         ("coarse", "voxels of different sizes"),
         ("newer", "newer version of recon"),
         ("no map", "map.recon"),
+        ("damaged", "damaged/map/map.recon: a record of the map is damaged (got rays 0,0)"),
+        ("odd", "odd/map/map.recon: content cannot be read (got KeyError: 'grain')"),
     ],
 )
 def test_what_cannot_be_merged_is_one_line(
@@ -205,6 +207,12 @@ def test_what_cannot_be_merged_is_one_line(
     elif second == "newer":
         with Map.open(other, read_only=False) as map_:
             map_.store._database.execute("PRAGMA user_version = 99")
+            map_.commit()
+    elif second in ("damaged", "odd"):  # with a wrong checksum, and with one that is right
+        with Map.open(other, read_only=False) as map_:
+            map_.store.put("rays", (0, 0), {})
+            if second == "damaged":
+                map_.store._database.execute("UPDATE record SET checksum = 0 WHERE kind = 'rays'")
             map_.commit()
     elif second == "no map":
         (other / "map/map.recon").unlink()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from itertools import chain
 
 import numpy as np
 
@@ -54,13 +55,26 @@ def copy_sessions(source: Map, target: Map, without: Collection[int] = ()) -> li
     return list(numbers.values())
 
 
+def read_all(map_: Map) -> None:
+    """Read what `copy_sessions` copies unread.
+
+    Raises:
+        FormatError: A record is damaged.
+    """
+    for session in map_.sessions:
+        for _ in chain(session.submaps, session.keyframes):
+            pass
+        for frame in range(session.ray_frames):
+            session.rays(frame)
+
+
 def check_session(session: Session, settings: DriveSettings) -> None:
     """Refuse a drive that cannot become part of a map with these settings."""
     voxel_m = session.info.config.get("fusion", {}).get("voxel_m")
     if voxel_m != settings.fusion.voxel_m:
         raise SettingsError(
             "the clouds of the maps have voxels of different sizes",
-            where=session.info.source,
+            where=session.where,
             got=f"{voxel_m} m",
             expected=f"{settings.fusion.voxel_m:g} m",
             hint="map one of the drives again with --set fusion.voxel_m=",
