@@ -58,10 +58,6 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         _fail(f"{name}{error.strerror or error}")
-    except RuntimeError as error:
-        if not str(error).startswith("Symlink loop"):  # of Path.resolve, before Python 3.13
-            _fail_unforeseen(error)
-        _fail(str(error))
     except KeyboardInterrupt as interrupt:
         typer.echo("; ".join(["interrupted", *map(str, interrupt.args)]), err=True)
         raise typer.Exit(INTERRUPTED) from None

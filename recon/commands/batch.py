@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from recon.core.errors import ClusterError, OutputError
+from recon.io.files import resolved
 from recon.report.batch_page import write_batch_page
 from recon.run.batch.cluster import BatchOptions
 from recon.run.batch.job import Job, is_done, last_outcome
@@ -35,7 +36,7 @@ def run_batch(
     Returns:
         The summary: ``jobs`` with the figures of each, ``succeeded``, ``failed`` and more.
     """
-    folder = (options.out or default_folder("batch")).resolve()
+    folder = resolved(options.out or default_folder("batch"))
     if listed is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         begun = "--resume goes on with it" if (folder / PLAN).is_file() else "choose another --out"
         raise OutputError("output folder is not empty", where=folder, hint=begun)

@@ -47,15 +47,14 @@ def run_fetch(
 
 def run_verify(names: Sequence[str], folder: Path = FOLDER) -> dict[str, Any]:
     """Compare the files of data sets, or of the parts that were fetched, with what was unpacked."""
-    there: dict[str, Path] = {}
+    there: dict[str, None] = {}
     for name in names:
-        places = {part.name: folder / part.name for part in find_parts(name)}
-        fetched = {part: place for part, place in places.items() if is_fetched(place)}
+        fetched = [part.name for part in find_parts(name) if is_fetched(folder / part.name)]
         if not fetched:
             hint = f"recon datasets fetch {name}"
             raise FormatError("this data set was not fetched", where=folder / name, hint=hint)
-        there |= fetched
-    return {"datasets": [verify_part(name, place) for name, place in there.items()]}
+        there |= dict.fromkeys(fetched)
+    return {"datasets": [verify_part(name, folder) for name in there]}
 
 
 def _described(parts: Sequence[Part], folder: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from recon.core.errors import SettingsError
 from recon.export.cloud_file import export_pair
 from recon.export.make import known_products, make, need_rays
 from recon.export.product import Order
-from recon.io.files import StrPath
+from recon.io.files import StrPath, resolved
 from recon.io.models.las import SUFFIXES as SURVEYED
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
@@ -109,7 +109,7 @@ def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | 
     if workers is None:
         return place_map(map_, settings, run.threads)
     with workers.connect() as cluster:
-        folder = run.state("tiles").resolve()
+        folder = resolved(run.state("tiles"))
         return place_map_on(map_, settings, folder, cluster.each, cluster.at_once)
 
 

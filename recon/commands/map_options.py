@@ -13,7 +13,7 @@ from recon.commands.config import ReconConfig
 from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
 from recon.export.make import USUAL
-from recon.io.files import StrPath
+from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_trajectory
 from recon.run.batch.cluster import BatchOptions
 from recon.run.progress import SILENT, Progress
@@ -145,4 +145,4 @@ class MapRequest:
 
 
 def _absolute(path: Path | None) -> str | None:
-    return None if path is None else str(path.resolve())
+    return None if path is None else str(resolved(path))

@@ -14,6 +14,7 @@ from recon.commands.config import ReconConfig
 from recon.commands.map_options import MapOptions
 from recon.commands.piece import PiecePlan, piece_job, read_plan, write_plan
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
+from recon.io.files import resolved
 from recon.map.drive.pieces import Piece, cut_drive, join_pieces, joined_drive
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
@@ -112,4 +113,4 @@ def _opened(plan: Path, count: int) -> Iterator[Map]:
 
 def _folder(plan: Path) -> Path:
     """Return the folder that has the folders of the pieces."""
-    return plan.resolve().with_suffix("")
+    return resolved(plan).with_suffix("")

@@ -12,6 +12,7 @@ from recon.commands.joined import copied, joined_settings, make_joined
 from recon.commands.map import map_whole
 from recon.commands.map_options import MapOptions
 from recon.core.errors import SettingsError
+from recon.io.files import resolved
 from recon.map.drive.refuse_empty import check_map
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.measured import Survey
@@ -134,6 +135,6 @@ def _refuse_twice(folders: Sequence[Path]) -> None:
     """Refuse a folder that is named twice."""
     seen: set[Path] = set()
     for folder in folders:
-        if folder.resolve() in seen:
+        if resolved(folder) in seen:
             raise SettingsError("the same run twice", got=folder, hint="name each run once")
-        seen.add(folder.resolve())
+        seen.add(resolved(folder))

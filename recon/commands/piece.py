@@ -13,7 +13,7 @@ from recon.commands.identity import identity_of
 from recon.commands.map_options import MapRequest
 from recon.commands.resume import begin_or_resume
 from recon.io.atomic import write_text
-from recon.io.files import read_text, reading
+from recon.io.files import read_text, reading, resolved
 from recon.map.drive.pieces import Piece
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
@@ -61,7 +61,7 @@ def piece_job(plan: Path, number: int, piece: Piece, threads: int | None) -> Job
         name=str(number),
         command="piece",
         source=f"{piece.first} to {piece.last - 1}",
-        words=("piece", str(plan.resolve()), str(number), *limit, "--json", "--verbose"),
+        words=("piece", str(resolved(plan)), str(number), *limit, "--json", "--verbose"),
         writes=True,
         folder=str(Path.cwd()),
     )

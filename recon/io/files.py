@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -26,6 +27,7 @@ SMALL_FILE_BYTES: Final = 1 << 22
 _LONGEST_REASON: Final = 120
 _NO_DATA: Final = "begin lines that are no data with #"
 FOLDER: Final = "a folder"
+_LOOP: Final = "a loop of symbolic links"
 _KINDS: Final = (
     (stat.S_ISDIR, FOLDER),
     (stat.S_ISFIFO, "a named pipe"),
@@ -94,12 +96,20 @@ def _refuse_special(path: StrPath) -> None:
         raise FormatError("not a regular file", where=path, got=kind)
 
 
+def resolved(path: StrPath) -> Path:
+    """Return the absolute path that a path leads to; a loop of links is refused."""
+    if special_kind(path) == _LOOP:
+        raise FormatError("not a path", where=path, got=_LOOP)
+    return Path(os.path.realpath(path))
+
+
 def special_kind(path: StrPath) -> str | None:
     """Return what a path leads to, such as ``a device``; None = a regular file, or nothing."""
     try:
         mode = Path(path).stat().st_mode
-    except (OSError, ValueError):  # missing, or not a path: found when it is opened
-        return None
+    except (OSError, ValueError) as error:
+        # what is missing, or no path, is found when it is opened
+        return _LOOP if getattr(error, "errno", None) == errno.ELOOP else None
     return next((name for test, name in _KINDS if test(mode)), None)
 
 

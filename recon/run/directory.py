@@ -17,6 +17,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -24,7 +25,7 @@ from typing_extensions import Self
 
 from recon.core.errors import ClusterError, FormatError, MemoryLimitError, OutputError
 from recon.io.atomic import check_targets, exchange, write_text
-from recon.io.files import read_text, reading
+from recon.io.files import read_text, reading, resolved
 from recon.io.lock import take_lock
 
 RECORD: Final = "run.json"
@@ -59,15 +60,23 @@ def default_folder(command: str) -> Path:
     return Path("outputs") / command / stamp
 
 
-def refuse_links(folder: Path) -> None:
-    """Refuse a result folder that has links in it, which may lead to files of anybody."""
-    for place, folders, files in os.walk(folder):
-        for name in sorted((*folders, *files)):
-            path = Path(place, name)
-            if path.is_symlink():
-                hint = "remove it; what it leads to stays"
-                what = "a link in a result folder is not followed"
-                raise FormatError(what, where=path, hint=hint)
+def refuse_links(folder: Path, *, below: Path | None = None) -> None:
+    """Refuse a folder of ours that has links in it, which may lead to files of anybody.
+
+    Args:
+        folder: The folder, which need not exist.
+        below: A folder around it; from there on it is reached by no link either.
+    """
+    way = [] if below is None else [folder, *folder.parents][: -len(below.parents) - 1]
+    inside = (
+        Path(place, name)
+        for place, folders, files in os.walk(folder)
+        for name in sorted((*folders, *files))
+    )
+    for path in chain(reversed(way), inside):
+        if path.is_symlink():
+            hint = "remove it; what it leads to stays"
+            raise FormatError("a link in a result folder is not followed", where=path, hint=hint)
 
 
 class RunDirectory:
@@ -182,7 +191,7 @@ class RunDirectory:
     def _content(self) -> Path:
         """Where the files of this run are written."""
         if self.whole:
-            folder = self.folder.resolve()
+            folder = resolved(self.folder)
             return folder.with_name(f".{folder.name}{_PARTIAL}")
         return self._partial
 
@@ -212,7 +221,7 @@ class RunDirectory:
         try:
             shutil.rmtree(self._content / _STATE, ignore_errors=True)
             self._keep_others()
-            exchange(self._content, self.folder.resolve())
+            exchange(self._content, resolved(self.folder))
         finally:  # the old folder, or a new one that was interrupted before it took its place
             self._withdraw()
 

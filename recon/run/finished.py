@@ -16,7 +16,7 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
-from recon.io.files import StrPath, read_text, reader, reading
+from recon.io.files import StrPath, read_text, reader, reading, resolved
 from recon.run.directory import RECORD, RECORD_BYTES, refuse_links
 from recon.run.run import SUMMARY
 
@@ -109,7 +109,7 @@ def figure_of(folder: Path, name: str) -> float | None:
 
 def refuse_as_target(run: Path, out: StrPath | None) -> None:
     """Refuse to write derived results into the folder of the run, which would replace it."""
-    if out is not None and Path(out).resolve() == run.resolve():
+    if out is not None and resolved(out) == resolved(run):
         raise SettingsError("the results would replace the run", where=out, hint="another --out")
 
 

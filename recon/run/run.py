@@ -14,7 +14,7 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.core.settings import Settings
-from recon.io.files import StrPath
+from recon.io.files import StrPath, resolved
 from recon.io.yaml_file import write_yaml
 from recon.run.directory import RECORD, RunDirectory, default_folder
 from recon.run.fingerprint import fingerprint
@@ -62,7 +62,7 @@ class Run(RunDirectory):
         standard = default_folder(command)
         folder = standard if out is None else Path(out)
         # A run in a default folder keeps its link when it is resumed.
-        stamped = out is not None and folder.parent.resolve() == standard.parent.resolve()
+        stamped = out is not None and resolved(folder.parent) == resolved(standard.parent)
         super().__init__(
             folder,
             latest=out is None or (resume and stamped),

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError, SourceError
 from recon.core.values import Rig, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
+from recon.io.files import resolved
 from recon.io.images.image import decode_image
 from recon.io.images.ros_image import pixels_of_ros_image
 from recon.sources.bag_topics import (
@@ -115,7 +116,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     also += list_others(bag, topics)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
-        name=path.resolve().name,
+        name=resolved(path).name,
         description=f"{kind}, {topics[0]} and {topics[1]}, paired by stamps{listing}{clock}, "
         f"{source}{also}",
         calibration=rig,

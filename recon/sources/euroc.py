@@ -24,6 +24,7 @@ from recon.core.geometry.se3 import invert
 from recon.core.values import Rig, SequenceTruth, StereoCalibration, check_size
 from recon.core.values.arrays import Float64
 from recon.io.cameras.euroc import NS, read_euroc_camera, read_euroc_truth
+from recon.io.files import resolved
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.images import ImageSource, image_size, pair_listed
 from recon.sources.settings import SourceSettings
@@ -45,7 +46,7 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
     rig, calibration_files = _read_rig(root, settings, views, image_size(frames[0].left, settings))
     truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
     return ImageSource(
-        name=folder.resolve().name,
+        name=resolved(folder).name,
         description=f"EuRoC drive, {views[0].name} and {views[1].name}, paired by stamps{listing}"
         f"{note}",
         calibration=rig,

@@ -21,6 +21,7 @@ from recon.io.atomic import write_text
 from recon.io.download import OnBytes, download
 from recon.io.files import read_text, reading
 from recon.io.lock import take_lock
+from recon.run.directory import refuse_links
 from recon.run.progress import Progress
 from recon.sources.datasets import Archive, Part
 
@@ -56,12 +57,17 @@ def fetch_part(part: Part, folder: Path, mirror: str | None, progress: Progress)
     """Fetch one part into its folder, unless it is there."""
     place, work = folder / part.name, folder / _PARTIAL / part.name
     found = {"name": part.name, "out": str(place)}
+    for ours in (place, work):
+        refuse_links(ours, below=folder)
     if is_fetched(place):
         return {**found, "files": len(_recorded_files(place)), "fetched": False}
     if place.exists():
         raise OutputError("folder was not made by recon datasets", where=place, hint="move it away")
     busy = "another process is fetching this data set"
-    lock = take_lock(work / ".lock", busy, where=place, hint="wait for it")
+    try:
+        lock = take_lock(work / ".lock", busy, where=place, hint="wait for it")
+    except OSError as error:
+        raise OutputError("cannot be written", where=folder, got=error.strerror) from error
     try:
         received = [_receive(one, part, work, mirror, progress) for one in part.archives]
         progress.on_stage("unpack")
@@ -154,8 +160,10 @@ def _unpack(part: Part, work: Path, received: Sequence[Mapping[str, Any]]) -> in
     return len(facts)
 
 
-def verify_part(name: str, place: Path) -> dict[str, Any]:
+def verify_part(name: str, folder: Path) -> dict[str, Any]:
     """Compare the files of a fetched part with what was unpacked; the first other one is named."""
+    place = folder / name
+    refuse_links(place, below=folder)
     files = _recorded_files(place)
     for file, facts in files.items():
         path = place / file

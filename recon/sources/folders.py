@@ -23,6 +23,7 @@ from recon.core.errors import SourceError
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
 from recon.io.cameras.kitti import kitti_cameras_of
+from recon.io.files import resolved
 from recon.io.frames_csv import FRAMES, read_frames
 from recon.sources.calibration import read_rig
 from recon.sources.frame_list import FrameList
@@ -68,7 +69,7 @@ def open_folders(folder: Path, settings: SourceSettings) -> ImageSource:
     rig, texts = read_rig(settings, folder, image_size(first, settings), kitti_cameras_of(first))
     truth, note = read_tum_truth(folder, stamps_s)
     return ImageSource(
-        name=folder.resolve().name,
+        name=resolved(folder).name,
         description=f"plain folders, {found.how}{found.listing}{clock}{note}",
         calibration=rig,
         images=[

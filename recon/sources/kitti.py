@@ -24,7 +24,7 @@ from recon.core.values import Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
-from recon.io.files import StrPath
+from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.frame_list import FrameList
@@ -66,7 +66,7 @@ def open_kitti(
     rig, calibration_files = _read_rig(path, settings, pair, images[0][0])
     texts = (*calibration_files, *time_files, _find_poses(path))
     return ImageSource(
-        name=path.resolve().name,
+        name=resolved(path).name,
         description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}{listing}",
         calibration=rig,
         images=[
@@ -175,6 +175,6 @@ def _read_truth(
 
 
 def _find_poses(folder: Path) -> Path | None:
-    path = folder.resolve()
+    path = resolved(folder)
     candidates = (path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt")
     return next((candidate for candidate in candidates if candidate.is_file()), None)

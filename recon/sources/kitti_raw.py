@@ -20,6 +20,7 @@ from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, Rig
 from recon.core.words import counted
 from recon.io.cameras.kitti import read_kitti_rig
+from recon.io.files import resolved
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.images import ImageSource, image_size, list_images, pair_listed
 from recon.sources.kitti import choose_cameras
@@ -40,7 +41,7 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
     )
     rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
     return ImageSource(
-        name=folder.resolve().name,
+        name=resolved(folder).name,
         description=f"KITTI raw drive, {views[0].name} and {views[1].name}, {rectified}, "
         f"paired by stamps{listing}",
         calibration=rig,
@@ -76,7 +77,7 @@ def _read_rig(
 ) -> tuple[Rig, tuple[Path, ...]]:
     if settings.has_camera:
         return read_rig(settings, folder, size, cameras)
-    candidates = [place / _CALIBRATION for place in (folder, folder.resolve().parent)]
+    candidates = [place / _CALIBRATION for place in (folder, resolved(folder).parent)]
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
     if path is None:
         raise SourceError(

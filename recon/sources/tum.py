@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from recon.core.errors import SourceError
+from recon.io.files import resolved
 from recon.sources.calibration import read_rig
 from recon.sources.image_names import find_partners
 from recon.sources.images import ImageSource, image_size, is_image, pair_listed
@@ -32,7 +33,7 @@ def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
     rig, texts = read_rig(settings, folder, image_size(frames[0].left, settings))
     truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
     return ImageSource(
-        name=folder.resolve().name,
+        name=resolved(folder).name,
         description=f"TUM drive, {paths[0].name} and {paths[1].name}, "
         f"paired by stamps{listing}{note}",
         calibration=rig,

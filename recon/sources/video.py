@@ -13,6 +13,7 @@ import numpy as np
 from recon.core.errors import FormatError, SourceError
 from recon.core.values import StereoPair, check_size
 from recon.core.values.arrays import UInt8
+from recon.io.files import resolved
 from recon.io.images.video import VIDEOS, VideoFile, open_video
 from recon.sources.calibration import read_rig
 from recon.sources.frame_list import pair_frames
@@ -98,12 +99,12 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
     frames = zip_longest(range(videos[0].frames), range(videos[-1].frames))
     numbers, listing = pair_frames(list(frames), settings, path)
     size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
-    home = path if path.is_dir() else path.resolve().parent
+    home = path if path.is_dir() else resolved(path).parent
     rig, texts = read_rig(settings, home, size)
     rate_hz = settings.rate_hz or videos[0].rate_hz
     layout = f"{settings.side_by_side} in one video" if len(videos) == 1 else "two videos"
     return VideoSource(
-        name=path.resolve().name,
+        name=resolved(path).name,
         description=f"{layout}, {rate_hz:g} Hz, paired frame by frame{listing}",
         calibration=rig,
         videos=videos,

@@ -13,7 +13,16 @@ from typing import Final
 
 import pytest
 
-from tests.hostile.refusals import assert_refused, run
+import recon
+from recon.commands.datasets import run_fetch, run_verify
+from recon.commands.demo import demo_source
+from recon.commands.map_options import MapOptions
+from recon.core.errors import FormatError
+from recon.io.atomic import check_targets
+from recon.io.files import resolved
+from recon.sources.fetching import RECORD
+from tests.hostile.refusals import assert_refused, refusal, run
+from tests.hostile.runs import DRIVE
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 EXPORT: Final = ("export", "run", "--to", "cloud", "--out", "evil")
@@ -196,3 +205,79 @@ def test_folders_and_outside_files_in_a_list_of_files_stay(finished: Path, outsi
     assert run(*EXPORT).code == 0
     assert Path("evil/sub").is_dir()
     assert content(outside) == {"file": "precious"}
+
+
+def small_drive() -> recon.StereoSource:
+    return demo_source(recon.load_config(None, [f"street.{k}={v}" for k, v in DRIVE.items()]))
+
+
+TAKERS: Final[dict[str, Callable[[Path], object]]] = {
+    "source": recon.open_source,
+    "map": recon.Map.open,
+    "run_map": lambda loop: recon.run_map(small_drive(), None, MapOptions(out=loop, audit=False)),
+    "run_localize": lambda loop: recon.run_localize(
+        small_drive(), loop, options=MapOptions(out=loop)
+    ),
+    "run_merge": lambda loop: recon.run_merge([loop, loop]),
+    "run_export": lambda loop: recon.run_export(loop, products=["cloud"], out=loop),
+    "run_middlebury": recon.run_middlebury,
+    "scene": recon.read_middlebury_scene,
+    "calibration": recon.read_calibration,
+    "data sets": lambda loop: run_fetch([PART], loop),
+    "resolved": resolved,
+    "written": lambda loop: check_targets([loop]),
+}
+
+
+@pytest.mark.parametrize("loop", ["loop", "loop/deep/er"])
+@pytest.mark.parametrize("taker", TAKERS)
+def test_a_loop_of_links_is_refused_in_python_too(taker: str, loop: str, here: Path) -> None:
+    Path("loop").symlink_to("loop")
+    assert refusal(lambda: TAKERS[taker](Path(loop))) is not None
+    assert [path.name for path in here.iterdir()] == ["loop"]
+
+
+PART: Final = "middlebury-2014/Pipes"
+LINKS_OF_DATA: Final = {
+    "a family": "middlebury-2014",
+    "a data set": PART,
+    "downloads": ".partial",
+    "a download": f".partial/{PART}",
+    "an archive": f".partial/{PART}/Pipes-perfect.zip",
+    "what was unpacked": f".partial/{PART}/files",
+}
+
+
+@pytest.mark.parametrize("link", LINKS_OF_DATA)
+def test_no_link_below_a_folder_of_data_sets_is_followed(link: str, here: Path) -> None:
+    outside = here / "outside"
+    outside.mkdir()
+    (outside / "file").write_text("precious")
+    path = here / "data" / LINKS_OF_DATA[link]
+    path.parent.mkdir(parents=True)
+    path.symlink_to(outside)
+    with pytest.raises(FormatError, match="link") as refused:
+        run_fetch([PART], here / "data", address="http://127.0.0.1:1")
+    assert refused.value.where == path
+    assert content(outside) == {"file": "precious"}
+
+
+@pytest.mark.parametrize("link", ["middlebury-2014", PART, f"{PART}/deep"])
+def test_data_that_lead_elsewhere_are_not_verified(link: str, here: Path) -> None:
+    place = here / "data" / PART
+    (place / "deep").mkdir(parents=True)
+    (place / RECORD).write_text('{"files": {}}')
+    assert run_verify([PART], here / "data")["datasets"]
+    moved = (here / "data" / link).rename(here / "moved")
+    (here / "data" / link).symlink_to(moved)
+    with pytest.raises(FormatError, match="link") as refused:
+        run_verify([PART], here / "data")
+    assert refused.value.where == here / "data" / link
+
+
+def test_the_folder_of_data_sets_itself_may_be_a_link(here: Path) -> None:
+    place = here / "real" / PART
+    place.mkdir(parents=True)
+    (place / RECORD).write_text('{"files": {}}')
+    (here / "data").symlink_to(here / "real")
+    assert run_verify([PART], here / "data")["datasets"]

@@ -12,7 +12,7 @@ import numpy as np
 from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
 from recon.evaluation.middlebury.rules import MiddleburyRules
-from recon.io.files import read_table
+from recon.io.files import read_table, resolved
 from recon.io.middlebury.layout import find_image, find_layout, scene_root
 from recon.io.middlebury.scene import MiddleburyScene, read_middlebury_scene, stand_in_camera
 
@@ -71,7 +71,7 @@ def find_scenes(folder: Path) -> dict[str, Path]:
             where=folder,
             expected="folders with im0 and im1 and calib.txt, view1 and view5, or im2 and im6",
         )
-    roots = [path.resolve() for path in paths]
+    roots = [resolved(path) for path in paths]
     short = [path.relative_to(scene_root(path).parent).as_posix() for path in roots]
     if len(set(short)) < len(short):
         short = [path.relative_to(folder).as_posix() for path in paths]
@@ -162,7 +162,7 @@ def find_results(
 
 def _names(folders: Sequence[Path], taken: Sequence[str]) -> list[str]:
     """Return the shortest ends of the paths that distinguish them."""
-    paths = [folder.resolve() for folder in folders]
+    paths = [resolved(folder) for folder in folders]
     if len(set(paths)) < len(paths):
         raise SettingsError("a folder of results is given twice", got=", ".join(map(str, folders)))
     for depth in range(1, max((len(path.parts) for path in paths), default=0)):

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.errors import FormatError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair, check_size
 from recon.core.values.arrays import Bool, Float32, UInt8, size_text
-from recon.io.files import StrPath, read_table, reader
+from recon.io.files import StrPath, read_table, reader, resolved
 from recon.io.images.disparity_png import read_disparity_png
 from recon.io.images.image import read_grey_levels, read_image
 from recon.io.images.pfm import read_pfm
@@ -67,7 +67,7 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
             of another size than the left image.
         CalibrationError: The calibration cannot give depth.
     """
-    path = Path(folder).resolve()
+    path = resolved(folder)
     layout = find_layout(path)
     if layout is None:
         raise FormatError(

@@ -17,7 +17,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.core.values.cloud import Frame
 from recon.io.atomic import write_text
-from recon.io.files import StrPath
+from recon.io.files import StrPath, resolved
 
 _IDENTITY: Final = np.eye(4)
 _SENSOR_MM: Final = 36.0
@@ -105,4 +105,4 @@ def _relative(file: StrPath, project: Path) -> str:
         raise OutputError(
             "a layer of the MeshLab project does not exist", where=file, hint="write it first"
         )
-    return Path(os.path.relpath(Path(file).resolve(), project.resolve().parent)).as_posix()
+    return Path(os.path.relpath(resolved(file), resolved(project).parent)).as_posix()

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from recon.core.errors import MappingError
 from recon.core.values.arrays import Float64
+from recon.io.files import resolved
 from recon.map.cut import Cutter
 from recon.map.sessions.placed import PlacedMap, PlacedSubmaps, looks_in, with_path
 from recon.map.settings import DriveSettings
@@ -87,7 +88,7 @@ def place_map_on(
     """
     if map_.store.path is None:
         raise MappingError("other processes cannot read a temporary map")
-    file = map_.store.path.resolve()
+    file = resolved(map_.store.path)
     placed, halvings, tiles = PlacedSubmaps(map_, settings), -1, None
     T_map_world, drives = map_.first.T_map_world, tuple(placed.drives)
     folder.mkdir(parents=True, exist_ok=True)

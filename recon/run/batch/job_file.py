@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator
 from recon.core.errors import FormatError, SettingsError
 from recon.core.settings import Settings, settings_error
 from recon.io.atomic import write_text
-from recon.io.files import read_text, reading
+from recon.io.files import read_text, reading, resolved
 from recon.io.toml_file import read_toml
 from recon.io.yaml_file import read_yaml
 from recon.run.batch.job import LOGS
@@ -93,7 +93,7 @@ def read_jobs(path: Path) -> JobList:
     """Read a job file."""
     content = read_toml(path) if path.suffix.lower() == ".toml" else read_yaml(path)
     folder = path.parent / str(content.get("folder", ""))
-    return _job_list({**content, "folder": str(folder.resolve())}, path)
+    return _job_list({**content, "folder": str(resolved(folder))}, path)
 
 
 def read_plan(folder: Path) -> JobList:
@@ -162,7 +162,7 @@ def _plain(text: str) -> str:
 
 def _names_of(sources: Sequence[str]) -> list[str]:
     """Return names of sources, by as many last parts of their paths as tell all apart."""
-    paths = [Path(source).resolve().parts[1:] for source in sources]
+    paths = [resolved(source).parts[1:] for source in sources]
     for count in range(1, max(map(len, paths)) + 1):
         names = [_name_of(parts[-count:]) for parts in paths]
         if len({name.lower() for name in names}) == len(names):
