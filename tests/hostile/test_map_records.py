@@ -130,8 +130,12 @@ def _info(value: np.ndarray[Any, Any]) -> Any:
 
 
 def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Yield every part of a tree with its path, but the tree itself."""
-    parts = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    """Yield every part of a tree with its path, but the tree itself; of a list, one of each type.
+
+    The items of a list are read by the same lines, and what precedes the last one is whole.
+    """
+    items = {type(item): (place, item) for place, item in enumerate(tree)}
+    parts = tree.items() if isinstance(tree, dict) else items.values()
     for name, part in parts:
         if name not in FREE:
             yield (*path, name), part

@@ -77,6 +77,37 @@ def test_a_value_that_nobody_means_is_refused(option: str, here: Path, drive: Pa
     assert not Path("out").exists()
 
 
+CAMERAS: Final = {
+    "--focal 1e9 --baseline 0.5": "focal",
+    "--focal 1e-9 --baseline 0.5": "focal",
+    "--focal nan --baseline 0.5": "focal",
+    "--focal 1e6 --baseline 0.5": "focal",
+    "--focal 1 --baseline 0.5": "focal",
+    "--focal 40 --baseline 1e300": "baseline",
+    "--focal 40 --baseline 1e-300": "baseline",
+    "--focal 40 --baseline inf": "baseline",
+    "--focal 40 --baseline 1e6": "baseline",
+    "--focal 40 --baseline 0.5 --cx 1e300": "cx_px",
+    "--focal 40 --baseline 0.5 --cy 1e6": "principal point",
+}
+
+
+@pytest.mark.parametrize("command", ["pair", "map", "audit", "live"])
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_camera_that_nobody_has_is_refused(
+    camera: str, command: str, pair: tuple[Path, Path]
+) -> None:
+    left, right = pair
+    source = [left, right] if command == "pair" else ["drive"]
+    for side, image in (("left", left), ("right", right)):
+        for name in ("0.png", "1.png"):
+            (target := Path("drive", side, name)).parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(image.read_bytes())
+    ended = run(command, *source, *camera.split(), "--quiet", "--out", "out")
+    assert_refused(ended, CAMERAS[camera])
+    assert not Path("out").exists()
+
+
 def test_a_full_disk_at_the_beginning_leaves_nothing(here: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
