@@ -11,7 +11,6 @@ Nothing heavy is imported before a command runs, so ``recon --help`` answers at 
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from typing import Annotated
 
@@ -29,6 +28,7 @@ from recon.cli.demo import demo
 from recon.cli.doctor import doctor
 from recon.cli.errors import report_unforeseen
 from recon.cli.export import export
+from recon.cli.interrupt import interrupt_on_signals
 from recon.cli.live import live
 from recon.cli.localize import localize
 from recon.cli.map import map_
@@ -98,9 +98,7 @@ def _root(
 def main() -> None:
     """Run the program; a request to end it is an interruption, after which nothing half is left."""
     _open_standard_streams()
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) == signal.SIG_DFL:  # else nohup has it ignored
-            signal.signal(number, signal.default_int_handler)
+    interrupt_on_signals()
     try:
         try:
             app()

@@ -1,11 +1,33 @@
-"""Ctrl-C as the end of a recording, not as an error."""
+"""Signals that end a command, and Ctrl-C as the end of a recording, not as an error."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Final
+
+_AGAIN_S: Final = 0.1
+
+
+def interrupt_on_signals() -> None:
+    """Let a request to end the program interrupt it, as Ctrl-C does, wherever it is."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_DFL:  # else nohup has it ignored
+            signal.signal(number, signal.default_int_handler)
+    show = sys.unraisablehook
+
+    def interrupt_again(lost: sys.UnraisableHookArgs) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            # In a callback, as of a weak reference, Python drops it; at once it would be here, too.
+            signal.signal(signal.SIGALRM, signal.default_int_handler)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        else:
+            show(lost)
+
+    sys.unraisablehook = interrupt_again
 
 
 @contextmanager

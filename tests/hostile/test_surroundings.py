@@ -160,6 +160,31 @@ def test_a_run_that_is_ended_by_a_signal_leaves_nothing(here: Path, number: int)
     assert list(here.iterdir()) == []
 
 
+def test_a_signal_that_comes_where_exceptions_are_lost_comes_again() -> None:
+    """As in the callback of a weak reference, in one of some ten runs."""
+    script = (
+        "import signal, time, weakref\nimport recon.cli as cli\n"
+        "class Thing: pass\n"
+        "def gone(_):\n"
+        "    signal.raise_signal(signal.SIGINT)\n"
+        "    for _ in range(9): pass\n"
+        "def app():\n"
+        "    thing = Thing()\n"
+        "    weak = weakref.ref(thing, gone)\n"
+        "    del thing\n"
+        "    print('lost', flush=True)\n"
+        "    time.sleep(600)\n"
+        "cli.app = app\ncli.main()\n"
+    )
+    surroundings = os.environ | {"PYTHONPATH": str(Path(recon.__file__).parents[1])}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(
+        command, env=surroundings, capture_output=True, timeout=LONG_S, check=False
+    )
+    assert (done.stdout, done.returncode) == (b"lost\n", -signal.SIGINT)
+    assert b"ignored" not in done.stderr
+
+
 def test_a_damaged_record_is_named_by_the_map_that_it_is_copied_from(here: Path) -> None:
     with Store.create(here / "damaged") as store, Store.create(here / "new") as new:
         store.put("kind", 0, {"a": 1})
