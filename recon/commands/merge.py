@@ -11,7 +11,7 @@ from recon.commands.config import ReconConfig, run_settings
 from recon.commands.joined import copied, joined_settings, make_joined
 from recon.commands.map import map_whole
 from recon.commands.map_options import MapOptions
-from recon.core.errors import SettingsError
+from recon.core.errors import FormatError, SettingsError
 from recon.io.files import resolved
 from recon.map.drive.refuse_empty import check_map
 from recon.map.sessions.copying import copy_sessions
@@ -128,7 +128,10 @@ def _mapped(
         check_map(mapped, source.name)
         kept = run.state("kept.recon")
         keep_map(drive, kept)
-    return copied(kept, map_, settings)
+    try:
+        return copied(kept, map_, settings)
+    except (FormatError, SettingsError) as error:  # not the file, which does not stay
+        raise error.but(where=source.name) from error
 
 
 def _refuse_twice(folders: Sequence[Path]) -> None:

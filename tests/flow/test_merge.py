@@ -19,6 +19,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_map_into, run_merge, run_remove
 from recon.commands.occupancy import run_occupancy
+from recon.core.errors import FormatError
 from recon.io.trajectory import read_trajectory
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.sessions.measured import Survey
@@ -162,6 +163,13 @@ def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) 
     assert content(run.parent) == before
     run_map_into(run, short, None, OPTIONS)  # and it can be tried again
     assert len(summary_of(run)["sessions"]) == 2
+
+
+def test_a_drive_that_the_run_has_already_is_named(run: Path) -> None:
+    before = content(run.parent)
+    with pytest.raises(FormatError, match=r"^film 0 to 10: the map has this"):
+        run_map_into(run, part(0), None, OPTIONS)
+    assert content(run.parent) == before
 
 
 def _refused(*arguments: object) -> str:
