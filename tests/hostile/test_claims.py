@@ -108,7 +108,9 @@ ROWS: Final = {"frames": 10**6, "rays": 10**7, "keyframe": 2 * 10**6, "submap": 
 def test_a_record_of_very_many_rows_is_refused(kind: str, neighbours: str, map_file: Path) -> None:
     changed(map_file, kind, many(ROWS[kind]))
     if neighbours == "forged":
-        changed(map_file, "submap_entry", lambda entry: {**entry, "voxels": 10**9, "cells": 10**9})
+        if kind != "keyframe":  # before which a forged entry is noticed
+            forged = {"voxels": 10**9, "cells": 10**9}
+            changed(map_file, "submap_entry", lambda entry: {**entry, **forged})
         camera = RectifiedCamera(1e5, 5e4, 5e4, 5e4, 0.5, 100_000, 100_000).__dict__
         changed(map_file, "axes", lambda axes: {**axes, "camera": camera})
     with little_memory():

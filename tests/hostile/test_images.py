@@ -97,7 +97,9 @@ def test_more_pixels_are_read_if_the_settings_allow_them(pair: tuple[Path, Path]
 
 
 def test_the_memory_limit_bounds_the_pixels(pair: tuple[Path, Path]) -> None:
-    small = ("--set", "memory.limit_mb=0.02")
+    for path in pair:
+        write_image(path, np.zeros((250, 250), np.uint8))
+    small = ("--set", "memory.limit_mb=1")
     assert_refused(run("disparity", *pair, *small, "--out", "out"), "left.png", "pixels")
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from recon.export.products import write_products
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import ReconError, SettingsError
+from recon.export.make import make
+from recon.export.product import Order
 from recon.map.drive.sequence import map_sequence
 from recon.map.settings import DriveSettings
 from recon.run.run import Run
@@ -46,7 +47,8 @@ def little_memory() -> Iterator[None]:
 def _map(source: SyntheticSource, overrides: list[str], out: Path) -> None:
     config = load_config(None, overrides)
     with Run("map", out, config) as run:
-        write_products(map_sequence(source, config), run)
+        mapped = map_sequence(source, config)
+        make(Order(mapped.map, mapped.placed, run, config.mesh), ("cloud", "octomap", "grid"))
 
 
 def _overrides(number: Number, value: float) -> list[str]:

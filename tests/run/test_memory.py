@@ -99,8 +99,9 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same() -> 
     assert maps[1].edge_cells < maps[0].edge_cells
     whole, cut = (join_clouds(tile.cloud for tile in tiles) for tiles in maps)
     assert len(whole) == len(cut) > 1000
-    order, other = np.lexsort(whole.xyz.T.round(3)), np.lexsort(cut.xyz.T.round(3))
-    # Sums of single precision in another order.
+    voxel_m = free.fusion.voxel_m
+    order, other = (np.lexsort(np.floor(cloud.xyz / voxel_m).T) for cloud in (whole, cut))
+    # Sums of single precision in another order, and rounded.
     np.testing.assert_allclose(whole.xyz[order], cut.xyz[other], atol=2e-5)
     whole_voxels, cut_voxels = (
         join_voxels((tile.voxels for tile in tiles), tiles.resolution_m) for tiles in maps

@@ -69,7 +69,7 @@ def test_every_layout_pairs_each_left_image_with_the_right_one_of_later(
     assert [shown(pair) for pair in found] == [(k, k + shift) for k in kept]
     assert [pair.timestamp_s for pair in found] == [times[k] for k in kept]
     assert [shown(pair) for pair in source.frames(3)] == [(k, k + shift) for k in kept[3:]]
-    assert f"right images {shift:+d} frames later" in source.description
+    assert f"right images {shift:+d} frame" in source.description
     assert isinstance(source, IncompleteSource)
     assert source.lines(FRAMES) == kept
     assert source.left_out == 0

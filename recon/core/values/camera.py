@@ -212,7 +212,7 @@ def _check_view(
     for f, c, n in zip(focal_px, centre_px, size_px, strict=True):
         if f <= 0:
             raise CalibrationError("focal length is not positive", got=f"{f:g} px")
-        if not _FOCAL_SIZES[0] <= f / max(size_px) <= _FOCAL_SIZES[1]:
+        if not _FOCAL_SIZES[0] * min(size_px) <= f <= _FOCAL_SIZES[1] * max(size_px):
             got = f"{f:g} px for images of {size} pixels"
             raise CalibrationError("focal length is implausible", got=got)
         if abs(c / n - 0.5) > _MOST_SIZES:
