@@ -28,6 +28,7 @@ from tests.scenery.patience import be_patient
 
 MODE, LAST = sys.argv[1], int(sys.argv[2])
 SIGNALS = {"interrupt": signal.SIGINT, "terminate": signal.SIGTERM}
+signal.signal(signal.SIGINT, signal.default_int_handler)  # perhaps ignored, in the background
 _replace, _fsync, _commit = Path.replace, os.fsync, Store.commit
 _writes = 0
 
