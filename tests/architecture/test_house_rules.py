@@ -13,20 +13,6 @@ NO_NAMES = {"utils", "common", "helpers", "misc"}
 MAX_LINES = 400
 TEXT = {"", ".py", ".md", ".toml", ".txt", ".sh", ".yaml", ".yml", ".html", ".js", ".css"}
 OURS = ("recon", "tests", "docs", "examples", "benchmarks", "scripts", ".ci")
-VERBS = """
-Accept Add Adjust Align Apply Ask Average Back-project Begin Blur Bring Build Calibrate Chain
-Check Choose Close Collapse Colour Compare Compile Complete Compute Concatenate Continue Convert
-Copy Correct Count Cover Cut Decode Decorate Delete Describe Do Download Draw Drop Encode End
-Estimate Exchange Expand Explain Fetch Fill Find Fit Fix Flatten Flush Follow Forget Give Go
-Grab Group Hand Hold Ignore Import Include Insert Integrate Join Keep Kill Label Lay Leave Lend
-Let Limit List Load Locate Lock Look Make Map Mark Match Measure Mesh Minimise Move Name Note
-Open Optimise Orient Pair Parse Place Pool Precompute Prepare Print Project Put Raise Read
-Rebuild Receive Recognise Reconstruct Record Rectify Reduce Refine Refuse Register Reject
-Release Remove Render Reorder Repeat Replace Resample Restore Resume Return Rotate Run Sample
-Save Say Scale Score Search See Send Set Shear Show Solve Sort Split Start Stop Store Suggest
-Sum Take Tell Thin Tilt Time Trace Track Transform Turn Unpack Update Use View Wait Walk Warm
-Watch Weigh Weight Work Write Yield Zoom
-"""
 MACHINE_PATH = re.compile(r"(?<![\w.])/(home|root|work|Users|opt|mnt)/\w")
 
 
@@ -52,22 +38,6 @@ def test_every_module_says_what_it_is(trees: dict[Path, ast.Module]) -> None:
     silent = [str(path) for path, tree in trees.items() if not ast.get_docstring(tree)]
 
     assert silent == []
-
-
-def test_the_docstring_of_a_function_begins_with_its_verb(
-    functions: list[tuple[Path, ast.FunctionDef]], root: Path
-) -> None:
-    """Properties are values, and kernels say what they give in the terms of their arrays."""
-    verbs = set(VERBS.split())
-    others = [
-        f"{path.relative_to(root)}:{node.lineno} {node.name}: {docstring.splitlines()[0]}"
-        for path, node in functions
-        if (docstring := ast.get_docstring(node))
-        and not any("property" in ast.unparse(mark) for mark in node.decorator_list)
-        and docstring.split()[0].strip(".,:;") not in verbs
-    ]
-
-    assert others == []
 
 
 def test_no_package_or_module_is_a_drawer_for_everything(trees: dict[Path, ast.Module]) -> None:
