@@ -34,8 +34,8 @@ from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.images.image import write_image
 from recon.io.trajectory import read_kitti_poses, write_kitti_poses
 from recon.map.drive.sequence import map_sequence
-from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
+from recon.sources.source import StereoSource
 
 NOISE_DN = 4.0
 EXPOSURE_SHARE = 0.15

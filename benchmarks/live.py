@@ -40,8 +40,8 @@ from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
 from recon.run.machine import available_cores
 from recon.run.threads import serial_algebra
-from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
+from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 SAME_TIME_S = 0.01

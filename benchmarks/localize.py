@@ -41,8 +41,8 @@ from recon.odometry.icp_points import select_points
 from recon.odometry.protocol import OdometryFrame
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.known_places import KnownPlaces, KnownView
-from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
+from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 WRONG_M = 0.5

@@ -53,10 +53,10 @@ from recon.map.drive.sequence import map_sequence as map_sequence
 from recon.map.sessions.measured import Survey as Survey
 from recon.map.store.map import Map as Map
 from recon.rig.audit.audit import Audit as Audit
-from recon.sources.pair_input import PairInput as PairInput
-from recon.sources.protocol import StereoSource as StereoSource
+from recon.sources.one_pair import PairInput as PairInput
 from recon.sources.registry import open_source as open_source
 from recon.sources.settings import SourceSettings as SourceSettings
+from recon.sources.source import StereoSource as StereoSource
 from recon.sources.synthetic import SyntheticSource as SyntheticSource
 from recon.stereo.match.protocol import Matcher as Matcher
 

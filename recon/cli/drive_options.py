@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from recon.commands.map_options import MapOptions, MapRequest
     from recon.map.localize.sequence import StartPose
     from recon.run.batch.cluster import BatchOptions
-    from recon.sources.protocol import StereoSource
+    from recon.sources.source import StereoSource
 
 Start = Annotated[int | None, typer.Option("--start", help="First frame to use.", show_default="0")]
 StartInMap = Annotated[

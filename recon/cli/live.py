@@ -14,7 +14,7 @@ from recon.cli.drive_options import DriveOptions, StartInMap, announced, open_dr
 from recon.cli.interrupt import until_interrupted
 
 if TYPE_CHECKING:
-    from recon.sources.protocol import StereoSource
+    from recon.sources.source import StereoSource
 
 
 @opt.takes_groups

@@ -62,7 +62,7 @@ def pair(
     with shared.one_line_errors():
         from recon.cli.overrides import pair_config
         from recon.commands.pair import run_pair
-        from recon.sources.pair_input import read_pair_input, with_truth
+        from recon.sources.one_pair import read_pair_input, with_truth
 
         changes = [*shared.changes, *known.numbers]
         settings = pair_config(shared.config, changes, matcher, ndisp)
@@ -110,7 +110,7 @@ def disparity(
     with shared.one_line_errors():
         from recon.cli.overrides import pair_config
         from recon.commands.pair import run_disparity
-        from recon.sources.pair_input import read_pair_input
+        from recon.sources.one_pair import read_pair_input
 
         settings = pair_config(shared.config, shared.changes, matcher, ndisp)
         given = read_pair_input(

@@ -11,7 +11,7 @@ from recon.io.files import StrPath
 from recon.report.audit_page import write_audit_page
 from recon.rig.audit.audit import Audit, audit_source, correct_calibration
 from recon.run.run import Run
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.match.registry import make_matcher
 
 

@@ -24,7 +24,7 @@ from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
 from recon.run.run import Run
 from recon.run.threads import serial_algebra
-from recon.sources.image_pairs import ImagePairs, pair_images
+from recon.sources.image_names import ImagePairs, pair_images
 
 
 def run_calibrate(

@@ -8,8 +8,15 @@ from typing import Any, Final
 
 from recon.core.errors import FormatError
 from recon.run.progress import SILENT, Progress
-from recon.sources.datasets import Part, datasets, find_parts, parts_of
-from recon.sources.fetching import fetch_part, is_fetched, verify_part
+from recon.sources.datasets import (
+    Part,
+    datasets,
+    fetch_part,
+    find_parts,
+    is_fetched,
+    parts_of,
+    verify_part,
+)
 
 FOLDER: Final = Path("datasets")
 

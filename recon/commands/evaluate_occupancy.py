@@ -19,7 +19,7 @@ from recon.io.occupancy.octomap import read_octomap
 from recon.report.colour import colour_grid_errors
 from recon.run.directory import recorded_files
 from recon.run.finished import GRID, OCTOMAP, FinishedRun, open_run
-from recon.sources.protocol import KnowsOccupancy
+from recon.sources.source import KnowsOccupancy
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from recon.map.store.map import Map
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.fingerprint import fingerprint
 from recon.run.machine import versions
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 _OTHER: Final = {
     "config": "other settings",

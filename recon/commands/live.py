@@ -20,7 +20,7 @@ from recon.map.localize.sequence import StartPose, localize_sequence
 from recon.map.store.map import Map
 from recon.rig.cameras import CameraSource
 from recon.sources.live import LiveSource
-from recon.sources.protocol import DerivedSource, StereoSource
+from recon.sources.source import DerivedSource, StereoSource
 
 _SLOWEST: Final = 1e-3
 _FIRST: Final = 3

@@ -17,7 +17,7 @@ from recon.map.store.map import MAP_FILE, Map
 from recon.report.localize_page import write_localize_page
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 
 def run_localize(

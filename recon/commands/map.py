@@ -16,8 +16,7 @@ from recon.export.map_run import MapRun
 from recon.export.product import Order
 from recon.export.trajectories import export_paths
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.refuse_empty import check_map
-from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.sequence import MappedSequence, check_map, map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.store.keep_map import keep_map
 from recon.map.store.map import MAP_FILE, Map
@@ -27,7 +26,7 @@ from recon.rig.audit.audit import quick_warnings
 from recon.run.run import Run
 from recon.run.summary import plain
 from recon.sources.live import LiveSource
-from recon.sources.protocol import IncompleteSource, StereoSource
+from recon.sources.source import IncompleteSource, StereoSource
 
 
 def run_map(

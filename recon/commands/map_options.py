@@ -19,8 +19,8 @@ from recon.run.batch.cluster import BatchOptions
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 from recon.sources.prior import read_prior
-from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
+from recon.sources.source import StereoSource
 
 
 @dataclass(frozen=True)

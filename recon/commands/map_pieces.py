@@ -22,7 +22,7 @@ from recon.map.store.map import Map
 from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.run.batch.results import JobResult, work_off
 from recon.run.run import Run
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 _PLAN: Final = "pieces.json"
 

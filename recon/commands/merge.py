@@ -13,14 +13,14 @@ from recon.commands.map import map_whole
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, SettingsError
 from recon.io.files import resolved
-from recon.map.drive.refuse_empty import check_map
+from recon.map.drive.sequence import check_map
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.measured import Survey
 from recon.map.store.keep_map import keep_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.run.finished import open_run, refuse_as_target
 from recon.run.run import Run
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 
 def run_merge(

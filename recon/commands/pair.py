@@ -11,13 +11,13 @@ from recon.evaluation.disparity import evaluate_disparity
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.files import StrPath
 from recon.io.models.mesh import check_mesh_formats
-from recon.map.drive.refuse_empty import check_cloud
+from recon.map.drive.sequence import check_cloud
 from recon.report.pair_page import write_disparity_images, write_pair_page
 from recon.rig.audit.pair_checks import check_found, find_pair_faults
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 from recon.run.summary import plain
-from recon.sources.pair_input import PairInput
+from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.pair_run import PairRun, cloud_figures, disparity_figures
 

@@ -17,7 +17,7 @@ from recon.rig.rectification import (
 )
 from recon.run.run import Run
 from recon.run.threads import serial_algebra
-from recon.sources.image_pairs import ImagePairs, pair_images
+from recon.sources.image_names import ImagePairs, pair_images
 from recon.sources.one_pair import read_pair
 
 _WARN_ROW_PX: Final = 0.5

@@ -19,7 +19,7 @@ from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.memory import memory_overrides
 from recon.run.run import Run
 from recon.sources.live import LiveSource
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 

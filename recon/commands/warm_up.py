@@ -23,7 +23,7 @@ from recon.io.occupancy.octomap import read_octomap
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
-from recon.sources.pair_input import PairInput
+from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.match.registry import MATCHERS
 

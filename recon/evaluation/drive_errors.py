@@ -22,7 +22,7 @@ from recon.evaluation.trajectory import evaluate_trajectory
 from recon.map.drive.sequence import MappedSequence
 from recon.map.ground.grid import drop_undecided
 from recon.map.settings import DriveSettings
-from recon.sources.protocol import KnowsOccupancy, StereoSource
+from recon.sources.source import KnowsOccupancy, StereoSource
 
 SURFACE_THRESHOLD_M: Final = 0.2
 """Distance to the true surface below which a map point counts as correct."""

@@ -18,7 +18,7 @@ from recon.report.style import ESTIMATE, INK, WIDE_IN, bare_figure, show_image, 
 from recon.rig.audit.audit import Audit
 from recon.rig.audit.sample import Look
 from recon.run.directory import RunDirectory
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
 
 # Row errors are drawn this much longer than they are, since a pixel is invisible in a page. The

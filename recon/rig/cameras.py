@@ -19,8 +19,8 @@ from recon.rig.capture import (
 )
 from recon.sources.calibration import CALIBRATE, read_rig
 from recon.sources.opencv_camera import Camera
-from recon.sources.protocol import source_text
 from recon.sources.settings import SourceSettings
+from recon.sources.source import source_text
 
 
 class CameraSource:

@@ -21,7 +21,7 @@ from recon.io.yaml_file import write_yaml
 from recon.rig.uncalibrated.rectify import UncalibratedRectification, rectify_images
 from recon.run.directory import RunDirectory
 from recon.run.summary import plain
-from recon.sources.image_pairs import ImagePairs
+from recon.sources.image_names import ImagePairs
 from recon.sources.one_pair import read_pair
 from recon.stereo.rectify.epipolar import epipolar_curves, epipolar_lines
 from recon.stereo.rectify.features import match_exactly

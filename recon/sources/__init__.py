@@ -1,10 +1,10 @@
 """Sources of stereo pairs: one module per kind of input.
 
-- `protocol.py`: what every source gives; `registry.py`: how the kind of a path is recognised;
-- `kitti.py`, `euroc.py`, `tum.py`, `folders.py`, `video.py`, `bag.py`: one kind each;
-- `images.py`: drives in image files, which `image_names.py` and `stamps.py` pair;
-- `frame_list.py`: which frames are pairs, and which of them are used; `times.py`, `calibration.py`;
-- `part.py`, `live.py`: a part of a drive, and a drive that arrives in its own time;
-- `one_pair.py`, `pair_input.py`: a single pair; `image_pairs.py`: images of two cameras by name;
-- `datasets.py`, `fetching.py`: public data sets and how they are fetched.
+- `source.py`: the base class of every source, and a part of one; `registry.py`: the kinds;
+- `kitti.py`, `listed.py` (EuRoC, TUM), `folders.py`, `video.py`, `bag.py`, `one_pair.py`,
+  `synthetic.py`: one kind each, or two alike;
+- `images.py`: drives in image files, which `image_names.py` and `times.py` pair;
+- `frame_list.py`: which frames are pairs, and which of them are used; `calibration.py`;
+- `live.py`: a drive that arrives in its own time; `opencv_camera.py`; `prior.py`;
+- `datasets.py`: public data sets and how they are fetched.
 """

@@ -39,8 +39,12 @@ from recon.sources.images import (
     pair_named,
 )
 from recon.sources.settings import SourceSettings
-from recon.sources.stamps import check_increasing, stamps_of_names
-from recon.sources.times import read_times_of_pairs, read_tum_truth
+from recon.sources.times import (
+    check_increasing,
+    read_times_of_pairs,
+    read_tum_truth,
+    stamps_of_names,
+)
 
 DEFAULT_RATE_HZ: Final = 10.0
 _TIMES: Final = "times.txt"

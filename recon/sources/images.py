@@ -19,13 +19,11 @@ from recon.core.values import (
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
 from recon.sources.frame_list import FrameList, check_most, pair_frames
-from recon.sources.image_names import natural_key
+from recon.sources.image_names import IMAGES, natural_key
 from recon.sources.one_pair import join_pair
-from recon.sources.protocol import Recording
 from recon.sources.settings import SourceSettings
-from recon.sources.stamps import pair_stamps, pairs_in_time
-
-IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+from recon.sources.source import Recording
+from recon.sources.times import pair_stamps, pairs_in_time
 
 _WHITE_SAMPLE: Final = 8
 """Frames, spread over a drive of 16-bit images, that its white is taken from."""

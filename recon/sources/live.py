@@ -15,7 +15,7 @@ from recon.core.errors import SourceError
 from recon.core.values import StereoPair
 from recon.core.words import counted
 from recon.run.progress import Progress, Step
-from recon.sources.protocol import DerivedSource, StereoSource
+from recon.sources.source import DerivedSource, StereoSource
 
 _WAITING: Final = 1
 """Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always

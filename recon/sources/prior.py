@@ -15,10 +15,9 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
 from recon.io.trajectory import read_tum
-from recon.sources.bag import BagSource
-from recon.sources.bag_topics import list_topics
-from recon.sources.protocol import StereoSource
+from recon.sources.bag import BagSource, list_topics
 from recon.sources.rosbags import POSES, TRANSFORMS, Bag, BagPose
+from recon.sources.source import StereoSource
 
 _STATIC: Final = "tf_static"
 _ODOMETRY: Final = "odom"

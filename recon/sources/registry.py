@@ -12,14 +12,12 @@ from recon.io.frames_csv import FRAMES
 from recon.io.images.video import VIDEOS
 from recon.io.middlebury.layout import find_layout
 from recon.sources.bag import BAGS, find_bags, open_bag
-from recon.sources.euroc import open_euroc
 from recon.sources.folders import find_views, open_folders
-from recon.sources.kitti import open_kitti
-from recon.sources.kitti_raw import open_kitti_raw
+from recon.sources.kitti import open_kitti, open_kitti_raw
+from recon.sources.listed import list_files, open_euroc, open_tum
 from recon.sources.one_pair import open_middlebury
-from recon.sources.protocol import StereoSource
 from recon.sources.settings import SourceSettings
-from recon.sources.tum import list_files, open_tum
+from recon.sources.source import StereoSource
 from recon.sources.video import list_videos, open_video_source
 
 SOURCES: Final[dict[str, Callable[[Path, SourceSettings], StereoSource]]] = {

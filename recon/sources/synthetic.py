@@ -15,7 +15,7 @@ from recon.core.values import (
     Trajectory,
 )
 from recon.core.values.arrays import Float64
-from recon.sources.protocol import source_text
+from recon.sources.source import source_text
 from recon.street.render import StreetCamera, SyntheticFrame
 from recon.street.settings import StreetSettings
 from recon.street.street import StreetWorld, build_street

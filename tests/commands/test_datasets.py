@@ -16,8 +16,7 @@ from recon.commands.datasets import run_fetch, run_list, run_verify
 from recon.core.errors import DownloadError, FormatError, OutputError, SettingsError
 from recon.core.values import RectifiedCamera
 from recon.io import download
-from recon.sources.datasets import datasets, find_parts, parts_of
-from recon.sources.fetching import RECORD
+from recon.sources.datasets import RECORD, datasets, find_parts, parts_of
 from recon.sources.registry import open_source, recognise_source
 from tests.flow.test_paper import write_scene
 from tests.hostile.refusals import assert_refused, run

@@ -15,7 +15,7 @@ from recon.commands.pair import run_pair
 from recon.core.errors import CalibrationError, ReconError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.images.image import write_image
-from recon.sources.pair_input import PairInput, read_pair_input
+from recon.sources.one_pair import PairInput, read_pair_input
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from tests.sources.test_chosen_frames import ALL

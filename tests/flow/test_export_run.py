@@ -22,7 +22,7 @@ from recon.io.occupancy.nav2 import read_nav2
 from recon.io.trajectory import read_tum
 from recon.map.store.records import Store
 from recon.run.batch.cluster import BatchOptions, Cluster
-from recon.sources.pair_input import PairInput
+from recon.sources.one_pair import PairInput
 from tests.hostile.refusals import assert_refused, run
 
 

@@ -17,7 +17,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.values import SequenceTruth, StereoPair
 from recon.export.map_run import MapRun
 from recon.io.trajectory import read_tum
-from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.mapper import FrameResult
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

@@ -25,8 +25,7 @@ from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.sessions.measured import Survey
 from recon.map.store.map import Map
 from recon.run.finished import open_run
-from recon.sources.part import SourcePart
-from recon.sources.protocol import StereoSource
+from recon.sources.source import SourcePart, StereoSource
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film
 

@@ -23,7 +23,7 @@ from recon.io.trajectory import read_tum
 from recon.map.store.map import MAP_FILE, Map
 from recon.map.store.records import Store
 from recon.sources.kitti import open_kitti
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 from tests.flow.rooms import RoomSource
 
 FOOTPRINT_M = 0.3

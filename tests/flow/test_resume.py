@@ -15,7 +15,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.export.map_run import MapRun
-from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.mapper import FrameResult
 from recon.map.store.map import Map
 from recon.map.store.records import Store
 from recon.run.progress import SILENT, Silent

@@ -10,7 +10,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapRequest
-from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.mapper import FrameResult
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene

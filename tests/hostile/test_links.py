@@ -20,7 +20,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError
 from recon.io.atomic import check_targets
 from recon.io.files import resolved
-from recon.sources.fetching import RECORD
+from recon.sources.datasets import RECORD
 from tests.hostile.refusals import assert_refused, refusal, run
 from tests.hostile.runs import DRIVE
 

@@ -11,7 +11,7 @@ import pytest
 
 from recon.sources.image_names import natural_key
 from recon.sources.registry import open_source
-from recon.sources.stamps import stamp_of_name
+from recon.sources.times import stamp_of_name
 from tests.hostile.refusals import assert_refused, refusal, run
 
 # The first match may have to compile.

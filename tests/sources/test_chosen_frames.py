@@ -15,9 +15,9 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import RectifiedCamera, StereoPair, Trajectory
 from recon.io.images.image import write_image
 from recon.map.drive.sequence import map_sequence
-from recon.sources.protocol import IncompleteSource, StampedSource
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
+from recon.sources.source import IncompleteSource, StampedSource
 from tests.sources import drives
 from tests.sources.test_stray_frames import LAYOUTS, images
 

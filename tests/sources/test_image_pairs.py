@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import SourceError
-from recon.sources.image_pairs import find_images, pair_images
+from recon.sources.image_names import find_images, pair_images
 
 
 def touch(folder: Path, *names: str) -> None:

@@ -10,8 +10,8 @@ from recon.core.errors import CalibrationError, FormatError, ReconError, SourceE
 from recon.io.images.image import write_image
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.kitti import open_kitti
-from recon.sources.protocol import StereoSource
 from recon.sources.settings import SourceSettings
+from recon.sources.source import StereoSource
 
 CALIB = {
     0: "700 0 16 0 0 700 8 0 0 0 1 0",

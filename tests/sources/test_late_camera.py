@@ -15,9 +15,9 @@ from recon.map.drive.sequence import map_sequence
 from recon.rig.audit.audit import audit_source
 from recon.rig.cameras import open_camera_source
 from recon.rig.capture import CaptureSettings
-from recon.sources.protocol import IncompleteSource
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
+from recon.sources.source import IncompleteSource
 from tests.sources import drives
 from tests.sources.test_chosen_frames import ALL, CAMERA, FRAMES
 from tests.sources.test_stray_frames import LAYOUTS, images

@@ -15,12 +15,12 @@ from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibrati
 from recon.io.cameras.kalibr import write_kalibr
 from recon.io.images.image import write_image
 from recon.io.images.ros_image import pixels_of_ros_image
-from recon.sources.bag_topics import rig_of_messages
+from recon.sources.bag import rig_of_messages
 from recon.sources.image_names import find_partners, natural_key
 from recon.sources.registry import open_source
 from recon.sources.rosbags import BagCameraInfo
 from recon.sources.settings import SourceSettings
-from recon.sources.stamps import pair_stamps, stamp_of_name
+from recon.sources.times import pair_stamps, stamp_of_name
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)

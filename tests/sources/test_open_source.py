@@ -7,10 +7,9 @@ import pytest
 
 from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.io.images.image import write_image
-from recon.sources.one_pair import read_pair
-from recon.sources.pair_input import read_pair_input
-from recon.sources.protocol import StereoSource
+from recon.sources.one_pair import read_pair, read_pair_input
 from recon.sources.registry import open_source, recognise_source
+from recon.sources.source import StereoSource
 
 KITTI = "P0: 700 0 16 0 0 700 8 0 0 0 1 0\nP1: 700 0 16 -350 0 700 8 0 0 0 1 0\n"
 MIDDLEBURY = (

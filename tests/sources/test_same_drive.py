@@ -12,8 +12,8 @@ from recon.commands.config import load_config
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.core.values.arrays import Float64
 from recon.map.drive.sequence import Workspace, map_sequence
-from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source, recognise_source
+from recon.sources.source import StereoSource
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")

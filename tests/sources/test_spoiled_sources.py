@@ -12,9 +12,9 @@ from recon.core.errors import ReconError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.images.image import write_image
 from recon.io.images.video import VideoFile
-from recon.sources.protocol import IncompleteSource
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
+from recon.sources.source import IncompleteSource
 from recon.sources.video import view_size
 from tests.hostile.refusals import assert_refused, run
 from tests.sources import drives

@@ -12,8 +12,8 @@ from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.frames_csv import FRAMES, CapturedFrame
 from recon.io.images.image import write_image
-from recon.sources.protocol import IncompleteSource, StampedSource
 from recon.sources.registry import open_source
+from recon.sources.source import IncompleteSource, StampedSource
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)

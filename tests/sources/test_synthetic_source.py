@@ -8,8 +8,7 @@ import pytest
 
 from recon.core.errors import OutputError
 from recon.sources.kitti import open_kitti
-from recon.sources.part import SourcePart
-from recon.sources.protocol import StereoSource
+from recon.sources.source import SourcePart, StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti

@@ -10,9 +10,9 @@ import pytest
 from recon.core.errors import FormatError, SourceError
 from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
-from recon.sources.protocol import StampedSource
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
+from recon.sources.source import StampedSource
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import TextIO
 
 from recon.core.words import counted
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 
 def announce(

@@ -10,17 +10,15 @@ from typing import Any, Final
 from recon.core.errors import RegistrationError
 from recon.core.values import RectifiedPair, Trajectory
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
-from recon.map.drive.frame_result import FrameResult
 from recon.map.drive.map_behind import Registered, poses_first
-from recon.map.drive.mapper import Mapper
+from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.drive.workspace import Workspace, resuming
 from recon.map.occupancy.rays import thin_rays
 from recon.map.settings import DriveSettings
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.lookahead import look_ahead
 from recon.sources.live import LiveSource
-from recon.sources.part import SourcePart
-from recon.sources.protocol import StereoSource
+from recon.sources.source import SourcePart, StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
 _COMMIT_S: Final = 3.0

@@ -18,7 +18,7 @@ from recon.odometry.prior_axes import find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame
 from recon.odometry.registry import make_odometry
 from recon.odometry.settings import PriorSettings
-from recon.sources.protocol import IncompleteSource, StampedSource, StereoSource
+from recon.sources.source import IncompleteSource, StampedSource, StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 _KNOWN: Final = PriorSettings(sigma_share=0.01)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.values import RectifiedPair
-from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.mapper import FrameResult
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.threads import work_in_background
 from recon.sources.live import LiveSource

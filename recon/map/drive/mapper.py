@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -11,8 +12,8 @@ import numpy as np
 from recon.core.errors import FormatError
 from recon.core.geometry.axes import transform_cloud
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
-from recon.core.values.arrays import Float64
-from recon.map.drive.frame_result import FrameResult
+from recon.core.values.arrays import Float64, freeze
+from recon.core.words import counted
 from recon.map.fusion.builder import fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.occupancy.rays import ray_grain, thin_rays
@@ -161,3 +162,60 @@ class Mapper:
             self.session.T_map_world,
             config.memory.submap_bytes,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """Result of one frame; a `Step` of the progress of a run.
+
+    Attributes:
+        index: Position in the run, from 0.
+        total: Number of frames in the run.
+        seconds: Time since the previous frame was done.
+        valid_share: Share of pixels with a disparity, in [0, 1].
+        points: Number of points in the cloud of the frame.
+        T_world_camera: float64 (4, 4), its pose.
+        health: Health of that pose.
+    """
+
+    index: int
+    total: int
+    seconds: float
+    valid_share: float
+    points: int
+    T_world_camera: Float64
+    health: OdometryHealth
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_world_camera", np.float64, (4, 4))
+
+    @property
+    def ok(self) -> bool:
+        """Whether the pose is trusted."""
+        return self.health.ok
+
+    @property
+    def event(self) -> dict[str, Any]:
+        """The frame for programs; what is NaN is None."""
+        return {
+            "event": "frame",
+            "index": self.index,
+            "total": self.total,
+            "seconds": round(self.seconds, 4),
+            "valid_share": _finite(self.valid_share),
+            "points": self.points,
+            "position_m": [_finite(x) for x in self.T_world_camera[:3, 3].tolist()],
+            "measured": self.health.ok,
+            "inliers": self.health.inliers,
+            "notes": list(self.health.notes),
+        }
+
+    @property
+    def state(self) -> str:
+        """The frame for people: share of valid pixels, and whether the pose is trusted."""
+        pose = counted(self.health.inliers, "inlier") if self.ok else "pose not trusted"
+        return f"{100 * self.valid_share:.0f} % valid, {pose}"
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None

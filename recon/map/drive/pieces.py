@@ -29,8 +29,7 @@ from recon.map.store.session import Session
 from recon.map.submaps import Submap
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.drift import path_lengths
-from recon.sources.part import SourcePart
-from recon.sources.protocol import StereoSource
+from recon.sources.source import SourcePart, StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 LEAD: Final = 20

@@ -15,7 +15,7 @@ from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
 from recon.run.machine import versions
 from recon.run.stopwatch import Stopwatch
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 ANEW: Final = "start the run anew, without --resume"
 

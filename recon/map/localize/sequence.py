@@ -24,7 +24,7 @@ from recon.run.lookahead import look_ahead
 from recon.run.progress import SILENT, Progress
 from recon.run.threads import serial_algebra
 from recon.sources.live import LiveSource
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 START_WITHIN_M: Final = 10.0

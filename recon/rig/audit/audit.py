@@ -33,7 +33,7 @@ from recon.rig.audit.sample import Look, Sample, take_sample
 from recon.rig.audit.seen_motion import SeenMotion, measure_turn, turn_figures
 from recon.rig.audit.settings import AuditedSettings
 from recon.run.summary import plain
-from recon.sources.protocol import IncompleteSource, StereoSource
+from recon.sources.source import IncompleteSource, StereoSource
 from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.rectify.rectifier import Rectifier, plan_turns

@@ -15,7 +15,7 @@ from recon.rig.audit.measures import Gaps
 from recon.rig.audit.right_turn import RightTurn
 from recon.rig.audit.sample import BLANK_DN, Sample
 from recon.rig.audit.seen_motion import turn_figures
-from recon.sources.protocol import IncompleteSource, StereoSource
+from recon.sources.source import IncompleteSource, StereoSource
 from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]

@@ -12,7 +12,7 @@ import numpy as np
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.odometry.pnp import find_consensus, fit_pose
-from recon.sources.protocol import StampedSource, StereoSource
+from recon.sources.source import StampedSource, StereoSource
 
 # Half of the pixels around a corner may be saturated before their median is.
 _AROUND_PX: Final = 9

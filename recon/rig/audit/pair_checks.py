@@ -11,8 +11,7 @@ from recon.core.values import Disparity, StereoPair
 from recon.rig.audit.audit import audit_source
 from recon.rig.audit.findings import Finding
 from recon.rig.audit.settings import AuditedSettings
-from recon.sources.one_pair import OnePair
-from recon.sources.pair_input import PairInput
+from recon.sources.one_pair import OnePair, PairInput
 
 #: Findings that images alone support, and those that need a calibration. The inspection of the
 #: frame reports swapped cameras and misaligned rows; few features do not matter if the disparity

@@ -21,7 +21,7 @@ from recon.rig.audit.measures import (
 )
 from recon.rig.audit.row_alignment import count_aligned
 from recon.rig.audit.settings import AuditSettings
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.rectify.features import NO_FEATURES, PairFeatures, match_features
 from recon.stereo.rectify.rectifier import Rectifier
 

@@ -30,7 +30,7 @@ from recon.rig.audit.rig_fit import StereoTracks
 from recon.rig.audit.right_turn import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.rig.audit.sample import plan_stretches
 from recon.run.threads import serial_algebra
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 from recon.stereo.settings import StereoSettings

@@ -14,7 +14,7 @@ from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.words import counted
 from recon.io.images.image import write_image
 from recon.io.images.video import VIDEOS, VideoFile
-from recon.sources.image_pairs import ImagePairs
+from recon.sources.image_names import ImagePairs
 from recon.sources.settings import SourceSettings
 from recon.sources.video import frames_of, open_videos, split_views, view_size
 from recon.stereo.rectify.grey import to_grey

@@ -15,7 +15,7 @@ from recon.io.images.image import read_image
 from recon.rig.calibrate.board_size import check_charuco, check_chessboard, grown_size
 from recon.rig.calibrate.bundle import Sighting, View
 from recon.rig.calibrate.detect import find_board, orient_like
-from recon.sources.image_pairs import ImagePairs
+from recon.sources.image_names import ImagePairs
 from recon.stereo.rectify.grey import to_grey
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 
 from recon.core.values.board import CalibrationBoard
 from recon.core.words import counted
-from recon.sources.image_pairs import ImagePairs
+from recon.sources.image_names import ImagePairs
 
 Verdict = Literal["good", "usable", "repeat"]
 Severity = Literal["fatal", "warning", "note"]

@@ -11,14 +11,14 @@ from rich.console import Console
 
 from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
 from recon.evaluation.middlebury.summary import SceneDone
-from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.mapper import FrameResult
 from recon.map.localize.localizer import Located, State
 from recon.map.localize.sequence import LocalizedFrame
 from recon.odometry.protocol import OdometryHealth
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult
 from recon.run.progress import SILENT, Progress, Silent, Step
-from recon.sources.fetching import _Megabyte
+from recon.sources.datasets import _Megabyte
 from tests.run.batch.jobs import job
 
 

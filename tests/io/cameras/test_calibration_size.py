@@ -19,7 +19,7 @@ from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
-from recon.sources.pair_input import read_pair_input
+from recon.sources.one_pair import read_pair_input
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from tests.sources import drives

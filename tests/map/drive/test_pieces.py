@@ -12,7 +12,7 @@ from recon.map.drive.pieces import LEAD, Piece, cut_drive, join_pieces, joined_d
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace, session_info
 from recon.map.store.map import Map
-from recon.sources.part import SourcePart
+from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
 from tests.scenery.film import Film, film
 

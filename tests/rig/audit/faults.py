@@ -19,7 +19,7 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import Float64
-from recon.sources.protocol import StereoSource
+from recon.sources.source import StereoSource
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ from recon.commands.config import load_config
 from recon.core.values import StereoCalibration, StereoPair
 from recon.io.cameras.calibration import read_calibration
 from recon.rig.audit.audit import audit_source, correct_calibration
-from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
+from recon.sources.source import StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.rig.audit import faults

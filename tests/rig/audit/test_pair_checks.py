@@ -17,7 +17,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.export.mesh.view import check_coverage
 from recon.run.progress import Silent
-from recon.sources.pair_input import PairInput
+from recon.sources.one_pair import PairInput
 from recon.stereo.pair_run import PairRun
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -6,7 +6,7 @@ import pytest
 
 from recon.core.values.board import parse_board
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
-from recon.sources.image_pairs import ImagePairs
+from recon.sources.image_names import ImagePairs
 
 PAIRS = ImagePairs((), by_order=False)
 

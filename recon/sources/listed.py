@@ -1,15 +1,12 @@
-"""Drives in the layout of EuRoC (ASL), also used by TUM VI and others.
+"""Drives with lists of images and their times, as in the TUM benchmarks.
 
 ::
 
     folder/
-      mav0/                            (or its content directly)
-        cam0/ cam1/
-          data.csv                     time [ns], file name
-          data/1403636579763555584.png
-          sensor.yaml                  lens, size, T_BS (or a camchain for both cameras)
-        state_groundtruth_estimate0/   optional: ground truth trajectory of the body
-          data.csv
+      left.txt right.txt        time [s] and file, one line per image (or cam0.txt cam1.txt …)
+      left/1305031102.175304.png …
+      groundtruth.txt           optional: t tx ty tz qx qy qz qw of the left camera
+      calib.txt                 or any other supported calibration file
 """
 
 from __future__ import annotations
@@ -26,10 +23,71 @@ from recon.core.values.arrays import Float64
 from recon.io.cameras.euroc import NS, read_euroc_camera, read_euroc_truth
 from recon.io.files import resolved
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
-from recon.sources.images import ImageSource, image_size, pair_listed
+from recon.sources.image_names import find_partners
+from recon.sources.images import ImageSource, image_size, is_image, pair_listed
 from recon.sources.settings import SourceSettings
-from recon.sources.stamps import check_increasing
-from recon.sources.times import read_stamped_names, truth_at
+from recon.sources.times import (
+    check_increasing,
+    check_seconds,
+    read_stamped_names,
+    read_tum_truth,
+    truth_at,
+)
+
+
+def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
+    """Open a drive with two lists; its images are paired by timestamp."""
+    paths = _find_tum_lists(folder, settings)
+    lists = [_read_tum_list(path) for path in paths]
+    frames, listing = pair_listed(lists, settings, folder)
+    rig, texts = read_rig(settings, folder, image_size(frames[0].left, settings))
+    truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
+    return ImageSource(
+        name=resolved(folder).name,
+        description=f"TUM drive, {paths[0].name} and {paths[1].name}, "
+        f"paired by stamps{listing}{note}",
+        calibration=rig,
+        images=frames,
+        listing=listing,
+        truth=truth,
+        texts=(*texts, *paths),
+    )
+
+
+def list_files(folder: Path) -> list[tuple[str, str]]:
+    """Return names (left, right) of the text files in a folder that list images."""
+    names = [path.name for path in folder.iterdir() if path.suffix == ".txt" and _lists(path)]
+    return find_partners(names)
+
+
+def _lists(path: Path) -> bool:
+    """Return whether a file is a list, by its first entry: a number, then the name of an image."""
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        words = next((line.split() for line in lines if line.strip() and line[0] != "#"), [])
+    return len(words) >= 2 and is_image(Path(words[1]))
+
+
+def _find_tum_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
+    if settings.left and settings.right:
+        return folder / settings.left, folder / settings.right
+    found = list_files(folder)
+    if not found:
+        raise SourceError(
+            "folder has no image lists of two cameras",
+            where=folder,
+            expected="left.txt and right.txt, or similar",
+            hint="name them with --left and --right",
+        )
+    return folder / found[0][0], folder / found[0][1]
+
+
+def _read_tum_list(path: Path) -> list[tuple[float, Path]]:
+    listed = [(stamp, path.parent / name) for stamp, name in read_stamped_names(path)]
+    stamps_s = np.array([stamp for stamp, _ in listed])
+    check_increasing(stamps_s, str(path))
+    check_seconds(stamps_s, path)
+    return listed
+
 
 _TRUTH: Final = "state_groundtruth_estimate0"
 
