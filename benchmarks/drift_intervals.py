@@ -35,7 +35,7 @@ from recon.run.threads import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
-from recon.street.image import View
+from recon.street.render import View
 from recon.street.settings import StreetScene
 
 FRAMES: Final = 36

@@ -33,8 +33,7 @@ from recon.stereo.frame import FrameReconstructor
 from recon.street import props
 from recon.street.render import StreetCamera
 from recon.street.settings import StreetScene
-from recon.street.shapes import cylinder
-from recon.street.soup import Material, Paint, TriangleSoup, merge, move
+from recon.street.shapes import Material, Paint, TriangleSoup, cylinder, merge, move
 
 ON_IT_M = 0.15
 """Points within this distance of a surface are on it, give or take its depth error."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.decimals import is_count
 from recon.core.errors import SettingsError
-from recon.stereo.match.foreign import name_of
+from recon.stereo.match.protocol import name_of
 from recon.stereo.match.registry import MatchingSettings, settings_of
 
 

@@ -13,8 +13,7 @@ from recon.io.cameras.calibration import read_calibration
 from recon.io.files import StrPath
 from recon.io.middlebury.scene import stand_in_camera
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
-from recon.stereo.match.foreign import name_of
-from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.protocol import Matcher, name_of
 from recon.stereo.match.registry import MATCHERS, check_matcher, field_of
 
 _Rig = RectifiedCamera | StereoCalibration

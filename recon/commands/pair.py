@@ -18,8 +18,7 @@ from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 from recon.run.summary import plain
 from recon.sources.one_pair import PairInput
-from recon.stereo.frame import FrameReconstructor
-from recon.stereo.pair_run import PairRun, cloud_figures, disparity_figures
+from recon.stereo.frame import FrameReconstructor, PairRun, cloud_figures, disparity_figures
 
 
 def run_pair(

@@ -32,13 +32,12 @@ from recon.io.middlebury.calib import read_middlebury_calib
 from recon.io.middlebury.scene import read_middlebury_scene
 from recon.run.summary import plain
 from recon.stereo.cloud.back_project import CloudSettings, back_project
-from recon.stereo.frame import FrameReconstructor
+from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import usual_ndisp
 from recon.stereo.rectify.grey import to_grey
 from recon.stereo.rectify.rectifier import Rectifier
-from recon.stereo.settings import StereoSettings
 
 EXPERIMENTS: Final[Mapping[int, str]] = MappingProxyType({2: "ArtL", 3: "Jadeplant", 4: "Pipes"})
 """Scene of each experiment, identified by Table 1: docs/paper.md."""

@@ -16,7 +16,7 @@ from recon.map.submaps import SubmapSettings
 from recon.odometry.settings import OdometrySettings
 from recon.run.memory import MemorySettings
 from recon.stereo.cloud.filters import FilterSettings
-from recon.stereo.settings import StereoSettings
+from recon.stereo.frame import StereoSettings
 
 
 class CheckpointSettings(Settings):

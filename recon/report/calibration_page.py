@@ -19,7 +19,7 @@ from recon.rig.calibrate.bootstrap import CONFIDENCE, MATCH_SIGMA_PX
 from recon.rig.calibrate.result import CalibrationRun
 from recon.rig.calibrate.summary import shared_pixels
 from recon.run.directory import RunDirectory
-from recon.stereo.rectify.epipolar import epipolar_curves
+from recon.stereo.rectify.lens import epipolar_curves
 from recon.stereo.rectify.rectifier import Rectifier
 
 _CELLS: Final = (8, 6)

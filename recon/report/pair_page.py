@@ -11,7 +11,7 @@ from recon.report.page import write_page
 from recon.report.pair_figures import ERROR_LIMIT_PX, error_figure, stereo_figures
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
-from recon.stereo.pair_run import PairRun
+from recon.stereo.frame import PairRun
 
 
 def write_pair_page(result: PairRun, run: RunDirectory) -> None:

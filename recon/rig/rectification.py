@@ -23,9 +23,9 @@ from recon.run.directory import RunDirectory
 from recon.run.summary import plain
 from recon.sources.image_names import ImagePairs
 from recon.sources.one_pair import read_pair
-from recon.stereo.rectify.epipolar import epipolar_curves, epipolar_lines
 from recon.stereo.rectify.features import match_exactly
 from recon.stereo.rectify.grey import to_grey
+from recon.stereo.rectify.lens import epipolar_curves, epipolar_lines
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, plan_turns
 
 _UNCALIBRATED_PAIRS: Final = 16

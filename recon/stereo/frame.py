@@ -1,31 +1,38 @@
-"""One frame, from the recorded pair to a filtered cloud: the stateless part of the pipeline."""
+"""One frame, from the recorded pair to a filtered cloud, with its settings and its figures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import Self
 
+from recon.core.settings import Settings
 from recon.core.values import (
     Disparity,
+    DisparityMetrics,
+    DisparityTruth,
     PointCloud,
     RayCloud,
+    Reason,
     RectifiedCamera,
     RectifiedPair,
     Rig,
     StereoPair,
+    TriangleMesh,
 )
+from recon.core.words import counted
 from recon.run.stopwatch import Stopwatch
-from recon.stereo.cloud.back_project import back_project
-from recon.stereo.cloud.edges import remove_flying_edges
-from recon.stereo.cloud.filters import filter_cloud
-from recon.stereo.match.half_size import HalfSizeMatcher
-from recon.stereo.match.registry import make_matcher
-from recon.stereo.rectify.inspect import check_inspection, inspect_pair
-from recon.stereo.rectify.rectifier import Rectifier
-from recon.stereo.settings import StereoSettings
+from recon.stereo.cloud.back_project import CloudSettings, back_project, remove_flying_edges
+from recon.stereo.cloud.filters import FilterSettings, filter_cloud
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.range import HalfSizeMatcher
+from recon.stereo.match.registry import MatchingSettings, check_matcher, make_matcher, searched
+from recon.stereo.rectify.features import check_inspection, inspect_pair
+from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 
 _INSPECT_EVERY: Final = 50
 """Frames from one inspection to the next: what it looks for, swapped cameras or rows that do not
@@ -77,7 +84,7 @@ class FrameReconstructor:
         self._stopwatch = stopwatch or Stopwatch()
         self._rectifier = Rectifier(calibration, config.rectification)
         self._matcher = make_matcher(config.matching.matcher, config.matching, threads)
-        self._rough_matcher = HalfSizeMatcher(config.matching, threads=1)
+        self._rough_matcher = HalfSizeMatcher(searched(config.matching), threads=1)
 
     @property
     def camera(self) -> RectifiedCamera:
@@ -144,3 +151,90 @@ class FrameReconstructor:
             return disparity
         with stage("edges"):
             return remove_flying_edges(disparity)
+
+
+class StereoSettings(Settings):
+    """Everything that determines the cloud of one frame."""
+
+    rectification: RectificationSettings = RectificationSettings()
+    matching: MatchingSettings = MatchingSettings()
+    cloud: CloudSettings = CloudSettings()
+    filters: FilterSettings = Field(
+        default=FilterSettings(),
+        description="Filters of the cloud of one frame, in this order; none turns one off. "
+        "Fusion thins and cleans the clouds of a drive anyway.",
+    )
+
+    def with_matcher(self, matcher: str | Matcher | None) -> Self:
+        """Return the settings with another matcher, by name or as an object; None = unchanged.
+
+        ``config.yaml`` has the name of an object only, so such a run is repeated from Python.
+        `map_sequence` and `run_map` call it from one thread, one pair after the other.
+        """
+        if matcher is None:
+            return self
+        check_matcher(matcher)
+        matching = self.matching.model_copy(update={"matcher": matcher})
+        return self.model_copy(update={"matching": matching})
+
+
+@dataclass(frozen=True, eq=False)
+class PairRun:
+    """Results of a run, from which its report is made.
+
+    Attributes:
+        name: Display name of the pair.
+        config: The configuration.
+        pair: The rectified images.
+        disparity: Their disparity.
+        summary: The figures of ``summary.json``.
+        cloud: The points in camera axes, or None if only the disparity was requested.
+        mesh: The surface in camera axes, or None.
+        truth: True disparity, or None.
+        metrics: Errors against it, or None.
+        warnings: Problems that did not stop the run.
+    """
+
+    name: str
+    config: StereoSettings
+    pair: RectifiedPair
+    disparity: Disparity
+    summary: dict[str, Any]
+    cloud: PointCloud | None = None
+    mesh: TriangleMesh | None = None
+    truth: DisparityTruth | None = None
+    metrics: DisparityMetrics | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        parts = (self.disparity, self.cloud, self.mesh)
+        made = ", ".join(repr(part) for part in parts if part is not None)
+        return f"PairRun({self.name!r}, {made}, {counted(len(self.warnings), 'warning')})"
+
+
+def disparity_figures(disparity: Disparity) -> dict[str, Any]:
+    """Return size, share of pixels for each reason, and median of a disparity, ready for JSON."""
+    found = disparity.values[disparity.valid]
+    shares = disparity.reason_shares
+    return {
+        "width_px": disparity.values.shape[1],
+        "height_px": disparity.values.shape[0],
+        "valid_percent": 100.0 * float(disparity.valid.mean()),
+        "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
+        "disparity_median_px": float(np.median(found)) if len(found) else None,
+    }
+
+
+def cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:
+    """Return the number of points, median depth and camera of a frame, ready for JSON."""
+    camera, z = frame.pair.camera, frame.cloud.xyz[:, 2]
+    return {
+        "points": len(frame.cloud),
+        "depth_median_m": float(np.median(z)) if len(z) else None,
+        "focal_px": camera.focal_px,
+        "field_of_view_deg": camera.field_of_view_deg,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
+        "baseline_m": camera.baseline_m,
+        "doffs_px": camera.doffs_px,
+    }

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Float64
-from recon.street.shapes import boxes, quads
-from recon.street.soup import Material, Paint, TriangleSoup, merge, painted
+from recon.street.shapes import Material, Paint, TriangleSoup, boxes, merge, painted, quads
 
 _REVEAL_M: Final = 0.18  # depth of the windows in the wall
 _OVERLAP_M: Final = 5e-4  # overlap of pieces of wall, so that no ray passes between them

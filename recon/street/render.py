@@ -1,4 +1,7 @@
-"""Renders the images of a street drive, with ground truth for each pixel."""
+"""Renders the images of a street drive, with ground truth for each pixel.
+
+All surfaces are Lambertian and the light is static, so a point has the same colour from everywhere.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,19 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.errors import SettingsError
 from recon.core.geometry.projection import disparity_from_depth
-from recon.core.values import DisparityTruth, StereoPair
-from recon.core.values.arrays import Float32, Float64, UInt8, freeze
-from recon.street.image import View, record, stereo_views, take_image
-from recon.street.stage import Stage, make_stage
+from recon.core.open3d_raycasting import RayScene
+from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8, freeze
+from recon.street.kernels.surface import SurfaceHits, SurfaceTable, describe_hits
+from recon.street.materials import GAMMA, albedo, sky_colour
+from recon.street.shapes import TriangleSoup
 from recon.street.street import StreetWorld
 
 
@@ -117,3 +124,211 @@ class StreetCamera:
             noise_dn=settings.noise_dn,
             key=[settings.seed, 1000, index, side],
         )
+
+
+_QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+_CREASE: Final = 0.92  # cosine of the angle between normals, below which there is an edge
+_EXPOSURE: Final = 0.9
+
+
+def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
+    """Render one view as float64 (H, W, 3), display values in [0, 1]."""
+    size = (view.height_px, view.width_px)
+    pixels = view.pixels()
+    sample = stage.look(view.origin, view.directions(pixels), 1.0 / view.focal_px)
+    light = _expose(sample.rgb)
+    if smooth_edges:
+        edge = _edges(sample, size)
+        light[edge] = _four_rays(stage, view, pixels[edge])
+    return np.asarray(light ** (1.0 / GAMMA)).reshape(*size, 3)
+
+
+def record(
+    image: Float64, *, gain: float, offset_dn: float, noise_dn: float, key: list[int]
+) -> UInt8:
+    """Apply a sensor model to display values (H, W, 3) in [0, 1]; ``key`` seeds the noise."""
+    levels = 255.0 * gain * image + offset_dn
+    if noise_dn > 0:
+        levels += noise_dn * np.random.default_rng(key).standard_normal(levels.shape)
+    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def _expose(light: Float64) -> Float64:
+    return np.clip(_EXPOSURE * light, 0.0, 1.0)
+
+
+def _four_rays(stage: Stage, view: View, pixels: Float64) -> Float64:
+    """Return the mean radiance (N, 3) over the four quarters of pixels (N, 2)."""
+    quarters = (pixels[:, None, :] + np.array(_QUARTERS)).reshape(-1, 2)
+    sample = stage.look(view.origin, view.directions(quarters), 0.5 / view.focal_px)
+    return np.asarray(_expose(sample.rgb).reshape(-1, 4, 3).mean(axis=1))
+
+
+def _edges(sample: Sample, size: tuple[int, int]) -> Bool:
+    """Return bool (H·W,), pixels that differ from a neighbour in object, material or normal."""
+    label = sample.label.reshape(size)
+    normal = sample.normal.reshape(*size, 3)
+    edge = np.zeros(size, dtype=np.bool_)
+    for a, b in (
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+    ):
+        differs = label[a] != label[b]
+        differs |= (label[a] >= 0) & (np.einsum("hwx,hwx->hw", normal[a], normal[b]) < _CREASE)
+        edge[a] |= differs
+        edge[b] |= differs
+    return edge.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A pinhole camera in a scene."""
+
+    T_scene_camera: Float64  # (4, 4)
+    focal_px: float
+    centre_px: tuple[float, float]  # principal point, column and row
+    width_px: int
+    height_px: int
+
+    @property
+    def origin(self) -> Float64:
+        """float64 (3,), the camera centre in the scene."""
+        return self.T_scene_camera[:3, 3]
+
+    def pixels(self) -> Float64:
+        """Return float64 (H·W, 2), column and row of each pixel, row by row."""
+        v, u = np.mgrid[0 : self.height_px, 0 : self.width_px]
+        return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+
+    def directions(self, pixels: Float64) -> Float64:
+        """Return rays (N, 3) through pixels (N, 2), scene axes, of unit depth."""
+        sight = np.ones((len(pixels), 3))
+        sight[:, :2] = (pixels - self.centre_px) / self.focal_px
+        return np.asarray(sight @ self.T_scene_camera[:3, :3].T)
+
+    def project(self, xyz: Float64) -> Float64:
+        """Return pixels (N, 2) of points in the scene; NaN behind the camera."""
+        local = (xyz - self.origin) @ self.T_scene_camera[:3, :3]
+        depth = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
+        return np.asarray(self.focal_px * local[:, :2] / depth + self.centre_px)
+
+    def inside(self, pixels: Float64) -> Bool:
+        """Return bool (N,), True where a position lies within the image."""
+        u, v = pixels[:, 0], pixels[:, 1]
+        with np.errstate(invalid="ignore"):
+            in_u = (u >= -0.5) & (u < self.width_px - 0.5)
+            return np.asarray(in_u & (v >= -0.5) & (v < self.height_px - 0.5))
+
+
+def stereo_views(camera: RectifiedCamera, T_scene_left: Float64) -> tuple[View, View]:
+    """Return the left and right view of a rig with its left camera at ``T_scene_left``."""
+    T_scene_right = T_scene_left.copy()
+    T_scene_right[:3, 3] += camera.baseline_m * T_scene_left[:3, 0]
+    size = camera.width_px, camera.height_px
+    left = View(T_scene_left, camera.focal_px, (camera.cx_px, camera.cy_px), *size)
+    right = View(T_scene_right, camera.focal_px, (camera.cx_right_px, camera.cy_px), *size)
+    return left, right
+
+
+_SUN: Final = np.array([1.50, 1.38, 1.18])
+_SKY: Final = np.array([0.52, 0.58, 0.68])
+_SIGHT: Final = 1.0 - 1e-4  # fraction of a line of sight that must be free
+_SKIN_M: Final = 2e-3  # shadow rays start this far above a surface
+_REACH_M: Final = 80.0  # length of shadow rays
+_SHELTER_M: Final = 1.0  # a horizontal surface with an object this close above sees little sky
+
+
+class Sample(NamedTuple):
+    """What rays hit."""
+
+    rgb: Float64  # (N, 3), linear light
+    normal: Float64  # (N, 3), shading normal; 0 for the sky
+    label: NDArray[np.int64]  # (N,), differs between objects, materials, and shadow and light
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A scene with its light."""
+
+    soup: TriangleSoup
+    table: SurfaceTable  # the triangles, precomputed for hits
+    rays: RayScene  # the triangles in the ray caster
+    to_sun: Float64  # (3,), unit vector towards the sun
+    seed: int  # of grain and clouds
+
+    def depth(self, origin: Float64, directions: Float64) -> Float64:
+        """Return float64 (N,), depth along rays of unit depth; NaN where they hit nothing."""
+        faces = self.rays.first_hit(origin, directions)
+        hit = faces >= 0
+        depth = np.full(len(directions), np.nan)
+        depth[hit] = plane_distance(self.table, faces[hit], origin, directions[hit])
+        return depth
+
+    def sees(self, origin: Float64, xyz: Float64) -> Bool:
+        """Return bool (N,), whether the line of sight from ``origin`` to each point is free."""
+        return ~self.rays.blocked(origin, xyz - origin, far=_SIGHT)
+
+    def look(self, origin: Float64, directions: Float64, pixel: float) -> Sample:
+        """Trace rays of unit depth, where a pixel is ``pixel`` wide, and shade what they hit."""
+        faces = self.rays.first_hit(origin, directions)
+        hit = np.flatnonzero(faces >= 0)
+        sky = np.flatnonzero(faces < 0)
+        rgb, normal = np.empty((len(faces), 3)), np.zeros((len(faces), 3))
+        label = np.full(len(faces), -1, dtype=np.int64)
+        rgb[sky] = sky_colour(directions[sky], pixel, self.seed)
+        met = faces[hit]
+        hits = describe_hits(self.table, met, origin, directions[hit], pixel)
+        light, lit = self._light(hits)
+        rgb[hit] = albedo(self.soup, met, hits, self.seed) * light
+        normal[hit] = hits.normal
+        part, material = self.soup.part[met], self.soup.material[met]
+        label[hit] = (part.astype(np.int64) * 32 + material) * 2 + lit
+        return Sample(rgb, normal, label)
+
+    def _light(self, points: SurfaceHits) -> tuple[Float64, Bool]:
+        """Return irradiance (N, 3) at points, and whether the sun reaches them."""
+        start = points.xyz + _SKIN_M * points.normal
+        facing = points.normal @ self.to_sun
+        lit = facing > 0
+        reach = np.broadcast_to(_REACH_M * self.to_sun, (int(lit.sum()), 3))
+        lit[lit] = ~self.rays.blocked(start[lit], reach)
+        openness = 0.72 + 0.28 * points.normal[:, 2]
+        floor = np.flatnonzero(points.normal[:, 2] > 0.7)
+        above = np.broadcast_to([0.0, 0.0, _SHELTER_M], (len(floor), 3))
+        openness[floor[self.rays.blocked(start[floor], above)]] *= 0.4
+        sun = np.where(lit, facing, 0.0)
+        return openness[:, None] * _SKY + sun[:, None] * _SUN, lit
+
+
+def make_stage(soup: TriangleSoup, to_sun: Float64, seed: int, threads: int = 0) -> Stage:
+    """Prepare a scene for rendering."""
+    return Stage(soup, surface_table(soup), RayScene(soup.vertices, threads), to_sun, seed)
+
+
+def surface_table(soup: TriangleSoup) -> SurfaceTable:
+    """Precompute each triangle, so that a hit costs only a few products."""
+    # The ray caster uses single precision; the planes must be exactly those that it hits.
+    corners = soup.vertices.astype(np.float32).astype(np.float64)
+    a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(e1, e2)
+    squared = np.maximum((normal**2).sum(axis=1, keepdims=True), 1e-24)
+    # Gradients of the two barycentric coordinates within the plane.
+    gradients = np.stack([np.cross(e2, normal), np.cross(normal, e1)], axis=1)
+    gradients /= squared[:, :, None]
+    return SurfaceTable(
+        anchor=a.copy(),
+        normal=normal / np.sqrt(squared),
+        to_uv=np.einsum("fkc,fkx->fcx", soup.uv[:, 1:] - soup.uv[:, :1], gradients),
+        uv=soup.uv[:, 0].copy(),
+        to_shading=np.einsum("fkc,fkx->fcx", soup.normals[:, 1:] - soup.normals[:, :1], gradients),
+        shading=soup.normals[:, 0].copy(),
+    )
+
+
+def plane_distance(
+    table: SurfaceTable, faces: Int32, origin: Float64, directions: Float64
+) -> Float64:
+    """Return distances (N,) of rays to the planes of their triangles, in their units."""
+    normal = table.normal[faces]
+    height = np.einsum("nx,nx->n", table.anchor[faces] - origin, normal)
+    return np.asarray(height / np.einsum("nx,nx->n", directions, normal))

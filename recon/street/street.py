@@ -14,11 +14,11 @@ from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64, freeze
 from recon.street import props
 from recon.street.buildings import draw_plan, house
-from recon.street.fences import SECTION_M, SECTIONS
 from recon.street.materials import ROAD_HALF_M
 from recon.street.path import BEHIND_M, CentreLine, camera_poses, centre_line
+from recon.street.props import SECTION_M, SECTIONS
 from recon.street.settings import StreetScene, StreetSettings
-from recon.street.soup import Material, Paint, TriangleSoup, merge, move, painted
+from recon.street.shapes import Material, Paint, TriangleSoup, merge, move, painted
 
 KERB_M: Final = 0.12  # pavement above road
 _WALL_M: Final = 8.2  # distance of facades from the centre line

@@ -10,8 +10,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values.arrays import Float64
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
-from recon.street.shapes import boxes
-from recon.street.soup import Material, Paint, merge
+from recon.street.shapes import Material, Paint, boxes, merge
 from recon.street.street import StreetWorld, rig
 
 ROOM_M = (9.0, 8.0, 3.2)

@@ -11,8 +11,8 @@ from recon.core.values import Disparity, RectifiedPair
 from recon.odometry.corners import in_crowd
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
-from recon.stereo.match.half_size import HalfSizeMatcher
-from recon.stereo.match.registry import MatchingSettings
+from recon.stereo.match.range import HalfSizeMatcher
+from recon.stereo.match.sad import SadSettings
 
 See = Callable[..., OdometryFrame]
 
@@ -226,7 +226,7 @@ def _exposed(frame: OdometryFrame, gain: float) -> OdometryFrame:
 def test_rough_disparities_give_nearly_the_same_path(
     see_both: See, street_poses: np.ndarray
 ) -> None:
-    matcher = HalfSizeMatcher(MatchingSettings(), threads=1)
+    matcher = HalfSizeMatcher(SadSettings(), threads=1)
     pairs = [see_both(T, index).pair for index, T in enumerate(street_poses)]
 
     found = follow([OdometryFrame(pair, matcher.match(pair), rough=True) for pair in pairs])

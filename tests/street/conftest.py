@@ -8,8 +8,7 @@ import pytest
 from recon.street.path import R_STREET_LEVEL
 from recon.street.render import StreetCamera
 from recon.street.settings import StreetScene
-from recon.street.shapes import boxes, quads
-from recon.street.soup import Material, Paint, merge
+from recon.street.shapes import Material, Paint, boxes, merge, quads
 from recon.street.street import StreetWorld, build_street, rig
 
 SMALL = {"frames": 4, "width_px": 320, "height_px": 120, "focal_px": 180.0, "noise_dn": 0.0}

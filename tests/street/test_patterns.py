@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.street.patterns import both, stripe, stripes, tile_joints, tile_tone
+from recon.street.materials import both, stripe, stripes, tile_joints, tile_tone
 
 
 @given(

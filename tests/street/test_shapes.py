@@ -7,6 +7,8 @@ import pytest
 
 from recon.core.geometry import se3
 from recon.street.shapes import (
+    Material,
+    Paint,
     boxes,
     bumpy_ball,
     cylinder,
@@ -14,9 +16,10 @@ from recon.street.shapes import (
     extrusion,
     frustum,
     icosphere,
+    merge,
+    move,
     quads,
 )
-from recon.street.soup import Material, Paint, merge, move
 
 PAINT = Paint(Material.BRICK, (0.2, 0.4, 0.6), 5)
 

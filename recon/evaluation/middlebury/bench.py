@@ -17,11 +17,10 @@ from recon.evaluation.middlebury.scenes import ResultFolder, ScoredScene, read_s
 from recon.evaluation.middlebury.score import Figures, confidence_figures, score_result
 from recon.io.files import naming
 from recon.io.images.pfm import read_pfm
-from recon.stereo.match.foreign import name_of
-from recon.stereo.match.protocol import Matcher
+from recon.stereo.frame import StereoSettings
+from recon.stereo.match.protocol import Matcher, name_of
 from recon.stereo.match.registry import check_matcher, make_matcher, searched_ndisp
 from recon.stereo.rectify.rectifier import Rectifier
-from recon.stereo.settings import StereoSettings
 
 _WARM_UP_ROWS: Final = 64
 _FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")

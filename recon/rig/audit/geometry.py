@@ -13,8 +13,7 @@ from recon.core.values.arrays import Float64
 from recon.rig.audit.measures import measure_time_skew
 from recon.rig.audit.row_alignment import RowAlignment, align_rows
 from recon.rig.audit.sample import Sample
-from recon.stereo.rectify.features import PairFeatures, pool_features
-from recon.stereo.rectify.inspect import inspect_features
+from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
 
 # Agreement at a lag, relative to that at lag 0, from which a delay is reported.
 _LAG_FACTOR: Final = 1.25

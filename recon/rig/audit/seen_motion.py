@@ -31,9 +31,8 @@ from recon.rig.audit.right_turn import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.rig.audit.sample import plan_stretches
 from recon.run.threads import serial_algebra
 from recon.sources.source import StereoSource
-from recon.stereo.frame import FrameReconstructor
+from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
-from recon.stereo.settings import StereoSettings
 
 _MIN_FRAMES: Final = 4
 """Windows of fewer frames, after a loss, are left out."""

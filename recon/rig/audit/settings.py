@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from recon.core.settings import Settings
-from recon.stereo.settings import StereoSettings
+from recon.stereo.frame import StereoSettings
 
 Metres = Annotated[float, Field(ge=0, le=1e6)]
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from recon.core.settings import Settings
-from recon.stereo.settings import StereoSettings
+from recon.stereo.frame import StereoSettings
 
 LensKind = Literal["radtan", "rational", "fisheye"]
 

@@ -1,18 +1,19 @@
-"""How many disparities to search where neither settings nor calibration say it."""
+"""What a pair at a small size shows: how many disparities to search, and rough disparities."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.sad import SadMatcher, SadSettings
-from recon.stereo.match.search import usual_ndisp
+from recon.stereo.match.sad import SadMatcher, SadSettings, halve
+from recon.stereo.match.search import SearchSettings, usual_ndisp
 
 _COARSE_WIDTH_PX: Final = 200
 """Approximate width of the small pair; images are reduced by whole factors."""
@@ -90,3 +91,61 @@ def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtyp
     settings = SadSettings(window_px=7, uniqueness_percent=10)
     found = SadMatcher(settings, threads=1, average=False).match(small)
     return found.values[found.valid & (found.confidence >= _CONFIDENCE)]
+
+
+Number = TypeVar("Number", np.float32, np.uint8)
+
+_WINDOW_PX: Final = 7
+"""Edge of the window at half size: nearly that of `sad` at full size."""
+
+
+class HalfSizeMatcher:
+    """Matches with `sad` at half size; a `Matcher` whose disparities are those of the full size.
+
+    They are as dense as those of the full size and cost about a fifth of the time, but are off by
+    a quarter of a pixel or more.
+
+    Args:
+        searched: The range at full size.
+        threads: Strips of rows worked on at once. The result does not depend on it.
+    """
+
+    def __init__(self, searched: SearchSettings, threads: int | None = None) -> None:
+        half = SadSettings(
+            window_px=_WINDOW_PX,
+            min_disparity_px=searched.min_disparity_px // 2,
+            ndisp=None if searched.ndisp is None else max(3, -(-searched.ndisp // 2)),
+        )
+        sad = SadMatcher(half, threads)
+        self._matcher: Matcher = sad if half.ndisp else AutoRangeMatcher(sad, half.min_disparity_px)
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Match one rectified pair."""
+        return _enlarged(self._matcher.match(_half(pair)), pair.left.shape)
+
+
+def _half(pair: RectifiedPair) -> RectifiedPair:
+    left, right = halve(pair.left), halve(pair.right)
+    height, width = left.shape
+    camera = pair.camera.resized(width, height)
+    valid = None if pair.valid is None else pair.valid[::2, ::2]
+    return RectifiedPair(left, right, camera, valid=valid)
+
+
+def _enlarged(found: Disparity, shape: tuple[int, ...]) -> Disparity:
+    """Return a disparity of half size at full size: four pixels have the value of one."""
+    return replace(
+        found,
+        values=_repeated(2 * found.values, shape),
+        confidence=_repeated(found.confidence, shape),
+        sigma_px=_repeated(2 * found.sigma_px, shape),
+        reason=_repeated(found.reason, shape),
+    )
+
+
+def _repeated(values: NDArray[Number], shape: tuple[int, ...]) -> NDArray[Number]:
+    rows, columns = values.shape
+    size = (2 * columns, 2 * rows)
+    large = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
+    cut = np.ascontiguousarray(large[: shape[0], : shape[1]])
+    return cut.astype(values.dtype, copy=False)

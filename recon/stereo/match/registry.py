@@ -10,16 +10,16 @@ from pydantic import Field, InstanceOf, field_serializer
 from recon.core.errors import SettingsError
 from recon.core.settings import Settings
 from recon.core.values import RectifiedPair
-from recon.stereo.match.foreign import (
+from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
+from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
+from recon.stereo.match.protocol import (
     CheckedMatcher,
+    Matcher,
     check_object,
     load_registered,
     name_of,
     registered_names,
 )
-from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
-from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
-from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.range import AutoRangeMatcher, estimate_ndisp
 from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import SearchSettings
@@ -92,6 +92,12 @@ def settings_of(matcher: str | Matcher, settings: MatchingSettings) -> Settings 
         return None
     own: Settings = getattr(settings, field_of(matcher))
     return own
+
+
+def searched(settings: MatchingSettings) -> SearchSettings:
+    """Return the range of the chosen matcher; that of `sad` where it searches none."""
+    own = settings_of(settings.matcher, settings)
+    return own if isinstance(own, SearchSettings) else settings.sad
 
 
 def searched_ndisp(

@@ -33,15 +33,18 @@ from recon.stereo.kernels.refine import (
 )
 from recon.stereo.kernels.sad import sad_minima
 from recon.stereo.kernels.tiles import Support, Tiles, make_tiles, offer_supported
-from recon.stereo.match.gradients import clipped_gradients, no_texture, texture
-from recon.stereo.match.scratch import ResultPool, ScratchPool
 from recon.stereo.match.search import (
     MeasuredSettings,
     OddInt,
+    ResultPool,
+    ScratchPool,
     UniquenessPercent,
+    clipped_gradients,
     finish,
     in_strips,
+    no_texture,
     rules_of,
+    texture,
 )
 
 _COST_CAP: Final = 20

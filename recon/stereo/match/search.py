@@ -1,19 +1,23 @@
-"""What all matchers over a range of disparities share: range, checks and post-processing."""
+"""What all matchers over a range of disparities share: range, checks, gradients, memory."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Executor
-from typing import Annotated, Final
+from contextlib import contextmanager
+from typing import Annotated, Final, Generic, TypeVar
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from recon.core.errors import MatchingError
 from recon.core.settings import Settings
-from recon.core.values import Disparity, Reason, RectifiedCamera
-from recon.core.values.arrays import Float32
+from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.stereo.kernels.opposite import average_opposite
 from recon.stereo.kernels.refine import EQUIANGULAR, ODDS, Refined, Rules, reject
 from recon.stereo.kernels.speckle import find_speckles
@@ -188,3 +192,138 @@ def in_strips(pool: Executor, threads: int, work: Callable[[range], None], rows:
 def usual_ndisp(width_px: int) -> int:
     """Return a number of disparities that suits most rigs: a tenth of the width, in steps of 16."""
     return 16 * max(1, -(-width_px // 160))
+
+
+T = TypeVar("T")
+
+
+class ScratchPool(Generic[T]):
+    """Lends scratch memory of one kind, also to several threads at once.
+
+    Args:
+        make: Makes scratch memory of a size, when there is none to lend.
+        most: How many pieces are kept.
+    """
+
+    def __init__(self, make: Callable[..., T], most: int) -> None:
+        self._make = make
+        self._free: deque[tuple[tuple[Hashable, ...], T]] = deque(maxlen=most)
+
+    @contextmanager
+    def borrow(self, *size: Hashable) -> Iterator[T]:
+        """Lend scratch memory for a ``with`` block; its content is undefined.
+
+        Args:
+            size: Arguments of ``make``. A kept piece of another size is given up.
+        """
+        try:
+            kept, scratch = self._free.pop()
+        except IndexError:
+            kept = None
+        if kept != size:
+            scratch = self._make(*size)
+        yield scratch
+        # Not after an error: another thread may still work in it.
+        self._free.append((size, scratch))
+
+
+class ResultPool:
+    """Lends memory for results, which returns when the last reference to it is gone.
+
+    Args:
+        most: How many returned blocks are kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._free: deque[UInt8] = deque(maxlen=most)
+
+    def lend(self, size_bytes: int) -> UInt8:
+        """Return uint8 (size_bytes,), lent as long as it or a view of it is referenced."""
+        try:
+            block = self._free.pop()
+        except IndexError:
+            block = np.empty(0, np.uint8)
+        if block.size != size_bytes:
+            block = np.empty(size_bytes, np.uint8)
+        return np.asarray(_Lent(block, self._free))
+
+
+class _Lent:
+    """The base of a lent array and of its views: its deletion returns the memory."""
+
+    def __init__(self, block: UInt8, free: deque[UInt8]) -> None:
+        self.__array_interface__ = block.__array_interface__
+        self._block, self._free = block, free
+
+    def __del__(self) -> None:
+        self._free.append(self._block)
+
+
+_GRADIENT_CAP: Final = 31
+"""Gradients (Sobel units) are clipped to plus or minus this before windows compare them."""
+
+_GAIN_OF_SOBEL: Final = 8.0
+"""A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
+
+
+def clipped_gradients(image: UInt8, rows: range) -> UInt8:
+    """Return what windows compare in some rows of an image (H, W): clipped horizontal gradients.
+
+    Returns:
+        uint8 (N, W) of N consecutive rows, Sobel units, plus the cap.
+    """
+    gradients = _sobel(image, rows)
+    np.clip(gradients, -_GRADIENT_CAP, _GRADIENT_CAP, out=gradients)
+    gradients += _GRADIENT_CAP
+    return gradients.astype(np.uint8)
+
+
+def texture(pair: RectifiedPair, window_px: int, rows: range) -> Float32:
+    """Return mean size of the horizontal gradient in the window around each pixel of the left view.
+
+    Args:
+        pair: The images.
+        window_px: Edge of the square window.
+        rows: N consecutive rows.
+
+    Returns:
+        float32 (N, W) of those rows, grey levels per pixel; NaN = no image.
+    """
+    reach = window_px // 2
+    sizes = _sobel(pair.left, _around(rows, reach, len(pair.left)))
+    sums = cv2.boxFilter(
+        np.abs(sizes, out=sizes).view(np.uint16),
+        cv2.CV_32F,
+        (window_px, window_px),
+        normalize=False,
+        borderType=cv2.BORDER_REPLICATE,
+    )
+    above = min(reach, rows.start)
+    mean = sums[above : above + len(rows)]
+    mean *= np.float32(1 / (_GAIN_OF_SOBEL * window_px * window_px))
+    return _where_seen(mean, pair.valid, rows)
+
+
+def no_texture(width: int, valid: Bool | None, rows: range) -> Float32:
+    """Return the same for checks that ask for none: 0, NaN where there is no image."""
+    return _where_seen(np.zeros((len(rows), width), np.float32), valid, rows)
+
+
+def _where_seen(mean: Float32, valid: Bool | None, rows: range) -> Float32:
+    if valid is not None:
+        mean[~valid[rows.start : rows.stop]] = np.nan
+    return mean
+
+
+def _around(rows: range, reach: int, height: int) -> range:
+    """Return rows, and those around them that the image has."""
+    return range(max(rows.start - reach, 0), min(rows.stop + reach, height))
+
+
+def _sobel(image: UInt8, rows: range) -> NDArray[np.int16]:
+    seen = _around(rows, 1, len(image))
+    gradient = cv2.Sobel(
+        image[seen.start : seen.stop], cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE
+    )
+    above = rows.start - seen.start
+    return np.asarray(gradient[above : above + len(rows)], dtype=np.int16)

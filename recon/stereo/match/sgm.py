@@ -30,9 +30,15 @@ from recon.stereo.kernels.semi_global import (
     scratch_bytes,
     semi_global_minima,
 )
-from recon.stereo.match.gradients import no_texture
-from recon.stereo.match.scratch import ResultPool, ScratchPool
-from recon.stereo.match.search import MeasuredSettings, OddInt, finish, rules_of
+from recon.stereo.match.search import (
+    MeasuredSettings,
+    OddInt,
+    ResultPool,
+    ScratchPool,
+    finish,
+    no_texture,
+    rules_of,
+)
 
 _LEVELS: Final = 250
 """Largest path cost before rounding, which needs the rest of a byte."""

@@ -18,7 +18,7 @@ from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibrati
 from recon.export.mesh.view import check_coverage
 from recon.run.progress import Silent
 from recon.sources.one_pair import PairInput
-from recon.stereo.pair_run import PairRun
+from recon.stereo.frame import PairRun
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import recon
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
-from recon.stereo.cloud.edges import remove_flying_edges
+from recon.stereo.cloud.back_project import remove_flying_edges
 
 
 def as_disparity(values: np.ndarray) -> Disparity:

@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.values import RectifiedPair
 from recon.io.middlebury.scene import stand_in_camera
-from recon.stereo.match.gradients import clipped_gradients, texture
+from recon.stereo.match.search import clipped_gradients, texture
 
 HEIGHT, WIDTH = 23, 17
 ALL = range(HEIGHT)

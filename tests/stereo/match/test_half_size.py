@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.stereo.match.half_size import HalfSizeMatcher
-from recon.stereo.match.registry import MatchingSettings
+from recon.stereo.match.range import HalfSizeMatcher
 from recon.stereo.match.sad import SadSettings
 from tests.stereo.match.images import HEIGHT, WIDTH, inner, warped_pair
 
-SEARCH = MatchingSettings(sad=SadSettings(ndisp=32))
+SEARCH = SadSettings(ndisp=32)
 
 
 @pytest.mark.parametrize("shift", [5.25, 7.5, 10.8])
@@ -31,8 +30,8 @@ def test_disparities_are_right_to_a_fraction_of_a_pixel(
 
 def test_the_range_is_that_of_the_full_size() -> None:
     pair = warped_pair(np.full((HEIGHT, WIDTH), 20.0))
-    negative = MatchingSettings(sad=SadSettings(min_disparity_px=-8, ndisp=16))
-    narrow = MatchingSettings(sad=SadSettings(ndisp=12))
+    negative = SadSettings(min_disparity_px=-8, ndisp=16)
+    narrow = SadSettings(ndisp=12)
 
     assert np.isfinite(inner(HalfSizeMatcher(SEARCH).match(pair).values)).mean() > 0.8
     for settings in (narrow, negative):
@@ -44,7 +43,7 @@ def test_the_calibration_may_know_the_range() -> None:
     pair = warped_pair(np.full((HEIGHT, WIDTH), 20.0))
     known = replace(pair, camera=replace(pair.camera, ndisp=32))
 
-    values = inner(HalfSizeMatcher(MatchingSettings()).match(known).values)
+    values = inner(HalfSizeMatcher(SadSettings()).match(known).values)
 
     assert np.nanmedian(np.abs(values - 20.0)) < 0.3
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.stereo.match.scratch import ResultPool
+from recon.stereo.match.search import ResultPool
 
 
 def test_unreferenced_memory_is_lent_again() -> None:

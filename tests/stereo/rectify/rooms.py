@@ -14,10 +14,8 @@ from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.io.images.image import write_image
 from recon.stereo.rectify.rectifier import RectifyingTurns
-from recon.street.image import View, take_image
-from recon.street.shapes import boxes, cylinder, quads
-from recon.street.soup import Material, Paint, TriangleSoup, merge, move
-from recon.street.stage import Stage, make_stage
+from recon.street.render import Stage, View, make_stage, take_image
+from recon.street.shapes import Material, Paint, TriangleSoup, boxes, cylinder, merge, move, quads
 
 # Camera axes (x right, y down, z forward) in room axes (x forward, y left, z up).
 T_ROOM_FORWARD = make_transform(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))

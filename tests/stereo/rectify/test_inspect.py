@@ -8,7 +8,7 @@ import pytest
 
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedCamera, RectifiedPair
-from recon.stereo.rectify.inspect import (
+from recon.stereo.rectify.features import (
     PairFeatures,
     check_inspection,
     inspect_features,
