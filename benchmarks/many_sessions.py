@@ -29,7 +29,8 @@ from recon.export.make import make
 from recon.export.product import Order
 from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
-from recon.map.store.map import MAP_FILE, Map
+from recon.map.store.map_file import MAP_FILE
+from recon.map.verbs import Map
 from recon.run.run import Run
 from tests.map.sessions.test_map_of_several_drives import _drive, _links, _poses
 

@@ -40,8 +40,8 @@ from recon.io.occupancy.nav2 import read_nav2
 from recon.io.trajectory import read_trajectory
 from recon.map.sessions.linking import find_links
 from recon.map.sessions.measured import Survey
-from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
+from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.drift import path_lengths

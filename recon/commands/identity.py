@@ -12,7 +12,7 @@ from recon.commands.config import ReconConfig
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import Trajectory
 from recon.map.drive.workspace import ANEW
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.fingerprint import fingerprint
 from recon.run.machine import versions

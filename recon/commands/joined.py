@@ -18,7 +18,8 @@ from recon.map.sessions.copying import check_session, copy_sessions, read_all
 from recon.map.sessions.joining import join_new
 from recon.map.sessions.measured import Survey, hold
 from recon.map.sessions.placed import place_map
-from recon.map.store.map import MAP_FILE, Map
+from recon.map.store.map_file import MAP_FILE
+from recon.map.verbs import Map
 from recon.report.joined_page import write_joined_page
 from recon.run.finished import open_run
 from recon.run.run import Run, WholeRun

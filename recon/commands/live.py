@@ -17,7 +17,7 @@ from recon.io.files import StrPath
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import StartPose, localize_sequence
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from recon.rig.cameras import CameraSource
 from recon.sources.live import LiveSource
 from recon.sources.source import DerivedSource, StereoSource

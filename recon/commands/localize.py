@@ -13,7 +13,8 @@ from recon.io.occupancy.nav2 import read_nav2
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.sequence import StartPose, localize_sequence
-from recon.map.store.map import MAP_FILE, Map
+from recon.map.store.map_file import MAP_FILE
+from recon.map.verbs import Map
 from recon.report.localize_page import write_localize_page
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource

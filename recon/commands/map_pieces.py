@@ -18,7 +18,7 @@ from recon.io.files import resolved
 from recon.map.drive.pieces import Piece, cut_drive, join_pieces, joined_drive
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.run.batch.results import JobResult, work_off
 from recon.run.run import Run

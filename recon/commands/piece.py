@@ -18,7 +18,8 @@ from recon.map.drive.pieces import Piece
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.sessions.copying import copy_sessions
-from recon.map.store.map import MAP_FILE, Map
+from recon.map.store.map_file import MAP_FILE
+from recon.map.verbs import Map
 from recon.run.batch.job import Job
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run

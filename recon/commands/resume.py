@@ -14,7 +14,7 @@ from recon.commands.identity import read_started, refuse_others
 from recon.commands.map_options import MapRequest
 from recon.core.errors import ClusterError, MemoryLimitError, OutputError
 from recon.map.drive.workspace import resuming, session_info
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.memory import memory_overrides
 from recon.run.run import Run

@@ -5,7 +5,8 @@ from __future__ import annotations
 from contextlib import closing
 from pathlib import Path
 
-from recon.map.store.map import MAP_FILE, Map
+from recon.map.store.map_file import MAP_FILE
+from recon.map.verbs import Map
 from recon.run.finished import FinishedRun
 
 

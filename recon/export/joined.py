@@ -13,7 +13,7 @@ from recon.export.make import Products
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map.sessions.lengths import doubts_of_lengths
 from recon.map.sessions.measured import doubts_of_positions, misfit_rms_m
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from recon.run.directory import RunDirectory
 
 

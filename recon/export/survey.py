@@ -20,7 +20,7 @@ from recon.map.sessions.measured import (
     span_m,
     trusted_path,
 )
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 
 _LARGEST_STRETCH: Final = 0.05
 """By how much the path may be too long or short before it is said."""

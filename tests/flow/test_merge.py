@@ -23,7 +23,7 @@ from recon.core.errors import FormatError
 from recon.io.trajectory import read_trajectory
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.sessions.measured import Survey
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from recon.run.finished import open_run
 from recon.sources.source import SourcePart, StereoSource
 from recon.street.settings import StreetScene

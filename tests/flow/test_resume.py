@@ -16,8 +16,8 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.export.map_run import MapRun
 from recon.map.drive.mapper import FrameResult
-from recon.map.store.map import Map
 from recon.map.store.records import Store
+from recon.map.verbs import Map
 from recon.run.progress import SILENT, Silent
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource

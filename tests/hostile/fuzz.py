@@ -38,8 +38,8 @@ from recon.io.trajectory import read_trajectory
 from recon.io.yaml_file import read_yaml
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.occupancy.rays import ray_grain
-from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
+from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.sources.registry import open_source
 from recon.sources.times import read_dates, read_stamped_names

@@ -19,11 +19,11 @@ from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.occupancy.rays import ray_grain
 from recon.map.occupancy.surface_points import SurfacePoints
 from recon.map.store.links import Link
-from recon.map.store.map import Map
 from recon.map.store.map_views import MapViews
 from recon.map.store.records import Key, Store
 from recon.map.store.session import ALONE, BENT, SessionInfo
 from recon.map.submaps import Submap
+from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import Fixes

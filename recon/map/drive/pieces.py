@@ -22,11 +22,11 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
-from recon.map.store.map import Map
 from recon.map.store.rays import RAYS
 from recon.map.store.records import Key
 from recon.map.store.session import Session
 from recon.map.submaps import Submap
+from recon.map.verbs import Map
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.drift import path_lengths
 from recon.sources.source import SourcePart, StereoSource

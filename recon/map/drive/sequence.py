@@ -34,9 +34,9 @@ from recon.map.drive.workspace import Workspace
 from recon.map.fusion.builder import fusion_range_m
 from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
-from recon.map.store.map import Map
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
+from recon.map.verbs import Map
 from recon.odometry.path_drift import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
 from recon.run.progress import SILENT, Progress

@@ -11,8 +11,8 @@ from typing import Any, Final
 from recon.core.errors import FormatError, ReconError
 from recon.io.files import reading
 from recon.map.settings import DriveSettings
-from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
+from recon.map.verbs import Map
 from recon.run.machine import versions
 from recon.run.stopwatch import Stopwatch
 from recon.sources.source import StereoSource

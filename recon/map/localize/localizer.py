@@ -13,11 +13,15 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import invert
+from recon.core.values import Rig, StereoPair
 from recon.core.values.arrays import Bool, Float64
 from recon.core.words import counted
 from recon.map.localize.belief import MAX_SIGMA_M, Belief
 from recon.map.localize.search import Search
 from recon.map.localize.surroundings import Surroundings
+from recon.map.settings import DriveSettings
+from recon.map.store.map_file import MapFile
+from recon.map.store.map_views import known_places
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualEstimate, VisualOdometry
@@ -26,6 +30,7 @@ from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.known_places import KnownPlaces
 from recon.places.loop import Loop
+from recon.stereo.frame import FrameReconstructor
 
 _VIEWS: Final = 2
 """Nearest views of the map that each frame is compared with."""
@@ -238,3 +243,13 @@ class Localizer:
             confirmed.surfaces,
             why,
         )
+
+
+def localize_pair(
+    map_: MapFile, pair: StereoPair, calibration: Rig, config: DriveSettings | None
+) -> Located:
+    """Find where a single pair was taken; see `Map.localize`."""
+    reconstructor = FrameReconstructor(calibration, config or DriveSettings())
+    # Several views of the map must show the place, since no second frame confirms it.
+    localizer = Localizer(known_places(map_), frames=1)
+    return localizer.add(OdometryFrame(*reconstructor.match(pair)))

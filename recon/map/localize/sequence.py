@@ -10,14 +10,14 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
-from recon.core.values import Rig, StereoPair, Trajectory
+from recon.core.values import StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.core.words import counted
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.map_views import known_places
 from recon.odometry.protocol import OdometryFrame
 from recon.run.lookahead import look_ahead
@@ -175,7 +175,7 @@ class LocalizedDrive:
 
 
 def open_localizer(
-    map_: Map, config: DriveSettings, *, start: StartPose | None = None
+    map_: MapFile, config: DriveSettings, *, start: StartPose | None = None
 ) -> Localizer:
     """Make ready to find a drive in a map.
 
@@ -196,16 +196,6 @@ def open_localizer(
                 hint="x and y in metres and the heading in degrees, in map axes",
             )
     return Localizer(known, Surroundings(map_, config.odometry.max_range_m), among=among)
-
-
-def localize_pair(
-    map_: Map, pair: StereoPair, calibration: Rig, config: DriveSettings | None
-) -> Located:
-    """Find where a single pair was taken; see `Map.localize`."""
-    reconstructor = FrameReconstructor(calibration, config or DriveSettings())
-    # Several views of the map must show the place, since no second frame confirms it.
-    localizer = Localizer(known_places(map_), frames=1)
-    return localizer.add(OdometryFrame(*reconstructor.match(pair)))
 
 
 def localize_sequence(

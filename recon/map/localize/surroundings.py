@@ -20,7 +20,7 @@ from recon.map.localize.surfaces import (
     fit_surfaces,
     misfit,
 )
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.icp_points import select_points
 from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
@@ -84,7 +84,7 @@ class Surroundings:
         max_range_m: Farther points are not used.
     """
 
-    def __init__(self, map_: Map, max_range_m: float) -> None:
+    def __init__(self, map_: MapFile, max_range_m: float) -> None:
         self._range_m = max_range_m
         self._parts = [part for session in map_.linked for part in _parts(map_, session)]
         options = KissIcpOptions(max_range_m, _VOXEL_M, iterations=50, convergence=1e-3)
@@ -159,7 +159,7 @@ def contrast(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -
     return min(aside) - here
 
 
-def _parts(map_: Map, session: Session) -> Iterator[_Part]:
+def _parts(map_: MapFile, session: Session) -> Iterator[_Part]:
     """Yield the submaps of a drive whose frames have a place in the map."""
     apart = session.trusted & ~map_.placed[session.number]
     corrections, T_map_session = session.corrections(), map_.T_world_session(session)

@@ -13,7 +13,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.cast_submaps import check_rays
 from recon.map.store.frames import FRAMES
 from recon.map.store.keyframes import KEYFRAME
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.rays import RAYS
 from recon.map.store.records import Key
 from recon.map.store.session import AXES, LOOPS, SESSION, Session
@@ -22,7 +22,7 @@ from recon.map.store.submaps import ENTRY, SUBMAP
 _KINDS = (SESSION, AXES, FRAMES, LOOPS, KEYFRAME, RAYS, SUBMAP, ENTRY)
 
 
-def copy_sessions(source: Map, target: Map, without: Collection[int] = ()) -> list[int]:
+def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = ()) -> list[int]:
     """Copy the drives of a map into another one, with the links between them.
 
     They keep their numbers where the other map is empty, else they get the next ones.
@@ -55,7 +55,7 @@ def copy_sessions(source: Map, target: Map, without: Collection[int] = ()) -> li
     return list(numbers.values())
 
 
-def read_all(map_: Map) -> None:
+def read_all(map_: MapFile) -> None:
     """Read what `copy_sessions` copies unread.
 
     Raises:
@@ -92,7 +92,7 @@ def _renumbered(keys: list[Key], numbers: dict[int, int]) -> dict[Key, Key]:
     return found
 
 
-def _refuse_again(session: Session, target: Map) -> None:
+def _refuse_again(session: Session, target: MapFile) -> None:
     """Refuse a drive that a map has already: it would be evidence of its own."""
     path = session.odometry
     for other in target.sessions:

@@ -14,7 +14,7 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.sessions.linking import find_links, path_up_to
 from recon.map.store.links import Link
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
 from recon.places.closure import DrivePath, Tie, join_drives
 from recon.places.fixes import Held
@@ -34,7 +34,7 @@ class _Joined:
     links: list[Link]
 
 
-def join_new(map_: Map, new: Collection[int]) -> None:
+def join_new(map_: MapFile, new: Collection[int]) -> None:
     """Find the links of new drives, and place all drives of the map, see `join_sessions`.
 
     Args:
@@ -44,7 +44,7 @@ def join_new(map_: Map, new: Collection[int]) -> None:
     join_sessions(map_, [*map_.links, *find_links(map_, new)])
 
 
-def join_sessions(map_: Map, links: Sequence[Link]) -> None:
+def join_sessions(map_: MapFile, links: Sequence[Link]) -> None:
     """Place the drives that links hold together; keep the links, and which drives those are.
 
     The first drive stays where it is, and its axes are those of the map. Drives that no link holds
@@ -65,7 +65,7 @@ def join_sessions(map_: Map, links: Sequence[Link]) -> None:
     map_.set_links([replace(link, kept=id(link) in kept) for link in links], [*linked])
 
 
-def _held_together(map_: Map, links: Sequence[Link]) -> _Joined:
+def _held_together(map_: MapFile, links: Sequence[Link]) -> _Joined:
     """Solve the graph until all of its drives are held by links that it believes."""
     while True:
         places = _reached(map_, links)
@@ -84,7 +84,7 @@ def _held_together(map_: Map, links: Sequence[Link]) -> _Joined:
         links = joined.links
 
 
-def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
+def _reached(map_: MapFile, links: Sequence[Link]) -> dict[int, Float64]:
     """Return about where the drives are that links or measured positions connect with the first.
 
     Returns:
@@ -108,7 +108,7 @@ def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
             found[one] = orthonormalise(found[other] @ invert(T_one_other))
 
 
-def _by_survey(map_: Map, found: dict[int, Float64]) -> dict[int, Float64]:
+def _by_survey(map_: MapFile, found: dict[int, Float64]) -> dict[int, Float64]:
     """Return about where the next drive is that only measured positions place beside others."""
     held = [session for session in map_.sessions if len(session.fixes)]
     there = [session for session in held if session.number in found]
@@ -133,7 +133,7 @@ def _motion(one: Session, other: Session, loop: Loop) -> Float64:
     return np.asarray(T_one_first @ loop.T_first_last @ invert(T_other_last))
 
 
-def _solve(map_: Map, places: dict[int, Float64], links: Sequence[Link]) -> _Joined:
+def _solve(map_: MapFile, places: dict[int, Float64], links: Sequence[Link]) -> _Joined:
     """Solve the pose graph of some drives, with their own loops and the links between them."""
     numbers = list(places)
     sessions = [map_.session(number) for number in numbers]
@@ -152,7 +152,7 @@ def _solve(map_: Map, places: dict[int, Float64], links: Sequence[Link]) -> _Joi
     return _Joined(dict(zip(numbers, joined.trajectories, strict=True)), believed)
 
 
-def _held(map_: Map, sessions: Sequence[Session], drives: Sequence[DrivePath]) -> Held | None:
+def _held(map_: MapFile, sessions: Sequence[Session], drives: Sequence[DrivePath]) -> Held | None:
     """Return the positions that were measured along drives; None if there are none."""
     fixes = [session.fixes for session in sessions]
     position_m = np.concatenate([each.position_m for each in fixes])
@@ -179,7 +179,7 @@ def _drive(session: Session, T_world_session: Float64) -> DrivePath:
     return DrivePath(replace(session.odometry, T_world_camera=poses), path_up_to(session))
 
 
-def _place(map_: Map, session: Session, path: Trajectory) -> None:
+def _place(map_: MapFile, session: Session, path: Trajectory) -> None:
     """Write where a drive is: its axes, and how its path is bent."""
     T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
     bent = invert(T_world_session) @ path.T_world_camera

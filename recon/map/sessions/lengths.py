@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import apply
 from recon.core.values import Trajectory
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.places.loop import Loop
 
 _FEWEST: Final = 5
@@ -21,7 +21,7 @@ _LARGEST: Final = 0.02
 _SIGMAS: Final = 4.0
 
 
-def doubts_of_lengths(map_: Map) -> list[str]:
+def doubts_of_lengths(map_: MapFile) -> list[str]:
     """Return a line for each two drives, one of which finds the same street longer."""
     kept = sorted((link for link in map_.links if link.kept), key=lambda link: link.sessions)
     lines = []

@@ -10,7 +10,7 @@ import numpy as np
 from recon.core.values.arrays import Float64
 from recon.map.sessions.shared_frames import link_by_frame, shared_frames
 from recon.map.store.links import Link
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.map_views import MapViews
 from recon.map.store.session import Session
 from recon.odometry.health import stretches
@@ -20,7 +20,7 @@ from recon.places.known_places import KnownPlaces, KnownView
 from recon.places.loop import Loop
 
 
-def find_links(map_: Map, new: Collection[int]) -> list[Link]:
+def find_links(map_: MapFile, new: Collection[int]) -> list[Link]:
     """Return the places that new drives of a map and the drives before them saw.
 
     Drives that have frames in common are linked by them. Besides, each keyframe of a new drive is
@@ -53,7 +53,7 @@ def path_up_to(session: Session) -> Float64:
     return path_lengths(session.odometry.T_world_camera, session.trusted)
 
 
-def _between(map_: Map, group: Sequence[int], new: Session) -> list[Link]:
+def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
     """Return the links from drives that share axes to a new one."""
     links, theirs, own = [], set(), set()
     for number in group:

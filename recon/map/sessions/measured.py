@@ -19,7 +19,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.words import counted
 from recon.io.files import read_table, reader
 from recon.io.trajectory import check_positions
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.path_drift import expected_drift
 from recon.places.drift import SIGMAS
@@ -219,7 +219,7 @@ def measure_along(
     return measured
 
 
-def hold(map_: Map, survey: Survey) -> list[str]:
+def hold(map_: MapFile, survey: Survey) -> list[str]:
     """Keep the positions that were measured during the drives of a map, with these drives.
 
     `join_sessions` then bends their paths to run through them.
@@ -241,7 +241,7 @@ def hold(map_: Map, survey: Survey) -> list[str]:
     return lines
 
 
-def misfit_rms_m(map_: Map) -> float | None:
+def misfit_rms_m(map_: MapFile) -> float | None:
     """Return how far paths and measured positions are apart, root mean square; None = none are.
 
     The positions are those of linked drives, moved rigidly to where they fit best.
@@ -256,7 +256,7 @@ def misfit_rms_m(map_: Map) -> float | None:
     return float(np.sqrt(np.mean(np.sum(_off_m(ours_m, position_m) ** 2, axis=1))))
 
 
-def doubts_of_positions(map_: Map) -> list[str]:
+def doubts_of_positions(map_: MapFile) -> list[str]:
     """Return a warning if paths that are held at measured positions are far from them still."""
     off_m = misfit_rms_m(map_)
     extent_m = max((span_m(each.trajectory.positions_m) for each in map_.linked), default=0.0)

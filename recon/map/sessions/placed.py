@@ -13,7 +13,7 @@ from recon.map.occupancy.looks import Looks
 from recon.map.sessions.shared_frames import seen_before
 from recon.map.settings import DriveSettings
 from recon.map.store.cast_submaps import CastSubmaps, check_rays, looks_of
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.records import Store
 from recon.map.store.session import Session
 from recon.map.store.submaps import Submaps
@@ -44,7 +44,7 @@ def settings_of(session: Session) -> DriveSettings:
     return DriveSettings.parse(config, where=session.where)
 
 
-def place_map(map_: Map, settings: DriveSettings, threads: int = 1) -> PlacedMap:
+def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> PlacedMap:
     """Cut the linked drives of a map into tiles.
 
     Occupancy that the drive kept is taken where it was made with these settings; else it is made
@@ -83,7 +83,7 @@ class PlacedSubmaps:
         ready: Whether they are read as they are, without a ray being cast.
     """
 
-    def __init__(self, map_: Map, settings: DriveSettings) -> None:
+    def __init__(self, map_: MapFile, settings: DriveSettings) -> None:
         sessions = map_.linked
         self.ready = len(sessions) == 1 and not _to_be_cast(sessions[0], settings)
         for session in [] if self.ready else sessions:
@@ -120,7 +120,7 @@ class PlacedSubmaps:
         return replace(submap, fused=submap.fused.moved(T[own], self._settings.fusion.voxel_m))
 
 
-def with_path(map_: Map, tiles: Tiles) -> PlacedMap:
+def with_path(map_: MapFile, tiles: Tiles) -> PlacedMap:
     """Return the tiles of a map with the paths of its linked drives."""
     sessions = map_.linked
     paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
@@ -129,7 +129,7 @@ def with_path(map_: Map, tiles: Tiles) -> PlacedMap:
     return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
 
 
-def has_occupancy(map_: Map) -> bool:
+def has_occupancy(map_: MapFile) -> bool:
     """Return whether a map knows what is free, or can find it out from its rays."""
     first = map_.first
     return first.ray_frames > 0 or any(entry.cells for entry in first.submaps.entries)
@@ -154,7 +154,9 @@ def _made_once(placed: PlacedSubmaps, settings: DriveSettings, threads: int) -> 
     return made
 
 
-def _beside(map_: Map, session: Session, settings: DriveSettings) -> tuple[CastSubmaps, Float64]:
+def _beside(
+    map_: MapFile, session: Session, settings: DriveSettings
+) -> tuple[CastSubmaps, Float64]:
     """Return the submaps of one of several drives, and what moves the sums of each."""
     T_world_session, corrections = map_.T_world_session(session), session.corrections()
     poses = T_world_session @ session.trajectory.T_world_camera
@@ -164,7 +166,7 @@ def _beside(map_: Map, session: Session, settings: DriveSettings) -> tuple[CastS
     return CastSubmaps(session, settings, map_.first.T_map_world, poses, without), moves
 
 
-def looks_in(map_: Map, settings: DriveSettings) -> Looks | None:
+def looks_in(map_: MapFile, settings: DriveSettings) -> Looks | None:
     """Return what single frames of the linked drives saw, where they lie; None = not known."""
     return looks_of(
         (
@@ -175,12 +177,12 @@ def looks_in(map_: Map, settings: DriveSettings) -> Looks | None:
     )
 
 
-def _no_evidence(map_: Map, session: Session) -> frozenset[int]:
+def _no_evidence(map_: MapFile, session: Session) -> frozenset[int]:
     """Return the frames without a place, and those whose images an earlier drive has, too."""
     return frozenset(seen_before(map_, session) | _without_place(map_, session))
 
 
-def _without_place(map_: Map, session: Session) -> frozenset[int]:
+def _without_place(map_: MapFile, session: Session) -> frozenset[int]:
     """Return the frames of a drive that saw something, but have no place in the map."""
     frames = np.flatnonzero(session.trusted & ~map_.placed[session.number])
     return frozenset(frames.tolist())

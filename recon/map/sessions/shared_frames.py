@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.places.loop import Loop
 
@@ -34,7 +34,7 @@ def link_by_frame(one: Session, first: int, last: int) -> Loop:
     return Loop(first, last, np.eye(4), _INFORMATION * np.eye(6), points, 1.0, same_frame=True)
 
 
-def seen_before(map_: Map, session: Session) -> frozenset[int]:
+def seen_before(map_: MapFile, session: Session) -> frozenset[int]:
     """Return the frames of a drive that an earlier one has in the map: no evidence of its own."""
     linked = map_.linked
     earlier, placed = linked[: linked.index(session)], map_.placed

@@ -20,7 +20,7 @@ from recon.io.files import resolved
 from recon.map.cut import Cutter
 from recon.map.sessions.placed import PlacedMap, PlacedSubmaps, looks_in, with_path
 from recon.map.settings import DriveSettings
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.tile_parts import TileKey, TileParts
 from recon.map.tiles import Tiles
 
@@ -75,7 +75,7 @@ class TileTask:
 
 
 def place_map_on(
-    map_: Map, settings: DriveSettings, folder: Path, each: Each, workers: int
+    map_: MapFile, settings: DriveSettings, folder: Path, each: Each, workers: int
 ) -> PlacedMap:
     """Do what `place_map` does, and make all tiles, on several processes.
 
@@ -119,7 +119,7 @@ def place_map_on(
 
 def cut_submaps(task: SubmapTask) -> None:
     """Cut some submaps of a map into tiles."""
-    with closing(Map.open(task.map)) as map_:
+    with closing(MapFile.open(task.map)) as map_:
         placed = PlacedSubmaps(map_, task.settings)
         T = placed.corrections
         cutter = Cutter(task.settings, map_.first.T_map_world, task.halvings)
@@ -144,7 +144,7 @@ def make_tiles(task: TileTask) -> None:
         path=task.file,
     )
     if tiles is not None:  # as known when the task was made
-        with closing(Map.open(task.map)) as map_:
+        with closing(MapFile.open(task.map)) as map_:
             tiles.with_looks(looks_in(map_, task.settings))
             for key in task.keys:
                 tiles.make_voxels(key)

@@ -2,7 +2,7 @@
 
 From the map down to the file:
 
-- `map.py`: drives in one file; `session.py`: what one drive keeps in it;
+- `map_file.py`: drives in one file; `session.py`: what one drive keeps in it;
 - `frames.py`, `rays.py`, `links.py`: values as records of their kind;
 - `submaps.py`, `keyframes.py`, `tile_parts.py`: lists of things that are read one at a time;
 - `records.py`: trees of arrays under a kind and a key; `arrays.py`: such a tree as bytes;

@@ -10,12 +10,12 @@ import numpy as np
 from recon.map.kernels import clamped
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.store.keyframes import KEYFRAME
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.map.store.rays import RAYS
 from recon.map.store.session import AXES, LOOPS
 
 
-def keep_map(mapped: Map, path: Path) -> None:
+def keep_map(mapped: MapFile, path: Path) -> None:
     """Write the map of finished drives: path, rays, keyframes, loops, and fused submaps.
 
     Occupancy is left out, since `place_map` makes it from the rays again.
@@ -24,7 +24,7 @@ def keep_map(mapped: Map, path: Path) -> None:
         mapped: The map as it was made.
         path: The new file.
     """
-    with Map.create(path) as kept:
+    with MapFile.create(path) as kept:
         for session in mapped.sessions:
             new = kept.begin(replace(session.info, start={}))
             for number, T_world_camera in enumerate(session.odometry.T_world_camera):

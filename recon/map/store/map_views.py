@@ -8,11 +8,11 @@ from typing import overload
 from recon.core.errors import MappingError
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.map.store.map import Map
+from recon.map.store.map_file import MapFile
 from recon.places.known_places import KnownPlaces, KnownView
 
 
-def known_places(map_: Map) -> KnownPlaces:
+def known_places(map_: MapFile) -> KnownPlaces:
     """Return all places of a map, to recognise them."""
     views = MapViews(map_)
     if not views:
@@ -33,7 +33,7 @@ class MapViews(Sequence[KnownView]):
             far as they have a place in it.
     """
 
-    def __init__(self, map_: Map, sessions: Collection[int] | None = None) -> None:
+    def __init__(self, map_: MapFile, sessions: Collection[int] | None = None) -> None:
         self._map = map_
         self._keys: list[tuple[int, int]] = []
         self._poses: dict[int, Float64] = {}

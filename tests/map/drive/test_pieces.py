@@ -11,7 +11,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.map.drive.pieces import LEAD, Piece, cut_drive, join_pieces, joined_drive
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace, session_info
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
 from tests.scenery.film import Film, film

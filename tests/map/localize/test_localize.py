@@ -20,8 +20,8 @@ from recon.map.localize.sequence import (
     open_localizer,
 )
 from recon.map.settings import DriveSettings
-from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
+from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryFrame
 from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import StreetScene

@@ -23,9 +23,9 @@ from recon.map.sessions.joining import join_new, join_sessions
 from recon.map.sessions.placed import PlacedSubmaps, place_map
 from recon.map.sessions.shared_frames import seen_before, shared_frames
 from recon.map.store.links import Link
-from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
+from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.places.fixes import Fixes
 from recon.places.loop import Loop

@@ -16,7 +16,7 @@ from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.joining import join_new
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
-from recon.map.store.map import Map
+from recon.map.verbs import Map
 from tests.map.sessions.test_map_of_several_drives import TRUE, _drive, _off_m
 
 T_SURVEY_WORLD = make_transform(

@@ -17,9 +17,9 @@ from recon.map.occupancy.part import join_occupancy
 from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.sessions.placed import PlacedSubmaps
 from recon.map.store.keep_map import keep_map
-from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
+from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 
 CONFIG = load_config(None, ["submaps.length_m=4"])

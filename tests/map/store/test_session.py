@@ -10,8 +10,8 @@ import pytest
 from recon.core.errors import FormatError, ShapeError
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera
 from recon.map.sessions.linking import path_up_to
-from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
+from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 
 GRAIN = RayGrain(0.1, 0.1 / 64, 25.0)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from typing_extensions import Self
 
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
-from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.core.values.arrays import Bool, Float64
 from recon.core.words import counted
 from recon.io.files import StrPath, reading
@@ -20,16 +19,11 @@ from recon.map.store.session import SESSION, Session, SessionInfo
 from recon.map.store.trust import doubts_of_drives, placed_frames
 from recon.run.directory import refuse_links
 
-if TYPE_CHECKING:
-    from recon.map.localize.localizer import Located
-    from recon.map.settings import DriveSettings
-    from recon.map.tiles import Tiles
-
 MAP_FILE: Final = "map/map.recon"
 """Where a finished run keeps its map."""
 
 
-class Map:
+class MapFile:
     """What is known of one or several drives, on disk; memory holds the poses and a cache.
 
     Open one with `create`, `open` or `temporary`.
@@ -84,7 +78,9 @@ class Map:
         return cls(Store.temporary())
 
     def __repr__(self) -> str:
-        return f"Map({self.store.name!r}, {counted(len(self.sessions), 'session')})"
+        return (
+            f"{type(self).__name__}({self.store.name!r}, {counted(len(self.sessions), 'session')})"
+        )
 
     def session(self, number: int = 0) -> Session:
         """Return a drive in the map.
@@ -179,66 +175,6 @@ class Map:
         """
         content = {"links": [link.to_tree() for link in links], "linked": sorted(linked)}
         self.store.put(LINKS, 0, content, compress=True)
-
-    def merge(self, other: Map) -> list[Session]:
-        """Add the drives of another finished map, and place those that saw the same places.
-
-        Args:
-            other: The other map; it stays as it is. `commit` makes the change permanent.
-
-        Returns:
-            The drives that are new here; those that could be placed are in `linked`.
-
-        Raises:
-            FormatError: A map is damaged, or a drive is in both.
-            OutputError: The map cannot be written.
-        """
-        from recon.map.sessions.copying import copy_sessions  # noqa: PLC0415 - it is above
-        from recon.map.sessions.joining import join_new  # noqa: PLC0415 - the same
-
-        new = copy_sessions(other, self)
-        join_new(self, new)
-        return [self.session(number) for number in new]
-
-    def tiles(self, settings: DriveSettings | None = None) -> Tiles:
-        """Return the linked drives in tiles: cloud, what moved, and occupancy from their rays.
-
-        Args:
-            settings: How to make them; None = the settings of the first drive.
-
-        Raises:
-            FormatError: A drive kept no rays, or the map is damaged.
-            SettingsError: The settings need finer or longer rays than were kept.
-        """
-        from recon.map.sessions.placed import place_map, settings_of  # noqa: PLC0415 - it is above
-
-        return place_map(self, settings or settings_of(self.first)).tiles
-
-    def localize(
-        self,
-        pair: StereoPair,
-        calibration: RectifiedCamera | StereoCalibration | None = None,
-        config: DriveSettings | None = None,
-    ) -> Located:
-        """Find where a single pair was taken, without knowing anything else.
-
-        A drive is found more surely, and faster, by `recon.run_localize`.
-
-        Args:
-            pair: The images.
-            calibration: Of the cameras that took them; None = those of the map, rectified.
-            config: How to match them; None = the defaults.
-
-        Returns:
-            State ``tracking`` with the pose in the world of the map, or ``searching``.
-
-        Raises:
-            ReconError: The map has no keyframes or is damaged, or images and calibration do not
-                fit together.
-        """
-        from recon.map.localize.sequence import localize_pair  # noqa: PLC0415 - it is above
-
-        return localize_pair(self, pair, calibration or self.first.camera, config)
 
     def begin(self, info: SessionInfo) -> Session:
         """Add a drive.

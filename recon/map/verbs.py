@@ -1,0 +1,73 @@
+"""A map with what is done with it: merge it, cut it into tiles, find a pair in it."""
+
+from __future__ import annotations
+
+from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
+from recon.map.localize.localizer import Located, localize_pair
+from recon.map.sessions.copying import copy_sessions
+from recon.map.sessions.joining import join_new
+from recon.map.sessions.placed import place_map, settings_of
+from recon.map.settings import DriveSettings
+from recon.map.store.map_file import MapFile
+from recon.map.store.session import Session
+from recon.map.tiles import Tiles
+
+
+class Map(MapFile):
+    """One or several drives on disk: open a map with `open`, then merge, cut or search it.
+
+    Begin one with `create` or `temporary`; `MapFile` has what is in it.
+    """
+
+    def merge(self, other: Map) -> list[Session]:
+        """Add the drives of another finished map, and place those that saw the same places.
+
+        Args:
+            other: The other map; it stays as it is. `commit` makes the change permanent.
+
+        Returns:
+            The drives that are new here; those that could be placed are in `linked`.
+
+        Raises:
+            FormatError: A map is damaged, or a drive is in both.
+            OutputError: The map cannot be written.
+        """
+        new = copy_sessions(other, self)
+        join_new(self, new)
+        return [self.session(number) for number in new]
+
+    def tiles(self, settings: DriveSettings | None = None) -> Tiles:
+        """Return the linked drives in tiles: cloud, what moved, and occupancy from their rays.
+
+        Args:
+            settings: How to make them; None = the settings of the first drive.
+
+        Raises:
+            FormatError: A drive kept no rays, or the map is damaged.
+            SettingsError: The settings need finer or longer rays than were kept.
+        """
+        return place_map(self, settings or settings_of(self.first)).tiles
+
+    def localize(
+        self,
+        pair: StereoPair,
+        calibration: RectifiedCamera | StereoCalibration | None = None,
+        config: DriveSettings | None = None,
+    ) -> Located:
+        """Find where a single pair was taken, without knowing anything else.
+
+        A drive is found more surely, and faster, by `recon.run_localize`.
+
+        Args:
+            pair: The images.
+            calibration: Of the cameras that took them; None = those of the map, rectified.
+            config: How to match them; None = the defaults.
+
+        Returns:
+            State ``tracking`` with the pose in the world of the map, or ``searching``.
+
+        Raises:
+            ReconError: The map has no keyframes or is damaged, or images and calibration do not
+                fit together.
+        """
+        return localize_pair(self, pair, calibration or self.first.camera, config)
