@@ -50,7 +50,7 @@ def audit(
         from recon.commands.audit import run_audit
         from recon.commands.config import load_config
         from recon.io.atomic import check_targets
-        from recon.report.audit_table import audit_lines
+        from recon.report.audit_page import audit_lines
         from recon.sources.registry import open_source
 
         if mend is not None and config is not None:

@@ -82,7 +82,7 @@ def middlebury(
         from recon.cli.show.progress import choose_viewer
         from recon.commands.config import load_config
         from recon.commands.evaluate_middlebury import run_middlebury
-        from recon.report.middlebury_tables import middlebury_tables
+        from recon.report.middlebury_page import middlebury_tables
         from recon.report.table import Table, join
 
         summary = run_middlebury(

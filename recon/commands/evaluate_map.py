@@ -21,7 +21,7 @@ from recon.evaluation.map_comparison import (
 )
 from recon.io.files import naming
 from recon.io.models.ply import read_ply
-from recon.report.map_errors import write_map_errors
+from recon.report.map_page import write_map_errors
 from recon.run.finished import CLOUD
 from recon.run.run import Run
 from recon.run.summary import plain

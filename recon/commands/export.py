@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.core.errors import SettingsError
-from recon.export.cloud_file import export_pair
 from recon.export.make import known_products, make, need_rays
+from recon.export.pair import export_pair
 from recon.export.product import Order
 from recon.io.files import StrPath, resolved
 from recon.io.models.las import SUFFIXES as SURVEYED

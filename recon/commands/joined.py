@@ -20,7 +20,7 @@ from recon.map.sessions.measured import Survey, hold
 from recon.map.sessions.placed import place_map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
-from recon.report.joined_page import write_joined_page
+from recon.report.map_page import write_joined_page
 from recon.run.finished import open_run
 from recon.run.run import Run, WholeRun
 

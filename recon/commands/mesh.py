@@ -8,7 +8,7 @@ from typing import Any
 
 from recon.commands.config import ReconConfig, run_settings
 from recon.commands.export import run_export
-from recon.export.cloud_file import finish_cloud_run, mesh_cloud
+from recon.export.pair import finish_cloud_run, mesh_cloud
 from recon.io.models.mesh import check_mesh_formats
 from recon.run.finished import PAIR_CLOUD, camera_of_pair, is_pair_run, refuse_as_target
 from recon.run.run import Run

@@ -20,8 +20,8 @@ from recon.io.images.image import write_image
 from recon.io.images.pfm import write_pfm
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import write_ply
-from recon.report.colour import colour_disparity
 from recon.report.paper_page import write_paper_page
+from recon.report.style import colour_disparity
 from recon.run.run import Run
 
 

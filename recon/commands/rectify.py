@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig
 from recon.io.images.image import write_image
-from recon.report.epipolar import write_epipolar_images
+from recon.report.calibration_page import write_epipolar_images
 from recon.rig.rectification import (
     RectifyRun,
     measure_rows,

@@ -9,9 +9,8 @@ from typing import Any, Final
 from recon.core.errors import MeshingError, SettingsError
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 from recon.export.cloud import cloud_product
-from recon.export.grid import grid_product
 from recon.export.mesh.pieces import mesh_product
-from recon.export.octomap import octomap_product
+from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import Made, Order, Product
 from recon.export.survey import survey_product
 from recon.map.sessions.placed import has_occupancy

@@ -1,21 +1,30 @@
-"""The files of one pair: disparity, depth, cloud, mesh, and a MeshLab project of them."""
+"""What is made of one pair, or of any cloud file: images, cloud, mesh, a MeshLab project."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from shutil import copyfile
+from typing import Any
 
 from recon.core.errors import MeshingError
 from recon.core.geometry.projection import depth_from_disparity
-from recon.core.values import Disparity, RectifiedPair, TriangleMesh
-from recon.export.mesh.poisson import MeshSettings
+from recon.core.values import Disparity, RectifiedCamera, RectifiedPair, TriangleMesh
+from recon.core.values.cloud import Frame
+from recon.export.mesh.pieces import LAYER, WHOLE, in_other_formats
+from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
+from recon.io.atomic import atomic_path
+from recon.io.files import naming, reading
 from recon.io.images.disparity_png import fitting_scale, write_disparity_png
 from recon.io.images.image import write_image
 from recon.io.images.pfm import write_pfm
 from recon.io.models.mesh import write_mesh
 from recon.io.models.mlp import Photo, write_mlp
-from recon.io.models.ply import write_ply
+from recon.io.models.ply import read_ply, write_ply
 from recon.run.directory import RunDirectory
+from recon.run.finished import PAIR_CLOUD, camera_of_pair
+from recon.run.run import Run
 from recon.stereo.frame import ReconstructedFrame
 
 
@@ -71,3 +80,75 @@ def _write_project(pair: RectifiedPair, run: RunDirectory) -> None:
     layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("clouds/cloud.ply")}
     write_image(path("mesh/left.png"), pair.colours)
     write_mlp(path("mesh/mesh.mlp"), layers, "camera", Photo(path("mesh/left.png"), pair.camera))
+
+
+def mesh_cloud(
+    path: Path,
+    camera: RectifiedCamera | None,
+    settings: MeshSettings,
+    run: Run,
+    formats: Sequence[str] = ("ply",),
+) -> dict[str, Any]:
+    """Mesh a cloud file in one piece, as its camera saw it if it is that of a pair.
+
+    Returns:
+        The figures of the mesh.
+    """
+    with run.stage("read"):
+        cloud = read_ply(path)
+        write_ply(run.path(LAYER), cloud)
+    with run.stage("mesh"), naming(path):
+        if camera is None:
+            mesh, coverage = reconstruct_mesh(cloud, settings), None
+        else:
+            mesh = reconstruct_view(cloud, camera, settings)
+            coverage = mesh_coverage(mesh, cloud)
+    write_mesh(run.path(WHOLE), mesh)
+    frame: Frame | None = None if camera is None else "camera"
+    write_mlp(run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": run.path(LAYER)}, frame)
+    in_other_formats(run, formats, frame)
+    figures = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    if coverage is None:
+        return {**figures, "warnings": []}
+    return {**figures, "mesh_coverage": coverage, "warnings": list(check_coverage(coverage))}
+
+
+def copy_file(file: Path, target: Path) -> None:
+    """Copy a file, atomically."""
+    with reading(file):
+        file.stat()
+    with atomic_path(target) as temporary:
+        copyfile(file, temporary)
+
+
+def export_pair(
+    source: Path, settings: MeshSettings, products: Sequence[str], run: Run, formats: Sequence[str]
+) -> dict[str, Any]:
+    """Write products of a run of `recon pair`: its cloud, and a mesh of it.
+
+    Args:
+        source: Folder of that run.
+        settings: Settings of the mesh.
+        products: Which of ``cloud`` and ``mesh``.
+        run: The run that makes them.
+        formats: Formats of the mesh.
+
+    Returns:
+        The figures of ``summary.json``.
+    """
+    cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
+    figures: dict[str, Any] = {"run": str(source), "warnings": []}
+    if "cloud" in products:
+        copy_file(cloud, run.path(PAIR_CLOUD))
+    if "mesh" in products:
+        figures |= mesh_cloud(cloud, camera, settings, run, formats)
+    return finish_cloud_run(source, cloud, run, figures)
+
+
+def finish_cloud_run(
+    source: Path, cloud: Path, run: Run, figures: dict[str, Any]
+) -> dict[str, Any]:
+    """Complete a run that made something of a cloud file."""
+    figures = {"cloud": str(cloud), **figures}
+    run.finish(figures, source=str(source), inputs=[cloud])
+    return figures

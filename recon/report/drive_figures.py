@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -15,24 +16,25 @@ from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import UNKNOWN, OccupancyGrid, Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
-from recon.evaluation.trajectory import TrajectoryComparison
 from recon.odometry.protocol import OdometryHealth
-from recon.report.colour import GRID_FREE, GRID_OCCUPIED, GRID_UNKNOWN, colour_grid, unit_colour
-from recon.report.pair_figures import colour_key
 from recon.report.style import (
     BAD,
     ESTIMATE,
     FAINT,
-    HALF_IN,
+    GRID_FREE,
+    GRID_OCCUPIED,
+    GRID_UNKNOWN,
     INK,
     TRUTH,
     WIDE_IN,
+    colour_grid,
+    colour_key,
     nice_length,
     styled,
     to_png,
+    unit_colour,
     write_note,
 )
-from recon.report.thin import thin_grid
 
 Line = tuple[Float64, Mapping[str, Any]]
 """Points (N, 2) and how matplotlib draws them."""
@@ -42,8 +44,8 @@ _MOST_CELLS: Final = 2400  # of a grid's figure, a side: some for each of its pi
 _MARGIN_CELLS: Final = 10
 _PATH_MARGIN_M: Final = 3.0
 _CIRCLES: Final = 5  # along a path, of its expected drift
-_ESTIMATE_LINE: Final = {"color": ESTIMATE, "linewidth": 1.8, "label": "estimate"}
-_TRUTH_LINE: Final = {"color": TRUTH, "linewidth": 3.5, "alpha": 0.75, "label": "truth"}
+ESTIMATE_LINE: Final = {"color": ESTIMATE, "linewidth": 1.8, "label": "estimate"}
+TRUTH_LINE: Final = {"color": TRUTH, "linewidth": 3.5, "alpha": 0.75, "label": "truth"}
 
 
 def path_figure(
@@ -64,17 +66,17 @@ def path_figure(
             up to there; 0 = not known.
     """
     path = seen_from_above(estimate, T_map_world)
-    lines: list[Line] = [(path, _ESTIMATE_LINE)]
+    lines: list[Line] = [(path, ESTIMATE_LINE)]
     if radius_share > 0.0:
         look = {"color": ESTIMATE, "linewidth": 0.8, "label": "95 % (expected drift)"}
         lines.append((_circles(path, radius_share * estimate.distances_m), look))
     if truth is not None:
-        lines.insert(0, (seen_from_above(truth, T_map_world), _TRUTH_LINE))
+        lines.insert(0, (seen_from_above(truth, T_map_world), TRUTH_LINE))
     bad = _bad_frames(health, len(estimate))
     if len(bad):
         look = {"marker": "x", "linestyle": "", "markersize": 8, "markeredgewidth": 2}
         lines.append((path[bad], {**look, "color": BAD, "label": f"not trusted ({len(bad)})"}))
-    return _top_view(lines, path, _MAP_LABELS)
+    return top_view(lines, path, _MAP_LABELS)
 
 
 def _circles(path: Float64, radii_m: Float64) -> Float64:
@@ -98,24 +100,14 @@ def loops_figure(
     look = {"marker": "o", "linewidth": 0.8, "markersize": 2.5}
     lines: list[Line] = [
         (odometry, {"color": FAINT, "linewidth": 1.4, "linestyle": "--", "label": "odometry"}),
-        (closed, {**_ESTIMATE_LINE, "label": "loops closed"}),
+        (closed, {**ESTIMATE_LINE, "label": "loops closed"}),
         (joined, {**look, "color": BAD, "label": f"loops ({len(loops)})"}),
     ]
-    return _top_view(lines, closed, _MAP_LABELS)
-
-
-def compared_paths_figure(comparison: TrajectoryComparison) -> bytes:
-    """Draw both paths on the two world axes along which the true one extends farthest."""
-    axes = list(widest_axes(comparison.truth.positions_m))
-    truth, estimate = (
-        path.positions_m[:, axes] for path in (comparison.truth, comparison.estimate)
-    )
-    labels = ("{} (m)".format("xyz"[axes[0]]), "{} (m)".format("xyz"[axes[1]]))
-    return _top_view([(truth, _TRUTH_LINE), (estimate, _ESTIMATE_LINE)], truth, labels)
+    return top_view(lines, closed, _MAP_LABELS)
 
 
 @styled
-def _top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> bytes:
+def top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> bytes:
     """Draw lines in a plane with equal axes, with the start and end of one path."""
     figure = Figure((WIDE_IN, _height_in(np.concatenate([points for points, _ in lines]))))
     axes = figure.subplots()
@@ -141,7 +133,7 @@ def drift_figure(
         write_note(figure.subplots(), note)
         return to_png(figure)
     drift = invert(truth.T_world_camera) @ estimate.T_world_camera
-    figure, all_axes = _errors_along(
+    figure, all_axes = errors_along(
         truth, np.linalg.norm(drift[:, :3, 3], axis=1), np.degrees(angle_rad(drift))
     )
     bad = truth.distances_m[_bad_frames(health, len(estimate))]
@@ -151,19 +143,10 @@ def drift_figure(
     return to_png(figure)
 
 
-@styled
-def pose_errors_figure(comparison: TrajectoryComparison) -> bytes:
-    """Draw position and rotation error of each aligned pose, along the true path."""
-    degrees = np.degrees(comparison.rotation_errors_rad)
-    figure, (upper, _) = _errors_along(comparison.truth, comparison.position_errors_m, degrees)
-    upper.axhline(comparison.metrics.ate_m, color=FAINT, linestyle="--", label="root mean square")
-    upper.legend(loc="best")
-    return to_png(figure)
-
-
-def _errors_along(
+def errors_along(
     truth: Trajectory, position_m: ArrayLike, rotation_deg: ArrayLike
 ) -> tuple[Figure, tuple[Axes, Axes]]:
+    """Draw errors of position and rotation along the true path; also return their axes."""
     figure = Figure((WIDE_IN, 4.6))
     upper, lower = figure.subplots(2, 1, sharex=True)
     upper.plot(truth.distances_m, position_m)
@@ -172,31 +155,6 @@ def _errors_along(
     lower.set(xlabel="distance along the true path (m)", ylabel="rotation error (°)")
     lower.set_ylim(bottom=0)
     return figure, (upper, lower)
-
-
-@styled
-def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool) -> bytes:
-    """Draw the relative error of the segments by length: mean and interquartile range."""
-    values = comparison.segment_deg_per_100m if rotation else comparison.segment_percent
-    lengths = np.unique(comparison.segments.length_m)
-    groups = [values[comparison.segments.length_m == length] for length in lengths]
-    quarters = np.array([np.percentile(group, (25, 75)) for group in groups])
-    figure = Figure((HALF_IN, 3.4))
-    axes = figure.subplots()
-    # One bar per length, as a line shows nothing for one or two lengths.
-    axes.vlines(lengths, *quarters.T, color=ESTIMATE, alpha=0.35, linewidth=8)
-    axes.plot(lengths, [float(np.mean(group)) for group in groups], "o-")
-    margin = max(10.0, 0.05 * float(np.ptp(lengths)))
-    axes.set_xlim(max(0.0, lengths[0] - margin), lengths[-1] + margin)
-    label = "rotation error (°/100 m)" if rotation else "translation error (%)"
-    axes.set(xlabel="length of the segments (m)", ylabel=label, ylim=(0, None))
-    return to_png(figure)
-
-
-def widest_axes(positions_m: Float64) -> tuple[int, int]:
-    """Return the two axes along which a path extends farthest, in order of the axes."""
-    first, second = sorted(np.argsort(-np.ptp(positions_m, axis=0), kind="stable")[:2].tolist())
-    return first, second
 
 
 @styled
@@ -228,21 +186,6 @@ def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
     handles = [colour_key(*key) for key in keys]
     named = lines if len(lines) > 1 else []
     figure.legend(handles=[*handles, *named], loc="outside lower center", ncols=3)
-    return to_png(figure)
-
-
-@styled
-def timing_figure(stages: Mapping[str, float]) -> bytes:
-    """Draw time and share of each stage, in the order of the mapping."""
-    figure = Figure((HALF_IN, max(1.6, 0.42 * len(stages) + 0.9)))
-    axes = figure.subplots()
-    seconds = np.asarray(list(stages.values()), dtype=np.float64)
-    total = max(float(seconds.sum()), 1e-12)
-    bars = axes.barh(list(stages), seconds, height=0.62)
-    axes.bar_label(bars, [f"{value:.2f} s · {value / total:.0%}" for value in seconds], padding=4)
-    axes.invert_yaxis()
-    axes.set(xlabel="time (s)", xlim=(0, max(float(seconds.max(initial=0.0)), 1e-12) * 1.28))
-    axes.grid(visible=False, axis="y")
     return to_png(figure)
 
 
@@ -330,3 +273,18 @@ def _draw_scale_bar(axes: Axes, low: NDArray[Any], size_m: NDArray[Any]) -> None
     axes.plot(ends, [bottom, bottom], color=INK, linewidth=4, solid_capstyle="butt")
     middle = (left + length / 2, bottom)
     axes.annotate(f"{length:g} m", middle, (0, 5), textcoords="offset points", ha="center")
+
+
+def thin_grid(grid: OccupancyGrid, limit: int) -> OccupancyGrid:
+    """Return a grid of larger cells, at most ``limit`` per side, for figures of large maps.
+
+    A larger cell is occupied if any of its cells is, else free if any is, so that no obstacle is
+    lost.
+    """
+    factor = math.ceil(max(grid.cells.shape) / limit)
+    if factor <= 1:
+        return grid
+    rows, columns = (np.arange(0, size, factor) for size in grid.cells.shape)
+    # Unknown is -1, free 0 and occupied larger, so the maximum is kept.
+    cells = np.maximum.reduceat(np.maximum.reduceat(grid.cells, rows, axis=0), columns, axis=1)
+    return OccupancyGrid(cells, grid.resolution_m * factor, grid.origin_m)

@@ -14,14 +14,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib.figure import Figure
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from recon.core.units import with_unit
 from recon.core.words import counted
 from recon.io.atomic import write_text
-from recon.report.drive_figures import timing_figure
+from recon.report.style import (
+    HALF_IN,
+    styled,
+    to_png,
+)
 from recon.report.table import NOT_KNOWN
 from recon.run.directory import RunDirectory
 from recon.run.machine import versions
@@ -155,3 +161,18 @@ def _embedded(png: bytes) -> str:
 def _words(name: str) -> list[str]:
     """Return the words of the name of a figure, between which a line may break."""
     return re.split(r"(?<=[._])(?=[a-z])", name)
+
+
+@styled
+def timing_figure(stages: Mapping[str, float]) -> bytes:
+    """Draw time and share of each stage, in the order of the mapping."""
+    figure = Figure((HALF_IN, max(1.6, 0.42 * len(stages) + 0.9)))
+    axes = figure.subplots()
+    seconds = np.asarray(list(stages.values()), dtype=np.float64)
+    total = max(float(seconds.sum()), 1e-12)
+    bars = axes.barh(list(stages), seconds, height=0.62)
+    axes.bar_label(bars, [f"{value:.2f} s · {value / total:.0%}" for value in seconds], padding=4)
+    axes.invert_yaxis()
+    axes.set(xlabel="time (s)", xlim=(0, max(float(seconds.max(initial=0.0)), 1e-12) * 1.28))
+    axes.grid(visible=False, axis="y")
+    return to_png(figure)

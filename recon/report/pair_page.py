@@ -1,15 +1,44 @@
-"""The report of one pair, and its results as colour images."""
+"""The report of a pair, and figures of pairs and of the results for their pixels, as PNG."""
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from collections.abc import Callable
+from typing import Any
 
-from recon.core.geometry.projection import depth_from_disparity
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from recon.core.geometry.projection import depth_from_disparity, disparity_from_depth
+from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values.arrays import UInt8
 from recon.io.images.image import write_image
-from recon.report.colour import colour_confidence, colour_disparity, colour_reasons
 from recon.report.page import write_page
-from recon.report.pair_figures import ERROR_LIMIT_PX, error_figure, stereo_figures
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
+from recon.report.style import (
+    CONFIDENCE_SCALE,
+    DISPARITY_SCALE,
+    ERROR_SCALE,
+    HALF_IN,
+    REASON_COLOURS,
+    REASON_LABELS,
+    WIDE_IN,
+    bare_figure,
+    colour_confidence,
+    colour_disparity,
+    colour_error,
+    colour_key,
+    colour_reasons,
+    colour_values,
+    show_image,
+    styled,
+    to_png,
+    value_range,
+)
 from recon.run.directory import RunDirectory
 from recon.stereo.frame import PairRun
 
@@ -53,3 +82,174 @@ def _beside_camera(result: PairRun) -> tuple[float, float, float]:
     known = depth_m[np.isfinite(depth_m)]
     far = float(np.median(known)) if known.size else 1.0
     return (-0.1 * far, 0.25 * far, 0.25 * far)
+
+
+ERROR_LIMIT_PX = 4.0
+"""Error of the last colour: the largest threshold of Middlebury's table."""
+
+# Height of the strip below an image: axis label and ticks, colour bar, and depths above it.
+_BELOW_IN = 1.0
+_BAR_BOTTOM_IN = 0.5
+_BAR_IN = 0.16
+_WIDE_ASPECT = 2.0
+_LABEL_ROOM = 0.1  # fraction of the length of a scale: "0.45 m" below a narrow image
+_FARTHEST_MARK_M = 1000.0
+# Ticks of a depth scale, the roundest first; the others fill the remaining space.
+_DEPTH_STEPS = ((1.0, 2.0, 5.0), (3.0, 4.0, 6.0, 8.0), (1.5, 2.5, 3.5, 4.5, 7.0, 9.0))
+
+
+def is_wide(shape: tuple[int, ...]) -> bool:
+    """Return whether images of this shape (H, W, …) need the whole width of a page."""
+    return shape[1] >= _WIDE_ASPECT * shape[0]
+
+
+def stereo_figures(pair: RectifiedPair, disparity: Disparity) -> dict[str, Any]:
+    """Draw a pair and the results for its pixels; also return what their captions need."""
+    return {
+        "pair": pair_figure(pair),
+        "disparity": disparity_figure(disparity, pair.camera),
+        "depth": depth_figure(depth_from_disparity(disparity.values, pair.camera)),
+        "reasons": reasons_figure(disparity),
+        "confidence": confidence_figure(disparity),
+        "valid_percent": float(100 * disparity.valid.mean()),
+        "wide": is_wide(disparity.values.shape),
+    }
+
+
+@styled
+def pair_figure(pair: RectifiedPair) -> bytes:
+    """Draw both rectified images: stacked if they are wide, else side by side."""
+    height, width = pair.left.shape
+    rows, columns = (2, 1) if is_wide(pair.left.shape) else (1, 2)
+    figure = Figure((WIDE_IN, (WIDE_IN / columns * height / width + 0.3) * rows))
+    left_axes, right_axes = figure.subplots(rows, columns)
+    show_image(left_axes, pair.colours, "Left, rectified")
+    right = pair.right if pair.right_rgb is None else pair.right_rgb
+    show_image(right_axes, right, "Right, rectified")
+    return to_png(figure)
+
+
+@styled
+def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
+    """Draw the disparity map, with scales in pixels below it and in metres of depth above that."""
+    limits = value_range(disparity.values)
+    figure = _image(colour_disparity(disparity.values, *limits))
+    bar = _colour_bar(figure, DISPARITY_SCALE, limits, "disparity in pixels")
+    _mark_depths(bar, limits, camera)
+    return to_png(figure)
+
+
+@styled
+def depth_figure(depth_m: NDArray[Any]) -> bytes:
+    """Draw a depth map (H, W) in metres, NaN = unknown; the scale is logarithmic, near is red."""
+    known_m = np.where(depth_m > 0, depth_m, np.nan)
+    low, high = value_range(known_m)
+    low = max(low, 1e-3)
+    limits = (math.log(low), math.log(max(high, low * 1.01)))
+    # Reversed, so that near has the same colour as in the disparity map.
+    scale = f"{DISPARITY_SCALE}_r"
+    figure = _image(colour_values(np.log(known_m), scale, limits))
+    bar = _colour_bar(figure, scale, limits, "depth in metres (logarithmic)")
+    depths = depth_marks(low, high, math.log, limits)
+    bar.set_xticks(np.log(depths).tolist(), [f"{depth:g}" for depth in depths])
+    return to_png(figure)
+
+
+@styled
+def confidence_figure(disparity: Disparity) -> bytes:
+    """Draw the confidence of each match, from 0 to 1."""
+    figure = _image(colour_confidence(disparity.confidence))
+    _colour_bar(figure, CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: no match)")
+    return to_png(figure)
+
+
+@styled
+def error_figure(error_px: NDArray[Any]) -> bytes:
+    """Draw the absolute disparity error of each pixel, up to the limit; NaN = not compared."""
+    figure = _image(colour_error(error_px, ERROR_LIMIT_PX))
+    label = "absolute disparity error in pixels (dark: not compared)"
+    _colour_bar(figure, ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
+    return to_png(figure)
+
+
+@styled
+def reasons_figure(disparity: Disparity) -> bytes:
+    """Draw why each pixel has a disparity or not, and the share of each reason."""
+    figure = _image(colour_reasons(disparity.reason))
+    handles = [
+        colour_key(f"{REASON_LABELS[reason]} {100 * share:.1f} %", REASON_COLOURS[reason])
+        for reason, share in disparity.reason_shares.items()
+    ]
+    columns = 4 if is_wide(disparity.reason.shape) else 3
+    middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
+    figure.legend(handles=handles, loc="center", ncols=columns, bbox_to_anchor=(0.5, middle))
+    return to_png(figure)
+
+
+def depth_marks(
+    low_m: float, high_m: float, place: Callable[[float], float], limits: tuple[float, float]
+) -> list[float]:
+    """Return round depths to mark on a scale, as many as there is room for labels.
+
+    Args:
+        low_m: Smallest depth on the scale, > 0.
+        high_m: Largest depth.
+        place: Maps a depth to its position on the scale.
+        limits: Start and end of the scale.
+
+    Returns:
+        The depths, increasing; the roundest are preferred.
+    """
+    powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
+    choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
+    room = _LABEL_ROOM * (limits[1] - limits[0])
+    marks: dict[float, float] = {}
+    for depth in choices:
+        there = place(depth)
+        free = all(abs(there - other) >= room for other in marks.values())
+        if low_m <= depth <= high_m and free:
+            marks[depth] = there
+    return sorted(marks)
+
+
+def _image(image: UInt8) -> Figure:
+    """Return an image that fills the width of its figure, with room for a scale or legend below."""
+    height, width = image.shape[:2]
+    width_in = WIDE_IN if is_wide(image.shape) else HALF_IN
+    height_in = width_in * height / width + _BELOW_IN
+    # Placed by hand, as layout engines ignore the ticks on the upper side of a scale.
+    figure = bare_figure(width_in, height_in)
+    axes = figure.add_axes((0.0, _BELOW_IN / height_in, 1.0, 1.0 - _BELOW_IN / height_in))
+    axes.imshow(image, aspect="auto")
+    axes.set_axis_off()
+    return figure
+
+
+def _colour_bar(
+    figure: Figure, scale: str, limits: tuple[float, float], label: str, extend: str = "neither"
+) -> Axes:
+    height_in = figure.get_size_inches()[1]
+    axes = figure.add_axes((0.05, _BAR_BOTTOM_IN / height_in, 0.9, _BAR_IN / height_in))
+    colours = ScalarMappable(Normalize(*limits), cmap=scale)
+    bar = figure.colorbar(colours, cax=axes, orientation="horizontal", extend=extend, label=label)
+    bar.outline.set_visible(False)
+    return axes
+
+
+def _mark_depths(bar: Axes, limits: tuple[float, float], camera: RectifiedCamera) -> None:
+    """Mark round depths on the upper side of a horizontal disparity bar."""
+    near, far = depth_from_disparity(np.asarray([limits[1], limits[0]]), camera).tolist()
+    if not math.isfinite(near):
+        return
+    # A disparity near 0 is an unbounded depth.
+    far = min(far, _FARTHEST_MARK_M) if math.isfinite(far) else _FARTHEST_MARK_M
+
+    def place(depth_m: float) -> float:
+        return float(disparity_from_depth(np.asarray(depth_m), camera))
+
+    depths = depth_marks(near, far, place, limits)
+    upper = bar.twiny()
+    upper.set_xlim(*limits)
+    upper.spines[:].set_visible(False)
+    upper.set_xticks([place(depth) for depth in depths], [f"{depth:g} m" for depth in depths])
+    upper.tick_params(length=2, pad=1)

@@ -23,9 +23,8 @@ from recon.evaluation.paper import (
     MethodResult,
     camera_of_table_1,
 )
-from recon.report.colour import DISPARITY_SCALE, colour_values, value_range
 from recon.report.page import write_page
-from recon.report.pair_figures import (
+from recon.report.pair_page import (
     ERROR_LIMIT_PX,
     depth_figure,
     disparity_figure,
@@ -36,14 +35,17 @@ from recon.report.pair_figures import (
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.report.style import (
     BAD,
+    DISPARITY_SCALE,
     ESTIMATE,
     FAINT,
     HALF_IN,
     TRUTH,
     WIDE_IN,
     bare_figure,
+    colour_values,
     styled,
     to_png,
+    value_range,
     write_note,
 )
 from recon.run.directory import RunDirectory

@@ -7,6 +7,7 @@ The colour of a point is one byte: its index in a palette of at most 256 colours
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -21,8 +22,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.words import counted
-from recon.report.colour import value_range
-from recon.report.thin import thin_cloud, thin_mesh
+from recon.report.style import value_range
 
 MAX_POINTS: Final = 120_000
 MAX_FACES: Final = 80_000
@@ -279,3 +279,53 @@ def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int,
     # Not to be moved after the last measurement of what is in view.
     centre = look_at - away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
     return len(np.unique(cells, axis=0)), centre + away * towards, centre
+
+
+def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:
+    """Return at most ``limit`` points, evenly spread: the first of each cell of a coarse grid."""
+    kept = np.arange(len(cloud))
+    longest_m = float(np.ptp(cloud.xyz, axis=0).max()) if len(cloud) else 0.0
+    # At first more than ``limit`` cells on a face of the bounding cube.
+    cell_m = max(longest_m / (4.0 * math.sqrt(limit)), 1e-6)
+    while len(kept) > limit:
+        kept = np.sort(np.unique(_cell_numbers(cloud.xyz, cell_m), return_index=True)[1])
+        cell_m *= max(math.sqrt(len(kept) / limit), 1.02)
+    return cloud.select(kept)
+
+
+def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
+    """Return at most about ``limit`` triangles, by merging vertices that share a cell.
+
+    Degenerate triangles are removed. For display, not for measurement.
+    """
+    # Open3D's quadric decimation takes nine times as long (1.6 s instead of 0.18 s of processor
+    # time, 168,579 to 80,000 triangles), and drops the colours.
+    cell_m, thinned = 0.0, mesh
+    while len(thinned.faces) > limit:
+        # The number of triangles falls with the square of the cell size.
+        grown_m = cell_m * math.sqrt(len(thinned.faces) / limit) * 1.05
+        cell_m = max(grown_m, _typical_edge_m(mesh))
+        thinned = _merge_vertices(mesh, cell_m)
+    return thinned
+
+
+def _cell_numbers(xyz: NDArray[Any], cell_m: float) -> NDArray[np.int64]:
+    """Return int64 (N,): the number of the cell of each point."""
+    cells = np.floor((xyz - xyz.min(axis=0)) / cell_m).astype(np.int64)
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
+
+
+def _merge_vertices(mesh: TriangleMesh, cell_m: float) -> TriangleMesh:
+    numbers = _cell_numbers(mesh.vertices, cell_m)
+    _, first, cell = np.unique(numbers, return_index=True, return_inverse=True)
+    faces = cell.reshape(-1)[mesh.faces].astype(np.int32)
+    a, b, c = faces.T
+    rgb = None if mesh.rgb is None else mesh.rgb[first]
+    return TriangleMesh(mesh.vertices[first], faces[(a != b) & (b != c) & (c != a)], rgb=rgb)
+
+
+def _typical_edge_m(mesh: TriangleMesh) -> float:
+    first, second = mesh.vertices[mesh.faces[:, :2]].swapaxes(0, 1)
+    lengths_m = np.linalg.norm(first - second, axis=1)
+    # At most 1e5 cells per side, so that cell numbers fit in an int64.
+    return max(float(np.median(lengths_m)), float(np.ptp(mesh.vertices, axis=0).max()) * 1e-5, 1e-6)

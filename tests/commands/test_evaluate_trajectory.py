@@ -14,7 +14,7 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
 from recon.evaluation.trajectory import TrajectoryRules
 from recon.io.trajectory import read_trajectory, write_kitti_poses, write_tum
-from recon.report.drive_figures import widest_axes
+from recon.report.trajectory_page import widest_axes
 
 RULES = TrajectoryRules()
 

@@ -16,8 +16,8 @@ from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.export.cloud import CloudSample
-from recon.export.grid import export_grid
 from recon.export.make import Products, make
+from recon.export.occupancy import export_grid
 from recon.export.product import Order
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.io.occupancy.nav2 import read_nav2

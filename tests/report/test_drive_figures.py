@@ -13,8 +13,8 @@ from recon.report.drive_figures import (
     health_figure,
     path_figure,
     seen_from_above,
-    timing_figure,
 )
+from recon.report.page import timing_figure
 from recon.report.style import nice_length
 
 

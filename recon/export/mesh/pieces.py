@@ -18,9 +18,8 @@ from recon.core.values.arrays import Float32
 from recon.core.values.cloud import Frame
 from recon.core.words import counted
 from recon.export.cloud import export_cloud
-from recon.export.mesh.cut import Plane, cut_mesh
+from recon.export.mesh.cut import Plane, close_seam, cut_mesh, open_edges
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
-from recon.export.mesh.seams import close_seam, open_edges
 from recon.export.product import Made, Order
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp

@@ -17,6 +17,7 @@ import numpy as np
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Bool, Float32
+from recon.export.mesh.cut import vertex_normals
 from recon.export.mesh.poisson import (
     MIN_DEPTH,
     OCTREE_SCALE,
@@ -27,7 +28,6 @@ from recon.export.mesh.poisson import (
     usable,
     widest_cell,
 )
-from recon.export.mesh.surgery import vertex_normals
 
 COVERED_WITHIN: Final = 0.005
 """A point is covered if the mesh is no farther from it than this share of its depth."""

@@ -10,10 +10,9 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.errors import MeshingError, OutputError
 from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
-from recon.export.mesh.cut import Plane
+from recon.export.mesh.cut import Plane, nearest_on_edges, open_edges
 from recon.export.mesh.pieces import export_mesh
 from recon.export.mesh.poisson import MeshSettings
-from recon.export.mesh.seams import nearest_on_edges, open_edges
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
 from recon.map.tiles import Tiles

@@ -13,7 +13,7 @@ from recon.core.values import (
     Reason,
     RectifiedCamera,
 )
-from recon.report.colour import (
+from recon.report.style import (
     GRID_FREE,
     GRID_OCCUPIED,
     GRID_UNKNOWN,

@@ -1,4 +1,4 @@
-"""The flat grid of a map for navigation."""
+"""The occupancy of a map as files: an OctoMap in 3-D, a flat grid for navigation."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.values.grid import log_odds
 from recon.export.product import Made, Order
 from recon.io.occupancy.nav2 import write_nav2
+from recon.io.occupancy.octomap import write_octomap_tiles
 from recon.map.ground.axes import base_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.floor import add_floors
-from recon.map.ground.grid import flatten, ground_depths
+from recon.map.ground.grid import drop_undecided, flatten, ground_depths
 from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,
@@ -248,3 +249,25 @@ def _paste(
     (x0, y0), (x1, y1) = begin - low, end - low
     (u0, v0), (u1, v1) = begin - corner, end - corner
     cells[y0:y1, x0:x1] = part.cells[v0:v1, u0:u1]
+
+
+def octomap_product(order: Order) -> Made:
+    """Write ``map/octomap.bt`` and ``.ot``."""
+    voxels, warnings = export_octomap(order.placed.tiles, order.run.path("map/octomap"))
+    return Made({"voxels": voxels}, warnings)
+
+
+def export_octomap(tiles: Tiles, stem: Path) -> tuple[int, list[str]]:
+    """Write ``stem.bt`` and ``stem.ot`` with the voxels that are occupied or free.
+
+    Returns:
+        The number of observed voxels, undecided ones included, and warnings: a map may be too large
+        for an OctoMap.
+    """
+    known = (drop_undecided(tile.voxels, tiles.config.grid) for tile in tiles)
+    warnings = []
+    try:
+        write_octomap_tiles(stem, known, tiles.edge_cells.bit_length() - 1, tiles.resolution_m)
+    except MappingError as error:
+        warnings.append(f"no OctoMap: {error}")
+    return sum(len(tile.voxels) for tile in tiles), warnings

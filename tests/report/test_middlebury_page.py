@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable
 from typing import Any
 
-from recon.report.middlebury_tables import csv_table, middlebury_tables
+from recon.report.middlebury_page import csv_table, middlebury_tables
 from recon.report.table import Table, join
 
 

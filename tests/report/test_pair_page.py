@@ -7,7 +7,7 @@ import numpy as np
 
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import UInt8
-from recon.report.pair_figures import (
+from recon.report.pair_page import (
     confidence_figure,
     depth_figure,
     depth_marks,
