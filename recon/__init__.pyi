@@ -33,8 +33,8 @@ from recon.core.values import TriangleMesh as TriangleMesh
 from recon.evaluation.disparity import evaluate_depth as evaluate_depth
 from recon.evaluation.disparity import evaluate_disparity as evaluate_disparity
 from recon.evaluation.map import evaluate_map as evaluate_map
-from recon.evaluation.middlebury.rules import MiddleburyRules as MiddleburyRules
-from recon.evaluation.middlebury.rules import evaluate_middlebury as evaluate_middlebury
+from recon.evaluation.middlebury.score import MiddleburyRules as MiddleburyRules
+from recon.evaluation.middlebury.score import evaluate_middlebury as evaluate_middlebury
 from recon.evaluation.trajectory import evaluate_trajectory as evaluate_trajectory
 from recon.export.mesh.poisson import reconstruct_mesh as reconstruct_mesh
 from recon.io.cameras.calibration import read_calibration as read_calibration

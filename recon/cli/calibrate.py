@@ -80,7 +80,7 @@ def calibrate(
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
         from recon.io.atomic import check_targets
-        from recon.rig.calibrate.summary import describe_depths
+        from recon.rig.calibrate.result import describe_depths
 
         # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form == "kalibr" else []

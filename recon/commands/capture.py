@@ -11,8 +11,15 @@ from typing import Any
 
 from recon.core.errors import FormatError
 from recon.io.atomic import write_text
-from recon.rig.capture import RecordingSettings, capture_pairs, open_cameras, warm_up
-from recon.rig.capture_folder import CaptureFolder, CaptureLog, write_pairs
+from recon.rig.capture import (
+    CaptureFolder,
+    CaptureLog,
+    RecordingSettings,
+    capture_pairs,
+    open_cameras,
+    warm_up,
+    write_pairs,
+)
 from recon.sources.opencv_camera import Camera
 
 

@@ -13,9 +13,8 @@ from recon.export.mesh.poisson import MeshSettings
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
 from recon.io.yaml_file import parse_yaml
 from recon.map.settings import DriveSettings
-from recon.rig.audit.settings import AuditedSettings
-from recon.rig.calibrate.settings import CalibratedSettings
 from recon.rig.capture import CaptureSettings
+from recon.rig.settings import AuditedSettings, CalibratedSettings
 from recon.run.finished import is_pair_run
 from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings

@@ -9,7 +9,14 @@ from pathlib import Path
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import SettingsError
-from recon.evaluation.middlebury.bench import Bench, check_names, read_result
+from recon.evaluation.middlebury.bench import (
+    Bench,
+    SceneDone,
+    SceneFigures,
+    check_names,
+    read_result,
+    summarise_scenes,
+)
 from recon.evaluation.middlebury.scenes import (
     check_folder,
     find_results,
@@ -17,7 +24,6 @@ from recon.evaluation.middlebury.scenes import (
     read_scored_scene,
 )
 from recon.evaluation.middlebury.score import Figures
-from recon.evaluation.middlebury.summary import SceneDone, SceneFigures, summarise_scenes
 from recon.io.files import StrPath
 from recon.io.images.pfm import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page

@@ -9,9 +9,8 @@ import numpy as np
 
 from recon.core.values import Trajectory
 from recon.core.words import counted
-from recon.evaluation.association import TOLERANCE_S, associate
 from recon.evaluation.doubts import doubts_of_file
-from recon.evaluation.interpolated_truth import interpolation_warnings
+from recon.evaluation.segments import TOLERANCE_S, associate, interpolation_warnings
 from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.trajectory_page import write_trajectory_page

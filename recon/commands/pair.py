@@ -13,7 +13,7 @@ from recon.io.files import StrPath
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.sequence import check_cloud
 from recon.report.pair_page import write_disparity_images, write_pair_page
-from recon.rig.audit.pair_checks import check_found, find_pair_faults
+from recon.rig.audit.audit import check_found, find_pair_faults
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 from recon.run.summary import plain

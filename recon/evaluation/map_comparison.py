@@ -16,9 +16,9 @@ from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
-from recon.evaluation.association import TOLERANCE_S, associate
 from recon.evaluation.doubts import doubts_of
 from recon.evaluation.map import evaluate_map, register_cloud, within_reach
+from recon.evaluation.segments import TOLERANCE_S, associate
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory
 from recon.places.path_fit import drift_at_end, fit_to_path

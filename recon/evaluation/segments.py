@@ -8,7 +8,11 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import EvaluationError
-from recon.core.values.arrays import Float64, Int32
+from recon.core.geometry.interpolation import nearest_sorted
+from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Bool, Float64, Int32
+from recon.core.words import counted
 
 KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI benchmark."""
@@ -77,3 +81,86 @@ def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -
     last = np.searchsorted(distances_m, distances_m[first] + length_m, side="right")
     fits = last < len(distances_m)
     return Segments(first[fits].astype(np.int32), last[fits].astype(np.int32), length_m[fits])
+
+
+TOLERANCE_S: Final = 0.01
+"""Largest time difference of two associated poses, unless another is given."""
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float
+) -> tuple[Trajectory, Trajectory]:
+    """Match poses that are mutually nearest in time; poses without a match are left out.
+
+    Args:
+        estimate: Estimated trajectory.
+        truth: True trajectory, on the same clock; its rate may differ.
+        tolerance_s: Largest time difference of a match.
+
+    Returns:
+        Two trajectories of equal length, pose by pose, each with its own timestamps.
+    """
+    there = nearest_sorted(estimate.timestamps_s, truth.timestamps_s)
+    back = nearest_sorted(truth.timestamps_s, estimate.timestamps_s)
+    apart_s = np.abs(truth.timestamps_s[there] - estimate.timestamps_s)
+    mutual = (back[there] == np.arange(len(estimate))) & (apart_s <= tolerance_s)
+    if not mutual.any():
+        raise EvaluationError(
+            "no poses of the two trajectories match in time",
+            got=f"times {_span(estimate)} and {_span(truth)}",
+            expected=f"times within {tolerance_s:g} s of each other",
+            hint="raise --tolerance, or make sure that both use the same clock",
+        )
+    return estimate.select(mutual), truth.select(there[mutual])
+
+
+def _span(path: Trajectory) -> str:
+    return f"{path.timestamps_s[0]:.3f} to {path.timestamps_s[-1]:.3f} s"
+
+
+_EVEN: Final = 0.02
+"""A turn changes evenly from frame to frame if it does so less than this share of the median."""
+
+_LEAST_CHANGES: Final = 5
+"""Fewer even changes in a row may be chance."""
+
+_LEAST_MEDIAN_RAD: Final = 5e-5
+"""Where turns change less than this everywhere, the digits of the file decide: KITTI has six."""
+
+
+def interpolated_poses(path: Trajectory) -> Bool:
+    """Return bool (N,): poses along which the path turns at one rate, as it does nowhere else.
+
+    A vehicle never does for more than a moment: its rates of turn change from frame to frame. A
+    path that turns evenly for the most part has none, as rendered ones do.
+
+    Args:
+        path: The true path, at about equal times.
+    """
+    found = np.zeros(len(path), np.bool_)
+    if len(path) < _LEAST_CHANGES + 2:
+        return found
+    step = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
+    change = angle_rad(invert(step[:-1]) @ step[1:])
+    typical = float(np.median(change))
+    even = (change < _EVEN * typical) & (typical > _LEAST_MEDIAN_RAD)
+    for first in np.flatnonzero(_runs(even)):
+        found[first : first + _LEAST_CHANGES + 2] = True
+    return found
+
+
+def interpolation_warnings(truth: Trajectory, segments: Segments) -> list[str]:
+    """Return what to know of relative errors: how many rest on poses that nobody measured."""
+    found = interpolated_poses(truth)
+    if not found.any():
+        return []
+    resting = int((found[segments.first] | found[segments.last]).sum())
+    first, last = np.flatnonzero(found)[[0, -1]]
+    which = f"{counted(int(found.sum()), 'true pose')} (between {first} and {last})"
+    where = f"{resting} of {counted(len(segments.first), 'segment')} begin or end there"
+    return [f"{which} turn evenly, as interpolated ones do: {where}"]
+
+
+def _runs(even: Bool) -> Bool:
+    """Return where so many even changes begin."""
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(even, _LEAST_CHANGES).all(axis=1))

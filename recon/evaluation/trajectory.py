@@ -12,12 +12,11 @@ from pydantic import Field
 
 from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import Similarity, fit_points, fit_upright
-from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.geometry.se3 import angle_rad, exp_so3, invert, quaternion_from_rotation
 from recon.core.settings import Settings
 from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Float64, Int32
 from recon.core.words import counted
-from recon.evaluation.roll import open_roll_axis, without_roll
 from recon.evaluation.segments import Segments, choose_segments
 from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
@@ -286,3 +285,50 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
             got=f"{fit.scale:.4g} times as large, {fit.scaled_m:.3g} m apart if that is undone",
             hint="both are in metres; sim3 compares an estimate whose scale is unknown",
         )
+
+
+# A path is straight if its width (rms) is at most this share of its length (rms).
+_STRAIGHT: Final = 0.05
+# The positions fix the roll to about their error over the width of the path, in radians.
+_FIXED_RAD: Final = float(np.radians(0.5))
+
+
+def open_roll_axis(estimate: Trajectory, truth: Trajectory) -> Float64 | None:
+    """Return the direction of a straight path about which aligned positions do not fix the roll.
+
+    Args:
+        estimate: The estimate, aligned to the true path by positions.
+        truth: The true path.
+
+    Returns:
+        float64 (3,), world axes of ``truth``; None if the positions fix every rotation.
+    """
+    centred = truth.positions_m - truth.positions_m.mean(axis=0)
+    _, _, directions = np.linalg.svd(centred, full_matrices=False)
+    along = directions[0]
+    length_m, width_m = _extent(centred @ along), _extent(_across(centred, along))
+    away_m = _extent(_across(estimate.positions_m - truth.positions_m, along))
+    fixed = away_m < _FIXED_RAD * width_m
+    return None if fixed or width_m > _STRAIGHT * length_m else np.asarray(along)
+
+
+def without_roll(estimate: Trajectory, truth: Trajectory, axis: Float64) -> Trajectory:
+    """Return the estimate with its poses rolled alike about an axis until their rotations fit best.
+
+    Positions stay as they are: across the axis they are too close to it to be moved.
+    """
+    wrong = truth.T_world_camera[:, :3, :3] @ np.swapaxes(estimate.T_world_camera[:, :3, :3], 1, 2)
+    xyzw = np.array([quaternion_from_rotation(each) for each in wrong])
+    rolls = 2 * np.arctan2(xyzw[:, :3] @ axis, xyzw[:, 3])
+    mean = np.arctan2(np.sin(rolls).mean(), np.cos(rolls).mean())
+    poses = estimate.T_world_camera.copy()
+    poses[:, :3, :3] = exp_so3(mean * axis) @ poses[:, :3, :3]
+    return Trajectory(poses, estimate.timestamps_s)
+
+
+def _across(vectors: Float64, axis: Float64) -> Float64:
+    return np.asarray(vectors - np.outer(vectors @ axis, axis))
+
+
+def _extent(values: Float64) -> float:
+    return float(np.sqrt((values**2).sum() / len(values)))

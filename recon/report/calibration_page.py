@@ -28,8 +28,7 @@ from recon.report.style import (
     to_png,
 )
 from recon.rig.calibrate.bootstrap import CONFIDENCE, MATCH_SIGMA_PX
-from recon.rig.calibrate.result import CalibrationRun
-from recon.rig.calibrate.summary import shared_pixels
+from recon.rig.calibrate.result import CalibrationRun, shared_pixels
 from recon.rig.rectification import RectifyRun
 from recon.run.directory import RunDirectory
 from recon.stereo.rectify.lens import epipolar_curves

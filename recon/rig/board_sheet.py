@@ -18,7 +18,7 @@ from recon.core.errors import OutputError, SettingsError
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
 from recon.io.atomic import write_bytes
-from recon.rig.opencv_boards import dark_rectangles
+from recon.rig.calibrate.detect import dark_rectangles
 
 _PAPERS_MM: Final = {
     "a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "a1": (594.0, 841.0),

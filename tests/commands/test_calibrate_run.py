@@ -15,8 +15,12 @@ from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.io.images.image import read_image, write_image
 from recon.rig.calibrate.board_views import find_views
-from recon.rig.calibrate.result import CalibrationForm, CalibrationRun, write_calibration
-from recon.rig.calibrate.summary import describe_depths
+from recon.rig.calibrate.result import (
+    CalibrationForm,
+    CalibrationRun,
+    describe_depths,
+    write_calibration,
+)
 from recon.sources.image_names import pair_images
 from recon.stereo.rectify.rectifier import Rectifier
 from tests.scenery.boards import board_rig, place_boards, render_views

@@ -20,8 +20,7 @@ from recon.core.values import RectifiedCamera, StereoPair
 from recon.io import atomic
 from recon.io.frames_csv import FRAMES, HEADER
 from recon.rig import capture
-from recon.rig.capture import RecordingSettings
-from recon.rig.capture_folder import CaptureFolder
+from recon.rig.capture import CaptureFolder, RecordingSettings
 from recon.sources.registry import open_source
 from tests.scenery.patience import LONG_S
 from tests.sources import drives

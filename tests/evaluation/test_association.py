@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recon.core.errors import EvaluationError
 from recon.core.geometry.interpolation import nearest_sorted
 from recon.core.values import Trajectory
-from recon.evaluation.association import associate
+from recon.evaluation.segments import associate
 
 TIMES = st.lists(st.floats(0, 100), min_size=1, max_size=30).map(np.sort)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recon.core.errors import EvaluationError
 from recon.core.values import Disparity, DisparityTruth
 from recon.evaluation.disparity import evaluate_disparity
-from recon.evaluation.middlebury.rules import evaluate_middlebury
+from recon.evaluation.middlebury.score import evaluate_middlebury
 
 NAN = float("nan")
 

@@ -7,8 +7,7 @@ import pytest
 
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
-from recon.evaluation.interpolated_truth import interpolated_poses, interpolation_warnings
-from recon.evaluation.segments import choose_segments
+from recon.evaluation.segments import choose_segments, interpolated_poses, interpolation_warnings
 
 
 def path(turns_deg: np.ndarray) -> Trajectory:

@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
-from recon.evaluation.open3d_registration import icp
+from recon.evaluation.map import icp
 
 
 def corner(seed: int) -> np.ndarray:

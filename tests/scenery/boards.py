@@ -14,7 +14,7 @@ from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.board import CalibrationBoard
-from recon.rig.opencv_boards import dark_rectangles
+from recon.rig.calibrate.detect import dark_rectangles
 from recon.stereo.rectify.lens import project_raw, rays_of
 
 Lens = Literal["radtan", "rational", "fisheye"]

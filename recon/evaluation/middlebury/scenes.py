@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import FormatError, SettingsError, SourceError
-from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
-from recon.evaluation.middlebury.rules import MiddleburyRules
+from recon.core.values import DisparityTruth, RectifiedCamera
+from recon.evaluation.middlebury.score import MiddleburyRules, ScoredScene
 from recon.io.files import read_table, resolved
 from recon.io.middlebury.layout import find_image, find_layout, scene_root
 from recon.io.middlebury.scene import MiddleburyScene, read_middlebury_scene, stand_in_camera
@@ -19,27 +19,6 @@ from recon.io.middlebury.scene import MiddleburyScene, read_middlebury_scene, st
 _STEP: Final = 16
 _DISPARITY: Final = "disp0"
 _SPARSE: Final = "_s"
-
-
-@dataclass(frozen=True, eq=False)
-class ScoredScene:
-    """One scene, ready to be matched and scored.
-
-    Attributes:
-        name: Name of its folder, with parent folders if several scenes share a name.
-        pair: The images.
-        camera: The camera for matching; its ``ndisp`` is set.
-        truth: True disparity, at the size of the images or another size.
-        truth_camera: The camera at the size of the truth, or None if none is published.
-        rules: How results are compared with the truth.
-    """
-
-    name: str
-    pair: StereoPair
-    camera: RectifiedCamera
-    truth: DisparityTruth
-    truth_camera: RectifiedCamera | None
-    rules: MiddleburyRules
 
 
 @dataclass(frozen=True)

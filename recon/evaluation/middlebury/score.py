@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from recon.core.errors import EvaluationError
 from recon.core.geometry.interpolation import nearest_sorted
-from recon.core.values import Disparity, DisparityMetrics, DisparityTruth
+from recon.core.values import (
+    Disparity,
+    DisparityMetrics,
+    DisparityTruth,
+    RectifiedCamera,
+    StereoPair,
+)
 from recon.core.values.arrays import Bool, Float32, Int32, frozen_array
 from recon.evaluation.confidence import (
     measure_reliability,
     measure_sparsification,
     share_within_sigma,
 )
-from recon.evaluation.disparity import evaluate_depth
-from recon.evaluation.middlebury.rules import (
-    estimate_at_truth_size,
-    evaluate_middlebury,
-    values_compared,
-)
-from recon.evaluation.middlebury.scenes import ScoredScene
+from recon.evaluation.disparity import evaluate_depth, evaluate_disparity, truth_of, values_of
 
 MASKS: Final = {"nonocc": False, "all": True}
 """Pixels that are scored: those seen by both cameras, or occluded ones as well."""
@@ -31,6 +33,27 @@ Figures = dict[str, Any]
 
 _RIGHT_PX: Final = 1.0  # largest error of a correct pixel, in pixels of the result
 _KEPT: Final = 5  # every fifth point of a sparsification curve: 20 of 100
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredScene:
+    """One scene, ready to be matched and scored.
+
+    Attributes:
+        name: Name of its folder, with parent folders if several scenes share a name.
+        pair: The images.
+        camera: The camera for matching; its ``ndisp`` is set.
+        truth: True disparity, at the size of the images or another size.
+        truth_camera: The camera at the size of the truth, or None if none is published.
+        rules: How results are compared with the truth.
+    """
+
+    name: str
+    pair: StereoPair
+    camera: RectifiedCamera
+    truth: DisparityTruth
+    truth_camera: RectifiedCamera | None
+    rules: MiddleburyRules
 
 
 def score_result(scene: ScoredScene, values: Float32) -> Figures:
@@ -151,3 +174,117 @@ def _last_known(known: Bool) -> Int32:
 def _gather(values: Float32, columns: Int32) -> Float32:
     there = np.take_along_axis(values, np.maximum(columns, 0).astype(np.intp), axis=1)
     return np.where(columns >= 0, there, np.float32(np.nan))
+
+
+_HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
+
+
+@dataclass(frozen=True)
+class MiddleburyRules:
+    """Rules of a scene for the evaluation of results.
+
+    Attributes:
+        full_size_factor: Full-size pixels per pixel of the truth.
+        largest_px: Results are clipped to [0, this], pixels of the truth; None = unknown.
+        isint: Whether results are rounded to whole pixels of the truth.
+    """
+
+    full_size_factor: float = 1.0
+    largest_px: float | None = None
+    isint: bool = False
+
+
+def evaluate_middlebury(
+    estimate: Disparity | ArrayLike,
+    truth: DisparityTruth | ArrayLike,
+    rules: MiddleburyRules | None = None,
+    *,
+    occluded: bool = False,
+) -> DisparityMetrics:
+    """Compare a result with the truth as the benchmark does; errors are in full-size pixels.
+
+    Args:
+        estimate: A disparity, or its values: (h, w), pixels of its own size, not finite = none.
+            Sparse as matched, or dense (holes filled).
+        truth: Ground truth, at the size of the result or 2 or 4 times larger or smaller; or its
+            values as `DisparityTruth.from_values` takes them.
+        rules: Rules of the scene; None = errors in pixels of the truth, nothing clipped or
+            rounded.
+        occluded: Whether to include pixels that only the left camera sees ("all").
+
+    Raises:
+        EvaluationError: The sizes do not fit, or no pixel has a known truth.
+    """
+    known, rules = truth_of(truth), rules or MiddleburyRules()
+    compared = values_compared(values_of(estimate), known.values.shape, rules)
+    return evaluate_disparity(compared, known, occluded=occluded, scale=rules.full_size_factor)
+
+
+def values_compared(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
+    """Return a result as it is compared: at the size (H, W) of the truth, clipped, rounded."""
+    sized = np.clip(at_truth_size(values, shape), np.float32(0), rules.largest_px)
+    # The SDK rounds halves up, as C does; numpy rounds them to even.
+    return np.asarray(np.floor(sized + np.float32(0.5)) if rules.isint else sized, np.float32)
+
+
+def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
+    """Return float32 (H, W), a result at the size of the truth, in pixels of that size.
+
+    Pixels are repeated or skipped, never interpolated.
+    """
+    step = _step(values.shape, shape)
+    return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)
+
+
+def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple[Disparity, float]:
+    """Return a result as `at_truth_size` does, and its original pixels per pixel of the truth."""
+    step = _step(estimate.values.shape, shape)
+    sized = Disparity(
+        values=at_truth_size(estimate.values, shape),
+        confidence=_taken(estimate.confidence, shape, step),
+        sigma_px=at_truth_size(estimate.sigma_px, shape),
+        reason=_taken(estimate.reason, shape, step),
+    )
+    return sized, step
+
+
+def scene_weight(name: str) -> float:
+    """Return what a scene counts for in the table's mean: 4 if it is a variant or hard, else 8.
+
+    ``name`` is that of its folder, or a path that ends in it.
+    """
+    scene = name.rpartition("/")[2].removesuffix("-perfect").removesuffix("-imperfect")
+    return 4.0 if scene in _HALF_WEIGHT else 8.0
+
+
+def weighted_mean(figures: Mapping[str, float]) -> float:
+    """Return the mean over scenes, weighted as in the table; NaN if any value is NaN."""
+    weights = [scene_weight(name) for name in figures]
+    return float(np.average(np.array(list(figures.values()), dtype=np.float64), weights=weights))
+
+
+def _step(shape: tuple[int, ...], truth_shape: tuple[int, ...]) -> float:
+    """Return pixels of a result for each pixel of the truth, along a row: 4, 2, 1, 0.5 or 0.25."""
+    for factor in (1, 2, 4):
+        if _fits(truth_shape, shape, factor):
+            return 1 / factor
+        if _fits(shape, truth_shape, factor):
+            return factor
+    raise EvaluationError(
+        "result and truth differ in size",
+        got=f"{shape[1]}x{shape[0]} against {truth_shape[1]}x{truth_shape[0]}",
+        expected="one 1, 2 or 4 times the other",
+    )
+
+
+def _fits(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
+    return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))
+
+
+def _taken(values: NDArray[Any], shape: tuple[int, ...], step: float) -> NDArray[Any]:
+    """Return the pixels at ``step`` times row and column, rounded down."""
+    rows, columns = (
+        np.minimum((np.arange(n) * step).astype(np.intp), limit - 1)
+        for n, limit in zip(shape, values.shape, strict=True)
+    )
+    return values[np.ix_(rows, columns)]

@@ -13,7 +13,7 @@ from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_came
 from recon.io.cameras.opencv_yaml import read_opencv_calibration
 from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
-from recon.io.middlebury.calib import read_middlebury_calib
+from recon.io.middlebury.scene import read_middlebury_calib
 
 _KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE | re.ASCII)
 _MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)

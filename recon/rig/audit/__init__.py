@@ -1,12 +1,9 @@
 """Audit of a recording: what its images, its features and its motion say, and a verdict.
 
-- `audit.py`: all of it, and the calibration that is written where it can be corrected;
-  `pair_checks.py`: the same for one pair;
-- `sample.py`: which frames are looked at; `measures.py`: what is measured in them;
-- `geometry.py`: rows, swapped cameras and delays, from the features of all pairs;
-  `row_alignment.py`: the small rotation with which rows meet;
-- `seen_motion.py`: features tracked through stretches of the drive, and what they show of the rig:
-  how the right camera is turned (`right_turn.py`), and what the lenses bend (`bent_lenses.py`),
-  both by one fit (`rig_fit.py`);
+- `audit.py`: all of it, the corrected calibration, and the short check of a pair;
+- `sample.py`: which frames are looked at, and the rows, swapped cameras and delays that they show;
+  `measures.py`: what is measured in them; `row_alignment.py`: the rotation with which rows meet;
+- `seen_motion.py`: features tracked through the drive; `corrections.py`: what they show
+  of the rig, a turned right camera and bent lenses; `rig_fit.py`: the fit of both;
 - `findings.py`: the problems found, with advice, and the verdict.
 """

@@ -9,12 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import CalibrationError
+from recon.core.errors import CalibrationError, MatchingError
 from recon.core.geometry.projection import depth_sigma
-from recon.core.values import RectifiedCamera, Rig, StereoCalibration
+from recon.core.values import Disparity, RectifiedCamera, Rig, StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64
 from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.rig.audit.bent_lenses import BentLenses, estimate_lenses
+from recon.rig.audit.corrections import BentLenses, estimate_lenses
 from recon.rig.audit.findings import (
     Finding,
     Verdict,
@@ -26,13 +26,13 @@ from recon.rig.audit.findings import (
     find_turn_faults,
     verdict_of,
 )
-from recon.rig.audit.geometry import Geometry, measure_geometry
 from recon.rig.audit.measures import Gaps, find_gaps
 from recon.rig.audit.row_alignment import RowAlignment, correct_rig
-from recon.rig.audit.sample import Look, Sample, take_sample
+from recon.rig.audit.sample import Geometry, Look, Sample, measure_geometry, take_sample
 from recon.rig.audit.seen_motion import SeenMotion, measure_turn, turn_figures
-from recon.rig.audit.settings import AuditedSettings
+from recon.rig.settings import AuditedSettings
 from recon.run.summary import plain
+from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import IncompleteSource, StereoSource
 from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
@@ -302,3 +302,71 @@ def _depth_figures(
         "disparity_5_50_95_px": np.quantile(disparity_px, [0.05, 0.5, 0.95]).tolist(),
         "depth_error_m": {f"{r:g}": float(e) for r, e in zip(RANGES_M, errors, strict=True)},
     }
+
+
+#: Findings that images alone support, and those that need a calibration. The inspection of the
+#: frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
+#: is dense.
+_BY_IMAGES: Final = frozenset({"black", "gain", "blur"})
+_BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
+
+FEW_VALID_SHARE: Final = 0.25
+"""Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs,
+even of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %."""
+
+
+def find_pair_faults(
+    given: PairInput, config: AuditedSettings, *, metric: bool
+) -> tuple[Finding, ...]:
+    """Return findings of a quick audit; none if it is switched off.
+
+    Args:
+        given: The pair.
+        config: The configuration; its ``audit`` and ``rectification`` sections are used.
+        metric: Whether depth is wanted, so that the calibration matters.
+    """
+    _check_two(given.pair)
+    if not config.audit.quick:
+        return ()
+    codes = _BY_IMAGES | _BY_CALIBRATION if metric else _BY_IMAGES
+    try:
+        audit = audit_source(OnePair(given.pair, given.calibration), config, quick=True)
+    except CalibrationError:
+        return ()  # the run itself reports this later
+    return tuple(finding for finding in audit.findings if finding.code in codes)
+
+
+def check_found(
+    disparity: Disparity, pair: StereoPair, faults: tuple[Finding, ...] = ()
+) -> tuple[str, ...]:
+    """Return warnings about the share of pixels with a disparity."""
+    share = float(disparity.valid.mean())
+    if share >= FEW_VALID_SHARE:
+        return ()
+    found = f"{100 * share:.0f} % of the pixels have a disparity ({_reasons(disparity)})"
+    advice = (
+        "check that both images show the same moment, that left and right are not swapped, that "
+        "the calibration is theirs, and the range (--ndisp)"
+    )
+    if share > 0:
+        return (f"only {found}; {advice}",)
+    raise MatchingError(
+        "no pixel has a match in the other image",
+        where=pair.name or None,
+        got=_reasons(disparity),
+        hint=next((fault.text for fault in faults if fault.fatal), advice),
+    )
+
+
+def _check_two(pair: StereoPair) -> None:
+    """Refuse one image given twice; rectified by two cameras it looks like a swapped pair."""
+    if np.array_equal(pair.left, pair.right) and np.ptp(pair.left):
+        hint = "name the image of each camera"
+        raise MatchingError("left and right are the same image", where=pair.name or None, hint=hint)
+
+
+def _reasons(disparity: Disparity) -> str:
+    """Return the two most common reasons for having no disparity."""
+    shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
+    most = list(shares.items())[:2]
+    return ", ".join(f"{share:.0f} % {r.name.lower().replace('_', ' ')}" for r, share in most)

@@ -10,10 +10,9 @@ import numpy as np
 
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.words import counted
-from recon.rig.audit.geometry import MIN_FEATURES, Geometry
+from recon.rig.audit.corrections import RightTurn
 from recon.rig.audit.measures import Gaps
-from recon.rig.audit.right_turn import RightTurn
-from recon.rig.audit.sample import BLANK_DN, Sample
+from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample
 from recon.rig.audit.seen_motion import turn_figures
 from recon.sources.source import IncompleteSource, StereoSource
 from recon.stereo.match.protocol import Matcher

@@ -26,8 +26,8 @@ from recon.odometry.patches import find_in_right, surface_slopes
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
 from recon.odometry.window import TrackWindow
+from recon.rig.audit.corrections import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.rig.audit.rig_fit import StereoTracks
-from recon.rig.audit.right_turn import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.rig.audit.sample import plan_stretches
 from recon.run.threads import serial_algebra
 from recon.sources.source import StereoSource

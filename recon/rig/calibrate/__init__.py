@@ -1,11 +1,9 @@
-"""Stereo calibration from images of a board.
+"""Stereo calibration from images of a board, in the order of `recon calibrate`.
 
-In the order of `recon calibrate`:
-
-- `board_video.py`: still views of a video; `board_views.py`: the board in all images, found by
-  `detect.py`; `board_size.py`: does it have the size that was stated?
-- `initial.py`: first guesses; `bundle.py`: cameras and boards fitted at once; `stereo.py`: both
-  steps, without the views that do not fit;
-- `bootstrap.py`: how sure the fit is; `summary.py`: its figures; `verdict.py`: what it is good for;
-- `result.py`: all of that, and the files.
+- `board_views.py`: still views of a video, and the board in all images; `detect.py`: the board in
+  one image, and whether it has the stated size;
+- `stereo.py`: first guesses, and both cameras without the views that do not fit; `bundle.py`: the
+  solver;
+- `bootstrap.py`: how sure the fit is; `result.py`: its figures and files; `verdict.py`: what it is
+  good for.
 """

@@ -17,8 +17,8 @@ from recon.core.values import StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
 from recon.rig.calibrate.bundle import RigState, moved, solve_scaled
-from recon.rig.calibrate.settings import CalibrationSettings
 from recon.rig.calibrate.stereo import StereoFit, stereo_of
+from recon.rig.settings import CalibrationSettings
 from recon.stereo.rectify.lens import project_into_image, rays_of
 
 # The depth error is evaluated on a 3 by 3 grid in the left image, in fractions of its size.

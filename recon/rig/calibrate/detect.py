@@ -1,17 +1,23 @@
-"""Detection of board corners in an image, with subpixel accuracy."""
+"""A calibration board in one image: its corners to subpixel accuracy; and its size."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import product
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 
+from recon.core.errors import CalibrationError, SettingsError
 from recon.core.values.arrays import Float64, Int32, UInt8
 from recon.core.values.board import CalibrationBoard
+from recon.core.words import counted
 from recon.rig.calibrate.bundle import Sighting
-from recon.rig.opencv_boards import find_charuco
+
+Inner = tuple[int, int]
 
 # Corners are detected at this width at most, and refined at full resolution.
 _SEARCH_WIDTH_PX: Final = 1280
@@ -22,25 +28,31 @@ _SMALLEST_WINDOW_PX: Final = 2
 _LARGEST_WINDOW_PX: Final = 25
 _SUB_PIXEL: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-5)
 _CHESS_FLAGS: Final = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+_SLOW_FLAGS: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _FEWEST_CORNERS: Final = 8
 # A corner that refinement moves farther than this, relative to the spacing, keeps its old position.
 _LOST: Final = 0.5
+# Least contrast of dark and light quadrants at an inner corner, relative to the median corner.
+_CORNER_CONTRAST: Final = 0.5
+_LARGEST: Final = 60
+# Images that must agree on a size, or markers per image, to rule out chance.
+_SURE: Final = 3
+# Images in which any board is searched if few show the given one.
+_PROBED: Final = 8
+# Fewer for markers, because all of OpenCV's twenty dictionaries are tried.
+_PROBED_MARKERS: Final = 2
+_PREFIX: Final = "DICT_"
 
 
 def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
-    """Find the corners of a board.
+    """Find the corners of a board in a grey image; None if fewer than 8, or all on one line.
 
-    Args:
-        grey: uint8 (H, W).
-        board: A chessboard must be fully visible, a ChArUco board may be partly visible.
-
-    Returns:
-        None if the board is not found, or too little of it (fewer than 8 corners, or collinear).
+    A chessboard must be fully visible, a ChArUco board may be partly visible.
     """
     if board.kind == "charuco":
-        numbers, pixels = find_charuco(grey, board)
+        numbers, pixels = _find_charuco(grey, board)
     else:
-        found = find_chessboard(grey, board.inner)
+        found = _find_chessboard(grey, board.inner)
         pixels = np.zeros((0, 2)) if found is None else found
         numbers = np.arange(len(pixels), dtype=np.int32)
     if not _enough(numbers, board):
@@ -48,58 +60,16 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
     # The edges of the markers must stay outside the window.
     free = (board.square_m - board.marker_m) / (2 * board.square_m)
     window = min(_WINDOW, 0.8 * free)
-    pixels = refine_corners(grey, pixels, _spacing(numbers, pixels, board), window)
+    pixels = _refine_corners(grey, pixels, _spacing(numbers, pixels, board), window)
     return Sighting(numbers, board.corners_m[numbers], pixels)
 
 
-def find_chessboard(grey: UInt8, inner: tuple[int, int]) -> Float64 | None:
-    """Return float64 (N, 2), approximate inner corners row by row, or None."""
-    scale = min(1.0, _SEARCH_WIDTH_PX / grey.shape[1])
-    small = (
-        grey
-        if scale == 1
-        else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    )
-    found, corners = cv2.findChessboardCorners(small, inner, flags=_CHESS_FLAGS)
-    if not found:
-        # Slower and stricter about margins, but finds tilted and badly lit boards.
-        found, corners = cv2.findChessboardCornersSB(
-            small, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-        )
-    if not found:
-        return None
-    return np.asarray((np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5)
-
-
-def refine_corners(
-    grey: UInt8, pixels: Float64, spacing_px: float, window: float = _WINDOW
-) -> Float64:
-    """Return float64 (N, 2), corners refined to subpixel accuracy.
-
-    Args:
-        grey: uint8 (H, W).
-        pixels: float64 (N, 2), corners to within a few pixels.
-        spacing_px: Distance between neighbouring corners.
-        window: Half width of the search window, relative to the spacing.
-    """
-    half = int(np.clip(round(window * spacing_px), _SMALLEST_WINDOW_PX, _LARGEST_WINDOW_PX))
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    refined = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), _SUB_PIXEL)
-    lost = np.linalg.norm(refined - start, axis=2) > _LOST * spacing_px
-    return np.where(lost[..., None], start, refined).reshape(-1, 2).astype(np.float64)
-
-
-def orient_like(reference: Float64, pixels: Float64, inner: tuple[int, int]) -> Float64:
-    """Reorder the corners of a whole chessboard as in another view of it.
+def orient_like(reference: Float64, pixels: Float64, inner: Inner) -> Float64:
+    """Reorder the corners (N, 2) of a whole chessboard as in another view of it.
 
     A chessboard looks the same when rotated by 180 degrees, and OpenCV may start at either end. Of
     all orders that preserve neighbours, this takes the one that resembles the reference most, up
     to translation and scale.
-
-    Args:
-        reference: float64 (N, 2), corners in the left image.
-        pixels: float64 (N, 2), corners in the right image.
-        inner: Number of inner corners along x and y.
     """
     columns, rows = inner
     grid = np.arange(columns * rows).reshape(rows, columns)
@@ -115,6 +85,32 @@ def _shape(pixels: Float64) -> Float64:
     return np.asarray(centred / np.linalg.norm(centred))
 
 
+def _find_chessboard(grey: UInt8, inner: Inner) -> Float64 | None:
+    """Return float64 (N, 2), approximate inner corners row by row, or None."""
+    scale = min(1.0, _SEARCH_WIDTH_PX / grey.shape[1])
+    small = grey
+    if scale != 1:
+        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    found, corners = cv2.findChessboardCorners(small, inner, flags=_CHESS_FLAGS)
+    if not found:
+        # Slower and stricter about margins, but finds tilted and badly lit boards.
+        found, corners = cv2.findChessboardCornersSB(small, inner, flags=_SLOW_FLAGS)
+    if not found:
+        return None
+    return np.asarray((np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5)
+
+
+def _refine_corners(
+    grey: UInt8, pixels: Float64, spacing_px: float, window: float = _WINDOW
+) -> Float64:
+    """Return corners (N, 2) refined in a window, whose half width is relative to the spacing."""
+    half = int(np.clip(round(window * spacing_px), _SMALLEST_WINDOW_PX, _LARGEST_WINDOW_PX))
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
+    refined = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), _SUB_PIXEL)
+    lost = np.linalg.norm(refined - start, axis=2) > _LOST * spacing_px
+    return np.where(lost[..., None], start, refined).reshape(-1, 2).astype(np.float64)
+
+
 def _enough(numbers: Int32, board: CalibrationBoard) -> bool:
     if len(numbers) < min(_FEWEST_CORNERS, len(board.corners_m)):
         return False
@@ -124,9 +120,9 @@ def _enough(numbers: Int32, board: CalibrationBoard) -> bool:
 
 def _spacing(numbers: Int32, pixels: Float64, board: CalibrationBoard) -> float:
     """Return the smallest distance between neighbouring corners of the board, pixels."""
-    place = np.full(len(board.corners_m) + board.inner[0], -1)
-    place[numbers] = np.arange(len(numbers))
     columns = board.inner[0]
+    place = np.full(len(board.corners_m) + columns, -1)
+    place[numbers] = np.arange(len(numbers))
     across = [(n, n + 1) for n in numbers if (n + 1) % columns]
     down = [(n, n + columns) for n in numbers]
     pairs = [(place[a], place[b]) for a, b in [*across, *down] if place[a] >= 0 and place[b] >= 0]
@@ -134,3 +130,267 @@ def _spacing(numbers: Int32, pixels: Float64, board: CalibrationBoard) -> float:
         return 3.0 * _SMALLEST_WINDOW_PX
     first, second = np.array(pairs).T
     return float(np.linalg.norm(pixels[first] - pixels[second], axis=1).min())
+
+
+def check_chessboard(
+    sizes: Sequence[Inner | None], read: Callable[[int], UInt8], board: CalibrationBoard
+) -> None:
+    """Check that the chessboard in the images has as many corners as the user gave.
+
+    OpenCV also detects part of a larger board, but not the same part in both cameras.
+
+    Args:
+        sizes: `grown_size` of the board found in each image, None if none was found.
+        read: Returns the grey image of a given number.
+        board: The board that the user gave.
+    """
+    claimed = _sorted(board.inner)
+    seen = Counter(_sorted(size) for size in sizes if size is not None)
+    if not seen:
+        _check_no_markers([read(n) for n in _spread(range(len(sizes)), _PROBED_MARKERS)], board)
+    probed: list[Inner | None] = []
+    if 2 * seen.total() < len(sizes):
+        # The few detections may be parts of a larger board.
+        empty = [number for number, size in enumerate(sizes) if size is None]
+        probed = [_probe_size(read(number)) for number in _spread(empty, _PROBED)]
+    others = Counter(_sorted(size) for size in probed if size is not None)
+    for votes, voters, enough in (
+        (others, len(probed), _SURE),
+        (seen + others, (seen + others).total(), (seen + others).total() // 2 + 1),
+    ):
+        size, most = next(iter(votes.most_common(1)), (claimed, 0))
+        larger = any(n > m for n, m in zip(size, claimed, strict=True))
+        # If the given board was seen whole, a smaller one is part of it.
+        if most >= enough and size != claimed and (larger or not seen[claimed]):
+            raise _wrong_size(size, f"{most} of {counted(voters, 'image')}", board)
+
+
+def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBoard) -> None:
+    """Explain why a ChArUco board was found in none of ``count`` images."""
+    probed = [read(number) for number in _spread(range(count), _PROBED_MARKERS)]
+    best, votes = _marker_votes(probed)
+    if votes[best] and votes[board.dictionary] < votes[best] / 2:
+        raise CalibrationError(
+            "the board has markers of another dictionary",
+            got=best.lower(),
+            expected=board.dictionary.lower(),
+            hint=f"try --board {board.kind}:{board.columns}x{board.rows}:…:{best.lower()}",
+        )
+    numbers = np.concatenate([_find_markers(p, board.dictionary) for p in probed])
+    if numbers.size:
+        raise CalibrationError(
+            "markers were found, but not in the layout of this board",
+            got=f"marker ids up to {numbers.max()}",
+            expected=f"0 to {_marker_count(board) - 1} for {board.columns}x{board.rows} squares",
+            hint="count squares, not corners; give columns first",
+        )
+    plain = [size for size in map(_probe_size, probed) if size is not None]
+    if plain:
+        columns, rows = max(plain, key=lambda size: size[0] * size[1])
+        raise CalibrationError(
+            "the images show a chessboard without markers",
+            got=f"{columns}x{rows} inner corners",
+            expected=str(board),
+            hint=f"try --board chess:{columns}x{rows}:…",
+        )
+
+
+def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
+    """Return columns and rows of a grid of inner corners, extended as far as corners are found.
+
+    ``inner`` is the size of the grid ``pixels`` (N, 2), which goes row by row.
+    """
+    columns, rows = inner
+    grid = pixels.reshape(rows, columns, 2)
+    usual = float(np.nanmedian(_contrast(grey, grid)))
+    for axis in (0, 1, 0, 1):
+        for _ in range(_LARGEST):
+            longer = _continue(grey, grid, axis, usual)
+            if longer is None:
+                grid = np.flip(grid, axis)
+                longer = _continue(grey, grid, axis, usual)
+            if longer is None:
+                break
+            grid = longer
+    return grid.shape[1], grid.shape[0]
+
+
+def _probe_size(grey: UInt8) -> Inner | None:
+    """Return inner columns and rows of any chessboard in an image, or None."""
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(
+        grey, (3, 3), cv2.CALIB_CB_LARGER | _SLOW_FLAGS
+    )
+    if not found or meta is None:
+        return None
+    rows, columns = meta.shape[:2]
+    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    if len(pixels) != rows * columns:
+        return None
+    size = grown_size(grey, pixels, (columns, rows))
+    # Detecting the whole extended board again rejects mere textures of squares.
+    return size if _find_chessboard(grey, size) is not None else None
+
+
+def _spread(numbers: Sequence[int], count: int) -> list[int]:
+    """Return at most ``count`` of the numbers, evenly spaced from first to last."""
+    at = np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))
+    return [numbers[place] for place in at]
+
+
+def _sorted(size: Inner) -> Inner:
+    """Return the size independent of orientation: a board may be held upright or sideways."""
+    return min(size), max(size)
+
+
+def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | None:
+    """Return the grid with one more line at the end of an axis, or None if there are no corners."""
+    lines = np.moveaxis(grid, axis, 0)
+    if len(lines) < 3 or len(lines) >= _LARGEST:
+        return None
+    # Quadratic extrapolation: perspective and lens distortion curve the spacing.
+    guess = 3 * lines[-1] - 3 * lines[-2] + lines[-3]
+    step = float(np.linalg.norm(guess - lines[-1], axis=1).min())
+    height, width = grey.shape
+    if step < 4 or (guess < 2).any() or (guess > (width - 3, height - 3)).any():
+        return None
+    longer = np.concatenate([lines, _refine_corners(grey, guess, step)[None]])
+    longer = np.moveaxis(longer, 0, axis)
+    added = np.moveaxis(_contrast(grey, longer), axis, 0)[-1]
+    if np.isnan(added).all() or not np.nanmedian(added) > _CORNER_CONTRAST * usual:
+        return None
+    return longer
+
+
+def _contrast(grey: UInt8, grid: Float64) -> Float64:
+    """Return float64 (R, C), how the diagonal pairs of quadrants of each corner differ.
+
+    Differences within a pair count against it. NaN where a quadrant is outside the image.
+    """
+    down, across = np.gradient(grid, axis=(0, 1))
+    quarters = [
+        grid + 0.4 * (a * across + b * down) for a, b in ((1, 1), (-1, -1), (1, -1), (-1, 1))
+    ]
+    smooth = cv2.blur(grey, (3, 3))
+    a, b, c, d = (_sample(smooth, places) for places in quarters)
+    return np.asarray(np.abs(a + b - c - d) - np.abs(a - b) - np.abs(c - d)) / 2
+
+
+def _sample(grey: UInt8, places: Float64) -> Float64:
+    at = np.rint(places).astype(int)
+    height, width = grey.shape
+    inside = ((at >= 0) & (at < (width, height))).all(axis=-1)
+    x, y = np.where(inside, at[..., 0], 0), np.where(inside, at[..., 1], 0)
+    return np.where(inside, grey[y, x].astype(np.float64), np.nan)
+
+
+def _check_no_markers(images: Sequence[UInt8], board: CalibrationBoard) -> None:
+    best, votes = _marker_votes(images)
+    if votes[best] >= _SURE * len(images):
+        raise CalibrationError(
+            "the images show a board with markers (ChArUco)",
+            got=f"markers of {best.lower()}",
+            expected=str(board),
+            hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, counting squares",
+        )
+
+
+def _wrong_size(size: Inner, where: str, board: CalibrationBoard) -> CalibrationError:
+    columns, rows = size if board.columns <= board.rows else size[::-1]
+    claimed = f"{board.columns}x{board.rows}"
+    squares = (columns + 1, rows + 1) == (board.columns, board.rows)
+    why = "count inner corners, not squares" if squares else "count the inner corners again"
+    return CalibrationError(
+        f"the board in the images does not have {claimed} inner corners",
+        got=f"{columns}x{rows} in {where}",
+        expected=claimed,
+        hint=f"{why}, or give --board chess:{columns}x{rows}:…",
+    )
+
+
+def dark_rectangles(board: CalibrationBoard) -> Float64:
+    """Return float64 (M, 4), the dark rectangles of a board: x0, y0, x1, y1 in metres.
+
+    The origin is the first inner corner, as in `CalibrationBoard.corners_m`.
+    """
+    columns, rows = board.squares
+    # OpenCV's boards have a dark square at the upper left corner, legacy ones at the lower left.
+    light = 1 if board.kind == "charuco" and board.legacy and rows % 2 == 0 else 0
+    dark = [(x, y) for y in range(rows) for x in range(columns) if (x + y) % 2 == light]
+    low = np.array(dark, dtype=np.float64)
+    if board.kind == "chess":
+        return np.asarray(np.hstack([low - 1.0, low]) * board.square_m)
+    charuco, low = _charuco(board), low * board.square_m
+    markers = [
+        _marker_cells(board, int(number), np.asarray(corners)[:, :2])
+        for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True)
+    ]
+    cells = np.concatenate([np.hstack([low, low + board.square_m]), *markers])
+    return np.asarray(cells - board.square_m)
+
+
+def _marker_cells(board: CalibrationBoard, number: int, corners: Float64) -> Float64:
+    """Return float64 (M, 4), dark cells of the marker with the given corners (4, 2), metres."""
+    dictionary = _dictionary(board.dictionary)
+    cells = dictionary.markerSize + 2
+    bits = cv2.aruco.generateImageMarker(dictionary, number, cells)
+    rows, columns = np.nonzero(bits == 0)
+    step = board.marker_m / cells
+    low = corners.min(axis=0) + np.stack([columns, rows], axis=1) * step
+    return np.asarray(np.hstack([low, low + step]))
+
+
+def _find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]:
+    """Return the numbers of the corners that are seen, int32 (N,), and their pixels (N, 2)."""
+    corners, numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
+    if numbers is None:
+        return np.zeros(0, dtype=np.int32), np.zeros((0, 2))
+    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    return np.asarray(numbers, dtype=np.int32).ravel(), pixels
+
+
+def _find_markers(grey: UInt8, dictionary: str) -> Int32:
+    """Return int32 (N,), ids of the markers of a dictionary found in an image."""
+    numbers = cv2.aruco.ArucoDetector(_dictionary(dictionary)).detectMarkers(grey)[1]
+    return np.zeros(0, np.int32) if numbers is None else np.asarray(numbers, np.int32).ravel()
+
+
+def _marker_votes(images: Sequence[UInt8]) -> tuple[str, Counter[str]]:
+    """Return the dictionary with the most markers found, and the number found of each."""
+    votes = Counter(
+        {name: sum(len(_find_markers(image, name)) for image in images) for name in _dictionaries()}
+    )
+    return votes.most_common(1)[0][0], votes
+
+
+def _dictionaries() -> list[str]:
+    """Return names of OpenCV's marker dictionaries, in upper case, without ``DICT_``."""
+    return sorted({n[len(_PREFIX) :].upper() for n in dir(cv2.aruco) if n.startswith(_PREFIX)})
+
+
+def _marker_count(board: CalibrationBoard) -> int:
+    columns, rows = board.squares
+    return columns * rows // 2
+
+
+def _dictionary(name: str) -> Any:
+    number = getattr(cv2.aruco, f"{_PREFIX}{name}", None)
+    if number is None:
+        raise SettingsError(
+            "unknown marker dictionary", got=name, expected=", ".join(_dictionaries())
+        )
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+@lru_cache(maxsize=4)
+def _charuco(board: CalibrationBoard) -> Any:
+    dictionary = _dictionary(board.dictionary)
+    if len(dictionary.bytesList) < _marker_count(board):
+        raise SettingsError(
+            "dictionary has too few markers for the board",
+            got=f"{board.dictionary.lower()} with {len(dictionary.bytesList)}",
+            expected=f"at least {_marker_count(board)}",
+        )
+    size = (board.columns, board.rows)
+    charuco = cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
+    charuco.setLegacyPattern(board.legacy)
+    return charuco

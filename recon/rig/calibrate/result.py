@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 
+from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
 from recon.io.cameras.camera_info import write_camera_info
@@ -15,11 +17,12 @@ from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.rig.calibrate.board_views import BoardViews
-from recon.rig.calibrate.bootstrap import Spread
+from recon.rig.calibrate.bootstrap import DepthError, Spread
 from recon.rig.calibrate.bundle import View
-from recon.rig.calibrate.settings import CalibratedSettings
 from recon.rig.calibrate.stereo import StereoFit
-from recon.rig.calibrate.summary import shared_pixels, summarise
+from recon.rig.calibrate.verdict import TILT_DEG
+from recon.rig.settings import CalibratedSettings
+from recon.run.summary import plain
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
@@ -92,3 +95,116 @@ def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
     left = turns.place(fit.calibration, left_px)
     right = turns.place(fit.calibration, right_px, right=True)
     return np.asarray(left[:, 1] - right[:, 1])
+
+
+# Image cells, 8 by 6: in a cell without corners, the lens model is extrapolated.
+_CELLS: Final = (8, 6)
+
+
+def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64) -> dict[str, Any]:
+    """Return the figures of ``summary.json``, without time and memory of the run."""
+    rig, tilts_deg, away_m = fit.calibration, tilt_deg(fit), distances_m(fit)
+    return {
+        "board": str(seen.board),
+        "model": rig.left.model,
+        "width_px": seen.size_px[0],
+        "height_px": seen.size_px[1],
+        "stereo_rms_px": fit.rms_px,
+        "left_rms_px": fit.alone_px[0],
+        "right_rms_px": fit.alone_px[1],
+        "epipolar_px": float(np.abs(rows_px).mean()),
+        "epipolar_95_px": float(np.quantile(np.abs(rows_px), 0.95)),
+        "baseline_m": rig.baseline_m,
+        "baseline_interval_m": list(spread.baseline_m),
+        "baseline_squares": rig.baseline_m / seen.board.square_m,
+        "focal_px": float(rig.left.matrix[0, 0]),
+        "focal_interval_px": list(spread.focal_px),
+        "focal_right_px": float(rig.right.matrix[0, 0]),
+        "rotation_spread_deg": spread.rotation_deg,
+        "views": seen.count,
+        "views_used": len(fit.views),
+        "views_repeated": list(fit.repeated),
+        "views_dropped": list(fit.dropped),
+        "dropped_error_px": fit.dropped,
+        "pictures_without_board": [path.name for path in seen.empty],
+        "view_errors_px": {
+            view.name: [float(value) for value in errors]
+            for view, errors in zip(fit.views, fit.errors_px, strict=True)
+        },
+        "coverage_left": coverage([view.seen[0].pixels for view in fit.views], rig.left),
+        "coverage_right": coverage([view.seen[1].pixels for view in fit.views], rig.right),
+        "tilt_max_deg": float(tilts_deg.max()),
+        "tilted_share": float((tilts_deg >= TILT_DEG).mean()),
+        "far_to_near": float(away_m.max() / away_m.min()),
+        "depth_error_cm": {f"{each.depth_m:g}": _depth_cm(each) for each in spread.depths},
+        "working_error": {
+            "distance_m": spread.working.depth_m,
+            "calibration_share": plain(spread.working.calibration_m / spread.working.depth_m),
+            "matching_share": spread.working.matching_m / spread.working.depth_m,
+        },
+    }
+
+
+def describe_depths(summary: dict[str, Any]) -> dict[str, str]:
+    """Return the depth errors of a summary as text, one line per distance."""
+    working = summary["working_error"]
+    share = working["calibration_share"]
+    text = "unknown" if share is None else f"{100 * share:.1f} %"
+    lines = {f"depth error at the working distance of {working['distance_m']:.3g} m": text}
+    for depth, cm in summary["depth_error_cm"].items():
+        known = "no common view"
+        if cm["calibration"] is not None:
+            known = f"{_short(cm['calibration'])} cm"
+            known += f", in the middle {_short(cm['low'])} to {_short(cm['high'])}"
+        lines[f"depth error at {depth} m"] = f"{known}; of matching {_short(cm['matching'])} cm"
+    return lines
+
+
+def _short(value: float) -> str:
+    """Return two significant digits, without an exponent."""
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
+
+
+def _depth_cm(each: DepthError) -> dict[str, float | None]:
+    metres = {
+        "calibration": each.calibration_m,
+        "low": each.low_m,
+        "high": each.high_m,
+        "matching": each.matching_m,
+    }
+    return {name: plain(100.0 * value) for name, value in metres.items()}
+
+
+def shared_pixels(view: View) -> tuple[Float64, Float64]:
+    """Return the corners that both cameras saw, in the left and right image: float64 (N, 2)."""
+    left, right = view.seen
+    _, of_left, of_right = np.intersect1d(left.numbers, right.numbers, return_indices=True)
+    return left.pixels[of_left], right.pixels[of_right]
+
+
+def coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
+    """Return the share of the 8 by 6 image cells in which a corner was seen, in [0, 1].
+
+    Args:
+        pixels: float64 (N, 2) for each view.
+        camera: The camera.
+    """
+    size = np.array([camera.width_px, camera.height_px])
+    cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
+    inside = np.clip(cells, 0, np.array(_CELLS) - 1)
+    return len(np.unique(inside, axis=0)) / (_CELLS[0] * _CELLS[1])
+
+
+def tilt_deg(fit: StereoFit) -> Float64:
+    """Return float64 (V,), angle between the board's normal and the left camera's optical axis."""
+    normals = np.array([T[2, 2] for T in fit.state.T_rig_board])
+    return np.asarray(np.degrees(np.arccos(np.clip(np.abs(normals), 0.0, 1.0))))
+
+
+def distances_m(fit: StereoFit) -> Float64:
+    """Return float64 (V,), distance of the middle of the board from the left camera."""
+    middles = [
+        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
+        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
+    ]
+    return np.asarray(np.linalg.norm(middles, axis=1))

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
-from recon.evaluation.middlebury.summary import SceneDone
+from recon.evaluation.middlebury.bench import SceneDone
 from recon.map.drive.mapper import FrameResult
 from recon.map.localize.localizer import Located, State
 from recon.map.localize.sequence import LocalizedFrame

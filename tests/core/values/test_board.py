@@ -5,7 +5,7 @@ import pytest
 
 from recon.core.errors import SettingsError
 from recon.core.values.board import CalibrationBoard, parse_board
-from recon.rig.opencv_boards import dark_rectangles
+from recon.rig.calibrate.detect import dark_rectangles
 
 
 @pytest.mark.parametrize(

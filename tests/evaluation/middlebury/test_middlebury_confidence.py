@@ -7,8 +7,8 @@ import pytest
 
 from recon.core.values import Disparity, DisparityTruth, Reason
 from recon.evaluation.confidence import share_within_sigma
+from recon.evaluation.middlebury.bench import weighted_confidence
 from recon.evaluation.middlebury.score import confidence_figures
-from recon.evaluation.middlebury.summary import weighted_confidence
 
 SHAPE = (60, 100)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from recon.core.errors import EvaluationError
 from recon.core.values import DisparityTruth, RectifiedCamera
 from recon.evaluation.disparity import evaluate_depth
-from recon.evaluation.middlebury.rules import (
+from recon.evaluation.middlebury.score import (
     MiddleburyRules,
     at_truth_size,
     evaluate_middlebury,

@@ -10,9 +10,13 @@ from recon.core.geometry.projection import depth_from_disparity
 from recon.evaluation.middlebury.scenes import find_scenes, read_scored_scene
 from recon.io.images.image import write_image
 from recon.io.images.pfm import write_pfm
-from recon.io.middlebury.calib import nominal_camera_2005, read_middlebury_calib
 from recon.io.middlebury.layout import Layout, find_layout, units_of
-from recon.io.middlebury.scene import cross_check, read_middlebury_scene
+from recon.io.middlebury.scene import (
+    cross_check,
+    nominal_camera_2005,
+    read_middlebury_calib,
+    read_middlebury_scene,
+)
 
 CALIB = """cam0=[999.421 0 294.182; 0 999.421 252.932; 0 0 1]
 cam1=[999.421 0 326.96; 0 999.421 252.932; 0 0 1]

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from recon.rig.audit.audit import _turn_faults
-from recon.rig.audit.bent_lenses import BentLenses, estimate_lenses, straightened
+from recon.rig.audit.corrections import BentLenses, RightTurn, estimate_lenses, straightened
 from recon.rig.audit.rig_fit import StereoTracks
-from recon.rig.audit.right_turn import RightTurn
 from recon.rig.audit.seen_motion import SeenMotion
 from recon.stereo.rectify.lens import rays_of
 from tests.rig.audit.test_right_turn import CAMERA, tracks

@@ -22,7 +22,7 @@ from recon.rig.audit.measures import (
 )
 from recon.rig.audit.row_alignment import align_rows, correct_rig, count_aligned, turn_features
 from recon.rig.audit.sample import plan_centres, plan_stretches
-from recon.rig.audit.settings import AuditSettings
+from recon.rig.settings import AuditSettings
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 

@@ -9,8 +9,8 @@ from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.odometry.window import TrackWindow
+from recon.rig.audit.corrections import estimate_turn, turned_places
 from recon.rig.audit.rig_fit import StereoTracks
-from recon.rig.audit.right_turn import estimate_turn, turned_places
 
 CAMERA = RectifiedCamera(
     focal_px=700.0,

@@ -10,8 +10,13 @@ import pytest
 from recon.core.errors import CalibrationError, SettingsError
 from recon.core.values.arrays import UInt8
 from recon.core.values.board import parse_board
-from recon.rig.calibrate.board_size import check_charuco, check_chessboard, grown_size
-from recon.rig.calibrate.detect import find_board, orient_like
+from recon.rig.calibrate.detect import (
+    check_charuco,
+    check_chessboard,
+    find_board,
+    grown_size,
+    orient_like,
+)
 from tests.scenery.boards import BoardView, board_rig, place_boards, render_views
 
 CHARUCO = "charuco:8x6:30mm:22mm:5x5_100"

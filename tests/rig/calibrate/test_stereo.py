@@ -13,8 +13,8 @@ from recon.core.values import StereoCalibration
 from recon.rig.calibrate import stereo
 from recon.rig.calibrate.bootstrap import measure_depth, measure_spread
 from recon.rig.calibrate.bundle import View
-from recon.rig.calibrate.settings import CalibrationSettings
 from recon.rig.calibrate.stereo import calibrate_stereo
+from recon.rig.settings import CalibrationSettings
 from recon.stereo.rectify.lens import project_raw, rays_of
 
 SIZE = (640, 480)

@@ -5,12 +5,12 @@ import pytest
 
 from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3
-from recon.rig.uncalibrated.fundamental import (
+from recon.rig.uncalibrated import (
     find_fundamental,
     fit_fundamental,
     line_distances,
+    rectifying_homographies,
 )
-from recon.rig.uncalibrated.homographies import rectifying_homographies
 from recon.stereo.rectify.features import PairFeatures
 
 SIZE = (640, 480)

@@ -12,12 +12,11 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3, hat
+from recon.core.least_squares import Problem, minimise
 from recon.core.values import RectifiedCamera
-from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.core.words import counted
 from recon.rig.audit.row_alignment import align_rows
-from recon.rig.uncalibrated.fundamental import find_fundamental
-from recon.rig.uncalibrated.homographies import Homographies, Size, rectifying_homographies
 from recon.stereo.rectify.features import (
     MOST_FEATURES,
     PairFeatures,
@@ -219,3 +218,161 @@ def _result(
         held_out_px=float(held_out[good].mean()) if good.any() else float("nan"),
         disparity_px=(float(low), float(high)),
     )
+
+
+Size = tuple[int, int]
+Homographies = tuple[Float64, Float64]
+
+_MOST_STRETCHED: Final = 20.0  # largest ratio of the scales at two corners of an image
+_SMALLEST_DISPARITY_PX: Final = 4.0  # of the farthest matches; a matcher searches from 0
+
+
+def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> Homographies:
+    """Return float64 (3, 3) for the left and for the right image, which align matching rows.
+
+    The borders of both images stay as near to their places as aligned rows allow, and then the
+    right image is shifted so that disparities are positive.
+
+    Args:
+        F: float64 (3, 3), ``right.T @ F @ left = 0``.
+        features: Correct matches, raw pixels.
+        size: (width, height) of the images.
+
+    Ref: Hartley 1999, "Theory and practice of projective rectification", as OpenCV has it.
+    """
+    left_px, right_px = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)
+    _, *found = cv2.stereoRectifyUncalibrated(left_px, right_px, F, size, threshold=0)
+    x, y = np.meshgrid(np.linspace(0, size[0] - 1, 3), np.linspace(0, size[1] - 1, 3))
+    border = np.delete(np.stack([x.ravel(), y.ravel()], axis=1), 4, axis=0)
+    views = _levelled([np.asarray(H, np.float64) for H in found], border)
+    moved = [map_pixels(H, border) for H in views]
+    # Rows are scaled and shifted alike; columns of each image scaled, sheared and shifted.
+    rows = _affine(np.concatenate(moved)[:, 1:], np.tile(border[:, 1], 2))
+    left, right = (
+        np.array([_affine(places, border[:, 0]), [0.0, *rows], [0.0, 0.0, 1.0]]) @ H
+        for places, H in zip(moved, views, strict=True)
+    )
+    columns = map_pixels(left, left_px)[:, 0] - map_pixels(right, right_px)[:, 0]
+    least = float(np.percentile(columns, 1)) - _SMALLEST_DISPARITY_PX
+    return left, np.array([[1.0, 0.0, least], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ right
+
+
+def _levelled(views: list[Float64], border: Float64) -> list[Float64]:
+    """Tilt both images together about a horizontal axis, until top and bottom have equal scale.
+
+    Rows stay aligned under (x, y) -> (x, y) / (1 + g·(y - y0)). The scale at a pixel depends on its
+    third coordinate: g makes this as even as possible along the borders of both images.
+    """
+    points = np.hstack([border, np.ones((len(border), 1))])
+    views = [H / (points @ H[2]).mean() for H in views]
+    for side, H in zip(("left", "right"), views, strict=True):
+        depth = points @ H[2]
+        if not depth.min() > depth.max() / _MOST_STRETCHED:  # also where it is NaN
+            raise CalibrationError(
+                f"the {side} image sees the other camera: one is in front of the other",
+                got="epipole in it, or close to its border",
+                expected="outside the image",
+                hint="put the cameras side by side",
+            )
+    y0 = float(np.mean([map_pixels(H, border.mean(axis=0)[None])[0, 1] for H in views]))
+    rows, depth = (
+        np.stack([points @ (H[k] - shift * H[2]) for H in views]) for k, shift in ((1, y0), (2, 0))
+    )
+    rows, depth = (each - each.mean(axis=1, keepdims=True) for each in (rows, depth))
+    g = -float((rows * depth).sum() / (rows * rows).sum())
+    return [np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, g, 1.0 - g * y0]]) @ H for H in views]
+
+
+def _affine(places: Float64, wanted: Float64) -> Float64:
+    """Return the factors of the coordinates (N, k) and the shift that give (N,) numbers best."""
+    found = np.linalg.lstsq(np.column_stack([places, np.ones(len(places))]), wanted, rcond=None)
+    return np.asarray(found[0], dtype=np.float64)
+
+
+_FEWEST: Final = 8
+# With little parallax, a wide threshold accepts a wrong geometry: several are tried.
+_DRAWS: Final = (
+    (cv2.USAC_MAGSAC, 1.0), (cv2.USAC_MAGSAC, 0.5), (cv2.USAC_MAGSAC, 0.25), (cv2.RANSAC, 1.0),
+)  # fmt: skip
+_ROUNDS: Final = 50
+_STILL: Final = 1e-7  # relative decrease of the cost at which the fit ends
+_STEP: Final = 1e-6
+_SMALLEST_PX: Final = 0.1  # errors below about this size are weighted alike
+
+
+def find_fundamental(features: PairFeatures, inlier_px: float) -> tuple[Float64 | None, Bool]:
+    """Estimate the fundamental matrix robustly (RANSAC, MAGSAC++) and refine it on its inliers.
+
+    Returns:
+        float64 (3, 3) with ``right.T @ F @ left = 0``, or None; and bool (N,), the matches that
+        are at most ``inlier_px`` away from their epipolar lines.
+    """
+    left, right = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)
+    best, distances = None, np.full(len(left), np.inf)
+    for method, share in _DRAWS if len(left) >= _FEWEST else ():
+        try:
+            F, _ = cv2.findFundamentalMat(left, right, method, share * inlier_px, 0.9999, 10000)
+        except cv2.error:  # no model found
+            continue
+        if F is None or F.shape != (3, 3):
+            continue
+        for _ in range(2):  # fitted to the inliers, and to those of that fit
+            agreeing = np.abs(line_distances(F, left, right)) <= inlier_px
+            if agreeing.sum() >= _FEWEST:
+                F = fit_fundamental(F, left[agreeing], right[agreeing])
+        apart = np.abs(line_distances(F, left, right))
+        if np.minimum(apart, inlier_px).sum() < np.minimum(distances, inlier_px).sum():
+            best, distances = F, apart
+    return best, np.asarray(distances <= inlier_px)
+
+
+def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
+    """Refine the seven parameters of a fundamental matrix, minimising absolute distances.
+
+    Args:
+        F: float64 (3, 3), initial guess.
+        left_px: float64 (N, 2), inliers.
+        right_px: float64 (N, 2), the matching pixels.
+
+    Ref: Bartoli and Sturm 2004, "Non-linear estimation of the fundamental matrix with minimal
+        parameters".
+    """
+    middle = np.concatenate([left_px, right_px]).mean(axis=0)
+    scale = 1.0 / max(float(np.abs([left_px - middle, right_px - middle]).mean()), 1e-12)
+    N = np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1.0]])
+    inverse = np.linalg.inv(N)
+    U, S, Vt = np.linalg.svd(inverse.T @ F @ inverse)
+
+    def moved(step: Float64) -> Float64:
+        angle = np.arctan2(S[1], S[0]) + step[6]
+        middle = np.diag([np.cos(angle), np.sin(angle), 0.0])
+        return np.asarray(N.T @ U @ exp_so3(step[:3]) @ middle @ exp_so3(step[3:6]) @ Vt @ N)
+
+    def apart(step: Float64) -> Float64:
+        return line_distances(moved(step), left_px, right_px)
+
+    def linearise(step: Float64) -> tuple[Float64, Float64]:
+        error = apart(step)
+        J = np.stack([(apart(step + _STEP * e) - error) / _STEP for e in np.eye(7)], axis=1)
+        weighted = J / np.hypot(error, small_px)[:, None]
+        return weighted.T @ J, weighted.T @ error
+
+    def solve(step: Float64, normal: tuple[Float64, Float64], damping: float) -> Float64:
+        A, a = normal
+        return step - np.linalg.lstsq(A + damping * np.diag(np.diag(A)), a, rcond=1e-12)[0]
+
+    small_px = _SMALLEST_PX + float(np.median(np.abs(apart(np.zeros(7)))))
+    cost = Problem(lambda step: float(np.hypot(apart(step), small_px).sum()), linearise, solve)
+    return moved(minimise(cost, np.zeros(7), rounds=_ROUNDS, min_gain=_STILL))
+
+
+def line_distances(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
+    """Return float64 (N,), signed Sampson distances: the error of each match to first order.
+
+    Ref: Hartley and Zisserman 2004, equation 11.9.
+    """
+    ones = np.ones((len(left_px), 1))
+    left, right = np.hstack([left_px, ones]), np.hstack([right_px, ones])
+    in_right, in_left = left @ F.T, right @ F
+    size = np.linalg.norm(np.hstack([in_right[:, :2], in_left[:, :2]]), axis=1)
+    return np.asarray((right * in_right).sum(axis=1) / np.maximum(size, 1e-300))
