@@ -1,7 +1,7 @@
 """Whether the odometry knows its error: how often its 95 % intervals hold.
 
 Short drives through rendered streets, each in other weather and with a rig that is calibrated as
-well as `recon.odometry.path_drift` assumes: its disparities, the angle between its cameras and
+well as `recon.odometry.health` assumes: its disparities, the angle between its cameras and
 its baseline are off by a random amount of that size. A segment is covered if its end is as near to
 the true one as ``expected_drift_percent`` says with 95 % probability. Segments with frames that the
 odometry itself does not trust do not count.
@@ -28,7 +28,7 @@ from recon.commands.config import load_config
 from recon.core.values import RectifiedCamera, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.evaluation.trajectory import TrajectoryRules, compare_paths
-from recon.odometry.path_drift import RIG_BASELINE, RIG_DISPARITY_PX, RIG_YAW_DEG, expected_drift
+from recon.odometry.health import RIG_BASELINE, RIG_DISPARITY_PX, RIG_YAW_DEG, expected_drift
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
 from recon.run.threads import serial_algebra

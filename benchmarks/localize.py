@@ -37,10 +37,10 @@ from recon.map.localize.sequence import localize_sequence
 from recon.map.localize.surroundings import Surroundings
 from recon.map.store.map_views import MapViews
 from recon.map.verbs import Map
-from recon.odometry.icp_points import select_points
+from recon.odometry.kiss import select_points
 from recon.odometry.protocol import OdometryFrame
+from recon.places.detector import KnownPlaces, KnownView
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.known_places import KnownPlaces, KnownView
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor

@@ -173,7 +173,7 @@ def deceiving(source: Filmed, options: argparse.Namespace) -> dict[str, Any]:
     """A repetitive street: loops closed, and loops found without the odometry check."""
     config = config_of(options, "alike")
     loops = mapped_with(source, config, 0.0)[0].loops
-    with patch.multiple("recon.places.drift", SHARE=1.0, TURN_DEG=5.0):
+    with patch.multiple("recon.places.places", SHARE=1.0, TURN_DEG=5.0):
         trusting = mapped_with(source, config, 0.0)[0].loops
     if loops is None or trusting is None:
         raise SystemExit("loop closure is off")

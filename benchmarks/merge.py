@@ -44,8 +44,8 @@ from recon.map.store.session import SessionInfo
 from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
-from recon.places.drift import path_lengths
 from recon.places.keyframe import make_keyframe
+from recon.places.places import path_lengths
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
 from recon.street.path import LANE_M

@@ -21,7 +21,7 @@ from recon.evaluation.map import evaluate_map, register_cloud, within_reach
 from recon.evaluation.segments import TOLERANCE_S, associate
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory
-from recon.places.path_fit import drift_at_end, fit_to_path
+from recon.places.places import drift_at_end, fit_to_path
 from recon.run.directory import RECORD
 from recon.run.finished import CLOUD, open_run
 

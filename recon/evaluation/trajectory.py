@@ -20,7 +20,7 @@ from recon.core.words import counted
 from recon.evaluation.segments import Segments, choose_segments
 from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
-from recon.places.path_fit import drift_at_end, fit_to_path
+from recon.places.places import drift_at_end, fit_to_path
 
 MIN_PATH_M: Final = 1.0
 """On a shorter path, relative errors would be dominated by the noise of the ground truth."""

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from recon.core.geometry.se3 import invert
+from recon.core.geometry.projection import depth_from_disparity, project, unproject
+from recon.core.geometry.se3 import apply, invert
 from recon.core.values import Disparity, RectifiedCamera
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float64, UInt8
 from recon.core.words import counted
-from recon.odometry.agreement import Sight, explain_motion
 from recon.odometry.protocol import (
     Odometry,
     OdometryFrame,
@@ -121,3 +124,194 @@ def _contradiction(share: float, informative: int) -> list[str]:
         return []
     patches = counted(informative, "patch", "patches")
     return [f"only {100 * share:.0f} % of {patches} of the image moved like that"]
+
+
+Int64 = NDArray[np.int64]
+
+_LEAST_NOISE = 0.5
+"""Grey values: rounding alone leaves 0.3."""
+
+
+_STRIDE_PX: Final = 5
+"""Every n-th row and column is sampled."""
+
+_PATCH_PX: Final = 48
+"""Edge of a patch."""
+
+_MIN_PIXELS: Final = 24
+"""Least number of samples with a disparity in a patch."""
+
+_MIN_TEXTURE: Final = 3.0
+"""A patch is used if its mean squared gradient, in the direction in which it is smallest, exceeds
+that of the noise by this factor."""
+
+_MIN_CORRELATION: Final = 0.6
+"""Least correlation of a patch that agrees."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How many patches of an image a motion explains.
+
+    Attributes:
+        informative: Patches with texture in all directions, which can distinguish motions.
+        share: Share of them that match where the motion takes them; NaN = there are none.
+    """
+
+    informative: int
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the check needs of a frame.
+
+    Attributes:
+        left: uint8 (H, W).
+        disparity: Its disparity.
+    """
+
+    left: UInt8
+    disparity: Disparity
+
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of the noise of the image, grey values."""
+        return noise_sigma(self.left)
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Pixels of an image that another image should show too.
+
+    Attributes:
+        patch: int64 (N,), number of the patch of each.
+        before: float64 (N,), grey values in the last image.
+        now: float64 (N,), grey values where the motion takes them in this one.
+        slope: float64 (N, 2), gradient of ``before`` per pixel to the right and down.
+    """
+
+    patch: Int64
+    before: Float64
+    now: Float64
+    slope: Float64
+
+
+def explain_motion(
+    before: Sight,
+    now: Sight,
+    T_before_now: Float64,
+    camera: RectifiedCamera,
+) -> Agreement:
+    """Count the patches of the last image that match where a motion takes them in this one.
+
+    Every sampled pixel with a disparity is moved. A patch matches where its grey values correlate
+    with those seen there, corrected for noise; brightness and contrast may change. Patches without
+    texture, or with edges in one direction alone, match after many motions and are not counted; in
+    an image that is dark by now no patch is.
+
+    Args:
+        before: The last frame.
+        now: This one.
+        T_before_now: float64 (4, 4), the motion in question.
+        camera: The rectified camera.
+    """
+    samples = _sample(before, now.left, T_before_now, camera)
+    count = np.bincount(samples.patch)
+    noise = (before.noise, now.noise)
+    informative = (count >= _MIN_PIXELS) & _textured(samples, count, noise[0])
+    # An image that shows little more than noise where the patches should be is blind.
+    blind = _power(samples, samples.now, count) < 2.0 * noise[1] ** 2
+    if not informative.any() or blind[informative].mean() > 0.5:
+        return Agreement(0, float("nan"))
+    agreeing = _correlation(samples, count, noise)[informative] >= _MIN_CORRELATION
+    return Agreement(int(informative.sum()), float(agreeing.mean()))
+
+
+def noise_sigma(grey: UInt8) -> float:
+    """Return the standard deviation of the noise of an image, grey values.
+
+    From the median of mixed fourth differences, in which gradients and straight edges cancel.
+
+    Ref:
+        Immerkær, "Fast noise variance estimation", CVIU 1996.
+    """
+    # Every fourth column and row: some ten thousand values give a median to one per cent.
+    columns = [grey[:, k : k + grey.shape[1] - 2 : 4].astype(np.int16) for k in range(3)]
+    across = columns[0] - 2 * columns[1] + columns[2]
+    rows = [across[k : k + len(across) - 2 : 4] for k in range(3)]
+    mixed = rows[0] - 2 * rows[1] + rows[2]
+    if not mixed.size:
+        return _LEAST_NOISE
+    # The weights' squares sum to 36; 0.6745 of a normal deviation is its median magnitude.
+    return max(float(np.median(np.abs(mixed))) / (6.0 * 0.6745), _LEAST_NOISE)
+
+
+def _sample(
+    before: Sight,
+    left: UInt8,
+    T_before_now: Float64,
+    camera: RectifiedCamera,
+) -> _Samples:
+    """Return every n-th pixel with a disparity that stays in the image."""
+    step, (height, width) = _STRIDE_PX, left.shape
+    # Slopes need a neighbour on either side.
+    row, column = np.nonzero(before.disparity.valid[1:-1:step, 1:-1:step])
+    row, column = 1 + step * row, 1 + step * column
+    depth_m = depth_from_disparity(before.disparity.values[row, column], camera)
+    xyz = unproject(column, row, depth_m.astype(np.float64), camera)
+    u, v, _ = project(apply(invert(T_before_now), xyz), camera)
+    with np.errstate(invalid="ignore"):
+        inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    row, column, u, v = row[inside], column[inside], u[inside], v[inside]
+    grey = before.left.astype(np.int16)
+    right, down = (grey[row, column + 1], grey[row + 1, column])
+    slope = np.stack([right - grey[row, column - 1], down - grey[row - 1, column]], axis=1)
+    patch = (row // _PATCH_PX) * -(-width // _PATCH_PX)
+    patch += column // _PATCH_PX
+    return _Samples(
+        patch, grey[row, column].astype(np.float64), _interpolated(left, u, v), 0.5 * slope
+    )
+
+
+def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
+    """Return grey values (N,) between pixels."""
+    if not len(u):
+        return np.zeros(0)
+    # OpenCV refuses maps of more than 32767 rows, so the points are wrapped into rows.
+    rows = -(-len(u) // 1024)
+    columns, lines = (np.resize(x.astype(np.float32), (rows, 1024)) for x in (u, v))
+    grey = np.asarray(cv2.remap(image, columns, lines, cv2.INTER_LINEAR), dtype=np.float64)
+    return grey.reshape(-1)[: len(u)]
+
+
+def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_]:
+    """Return bool (P,), patches with gradients in every direction that exceed the noise."""
+    x, y = samples.slope.T
+    xx, yy, xy = (_mean(samples, values, count) for values in (x * x, y * y, x * y))
+    least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    # Half the difference of two noisy values has half their variance.
+    return np.asarray(least > _MIN_TEXTURE * 0.5 * sigma**2)
+
+
+def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) -> Float64:
+    """Return the correlation (P,) of each patch between the two images, corrected for noise."""
+    one, other = samples.before, samples.now
+    mean, mean_other = (_mean(samples, values, count) for values in (one, other))
+    both = _mean(samples, one * other, count) - mean * mean_other
+    power, power_other = (
+        _power(samples, values, count) - sigma**2
+        for values, sigma in zip((one, other), noise, strict=True)
+    )
+    floor = _LEAST_NOISE**2
+    return np.asarray(both / np.sqrt(np.maximum(power, floor) * np.maximum(power_other, floor)))
+
+
+def _power(samples: _Samples, values: Float64, count: Int64) -> Float64:
+    """Return the variance of values (N,) in each patch, noise included."""
+    return _mean(samples, values**2, count) - _mean(samples, values, count) ** 2
+
+
+def _mean(samples: _Samples, values: Float64, count: Int64) -> Float64:
+    """Return the mean of values (N,) in each patch; 0 in empty ones."""
+    return np.asarray(np.bincount(samples.patch, values) / np.maximum(count, 1))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.values.arrays import Bool
+from recon.core.values import RectifiedCamera, Trajectory
+from recon.core.values.arrays import Bool, Float64
 from recon.core.words import counted
 from recon.odometry.protocol import OdometryHealth
 
@@ -93,3 +95,100 @@ def _stretches(indices: Sequence[int]) -> list[tuple[int, int]]:
         else:
             stretches.append((index, index))
     return stretches
+
+
+RIG_DISPARITY_PX: Final = 0.1
+"""Standard deviation of an error common to all disparities, of a rig that was calibrated well."""
+
+RIG_YAW_DEG: Final = 0.02
+"""That of the angle between the cameras, which shifts all disparities, too."""
+
+RIG_BASELINE: Final = 0.002
+"""That of the baseline, as a share of it."""
+
+_SEGMENT_M: Final = 100.0
+"""Length over which the drift is stated, or the path if it is shorter: errors of the heading make
+it grow with the length."""
+
+_SIGMAS: Final = 1.96
+"""Half width of a 95 % interval, in standard deviations."""
+
+_MOST_PERCENT: Final = 3.0
+"""Half width of that interval above which the length of a path is in question."""
+
+
+@dataclass(frozen=True)
+class ExpectedDrift:
+    """Standard deviation of a position after a segment of the path, per cent of its length.
+
+    Attributes:
+        percent: All of it.
+        rig_percent: The part that is due to the rig, common to the whole path: its length.
+        rests_on_m: Distance of the points on which the length rests.
+    """
+
+    percent: float
+    rig_percent: float
+    rests_on_m: float
+
+    @property
+    def radius_share(self) -> float:
+        """Where a position is with 95 % probability: within this share of the path up to it."""
+        return _SIGMAS * self.percent / 100.0
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know: that the length of the path is not certain."""
+        half_width = _SIGMAS * self.rig_percent
+        if half_width <= _MOST_PERCENT:
+            return []
+        where = f"scale rests on points about {self.rests_on_m:.0f} m away"
+        return [f"{where}: the length of the path is certain to ± {half_width:.0f} % only"]
+
+
+def expected_drift(
+    path: Trajectory, health: Sequence[OdometryHealth], camera: RectifiedCamera
+) -> ExpectedDrift | None:
+    """Return how far a path may be off; None where no motion was measured.
+
+    Frames without a trusted pose do not count: `health_warnings` names them.
+
+    Args:
+        path: The path by odometry.
+        health: The health of each pose.
+        camera: The rectified camera.
+    """
+    steps_m = np.linalg.norm(np.diff(path.positions_m, axis=0), axis=1)
+    figures = np.array([(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]])
+    known = np.isfinite(figures).all(axis=1) if len(figures) else np.zeros(0, np.bool_)
+    known &= np.array([h.ok for h in health[1:]], dtype=np.bool_)
+    length_m = float(steps_m[known].sum())
+    if not length_m > 0.0:
+        return None
+    scale_px, sigma_m, sigma_deg = figures[known].T
+    share = _scale_share(scale_px, camera)
+    rig = float(np.hypot(steps_m[known] @ share / length_m, RIG_BASELINE))
+    step_m = length_m / float(known.sum())
+    random = _random_share(step_m, length_m, sigma_m, np.deg2rad(sigma_deg))
+    rests_on_px = length_m / float(steps_m[known] @ (1.0 / scale_px))
+    return ExpectedDrift(
+        percent=100.0 * float(np.hypot(rig, random)),
+        rig_percent=100.0 * rig,
+        rests_on_m=camera.focal_px * camera.baseline_m / rests_on_px,
+    )
+
+
+def _scale_share(scale_px: Float64, camera: RectifiedCamera) -> Float64:
+    """Return what an error of all disparities does to the lengths (N,) of steps, as a share."""
+    yaw_px = camera.focal_px * np.deg2rad(RIG_YAW_DEG)
+    return np.asarray(np.hypot(RIG_DISPARITY_PX, yaw_px) / scale_px)
+
+
+def _random_share(step_m: float, length_m: float, sigma_m: Float64, sigma_rad: Float64) -> float:
+    """Return what errors of single steps add up to over a segment, as a share of its length.
+
+    Translations add as they are; a turn moves all that follows, on average a third of its square.
+    """
+    segment_m = min(_SEGMENT_M, length_m)
+    steps = segment_m / step_m
+    moved = np.mean(sigma_m**2) + np.mean(sigma_rad**2) * segment_m**2 / 3.0
+    return float(np.sqrt(steps * moved) / segment_m)

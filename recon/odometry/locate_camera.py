@@ -1,16 +1,17 @@
-"""The pose of one frame from tracks of known points."""
+"""The pose of one frame: predicted by the last motion, and found from known points that it sees."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Final
 
+import cv2
 import numpy as np
 
 from recon.core.geometry.projection import project
-from recon.core.geometry.se3 import apply, invert
+from recon.core.geometry.se3 import apply, exp_so3, invert, log_so3, make_transform, orthonormalise
 from recon.core.values import RectifiedCamera
-from recon.core.values.arrays import Float64
-from recon.odometry.pnp import LocatedCamera, find_consensus, fit_pose
+from recon.core.values.arrays import Bool, Float64
 
 REPROJECTION_PX: Final = 2.0
 """RANSAC's inlier limit."""
@@ -80,3 +81,139 @@ def _agreement(
     error_px = np.hypot(u - uv[:, 0], v - uv[:, 1])
     # A point behind the camera has a NaN error, which compares as False.
     return LocatedCamera(T_world_camera, np.asarray(error_px <= REPROJECTION_PX))
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedCamera:
+    """The pose of a camera, from known points.
+
+    Attributes:
+        T_world_camera: float64 (4, 4).
+        agree: bool (N,), True for the points that agree with it.
+    """
+
+    T_world_camera: Float64
+    agree: Bool
+
+
+def find_consensus(
+    xyz_world: Float64,
+    uv: Float64,
+    camera: RectifiedCamera,
+    *,
+    limit_px: float,
+    iterations: int,
+    min_inliers: int,
+) -> LocatedCamera | None:
+    """Find the largest set of points that agree on one pose (RANSAC).
+
+    The pose that comes with it is a closed-form fit (EPnP) that one point near the horizon throws
+    off by metres or kilometres: fit it again with `fit_pose`. RANSAC seeds its own generator, so
+    equal input gives equal output.
+
+    Args:
+        xyz_world: float64 (N, 3), the points.
+        uv: float64 (N, 2), where the camera sees them.
+        camera: The rectified camera.
+        limit_px: Largest reprojection error of a point that agrees.
+        iterations: Samples at most.
+        min_inliers: Fewer points that agree give no pose.
+
+    Ref:
+        Fischler and Bolles, "Random sample consensus", CACM 1981.
+    """
+    if len(xyz_world) < min_inliers:
+        return None
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        xyz_world,
+        uv,
+        camera.matrix,
+        None,
+        iterationsCount=iterations,
+        reprojectionError=limit_px,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    # Four points give a closed-form pose anyhow; the fit that follows needs more.
+    if not found or inliers is None or len(inliers) < min_inliers:
+        return None
+    agree = np.zeros(len(xyz_world), np.bool_)
+    agree[inliers.reshape(-1)] = True
+    return LocatedCamera(_pose(rotation, translation), agree)
+
+
+def fit_pose(
+    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, T_world_start: Float64 | None = None
+) -> Float64:
+    """Fit the pose (4, 4) of least squared reprojection error (Levenberg-Marquardt).
+
+    Args:
+        xyz_world: float64 (N, 3), points that agree.
+        uv: float64 (N, 2), where the camera sees them.
+        camera: The rectified camera.
+        T_world_start: float64 (4, 4), initial pose; None = in closed form from the points.
+    """
+    if T_world_start is None:
+        _, rotation, translation = cv2.solvePnP(
+            xyz_world, uv, camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    else:
+        T_camera_world = invert(T_world_start)
+        rotation, _ = cv2.Rodrigues(T_camera_world[:3, :3])
+        translation = T_camera_world[:3, 3].reshape(3, 1).copy()
+    rotation, translation = cv2.solvePnPRefineLM(
+        xyz_world, uv, camera.matrix, None, rotation, translation
+    )
+    return _pose(rotation, translation)
+
+
+def _pose(rotation: Float64, translation: Float64) -> Float64:
+    """Return T_world_camera from OpenCV's rotation vector and translation."""
+    R, _ = cv2.Rodrigues(rotation)
+    return invert(make_transform(R, translation))
+
+
+_LONGEST_GAP: Final = 20.0
+"""In intervals: over a longer gap the motion is not extrapolated in time, but repeated once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The last pose, and how the camera moved to it.
+
+    Attributes:
+        T_world_camera: float64 (4, 4), the last pose.
+        T_before_camera: float64 (4, 4), the motion to it.
+        timestamp_s: Time of the last pose.
+        interval_s: Time that the motion took; 0 = not known.
+    """
+
+    T_world_camera: Float64
+    timestamp_s: float
+    T_before_camera: Float64 = field(default_factory=lambda: np.eye(4))
+    interval_s: float = 0.0
+
+    def predict(self, timestamp_s: float) -> Float64:
+        """Return the pose (4, 4) at a time: with constant velocity, where times are known."""
+        passed_s = timestamp_s - self.timestamp_s
+        share = passed_s / self.interval_s if self.interval_s > 0.0 else 1.0
+        if not 0.0 < share <= _LONGEST_GAP:
+            share = 1.0
+        return orthonormalise(self.T_world_camera @ part_of(self.T_before_camera, share))
+
+    def moved(self, T_world_camera: Float64, timestamp_s: float) -> Motion:
+        """Return the model after a measured pose, which gives a new motion."""
+        motion = invert(self.T_world_camera) @ T_world_camera
+        return Motion(T_world_camera, timestamp_s, motion, timestamp_s - self.timestamp_s)
+
+    def drifted(self, timestamp_s: float) -> Motion:
+        """Return the model after a frame without a measured pose: the same motion continues."""
+        T = self.predict(timestamp_s)
+        return Motion(T, timestamp_s, self.T_before_camera, self.interval_s)
+
+
+def part_of(T: Float64, share: float) -> Float64:
+    """Return a fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
+    if share == 1.0:
+        return T
+    return make_transform(exp_so3(share * log_so3(T[:3, :3])), share * T[:3, 3])

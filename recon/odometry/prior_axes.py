@@ -14,11 +14,11 @@ from recon.core.geometry.se3 import as_step, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
-from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import PriorSettings
 from recon.odometry.visual import VisualOdometry
+from recon.odometry.window import covariance_of, distance_in_sigmas, step_covariance
 
 Axes = Literal["camera", "body"]
 

@@ -7,16 +7,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.geometry.se3 import as_step, invert
+from recon.core.geometry.se3 import (
+    as_step,
+    invert,
+)
 from recon.core.values import Disparity
 from recon.core.values.arrays import Float64
 from recon.core.words import counted
-from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
-from recon.odometry.locate_camera import MIN_INLIERS, enough_agree, locate_camera
-from recon.odometry.motion import Motion
-from recon.odometry.prior import MAX_SIGMAS, MotionPrior
-from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
-from recon.odometry.visual_features import (
+from recon.odometry.features import (
     VisualState,
     empty_window,
     feature_disparity,
@@ -26,8 +24,19 @@ from recon.odometry.visual_features import (
     points_of,
     replenish,
 )
-from recon.odometry.visual_uncertainty import newest_health, newest_information
-from recon.odometry.window import TrackWindow, adjust, misfits
+from recon.odometry.locate_camera import MIN_INLIERS, Motion, enough_agree, locate_camera
+from recon.odometry.prior import MAX_SIGMAS, MotionPrior
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
+from recon.odometry.window import (
+    TrackWindow,
+    adjust,
+    covariance_of,
+    distance_in_sigmas,
+    misfits,
+    newest_health,
+    newest_information,
+    step_covariance,
+)
 from recon.stereo.rectify.features import match_features
 
 _FRAMES: Final = 6

@@ -12,7 +12,7 @@ from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, as_transform, invert, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
-from recon.odometry.pnp import find_consensus, fit_pose
+from recon.odometry.locate_camera import find_consensus, fit_pose
 
 _ITERATIONS: Final = 500
 """RANSAC's samples at most."""

@@ -16,10 +16,9 @@ from recon.core.geometry.interpolation import pose_between
 from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.places.drift import Drift, drift_over
-from recon.places.fixes import Held
+from recon.places.fixes import Held, PoseEdge, optimise_poses
 from recon.places.loop import Loop
-from recon.places.open3d_pose_graph import PoseEdge, optimise_poses
+from recon.places.places import Drift, drift_over
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
 _KEPT: Final = 0.25  # least weight of a loop that is believed

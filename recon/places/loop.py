@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final, TypeAlias
 
 import numpy as np
 
+from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Float64, freeze
+from recon.places.places import Drift, drift_over, is_possible
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,3 +39,71 @@ class Loop:
     def __post_init__(self) -> None:
         freeze(self, "T_first_last", np.float64, (4, 4))
         freeze(self, "information", np.float64, (6, 6))
+
+
+Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
+"""For each keyframe its pose by odometry, and the path up to it."""
+
+LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
+"""Standard deviation of a verified loop, added to the drift: small, but never zero."""
+
+_MIN_AGREEING: Final = 3
+"""Loops that must agree, no two between the same keyframes."""
+
+_NEAR_M: Final = 12.0
+"""Path within which neighbouring loops are compared."""
+
+_MAJORITY: Final = 2  # loops that confirm one, for each that contradicts it
+
+
+def agreeing_loops(
+    loops: Sequence[Loop],
+    firsts: Poses,
+    lasts: Poses,
+    *,
+    keyframes: int = _MIN_AGREEING,
+) -> list[Loop]:
+    """Return the loops that enough others confirm, and few contradict.
+
+    Two loops and the odometry between their ends form a cycle that must close within the drift
+    over its two odometry sections. False loops would have to be wrong in the same way several
+    times. Where a row of similar houses makes them so, right loops nearby contradict them: without
+    a clear majority none is accepted.
+
+    Args:
+        loops: Verified loops.
+        firsts: For each keyframe in which a loop begins its pose by odometry, and the path up to
+            it; in a map without drift of its own, always 0.
+        lasts: The same for those in which one ends; those of another drive may have other axes.
+        keyframes: Least number of later keyframes among the loops that agree.
+    """
+    poses = (firsts, lasts)
+    paths_m = np.array([(firsts[loop.first][1], lasts[loop.last][1]) for loop in loops])
+    agreeing = []
+    for number, loop in enumerate(loops):
+        firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
+        near = np.flatnonzero(lasts_m <= _NEAR_M)
+        rings = {k: _closes(loop, loops[k], poses) for k in near.tolist()}
+        against = sum(not closes for closes in rings.values())
+        # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
+        same = [loops[k] for k, closes in rings.items() if closes and firsts_m[k] <= _NEAR_M]
+        confirmed = len(same) >= max(_MIN_AGREEING, _MAJORITY * against)
+        if confirmed and len({other.last for other in same}) >= keyframes:
+            agreeing.append(loop)
+    return agreeing
+
+
+def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses]) -> bool:
+    """Return whether two loops agree within the drift of the odometry between them."""
+    firsts, lasts = poses
+    T_lasts, lasts_m = _between(one.last, other.last, lasts)
+    T_firsts, firsts_m = _between(one.first, other.first, firsts)
+    ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
+    drift = drift_over(lasts_m + firsts_m)
+    return is_possible(ring, drift, LOOP_SIGMAS)
+
+
+def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:
+    """Return ``T_first_last`` by odometry, and the path between the two."""
+    (T_world_first, from_m), (T_world_last, to_m) = poses[first], poses[last]
+    return invert(T_world_first) @ T_world_last, abs(to_m - from_m)

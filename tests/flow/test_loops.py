@@ -161,7 +161,7 @@ def test_a_street_that_repeats_itself_is_mapped_as_if_nobody_looked_for_loops(
     drive = _Filmed(ALIKE)
     looked = _run(drive, tmp_path / "looked")
     _run(drive, tmp_path / "off", "loops.enabled=false")
-    with patch.multiple("recon.places.drift", SHARE=1.0, TURN_DEG=5.0):
+    with patch.multiple("recon.places.places", SHARE=1.0, TURN_DEG=5.0):
         blind = _run(drive, tmp_path / "blind")
 
     assert looked.summary["loops"]["found"] == 0

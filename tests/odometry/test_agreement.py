@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
-from recon.odometry.agreement import Agreement, Sight, explain_motion, noise_sigma
-from recon.odometry.checked import MIN_SHARE
+from recon.odometry.checked import MIN_SHARE, Agreement, Sight, explain_motion, noise_sigma
 from recon.odometry.protocol import OdometryFrame
 
 See = Callable[..., OdometryFrame]

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.odometry import icp_points
-from recon.odometry.icp_points import consistent, select_points, textured
+from recon.odometry import kiss
+from recon.odometry.kiss import consistent, select_points, textured
 from recon.odometry.protocol import OdometryFrame
 
 See = Callable[..., OdometryFrame]
@@ -26,8 +26,8 @@ def test_selected_points_lie_on_the_street(see: See) -> None:
 def test_range_and_accuracy_bound_the_selection(see: See, monkeypatch: pytest.MonkeyPatch) -> None:
     frame = see(np.eye(4))
     every = select_points(frame, 30.0)
-    monkeypatch.setattr(icp_points, "_MIN_RANGE_M", 6.0)
-    monkeypatch.setattr(icp_points, "_MAX_SIGMA_M", 0.2)
+    monkeypatch.setattr(kiss, "_MIN_RANGE_M", 6.0)
+    monkeypatch.setattr(kiss, "_MAX_SIGMA_M", 0.2)
     cloud = select_points(frame, 20.0)
     assert cloud.xyz[:, 2].min() >= 6.0
     assert cloud.xyz[:, 2].max() <= 20.0

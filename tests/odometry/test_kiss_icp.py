@@ -5,7 +5,7 @@ import pytest
 
 from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
-from recon.odometry.kiss_icp import KissIcp, KissIcpOptions
+from recon.odometry.kiss import KissIcp, KissIcpOptions
 
 OPTIONS = KissIcpOptions(max_range_m=30.0, voxel_m=0.3)
 T_MOVED = make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.1, 0.0, 0.15]))
@@ -119,7 +119,7 @@ def test_the_threshold_is_that_of_kiss_icp() -> None:
     """Our threshold, unlike that of kiss-icp, can be saved; it gives the same values."""
     from kiss_icp.pybind import kiss_icp_pybind
 
-    from recon.odometry.kiss_icp import _INITIAL_THRESHOLD_M, _MIN_MOTION_M, _AdaptiveThreshold
+    from recon.odometry.kiss import _INITIAL_THRESHOLD_M, _MIN_MOTION_M, _AdaptiveThreshold
 
     theirs = kiss_icp_pybind._AdaptiveThreshold(
         initial_threshold=_INITIAL_THRESHOLD_M, min_motion_th=_MIN_MOTION_M, max_range=30.0

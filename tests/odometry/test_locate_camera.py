@@ -9,8 +9,8 @@ from recon.core.geometry.projection import depth_from_disparity, project, unproj
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.odometry.locate_camera import REPROJECTION_PX, locate_camera
-from recon.odometry.visual_features import MIN_DISPARITY_PX
+from recon.odometry.features import MIN_DISPARITY_PX
+from recon.odometry.locate_camera import REPROJECTION_PX, Motion, locate_camera, part_of
 
 CAMERA = RectifiedCamera(360.0, 320.0, 120.0, 320.0, 0.54, 640, 240)
 T_TRUE = make_transform(exp_so3(np.array([0.002, 0.01, -0.003])), np.array([-0.03, -0.02, 1.0]))
@@ -76,3 +76,34 @@ def test_points_that_agree_on_nothing_give_no_pose() -> None:
 def test_too_few_points_give_no_pose() -> None:
     xyz, uv = street(3)
     assert locate_camera(xyz[-10:], uv[-10:], CAMERA, np.eye(4)) is None
+
+
+STEP = make_transform(exp_so3(np.array([0.0, 0.03, 0.01])), np.array([0.1, 0.0, 1.2]))
+
+
+def test_with_known_times_the_velocity_goes_on() -> None:
+    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1)
+    np.testing.assert_allclose(motion.predict(0.2), STEP @ STEP, atol=1e-12)
+    np.testing.assert_allclose(motion.predict(0.4), STEP @ part_of(STEP, 3.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("time_s", [0.0, 0.1, 1000.0, -5.0])
+def test_times_that_give_no_answer_repeat_the_last_motion(time_s: float) -> None:
+    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1)
+    np.testing.assert_allclose(motion.predict(time_s), STEP @ STEP, atol=1e-12)
+
+
+def test_sources_without_times_repeat_the_last_motion() -> None:
+    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.0)
+    np.testing.assert_allclose(motion.predict(0.0), STEP @ STEP, atol=1e-12)
+
+
+def test_frames_that_are_not_seen_keep_the_velocity() -> None:
+    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1).drifted(0.2).drifted(0.3)
+    np.testing.assert_allclose(motion.T_world_camera, np.linalg.matrix_power(STEP, 3), atol=1e-12)
+    np.testing.assert_allclose(motion.predict(0.4), np.linalg.matrix_power(STEP, 4), atol=1e-12)
+
+
+def test_half_a_motion_done_twice_turns_as_far() -> None:
+    half = part_of(STEP, 0.5)
+    np.testing.assert_allclose((half @ half)[:3, :3], STEP[:3, :3], atol=1e-12)

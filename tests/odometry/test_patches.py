@@ -10,10 +10,9 @@ import pytest
 from recon.core.geometry.projection import project, unproject
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
-from recon.odometry.corners import find_corners
+from recon.odometry.features import find_corners, follow
 from recon.odometry.patches import find_again, measure_disparity, surface_slopes, warp_of
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.tracking import follow
 
 See = Callable[..., OdometryFrame]
 TURN = exp_so3(np.array([0.004, 0.01, 0.02]))

@@ -8,7 +8,7 @@ import pytest
 
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import Disparity, RectifiedPair
-from recon.odometry.corners import in_crowd
+from recon.odometry.features import in_crowd
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
 from recon.stereo.match.range import HalfSizeMatcher

@@ -12,9 +12,9 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
 from recon.places.detector import LoopDetector, StoredKeyframe
-from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.loop import Loop
+from recon.places.places import path_lengths
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import build_street

@@ -9,9 +9,8 @@ import pytest
 
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
-from recon.places.agree import agreeing_loops
 from recon.places.closure import close_loops
-from recon.places.loop import Loop
+from recon.places.loop import Loop, agreeing_loops
 from tests.places.conftest import drifted, true_loop
 
 LAP = 200

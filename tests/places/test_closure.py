@@ -11,8 +11,8 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places.closure import DrivePath, Tie, close_loops, join_drives
-from recon.places.drift import Drift, drift_over, is_possible, path_lengths
 from recon.places.loop import Loop
+from recon.places.places import Drift, drift_over, is_possible, path_lengths
 from tests.places.conftest import INFORMATION, true_loop
 
 LAP = 200

@@ -7,7 +7,7 @@ from unittest.mock import patch
 import numpy as np
 
 from recon.core.geometry import se3
-from recon.places import drift
+from recon.places import places
 from recon.places.detector import LoopDetector
 from tests.places.conftest import LAP, PERIOD, KeyframeMemory, drifted
 
@@ -42,13 +42,13 @@ def test_a_street_that_looks_the_same_is_refused(alike):
 
     assert detector.loops == []
     # The trap is a real one: who does not ask odometry falls into it.
-    with patch.multiple(drift, **BLIND):
+    with patch.multiple(places, **BLIND):
         deceived, _ = alike.detect(frames, alike.truth)
         assert len(deceived.agreeing()) >= 3
 
 
 def test_places_that_are_not_the_same_are_refused_by_geometry_alone(block):
-    with patch.multiple(drift, **BLIND):
+    with patch.multiple(places, **BLIND):
         detector, _ = block.detect([0, 2, 4, 60, 62, 100, 102], block.truth)
 
     assert detector.loops == []

@@ -10,8 +10,8 @@ from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_tran
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.places.closure import DrivePath, JoinedDrives, join_drives
-from recon.places.drift import path_lengths
 from recon.places.fixes import NO_FIXES, Fixes, Held
+from recon.places.places import path_lengths
 from tests.places.conftest import drifted
 
 T_SURVEY_WORLD = make_transform(exp_so3(np.array([0.1, 2.0, -0.3])), np.array([30.0, -8.0, 5.0]))

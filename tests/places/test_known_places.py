@@ -7,9 +7,9 @@ import pytest
 
 from recon.core.geometry import se3
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
-from recon.places.agree import agreeing_loops
+from recon.places.detector import KnownPlaces, KnownView
 from recon.places.keyframe import make_keyframe
-from recon.places.known_places import KnownPlaces, KnownView
+from recon.places.loop import agreeing_loops
 from tests.places.conftest import LAP, PERIOD
 
 AHEAD = RectifiedCamera(180.0, 159.5, 59.5, 159.5, 0.54, 320, 120)

@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.errors import ShapeError
 from recon.core.geometry import se3
-from recon.places.open3d_pose_graph import PoseEdge, optimise_poses
+from recon.places.fixes import PoseEdge, optimise_poses
 
 STIFF = np.diag([1e8] * 6)
 SOFT = np.diag([4.0, 4.0, 4.0, 9.0, 9.0, 9.0])

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from recon.core.geometry import se3
 from recon.places import places as places_file
-from recon.places.drift import SIGMAS, drift_over
-from recon.places.places import Place, Places, WordIndex
+from recon.places.places import SIGMAS, Place, Places, WordIndex, drift_over
 
 images = st.lists(st.sets(st.integers(0, 30)), max_size=20)
 

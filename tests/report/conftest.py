@@ -21,7 +21,7 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.core.values.arrays import Float64
-from recon.odometry.path_drift import ExpectedDrift
+from recon.odometry.health import ExpectedDrift
 from recon.odometry.protocol import OdometryHealth
 
 HEIGHT_PX, WIDTH_PX = 24, 60

@@ -16,7 +16,7 @@ from recon.core.words import counted
 from recon.map.store.keyframes import Keyframes
 from recon.places.closure import Closure, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
-from recon.places.drift import path_lengths
+from recon.places.places import path_lengths
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 

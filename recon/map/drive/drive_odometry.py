@@ -12,11 +12,10 @@ from recon.core.errors import RegistrationError
 from recon.core.values import Trajectory
 from recon.core.words import counted
 from recon.map.settings import DriveSettings
-from recon.odometry.known_poses import KnownPoses
 from recon.odometry.prior import MotionPrior
 from recon.odometry.prior_axes import find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame
-from recon.odometry.registry import make_odometry
+from recon.odometry.registry import KnownPoses, make_odometry
 from recon.odometry.settings import PriorSettings
 from recon.sources.source import IncompleteSource, StampedSource, StereoSource
 from recon.stereo.frame import FrameReconstructor

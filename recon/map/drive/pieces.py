@@ -28,7 +28,7 @@ from recon.map.store.session import Session
 from recon.map.submaps import Submap
 from recon.map.verbs import Map
 from recon.places.detector import LoopDetector, StoredKeyframe
-from recon.places.drift import path_lengths
+from recon.places.places import path_lengths
 from recon.sources.source import SourcePart, StereoSource
 from recon.stereo.frame import FrameReconstructor
 

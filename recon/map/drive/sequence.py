@@ -37,7 +37,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 from recon.map.verbs import Map
-from recon.odometry.path_drift import ExpectedDrift, expected_drift
+from recon.odometry.health import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
 from recon.run.progress import SILENT, Progress
 from recon.run.threads import serial_algebra

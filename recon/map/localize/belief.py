@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import adjoint, as_step, as_transform, invert, orthonormalise
 from recon.core.values.arrays import Float64
-from recon.places.drift import drift_over
+from recon.places.places import drift_over
 
 MAX_SIGMA_M: Final = 0.15
 """Poses less certain than this are not given out: an error of 0.5 m is then beyond three sigmas."""

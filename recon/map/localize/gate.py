@@ -13,8 +13,8 @@ import numpy as np
 
 from recon.core.values.arrays import Float64
 from recon.map.localize.surfaces import Fit
-from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
 from recon.odometry.prior import MAX_SIGMAS
+from recon.odometry.window import covariance_of, distance_in_sigmas, step_covariance
 
 _MIN_OVERLAP: Final = 0.5
 """Least share of points that lie in a cell of the map."""

@@ -22,14 +22,14 @@ from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
 from recon.map.store.map_views import known_places
-from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualEstimate, VisualOdometry
+from recon.odometry.window import covariance_of, step_covariance
 from recon.places.closure import loop_bias
-from recon.places.drift import path_lengths
+from recon.places.detector import KnownPlaces
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.known_places import KnownPlaces
 from recon.places.loop import Loop
+from recon.places.places import path_lengths
 from recon.stereo.frame import FrameReconstructor
 
 _VIEWS: Final = 2

@@ -8,10 +8,9 @@ from typing import Final
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
-from recon.places.agree import agreeing_loops
+from recon.places.detector import KnownPlaces
 from recon.places.keyframe import Keyframe
-from recon.places.known_places import KnownPlaces
-from recon.places.loop import Loop
+from recon.places.loop import Loop, agreeing_loops
 
 _REMEMBERED: Final = 10
 """Frames whose recognised places still count."""

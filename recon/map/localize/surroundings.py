@@ -22,10 +22,9 @@ from recon.map.localize.surfaces import (
 )
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
-from recon.odometry.icp_points import select_points
-from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
+from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
 from recon.odometry.protocol import OdometryFrame
-from recon.places.drift import SIGMAS
+from recon.places.places import SIGMAS
 
 _VOXEL_M: Final = 0.3
 """Edge of a voxel of the map of ICP."""

@@ -14,10 +14,9 @@ from recon.map.store.map_file import MapFile
 from recon.map.store.map_views import MapViews
 from recon.map.store.session import Session
 from recon.odometry.health import stretches
-from recon.places.agree import agreeing_loops
-from recon.places.drift import path_lengths
-from recon.places.known_places import KnownPlaces, KnownView
-from recon.places.loop import Loop
+from recon.places.detector import KnownPlaces, KnownView
+from recon.places.loop import Loop, agreeing_loops
+from recon.places.places import path_lengths
 
 
 def find_links(map_: MapFile, new: Collection[int]) -> list[Link]:

@@ -21,10 +21,9 @@ from recon.io.files import read_table, reader
 from recon.io.trajectory import check_positions
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
-from recon.odometry.path_drift import expected_drift
-from recon.places.drift import SIGMAS
+from recon.odometry.health import expected_drift
 from recon.places.fixes import Fixes
-from recon.places.path_fit import RECEIVER_M, drift_at_end, fit_to_path
+from recon.places.places import RECEIVER_M, SIGMAS, drift_at_end, fit_to_path
 
 LARGEST_MISFIT: Final = 0.01
 """Misfit, as a share of the extent of the path, that drift may explain."""

@@ -9,7 +9,7 @@ from recon.core.errors import MappingError
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.map.store.map_file import MapFile
-from recon.places.known_places import KnownPlaces, KnownView
+from recon.places.detector import KnownPlaces, KnownView
 
 
 def known_places(map_: MapFile) -> KnownPlaces:

@@ -26,7 +26,7 @@ from recon.map.drive import drive_loops
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
-from recon.places import drift
+from recon.places import places
 from recon.places.closure import close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.stereo.frame import ReconstructedFrame
@@ -191,7 +191,7 @@ def test_a_foreign_keyframe_is_reported(frames):
 def test_loops_that_contradict_odometry_are_a_warning(closed):
     """Odometry is believed to the millimetre, so that bending it is impossible."""
     path = closed.odometry
-    with patch.multiple(drift, SHARE=1e-6, TURN_DEG=1e-5):
+    with patch.multiple(places, SHARE=1e-6, TURN_DEG=1e-5):
         refused = close_loops(path, path.distances_m, list(closed.closure.closed))
     loops = DriveLoops(path, refused, FRAMES, len(closed.closure.closed), {})
 

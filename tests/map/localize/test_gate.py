@@ -6,7 +6,7 @@ import pytest
 from recon.map.localize.gate import Correction, is_worthwhile
 from recon.map.localize.surfaces import Fit, describe_surfaces, fit_surfaces
 from recon.map.localize.surroundings import contrast
-from recon.odometry.covariance import step_covariance
+from recon.odometry.window import step_covariance
 
 UNSURE = step_covariance(0.3, 1.0)
 SURE = step_covariance(0.002, 0.005)

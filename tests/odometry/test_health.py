@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.geometry.se3 import as_transform
 from recon.core.values import RectifiedCamera, Trajectory
-from recon.odometry.path_drift import expected_drift
+from recon.odometry.health import expected_drift
 from recon.odometry.protocol import OdometryHealth
 
 GOOD = OdometryHealth(scale_px=30.0, sigma_m=0.01, sigma_deg=0.02)

@@ -5,31 +5,31 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from recon.odometry import corners
-from recon.odometry.corners import find_corners, find_fewer_corners, in_crowd
+from recon.odometry import features
+from recon.odometry.features import find_corners, find_fewer_corners, in_crowd
 from recon.odometry.protocol import OdometryFrame
 
 NONE = np.zeros((0, 2), np.float32)
 
 
 def per_cell(uv: np.ndarray) -> np.ndarray:
-    cells = (uv[:, 1] // corners._CELL_PX) * 1000 + uv[:, 0] // corners._CELL_PX
+    cells = (uv[:, 1] // features._CELL_PX) * 1000 + uv[:, 0] // features._CELL_PX
     return np.unique(cells, return_counts=True)[1]
 
 
 def test_no_cell_holds_more_than_its_share(see: Callable[..., OdometryFrame]) -> None:
     uv = find_corners(see(np.eye(4)).pair.left, NONE)
     assert len(uv) > 50
-    assert per_cell(uv).max() <= corners._PER_CELL
+    assert per_cell(uv).max() <= features._PER_CELL
 
 
 def test_features_already_followed_fill_their_cells(see: Callable[..., OdometryFrame]) -> None:
     grey = see(np.eye(4)).pair.left
     first = find_corners(grey, NONE)
     more = find_corners(grey, first)
-    assert per_cell(np.concatenate([first, more])).max() <= corners._PER_CELL
+    assert per_cell(np.concatenate([first, more])).max() <= features._PER_CELL
     distance = np.linalg.norm(first[:, None] - more[None], axis=2)
-    assert distance.size == 0 or distance.min() >= corners._DISTANCE_PX
+    assert distance.size == 0 or distance.min() >= features._DISTANCE_PX
 
 
 def test_of_a_crowd_those_that_come_first_stay() -> None:
