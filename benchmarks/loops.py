@@ -26,7 +26,7 @@ import numpy as np
 from recon.commands.config import ReconConfig, load_config
 from recon.core.geometry import se3
 from recon.core.geometry.alignment import fit_points
-from recon.core.geometry.axes import transform_cloud
+from recon.core.geometry.se3 import transform_cloud
 from recon.core.values import OCCUPIED, OccupancyGrid, PointCloud, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
 from recon.evaluation.map import evaluate_map

@@ -38,11 +38,11 @@ from recon.evaluation.middlebury.score import evaluate_middlebury as evaluate_mi
 from recon.evaluation.trajectory import evaluate_trajectory as evaluate_trajectory
 from recon.export.mesh.poisson import reconstruct_mesh as reconstruct_mesh
 from recon.io.cameras.calibration import read_calibration as read_calibration
+from recon.io.images.disparity import read_pfm as read_pfm
+from recon.io.images.disparity import write_pfm as write_pfm
 from recon.io.images.image import read_image as read_image
-from recon.io.images.pfm import read_pfm as read_pfm
-from recon.io.images.pfm import write_pfm as write_pfm
-from recon.io.middlebury.scene import MiddleburyScene as MiddleburyScene
-from recon.io.middlebury.scene import read_middlebury_scene as read_middlebury_scene
+from recon.io.middlebury import MiddleburyScene as MiddleburyScene
+from recon.io.middlebury import read_middlebury_scene as read_middlebury_scene
 from recon.io.models.mesh import read_mesh as read_mesh
 from recon.io.models.mesh import write_mesh as write_mesh
 from recon.io.models.ply import read_ply as read_ply

@@ -8,7 +8,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from recon.core.decimals import refuse_other_numbers
+from recon.core.text import refuse_other_numbers
 
 
 class Commands(typer.Typer):
@@ -20,7 +20,7 @@ class Commands(typer.Typer):
 
 
 class _Command(TyperCommand):
-    """A command that looks at the text of each number, see `recon.core.decimals`."""
+    """A command that looks at the text of each number, see `recon.core.text`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         texts, _, _ = self.make_parser(ctx).parse_args([*args])

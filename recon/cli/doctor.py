@@ -9,7 +9,7 @@ import typer
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json
-from recon.core.words import counted
+from recon.core.text import counted
 
 
 def doctor(

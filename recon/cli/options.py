@@ -15,8 +15,8 @@ import typer
 
 from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json, print_run
-from recon.core import decimals
 from recon.core.errors import SettingsError
+from recon.core.text import parse_number
 
 if TYPE_CHECKING:
     from recon.map.sessions.measured import Survey
@@ -118,7 +118,7 @@ def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
-        return tuple(decimals.parse_numbers(text.split(",")))
+        return tuple(map(parse_number, text.split(",")))
     except ValueError as error:
         raise SettingsError(
             "not numbers separated by commas", where=option, got=text, expected="0.1,0.2,0.5"

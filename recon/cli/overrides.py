@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
-from recon.core.decimals import is_count
 from recon.core.errors import SettingsError
+from recon.core.text import is_count
 from recon.stereo.match.protocol import name_of
 from recon.stereo.match.registry import MatchingSettings, settings_of
 

@@ -13,7 +13,7 @@ import typer
 
 from recon.core.errors import SettingsError
 from recon.io.files import naming
-from recon.io.middlebury.layout import find_image, find_layout
+from recon.io.middlebury import find_image, find_layout
 from recon.run.batch.job import Job
 from recon.run.batch.job_file import Entry, JobList, check_names, name_of_swept
 from recon.run.memory import parse_size_mb

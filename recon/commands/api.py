@@ -11,7 +11,7 @@ from recon.core.values import Disparity, RectifiedCamera, StereoCalibration, Ste
 from recon.core.values.arrays import UInt8
 from recon.io.cameras.calibration import read_calibration
 from recon.io.files import StrPath
-from recon.io.middlebury.scene import stand_in_camera
+from recon.io.middlebury import stand_in_camera
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 from recon.stereo.match.protocol import Matcher, name_of
 from recon.stereo.match.registry import MATCHERS, check_matcher, field_of

@@ -9,7 +9,7 @@ from recon.commands.config import ReconConfig
 from recon.core.errors import OutputError, SourceError
 from recon.core.values.board import CalibrationBoard
 from recon.io.atomic import check_targets
-from recon.io.cameras.camera_info import camera_info_paths
+from recon.io.cameras.ros import camera_info_paths
 from recon.report.calibration_page import write_calibration_page
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
 from recon.rig.calibrate.bootstrap import measure_spread

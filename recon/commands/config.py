@@ -10,8 +10,8 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.settings import Settings, merge
 from recon.evaluation.paper import PaperConfig
 from recon.export.mesh.poisson import MeshSettings
+from recon.io.fields import parse_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
-from recon.io.yaml_file import parse_yaml
 from recon.map.settings import DriveSettings
 from recon.rig.capture import CaptureSettings
 from recon.rig.settings import AuditedSettings, CalibratedSettings

@@ -12,9 +12,8 @@ from recon.core.values import Disparity, DisparityTruth, Reason
 from recon.core.values.arrays import Float32
 from recon.evaluation.disparity import evaluate_disparity
 from recon.evaluation.middlebury.score import curve_figures, dense_map, named_figures
-from recon.io.images.disparity_png import read_disparity
+from recon.io.images.disparity import read_disparity, read_pfm
 from recon.io.images.image import read_grey_levels
-from recon.io.images.pfm import read_pfm
 from recon.run.summary import plain
 
 _COUNTED: Final = 255

@@ -25,7 +25,7 @@ from recon.evaluation.middlebury.scenes import (
 )
 from recon.evaluation.middlebury.score import Figures
 from recon.io.files import StrPath
-from recon.io.images.pfm import write_pfm
+from recon.io.images.disparity import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run

@@ -14,8 +14,8 @@ from recon.evaluation.drive_errors import LEAST_FRAMES, known_occupancy
 from recon.evaluation.occupancy import evaluate_occupancy
 from recon.io.atomic import check_targets
 from recon.io.images.image import write_image
-from recon.io.occupancy.nav2 import read_nav2
-from recon.io.occupancy.octomap import read_octomap
+from recon.io.models.nav2 import read_nav2
+from recon.io.models.octomap import read_octomap
 from recon.report.style import colour_grid_errors
 from recon.run.directory import recorded_files
 from recon.run.finished import GRID, OCTOMAP, FinishedRun, open_run

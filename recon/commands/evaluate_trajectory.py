@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from recon.core.text import counted
 from recon.core.values import Trajectory
-from recon.core.words import counted
 from recon.evaluation.doubts import doubts_of_file
 from recon.evaluation.segments import TOLERANCE_S, associate, interpolation_warnings
 from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths

@@ -9,7 +9,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.values import OccupancyGrid
 from recon.export.trajectories import export_localized
 from recon.io.files import StrPath
-from recon.io.occupancy.nav2 import read_nav2
+from recon.io.models.nav2 import read_nav2
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.sequence import StartPose, localize_sequence

@@ -9,7 +9,7 @@ from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
 from recon.commands.resume import begin_or_resume, with_resume_hint
-from recon.core.words import counted
+from recon.core.text import counted
 from recon.evaluation.drive_errors import compare_with_truth
 from recon.export.make import make
 from recon.export.map_run import MapRun

@@ -16,8 +16,8 @@ from recon.evaluation.paper import (
     table_1_row,
     try_patches,
 )
+from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
-from recon.io.images.pfm import write_pfm
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import write_ply
 from recon.report.paper_page import write_paper_page

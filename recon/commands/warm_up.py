@@ -19,7 +19,7 @@ from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling
 from recon.core.values import StereoPair
-from recon.io.occupancy.octomap import read_octomap
+from recon.io.models.octomap import read_octomap
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP

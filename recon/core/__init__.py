@@ -3,8 +3,7 @@
 - `values/`: the data types, checked when they are made; `geometry/se3.py`: poses;
 - `errors.py`: one tree, one line each; `settings.py`: the base of all settings;
 - `kernels/compiled.py`: how loops are compiled; `kernels/cache.py`: where machine code is kept;
-- `decimals.py`: numbers in text from outside;
-- `words.py`: numbers of things in words; `units.py`: units of figures;
-- `keys.py`: sets of packed cells;
+- `kernels/voxels.py`: hashes and sets of packed cells;
+- `text.py`: numbers read from text and written with words and units;
 - `least_squares.py`: the loop of every non-linear fit.
 """

@@ -24,7 +24,9 @@ The command line prints ``str(error)`` and exits with 1; the library only raises
 
 from __future__ import annotations
 
+from importlib import import_module
 from os import PathLike
+from types import ModuleType
 from typing import Any, Final
 
 from typing_extensions import Self
@@ -147,3 +149,18 @@ class MemoryLimitError(ReconError):
 
 class MissingDependencyError(ReconError):
     """An optional package is not installed."""
+
+
+def require(module: str, *, extra: str) -> ModuleType:
+    """Import an optional package.
+
+    Returns:
+        The imported module.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            f"the optional package {module!r} is not installed",
+            hint=f"run: pip install 'recon[{extra}]'",
+        ) from error

@@ -18,8 +18,8 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
-from recon.core.decimals import refuse_other_numbers
 from recon.core.errors import SettingsError
+from recon.core.text import refuse_other_numbers
 
 
 class Settings(BaseModel):
@@ -45,7 +45,7 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _check_decimals(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse what only Python takes for numbers, see `recon.core.decimals`."""
+        """Refuse what only Python takes for numbers, see `recon.core.text`."""
         if _is_numeric(cls.model_fields[str(info.field_name)].annotation):
             for part in value if isinstance(value, list | tuple) else [value]:
                 if isinstance(part, str):

@@ -11,11 +11,10 @@ import numpy as np
 
 from recon.core.errors import EvaluationError, RegistrationError, SettingsError
 from recon.core.geometry.alignment import fit_paths
-from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.geometry.se3 import angle_rad, invert, transform_cloud
+from recon.core.text import counted
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.evaluation.doubts import doubts_of
 from recon.evaluation.map import evaluate_map, register_cloud, within_reach
 from recon.evaluation.segments import TOLERANCE_S, associate

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from recon.core.errors import EvaluationError
 from recon.core.geometry import se3
 from recon.core.geometry.projection import project
-from recon.core.kernels.voxels import pack_keys
-from recon.core.keys import find_keys
+from recon.core.kernels.voxels import find_keys, pack_keys
+from recon.core.text import counted
 from recon.core.values import (
     FREE,
     OCCUPIED,
@@ -31,7 +31,6 @@ from recon.core.values import (
     VoxelMetrics,
 )
 from recon.core.values.arrays import Bool, Int32
-from recon.core.words import counted
 
 _TOLERANCE: Final = 1
 

@@ -28,7 +28,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32, Int32
 from recon.evaluation.disparity import evaluate_disparity
-from recon.io.middlebury.scene import read_middlebury_calib, read_middlebury_scene
+from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
 from recon.run.summary import plain
 from recon.stereo.cloud.back_project import CloudSettings, back_project
 from recon.stereo.frame import FrameReconstructor, StereoSettings

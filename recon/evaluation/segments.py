@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.interpolation import nearest_sorted
+from recon.core.geometry.alignment import nearest_sorted
 from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64, Int32
-from recon.core.words import counted
 
 KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI benchmark."""

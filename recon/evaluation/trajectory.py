@@ -14,9 +14,9 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import Similarity, fit_points, fit_upright
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, quaternion_from_rotation
 from recon.core.settings import Settings
+from recon.core.text import counted
 from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Float64, Int32
-from recon.core.words import counted
 from recon.evaluation.segments import Segments, choose_segments
 from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from recon.core.text import counted
 from recon.core.values import (
     MapMetrics,
     OccupancyGrid,
@@ -14,7 +15,6 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
-from recon.core.words import counted
 from recon.export.make import Products
 from recon.map.drive.sequence import MappedSequence
 from recon.map.settings import DriveSettings

@@ -17,8 +17,8 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.grid import log_odds
 from recon.export.product import Made, Order
-from recon.io.occupancy.nav2 import write_nav2
-from recon.io.occupancy.octomap import write_octomap_tiles
+from recon.io.models.nav2 import write_nav2
+from recon.io.models.octomap import write_octomap_tiles
 from recon.map.ground.axes import base_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.floor import add_floors

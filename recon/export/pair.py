@@ -16,9 +16,8 @@ from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
 from recon.io.atomic import atomic_path
 from recon.io.files import naming, reading
-from recon.io.images.disparity_png import fitting_scale, write_disparity_png
+from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
 from recon.io.images.image import write_image
-from recon.io.images.pfm import write_pfm
 from recon.io.models.mesh import write_mesh
 from recon.io.models.mlp import Photo, write_mlp
 from recon.io.models.ply import read_ply, write_ply

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import MeshingError
+from recon.core.text import counted
 from recon.core.values.arrays import Float32, Int32
-from recon.core.words import counted
 
 _POINTS, _SURFACE = "points.npz", "surface.npz"
 

@@ -14,8 +14,8 @@ from typing import Final, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from recon.core.decimals import parse_numbers
 from recon.core.errors import FormatError, ReconError
+from recon.core.text import parse_numbers
 from recon.core.values.arrays import Float64
 
 StrPath = str | PathLike[str]

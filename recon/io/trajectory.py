@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from typing import Final
+
 import numpy as np
 
 from recon.core.errors import FormatError
@@ -11,11 +15,11 @@ from recon.core.geometry.se3 import (
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
+from recon.core.text import counted, parse_number
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.io.atomic import write_text
-from recon.io.files import StrPath, read_table, reader
+from recon.io.files import StrPath, read_table, read_text, reader
 
 # Files print rotations with four to seven digits; a larger deviation means it is not a rotation.
 _RIGID_TOLERANCE = 1e-3
@@ -145,3 +149,50 @@ def _check_rotation(rotation: Float64, where: str) -> None:
             where=where,
             expected="a row-major 3x4 matrix of rotation and translation",
         )
+
+
+FRAMES: Final = "frames.csv"
+HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
+
+
+@dataclass(frozen=True)
+class CapturedFrame:
+    """One line: a pair of images and their times.
+
+    Attributes:
+        left: Left image, relative to the folder of the list.
+        right: Right image, likewise.
+        left_s: Time of the left image.
+        right_s: Time of the right image.
+    """
+
+    left: str
+    right: str
+    left_s: float
+    right_s: float
+
+    def line(self) -> str:
+        """Return this frame as a line, with the newline."""
+        return f"{self.left},{self.right},{self.left_s:.6f},{self.right_s:.6f}\n"
+
+
+@reader
+def read_frames(path: StrPath) -> list[CapturedFrame]:
+    """Read the list."""
+    lines = enumerate(read_text(path).splitlines(), start=1)
+    frames = [_parse(line, f"{path}:{n}") for n, line in lines if line and line[0] != "#"]
+    if not frames:
+        raise FormatError("file lists no images", where=path)
+    return frames
+
+
+def _parse(line: str, where: str) -> CapturedFrame:
+    words = [word.strip() for word in line.split(",")]
+    try:
+        left, right, left_s, right_s = words
+        times = parse_number(left_s), parse_number(right_s)
+    except ValueError as error:
+        raise FormatError("not two images and their times", where=where, got=line[:60]) from error
+    if not all(math.isfinite(time) for time in times):
+        raise FormatError("time is not finite", where=where, got=line[:60])
+    return CapturedFrame(left, right, *times)

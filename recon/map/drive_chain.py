@@ -12,8 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels import pack_keys, unpack_keys
-from recon.core.keys import are_among, distinct_keys
+from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
 from recon.core.values import OccupancyVoxels, join_voxels
 from recon.core.values.grid import log_odds
 from recon.map.cut import OCCUPANCY

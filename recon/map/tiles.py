@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import apply
+from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter

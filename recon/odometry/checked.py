@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import apply, invert
+from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64, UInt8
-from recon.core.words import counted
 from recon.odometry.protocol import (
     Odometry,
     OdometryFrame,

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.core.words import counted
 from recon.odometry.protocol import OdometryHealth
 
 _MANY: Final = 0.1

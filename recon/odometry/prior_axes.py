@@ -11,9 +11,9 @@ import numpy as np
 
 from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import as_step, invert
+from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import PriorSettings

@@ -9,8 +9,8 @@ import numpy as np
 
 from recon.core.errors import RegistrationError, SettingsError
 from recon.core.geometry.se3 import invert
+from recon.core.text import counted
 from recon.core.values import Trajectory
-from recon.core.words import counted
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.prior import MotionPrior

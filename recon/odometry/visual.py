@@ -11,9 +11,9 @@ from recon.core.geometry.se3 import (
     as_step,
     invert,
 )
+from recon.core.text import counted
 from recon.core.values import Disparity
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.odometry.features import (
     VisualState,
     empty_window,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import ShapeError
 from recon.core.geometry.projection import depth_from_disparity, unproject
-from recon.core.keys import distinct_keys
+from recon.core.kernels.voxels import distinct_keys
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
 

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.report.page import write_page
 from recon.report.pair_page import disparity_figure, is_wide, pair_figure
 from recon.report.style import ESTIMATE, INK, WIDE_IN, bare_figure, show_image, styled, to_png

@@ -13,9 +13,9 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
 from recon.core.geometry.se3 import angle_rad, apply, invert
+from recon.core.text import counted
 from recon.core.values import UNKNOWN, OccupancyGrid, Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.odometry.protocol import OdometryHealth
 from recon.report.style import (
     BAD,

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from recon.core.text import counted
 from recon.core.values.arrays import UInt8
-from recon.core.words import counted
 from recon.evaluation.middlebury.bench import SceneResult
 from recon.evaluation.middlebury.score import error_map
 from recon.io.atomic import write_text

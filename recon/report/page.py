@@ -20,8 +20,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from recon.core.units import with_unit
-from recon.core.words import counted
+from recon.core.text import counted, with_unit
 from recon.io.atomic import write_text
 from recon.report.style import (
     HALF_IN,

@@ -19,9 +19,9 @@ from plotly import graph_objects as go
 from plotly.colors import get_colorscale
 
 from recon.core.geometry.se3 import apply
+from recon.core.text import counted
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.core.words import counted
 from recon.report.style import value_range
 
 MAX_POINTS: Final = 120_000

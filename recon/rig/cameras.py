@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
-from recon.core.decimals import is_count
 from recon.core.errors import SettingsError, SourceError
+from recon.core.text import is_count
 from recon.core.values import Rig, StereoPair
 from recon.rig.capture import (
     CaptureSettings,

@@ -23,8 +23,8 @@ from typing_extensions import Self
 from recon.core.errors import OutputError, ReconError, SourceError
 from recon.core.settings import Settings
 from recon.core.values.arrays import UInt8
-from recon.io.frames_csv import FRAMES, HEADER, CapturedFrame
 from recon.io.images.image import write_image
+from recon.io.trajectory import FRAMES, HEADER, CapturedFrame
 from recon.sources.opencv_camera import Camera, OpenCvCamera
 from recon.sources.settings import SourceSettings
 from recon.sources.video import split_views

@@ -17,7 +17,7 @@ from recon.core.values.arrays import Float64, UInt8
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.io.yaml_file import write_yaml
+from recon.io.fields import write_yaml
 from recon.rig.uncalibrated import UncalibratedRectification, rectify_images
 from recon.run.directory import RunDirectory
 from recon.run.summary import plain

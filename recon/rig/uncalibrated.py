@@ -13,9 +13,9 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3, hat
 from recon.core.least_squares import Problem, minimise
+from recon.core.text import counted
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, UInt8
-from recon.core.words import counted
 from recon.rig.audit.row_alignment import align_rows
 from recon.stereo.rectify.features import (
     MOST_FEATURES,

@@ -24,9 +24,8 @@ from typing import Any, ClassVar, Final
 from typing_extensions import Self
 
 from recon.core.errors import ClusterError, FormatError, MemoryLimitError, OutputError
-from recon.io.atomic import check_targets, exchange, write_text
+from recon.io.atomic import check_targets, exchange, take_lock, write_text
 from recon.io.files import read_text, reading, resolved
-from recon.io.lock import take_lock
 
 RECORD: Final = "run.json"
 RECORD_BYTES: Final = 1 << 26

@@ -11,9 +11,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.decimals import is_count
 from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import check_rigid
+from recon.core.text import is_count
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
 from recon.io.files import StrPath, read_text, reader, reading, resolved

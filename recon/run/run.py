@@ -14,8 +14,8 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.core.settings import Settings
+from recon.io.fields import write_yaml
 from recon.io.files import StrPath, resolved
-from recon.io.yaml_file import write_yaml
 from recon.run.directory import RECORD, RunDirectory, default_folder
 from recon.run.fingerprint import fingerprint
 from recon.run.machine import peak_memory_mb, versions

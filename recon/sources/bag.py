@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from recon.core.errors import CalibrationError, FormatError, SourceError
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
-from recon.io.cameras.camera_info import check_shift, rig_of_camera_infos
-from recon.io.cameras.lens_models import ROS_MODELS, lens_of
+from recon.io.cameras.ros import ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
 from recon.io.files import reading, resolved
-from recon.io.images.image import decode_image
-from recon.io.images.ros_image import pixels_of_ros_image
+from recon.io.images.image import decode_image, pixels_of_ros_image
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.frame_list import check_most, pair_frames
 from recon.sources.image_names import find_partners, partner_names

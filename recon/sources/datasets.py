@@ -24,12 +24,10 @@ from pydantic import Field
 
 from recon.core.errors import DownloadError, FormatError, OutputError, SettingsError
 from recon.core.settings import Settings
-from recon.io.archives import unpack
-from recon.io.atomic import write_text
-from recon.io.download import OnBytes, download
+from recon.io.atomic import take_lock, write_text
+from recon.io.download import OnBytes, download, unpack
+from recon.io.fields import read_toml
 from recon.io.files import read_text, reading
-from recon.io.lock import take_lock
-from recon.io.toml_file import read_toml
 from recon.run.directory import refuse_links
 from recon.run.progress import Progress
 

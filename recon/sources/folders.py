@@ -20,11 +20,11 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import SourceError
+from recon.core.text import counted
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import resolved
-from recon.io.frames_csv import FRAMES, read_frames
+from recon.io.trajectory import FRAMES, read_frames
 from recon.sources.calibration import read_rig
 from recon.sources.frame_list import FrameList
 from recon.sources.image_names import find_partners, natural_key, partner_names, split_sides

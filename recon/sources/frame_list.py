@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TypeVar
 
-from recon.core.decimals import is_count
 from recon.core.errors import SourceError
-from recon.core.words import counted
+from recon.core.text import counted, is_count
 from recon.sources.settings import SourceSettings
 
 Item = TypeVar("Item")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from recon.core.errors import SourceError
-from recon.core.words import counted
+from recon.core.text import counted
 
 IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 # Parts of names that mark the left camera, each with its counterpart for the right one.

@@ -19,12 +19,11 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.decimals import is_count
 from recon.core.errors import SourceError
 from recon.core.geometry.se3 import invert
+from recon.core.text import counted, is_count
 from recon.core.values import RectifiedCamera, Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
 from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_kitti_poses

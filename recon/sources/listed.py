@@ -20,7 +20,7 @@ from recon.core.errors import SourceError
 from recon.core.geometry.se3 import invert
 from recon.core.values import Rig, SequenceTruth, StereoCalibration, check_size
 from recon.core.values.arrays import Float64
-from recon.io.cameras.euroc import NS, read_euroc_camera, read_euroc_truth
+from recon.io.cameras.ros import NS, read_euroc_camera, read_euroc_truth
 from recon.io.files import resolved
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.image_names import find_partners

@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import SourceError
+from recon.core.text import counted
 from recon.core.values import StereoPair
-from recon.core.words import counted
 from recon.run.progress import Progress, Step
 from recon.sources.source import DerivedSource, StereoSource
 

@@ -9,8 +9,8 @@ from typing import Final, Protocol
 import cv2
 import numpy as np
 
-from recon.core.decimals import is_count
 from recon.core.errors import SourceError
+from recon.core.text import is_count
 from recon.core.values.arrays import UInt8
 from recon.io.images.image import silent_opencv
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from recon.core.errors import FormatError, SourceError
 from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
+from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.io.trajectory import read_tum
 from recon.sources.bag import BagSource, list_topics
 from recon.sources.rosbags import POSES, TRANSFORMS, Bag, BagPose

@@ -8,9 +8,9 @@ from typing import Final
 
 from recon.core.errors import SourceError
 from recon.io.files import StrPath, reading
-from recon.io.frames_csv import FRAMES
 from recon.io.images.video import VIDEOS
-from recon.io.middlebury.layout import find_layout
+from recon.io.middlebury import find_layout
+from recon.io.trajectory import FRAMES
 from recon.sources.bag import BAGS, find_bags, open_bag
 from recon.sources.folders import find_views, open_folders
 from recon.sources.kitti import open_kitti, open_kitti_raw

@@ -17,10 +17,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import FormatError, ReconError
-from recon.core.optional import require
+from recon.core.errors import FormatError, ReconError, require
+from recon.core.text import counted
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 
 IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"

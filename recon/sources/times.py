@@ -11,13 +11,12 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.decimals import parse_integer, parse_number
 from recon.core.errors import FormatError, SourceError
-from recon.core.geometry.interpolation import interpolate_poses, nearest_sorted
+from recon.core.geometry.alignment import interpolate_poses, nearest_sorted
 from recon.core.geometry.se3 import invert
+from recon.core.text import counted, parse_integer, parse_number
 from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.io.files import read_table, read_text, reader
 from recon.io.trajectory import read_tum
 from recon.sources.frame_list import FrameList

@@ -11,6 +11,7 @@ from pydantic import Field
 from typing_extensions import Self
 
 from recon.core.settings import Settings
+from recon.core.text import counted
 from recon.core.values import (
     Disparity,
     DisparityMetrics,
@@ -24,7 +25,6 @@ from recon.core.values import (
     StereoPair,
     TriangleMesh,
 )
-from recon.core.words import counted
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.cloud.back_project import CloudSettings, back_project, remove_flying_edges
 from recon.stereo.cloud.filters import FilterSettings, filter_cloud

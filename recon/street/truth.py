@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import EvaluationError
 from recon.core.geometry import se3
-from recon.core.kernels.voxels import pack_keys, unpack_keys
-from recon.core.keys import distinct_keys
+from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, OccupancyTruth, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int32

@@ -72,7 +72,7 @@ def test_every_optional_library_is_declared_by_the_extra_that_its_error_names(
 
 
 def _required(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Library and extra of each call of `recon.core.optional.require`."""
+    """Library and extra of each call of `recon.core.errors.require`."""
     texts = {
         node.target.id if isinstance(node, ast.AnnAssign) else node.targets[0].id: node.value.value
         for node in tree.body

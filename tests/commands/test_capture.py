@@ -18,7 +18,7 @@ from recon.commands.capture import record, run_capture
 from recon.core.errors import OutputError, ReconError, SourceError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io import atomic
-from recon.io.frames_csv import FRAMES, HEADER
+from recon.io.trajectory import FRAMES, HEADER
 from recon.rig import capture
 from recon.rig.capture import CaptureFolder, RecordingSettings
 from recon.sources.registry import open_source

@@ -10,7 +10,7 @@ import yaml
 
 from recon.commands.config import GROUPS, PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
-from recon.io.yaml_file import write_yaml
+from recon.io.fields import write_yaml
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ import pytest
 
 from recon.commands.evaluate_map import run_evaluate_map
 from recon.core.errors import EvaluationError, FormatError, RegistrationError, SettingsError
-from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_cloud
 from recon.core.values import PointCloud, Trajectory
 from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import write_kitti_poses, write_tum

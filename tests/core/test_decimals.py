@@ -9,13 +9,13 @@ import pytest
 
 from recon.cli.options import parse_numbers as parse_option
 from recon.commands.config import load_config
-from recon.core.decimals import is_count, parse_integer, parse_number
 from recon.core.errors import ReconError
-from recon.io.file_storage import read_file_storage
+from recon.core.text import is_count, parse_integer, parse_number
+from recon.io.cameras.opencv_yaml import read_file_storage
+from recon.io.fields import parse_yaml
 from recon.io.files import read_table
-from recon.io.frames_csv import read_frames
 from recon.io.models.ply import read_ply
-from recon.io.yaml_file import parse_yaml
+from recon.io.trajectory import read_frames
 from recon.run.memory import parse_size_mb
 from recon.sources.times import read_dates, read_stamped_names
 

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from recon.core import errors
-from recon.core.errors import FormatError, MissingDependencyError, ReconError
-from recon.core.optional import require
+from recon.core.errors import FormatError, MissingDependencyError, ReconError, require
 
 
 def test_a_line_tells_where_what_got_expected_and_what_to_do_in_that_order() -> None:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from recon.core.keys import are_among, distinct_keys, find_keys
+from recon.core.kernels.voxels import are_among, distinct_keys, find_keys
 
 ANY = st.integers(-(2**62), 2**62) | st.integers(0, 9)
 KEYS = hnp.arrays(np.int64, st.integers(0, 30), elements=ANY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from recon.core.units import unit_of, with_unit
+from recon.core.text import unit_of, with_unit
 
 
 @pytest.mark.parametrize(

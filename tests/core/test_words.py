@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from recon.core.words import counted
+from recon.core.text import counted
 
 
 @pytest.mark.parametrize(

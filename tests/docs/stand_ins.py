@@ -22,8 +22,8 @@ from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.board import parse_board
 from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
-from recon.io.images.pfm import write_pfm
 from recon.io.models.ply import write_ply
 from recon.io.trajectory import write_tum
 from recon.sources.synthetic import SyntheticSource

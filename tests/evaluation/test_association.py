@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.interpolation import nearest_sorted
+from recon.core.geometry.alignment import nearest_sorted
 from recon.core.values import Trajectory
 from recon.evaluation.segments import associate
 

@@ -12,15 +12,14 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.core.errors import MappingError, OutputError
-from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import apply
+from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.export.cloud import CloudSample
 from recon.export.make import Products, make
 from recon.export.occupancy import export_grid
 from recon.export.product import Order
+from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply, write_ply_tiles
-from recon.io.occupancy.nav2 import read_nav2
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.ground.floor import add_floors, find_floors
 from recon.map.ground.grid import drop_undecided, flatten
@@ -117,7 +116,7 @@ def test_a_map_too_large_for_an_octomap_has_all_else(
     mapped: MappedSequence, folder: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = write_products(mapped, folder)
-    monkeypatch.setattr("recon.io.occupancy.octomap.KEY_LIMIT", 20)
+    monkeypatch.setattr("recon.io.models.octomap.KEY_LIMIT", 20)
     folder.path("map/octomap.bt").unlink()
     folder.path("map/octomap.ot").unlink()
     written = write_products(mapped, folder)

@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.io.images.disparity_png import write_disparity_png
+from recon.io.images.disparity import write_disparity_png, write_pfm
 from recon.io.images.image import read_image
-from recon.io.images.pfm import write_pfm
 from tests.hostile import refusals
 
 HEIGHT, WIDTH, NEAR, FAR = 48, 96, 12, 4

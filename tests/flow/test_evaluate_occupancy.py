@@ -13,7 +13,7 @@ import pytest
 
 from recon.commands.evaluate_occupancy import run_evaluate_occupancy
 from recon.core.errors import EvaluationError, FormatError
-from recon.io.occupancy.nav2 import read_nav2
+from recon.io.models.nav2 import read_nav2
 from recon.report.style import GRID_ERRORS, GRID_NOT_COUNTED
 from recon.run.summary import plain
 from tests.hostile import refusals

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 import recon
 from recon.cli import app
-from recon.io.images.pfm import read_pfm, write_pfm
+from recon.io.images.disparity import read_pfm, write_pfm
 from tests.flow.test_evaluate import WIDTH, write_scene
 
 

@@ -17,8 +17,8 @@ from recon.commands.pair import run_pair
 from recon.core.errors import FormatError, SettingsError
 from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
 from recon.io.models.mesh import read_mesh
+from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
-from recon.io.occupancy.nav2 import read_nav2
 from recon.io.trajectory import read_tum
 from recon.map.store.records import Store
 from recon.run.batch.cluster import BatchOptions, Cluster

@@ -16,8 +16,8 @@ from recon.commands.evaluate_occupancy import run_evaluate_occupancy
 from recon.commands.occupancy import run_occupancy
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import OCCUPIED
-from recon.io.occupancy.nav2 import read_nav2
-from recon.io.occupancy.octomap import read_octomap
+from recon.io.models.nav2 import read_nav2
+from recon.io.models.octomap import read_octomap
 from recon.map.store.records import Store
 from recon.stereo import frame
 from tests.hostile.refusals import assert_refused, run

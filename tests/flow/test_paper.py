@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from recon.commands.config import load_config
 from recon.commands.paper import headline, run_paper
 from recon.core.values import RectifiedCamera
+from recon.io.images.disparity import read_pfm, write_pfm
 from recon.io.images.image import write_image
-from recon.io.images.pfm import read_pfm, write_pfm
 from recon.io.models.ply import read_ply
 from recon.report import paper_page
 from tests.hostile import refusals

@@ -24,18 +24,16 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.euroc import read_euroc_camera, read_euroc_truth
-from recon.io.frames_csv import read_frames
-from recon.io.images.disparity_png import read_disparity_png
+from recon.io.cameras.ros import read_euroc_camera, read_euroc_truth
+from recon.io.fields import read_yaml
+from recon.io.images.disparity import read_disparity_png, read_pfm, write_pfm
 from recon.io.images.image import read_image
-from recon.io.images.pfm import read_pfm, write_pfm
 from recon.io.images.video import open_video
 from recon.io.models.mesh import read_mesh, write_mesh
+from recon.io.models.nav2 import read_nav2, write_nav2
+from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
-from recon.io.occupancy.nav2 import read_nav2, write_nav2
-from recon.io.occupancy.octomap import read_octomap
-from recon.io.trajectory import read_trajectory
-from recon.io.yaml_file import read_yaml
+from recon.io.trajectory import read_frames, read_trajectory
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.occupancy.rays import ray_grain
 from recon.map.store.session import SessionInfo

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import RectifiedCamera
-from recon.io.occupancy.octomap import read_octomap
+from recon.io.models.octomap import read_octomap
 from recon.map.store.records import Store
 from recon.map.verbs import Map
 from tests.hostile.refusals import refusal

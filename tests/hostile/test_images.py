@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.io.images.disparity import read_pfm, write_pfm
 from recon.io.images.image import read_image, write_image
-from recon.io.images.image_integrity import stated_size
-from recon.io.images.pfm import read_pfm, write_pfm
+from recon.io.images.image_header import stated_size
 from tests.hostile.calibrations import OURS
 from tests.hostile.refusals import assert_refused, refusal, run
 

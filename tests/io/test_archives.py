@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import FormatError
-from recon.io.archives import unpack
+from recon.io.download import unpack
 
 FILES = {"data/a.txt": b"one", "data/b/c.png": b"two", "README": b"three"}
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from recon.core.errors import FormatError
+from recon.io.fields import read_yaml, write_yaml
 from recon.io.files import read_bytes, read_table, read_text
-from recon.io.yaml_file import read_yaml, write_yaml
 
 
 @pytest.mark.parametrize(

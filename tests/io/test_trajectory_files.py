@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recon.core.errors import FormatError, ReconError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
-from recon.io.cameras.euroc import read_euroc_truth
+from recon.io.cameras.ros import read_euroc_truth
 from recon.io.trajectory import (
     read_kitti_poses,
     read_trajectory,

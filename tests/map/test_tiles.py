@@ -9,8 +9,7 @@ import pytest
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import FormatError
-from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Float32, Float64
 from recon.map.fusion.part import join_fused

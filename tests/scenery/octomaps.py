@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from recon.core.values import OccupancyVoxels
-from recon.io.occupancy.octomap import write_octomap_tiles
+from recon.io.models.octomap import write_octomap_tiles
 
 
 def write_octomap(path: Path, voxels: OccupancyVoxels) -> tuple[Path, Path]:

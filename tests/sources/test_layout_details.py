@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
-from recon.io.cameras.kalibr import write_kalibr
-from recon.io.images.image import write_image
-from recon.io.images.ros_image import pixels_of_ros_image
+from recon.io.cameras.ros import write_kalibr
+from recon.io.images.image import pixels_of_ros_image, write_image
 from recon.sources.bag import rig_of_messages
 from recon.sources.image_names import find_partners, natural_key
 from recon.sources.registry import open_source

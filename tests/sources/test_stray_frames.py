@@ -10,8 +10,8 @@ import pytest
 
 from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, StereoPair
-from recon.io.frames_csv import FRAMES, CapturedFrame
 from recon.io.images.image import write_image
+from recon.io.trajectory import FRAMES, CapturedFrame
 from recon.sources.registry import open_source
 from recon.sources.source import IncompleteSource, StampedSource
 from tests.sources import drives

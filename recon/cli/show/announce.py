@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable
 from typing import TextIO
 
-from recon.core.words import counted
+from recon.core.text import counted
 from recon.sources.source import StereoSource
 
 

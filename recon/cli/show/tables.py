@@ -13,8 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from recon.core.units import with_unit
-from recon.core.words import counted
+from recon.core.text import counted, with_unit
 
 if TYPE_CHECKING:
     from recon.commands.settings_list import SettingEntry, SettingGroup

@@ -309,3 +309,29 @@ def _add_rows(
             sums[row, c] += new_sums[n, c]
         information[row] += new_information[n]
         frames[row] += new_frames[n]
+
+
+Key = TypeVar("Key", np.int64, np.uint32)
+
+
+def distinct_keys(keys: NDArray[Key]) -> NDArray[Key]:
+    """Return the different ones of some keys (N,), sorted."""
+    ordered = np.sort(keys)
+    first = np.ones(len(ordered), np.bool_)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return ordered[first]
+
+
+def find_keys(
+    wanted: NDArray[np.int64], keys: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return where in sorted keys the wanted ones (N,) are, and which of them are there."""
+    if not len(keys):
+        return np.zeros(len(wanted), np.intp), np.zeros(len(wanted), np.bool_)
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return place, np.asarray(keys[place] == wanted)
+
+
+def are_among(keys: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return bool (N,), which keys are among others, in whatever order."""
+    return find_keys(keys, np.sort(others))[1]

@@ -11,8 +11,7 @@ from recon.core.values.camera import (
     check_unsized,
     other_size,
 )
-from recon.core.values.cloud import Frame, PointCloud, join_clouds
-from recon.core.values.disparity import Disparity, Reason
+from recon.core.values.cloud import Frame, PointCloud, RayCloud, RayGrain, TriangleMesh, join_clouds
 from recon.core.values.grid import (
     FREE,
     OCCUPIED,
@@ -21,21 +20,21 @@ from recon.core.values.grid import (
     OccupancyVoxels,
     join_voxels,
 )
-from recon.core.values.image import RectifiedPair, StereoPair
-from recon.core.values.mesh import TriangleMesh
-from recon.core.values.metrics import (
+from recon.core.values.image import Disparity, Reason, RectifiedPair, StereoPair
+from recon.core.values.trajectory import Trajectory
+from recon.core.values.truth import (
     DepthMetrics,
     DisparityMetrics,
+    DisparityTruth,
     GridMetrics,
     LengthErrors,
     MapMetrics,
     OccupancyMetrics,
+    OccupancyTruth,
+    SequenceTruth,
     TrajectoryMetrics,
     VoxelMetrics,
 )
-from recon.core.values.rays import RayCloud, RayGrain
-from recon.core.values.trajectory import Trajectory
-from recon.core.values.truth import DisparityTruth, OccupancyTruth, SequenceTruth
 
 __all__ = [
     "FREE",

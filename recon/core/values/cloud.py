@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.text import counted
 from recon.core.values.arrays import Float32, Int32, UInt8, extent_text, freeze
-from recon.core.words import counted
 
 Frame = Literal["camera", "world", "map"]
 
@@ -83,3 +83,89 @@ def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointClou
         if all(array is not None for array in arrays)
     }
     return PointCloud(**shared, frame=frame)
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A surface of triangles.
+
+    Attributes:
+        vertices: float32 (V, 3), metres.
+        faces: int32 (F, 3), counter-clockwise seen from outside.
+        normals: float32 (V, 3) unit vectors, or None.
+        rgb: uint8 (V, 3), or None.
+    """
+
+    vertices: Float32
+    faces: Int32
+    normals: Float32 | None = None
+    rgb: UInt8 | None = None
+
+    def __post_init__(self) -> None:
+        freeze(self, "vertices", np.float32, (None, 3))
+        freeze(self, "faces", np.int32, (None, 3))
+        freeze(self, "normals", np.float32, (len(self.vertices), 3))
+        freeze(self, "rgb", np.uint8, (len(self.vertices), 3))
+
+    def __repr__(self) -> str:
+        vertices = counted(len(self.vertices), "vertex", "vertices")
+        sizes = f"{counted(len(self.faces), 'face')}, {vertices}"
+        return f"TriangleMesh({sizes}, {extent_text(self.vertices)})"
+
+
+_CERTAIN: Final = 255
+
+
+@dataclass(frozen=True)
+class RayGrain:
+    """Resolution of stored rays.
+
+    Attributes:
+        cell_m: Edge length of the cubes in which points are averaged.
+        unit_m: Quantisation step of the end points.
+        max_range_m: Points farther away are moved along their rays to just beyond this range.
+    """
+
+    cell_m: float
+    unit_m: float
+    max_range_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class RayCloud:
+    """Rays of one frame, from the camera to the observed points, in camera axes.
+
+    Attributes:
+        places: int16 (N, 3), end points of the rays, multiples of ``unit_m``.
+        sigma_m: float16 (N,), standard deviation of the depth.
+        confidence: uint8 (N,), 255 = certain.
+        count: uint8 (N,), number of averaged points; 255 = 255 or more.
+        unit_m: Quantisation step of ``places``.
+    """
+
+    places: NDArray[np.int16]
+    sigma_m: NDArray[np.float16]
+    confidence: UInt8
+    count: UInt8
+    unit_m: float
+
+    def __post_init__(self) -> None:
+        freeze(self, "places", np.int16, (None, 3))
+        freeze(self, "sigma_m", np.float16, (len(self.places),))
+        freeze(self, "confidence", np.uint8, (len(self.places),))
+        freeze(self, "count", np.uint8, (len(self.places),))
+
+    def __repr__(self) -> str:
+        return f"RayCloud({counted(len(self), 'ray')})"
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def cloud(self) -> PointCloud:
+        """Return the end points as a cloud; ``count`` is the number of averaged points."""
+        return PointCloud(
+            self.places * np.float32(self.unit_m),
+            sigma_m=self.sigma_m.astype(np.float32),
+            confidence=self.confidence / np.float32(_CERTAIN),
+            count=self.count.astype(np.int32),
+        )

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.text import counted
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze, size_text
-from recon.core.words import counted
 
 FREE: Final = 0
 OCCUPIED: Final = 100

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
+from recon.core.text import counted
 from recon.core.values.arrays import Float64, freeze
-from recon.core.words import counted
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import SettingsError, SourceError
+from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float32, Float64
-from recon.core.words import counted
 from recon.evaluation.middlebury.scenes import ResultFolder, read_seconds
 from recon.evaluation.middlebury.score import (
     MASKS,
@@ -28,7 +28,7 @@ from recon.evaluation.middlebury.score import (
     weighted_mean,
 )
 from recon.io.files import naming
-from recon.io.images.pfm import read_pfm
+from recon.io.images.disparity import read_pfm
 from recon.run.summary import plain
 from recon.stereo.frame import StereoSettings
 from recon.stereo.match.protocol import Matcher, name_of

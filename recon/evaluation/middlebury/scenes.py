@@ -13,8 +13,14 @@ from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.values import DisparityTruth, RectifiedCamera
 from recon.evaluation.middlebury.score import MiddleburyRules, ScoredScene
 from recon.io.files import read_table, resolved
-from recon.io.middlebury.layout import find_image, find_layout, scene_root
-from recon.io.middlebury.scene import MiddleburyScene, read_middlebury_scene, stand_in_camera
+from recon.io.middlebury import (
+    MiddleburyScene,
+    find_image,
+    find_layout,
+    read_middlebury_scene,
+    scene_root,
+    stand_in_camera,
+)
 
 _STEP: Final = 16
 _DISPARITY: Final = "disp0"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.interpolation import nearest_sorted
+from recon.core.geometry.alignment import nearest_sorted
 from recon.core.values import (
     Disparity,
     DisparityMetrics,

@@ -13,10 +13,10 @@ import numpy as np
 
 from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32
 from recon.core.values.cloud import Frame
-from recon.core.words import counted
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import Plane, close_seam, cut_mesh, open_edges
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh

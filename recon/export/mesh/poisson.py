@@ -12,9 +12,9 @@ from pydantic import Field
 
 from recon.core.errors import MeshingError
 from recon.core.settings import Settings
+from recon.core.text import counted
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32
-from recon.core.words import counted
 from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes

@@ -7,13 +7,12 @@ from typing import Final
 
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.values import Rig, check_size
-from recon.io.cameras.camera_info import read_camera_info
-from recon.io.cameras.kalibr import read_kalibr
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import read_opencv_calibration
 from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
+from recon.io.cameras.ros import read_camera_info, read_kalibr
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
-from recon.io.middlebury.scene import read_middlebury_calib
+from recon.io.middlebury import read_middlebury_calib
 
 _KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE | re.ASCII)
 _MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)

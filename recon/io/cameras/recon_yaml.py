@@ -13,10 +13,9 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
-from recon.io.cameras.lens_models import pinhole_matrix
-from recon.io.fields import Fields
+from recon.io.cameras.ros import pinhole_matrix
+from recon.io.fields import Fields, read_yaml
 from recon.io.files import StrPath, reader
-from recon.io.yaml_file import read_yaml
 
 MARK: Final = "recon-calibration"
 _VERSION: Final = 1

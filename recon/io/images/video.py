@@ -12,8 +12,8 @@ from typing import Final
 import cv2
 
 from recon.core.errors import FormatError
+from recon.core.text import counted
 from recon.core.values.arrays import UInt8
-from recon.core.words import counted
 from recon.io.files import StrPath, reader
 from recon.io.images.image import MAX_MEGAPIXELS, silent_opencv, swap_red_and_blue
 

@@ -8,9 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import EvaluationError, SettingsError
+from recon.core.errors import EvaluationError, SettingsError, require
 from recon.core.geometry.se3 import apply
-from recon.core.optional import require
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
 from recon.io.atomic import atomic_path

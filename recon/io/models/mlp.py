@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from recon.core.errors import OutputError
-from recon.core.geometry.axes import T_YUP_FRAME
+from recon.core.geometry.se3 import T_YUP_FRAME
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.core.values.cloud import Frame

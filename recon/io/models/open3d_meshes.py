@@ -10,9 +10,9 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, MeshingError, OutputError
+from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Int32
-from recon.core.words import counted
 from recon.io.files import StrPath
 
 

@@ -14,9 +14,8 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.decimals import parse_numbers
 from recon.core.errors import FormatError
-from recon.core.words import counted
+from recon.core.text import counted, parse_numbers
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, reader, reading
 

@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.map.store.keyframes import Keyframes
 from recon.places.closure import Closure, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector

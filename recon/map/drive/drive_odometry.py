@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import RegistrationError
+from recon.core.text import counted
 from recon.core.values import Trajectory
-from recon.core.words import counted
 from recon.map.settings import DriveSettings
 from recon.odometry.prior import MotionPrior
 from recon.odometry.prior_axes import find_axes, first_moving

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from recon.core.errors import FormatError
-from recon.core.geometry.axes import transform_cloud
+from recon.core.geometry.se3 import transform_cloud
+from recon.core.text import counted
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
-from recon.core.words import counted
 from recon.map.fusion.builder import fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.occupancy.rays import ray_grain, thin_rays

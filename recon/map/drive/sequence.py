@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from recon.core.errors import MappingError
-from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.projection import depth_from_disparity
-from recon.core.geometry.se3 import apply, invert
+from recon.core.geometry.se3 import apply, invert, transform_cloud
+from recon.core.text import counted
 from recon.core.values import (
     Disparity,
     OccupancyVoxels,
@@ -25,7 +25,6 @@ from recon.core.values import (
     join_voxels,
 )
 from recon.core.values.arrays import Bool, Float64
-from recon.core.words import counted
 from recon.map.drive.drive import Drive
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of

@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import invert
+from recon.core.text import counted
 from recon.core.values import Rig, StereoPair
 from recon.core.values.arrays import Bool, Float64
-from recon.core.words import counted
 from recon.map.localize.belief import MAX_SIGMA_M, Belief
 from recon.map.localize.search import Search
 from recon.map.localize.surroundings import Surroundings

@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
+from recon.core.text import counted
 from recon.core.values import StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.core.words import counted
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings

@@ -24,8 +24,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels import pack_keys
-from recon.core.keys import find_keys
+from recon.core.kernels.voxels import find_keys, pack_keys
 from recon.core.values.arrays import Bool, Float64, Int8
 
 _DISAGREEMENT: Final = 0.4

@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.kernels.voxels import pack_keys
-from recon.core.keys import find_keys
+from recon.core.kernels.voxels import find_keys, pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import apply, invert
-from recon.core.kernels.voxels import pack_keys, unpack_keys
-from recon.core.keys import find_keys
+from recon.core.kernels.voxels import find_keys, pack_keys, unpack_keys
 from recon.core.values import PointCloud, RayCloud
 from recon.core.values.arrays import Bool, Float64, Int8
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE, cast_rays, make_blocks

@@ -31,8 +31,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels import pack_keys
-from recon.core.keys import are_among, find_keys
+from recon.core.kernels.voxels import are_among, find_keys, pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.core.values.grid import log_odds

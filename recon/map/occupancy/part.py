@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
 from recon.core.kernels import voxels
-from recon.core.keys import are_among
+from recon.core.kernels.voxels import are_among
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Float32, Float64, Int32, array_in, frozen_array
 from recon.map.kernels import clamped, raycast

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import apply
 from recon.core.kernels import voxels
-from recon.core.keys import are_among
+from recon.core.kernels.voxels import are_among
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, array_in
 from recon.map.kernels import facets
 from recon.map.kernels.raycast import BLOCK_BITS

@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.words import counted
+from recon.core.text import counted
 from recon.map.settings import DriveSettings
 from recon.map.store.cast_submaps import check_rays
 from recon.map.store.frames import FRAMES

@@ -11,12 +11,16 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import EvaluationError, FormatError, SettingsError
-from recon.core.geometry.alignment import find_agreeing, fit_upright
-from recon.core.geometry.interpolation import interpolate_poses, nearest_sorted
+from recon.core.geometry.alignment import (
+    find_agreeing,
+    fit_upright,
+    interpolate_poses,
+    nearest_sorted,
+)
 from recon.core.geometry.se3 import apply, invert
+from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.core.words import counted
 from recon.io.files import read_table, reader
 from recon.io.trajectory import check_positions
 from recon.map.store.map_file import MapFile

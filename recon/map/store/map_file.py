@@ -10,8 +10,8 @@ from typing_extensions import Self
 
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
+from recon.core.text import counted
 from recon.core.values.arrays import Bool, Float64
-from recon.core.words import counted
 from recon.io.files import StrPath, reading
 from recon.map.store.links import LINKS, Link
 from recon.map.store.records import CACHE_BYTES, Store

@@ -10,9 +10,9 @@ import numpy as np
 
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import check_rigid
+from recon.core.text import counted
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in
-from recon.core.words import counted
 from recon.io.files import reading
 from recon.map.store.frames import FRAMES, frames_in, frames_record, path_of
 from recon.map.store.keyframes import Keyframes

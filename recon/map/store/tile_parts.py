@@ -12,8 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels import pack_keys, unpack_keys
-from recon.core.keys import distinct_keys
+from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.values.arrays import Bool
 from recon.map.rectangle import Rectangle
 from recon.map.store.records import Store

@@ -8,8 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
+from recon.core.text import counted
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
-from recon.core.words import counted
 from recon.rig.audit.corrections import RightTurn
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample

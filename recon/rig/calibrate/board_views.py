@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError, SourceError
+from recon.core.text import counted
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.board import CalibrationBoard
-from recon.core.words import counted
 from recon.io.images.image import read_image, write_image
 from recon.io.images.video import VIDEOS, VideoFile
 from recon.rig.calibrate.bundle import Sighting, View

@@ -13,9 +13,9 @@ import numpy as np
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, invert
+from recon.core.text import counted
 from recon.core.values import StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.core.words import counted
 from recon.rig.calibrate.bundle import RigState, moved, solve_scaled
 from recon.rig.calibrate.stereo import StereoFit, stereo_of
 from recon.rig.settings import CalibrationSettings

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError, SettingsError
+from recon.core.text import counted
 from recon.core.values.arrays import Float64, Int32, UInt8
 from recon.core.values.board import CalibrationBoard
-from recon.core.words import counted
 from recon.rig.calibrate.bundle import Sighting
 
 Inner = tuple[int, int]

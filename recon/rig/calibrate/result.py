@@ -12,10 +12,9 @@ import numpy as np
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
-from recon.io.cameras.camera_info import write_camera_info
-from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.ros import write_camera_info, write_kalibr
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bootstrap import DepthError, Spread
 from recon.rig.calibrate.bundle import View

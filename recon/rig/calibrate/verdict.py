@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from recon.core.text import counted
 from recon.core.values.board import CalibrationBoard
-from recon.core.words import counted
 from recon.sources.image_names import ImagePairs
 
 Verdict = Literal["good", "usable", "repeat"]

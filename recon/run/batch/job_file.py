@@ -15,9 +15,8 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator
 from recon.core.errors import FormatError, SettingsError
 from recon.core.settings import Settings, settings_error
 from recon.io.atomic import write_text
+from recon.io.fields import read_toml, read_yaml
 from recon.io.files import read_text, reading, resolved
-from recon.io.toml_file import read_toml
-from recon.io.yaml_file import read_yaml
 from recon.run.batch.job import LOGS
 
 SUFFIXES: Final = (".toml", ".yaml", ".yml")

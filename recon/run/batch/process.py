@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from recon.core.errors import OutputError
-from recon.io.lock import is_locked
+from recon.io.atomic import is_locked
 from recon.run.batch.job import Job, Outcome, State, is_done, last_outcome, log_file
 from recon.run.directory import lock_file, refuse_links
 from recon.run.run import Run

@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.core.errors import FormatError, MatchingError, SettingsError
-from recon.core.optional import require
+from recon.core.errors import FormatError, MatchingError, SettingsError, require
 from recon.core.settings import Settings
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.errors import MatchingError, ReconError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
-from recon.core.values.disparity import ASSUMED_CONFIDENCE, ASSUMED_SIGMA_PX
+from recon.core.values.image import ASSUMED_CONFIDENCE, ASSUMED_SIGMA_PX
 
 
 @runtime_checkable

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
+from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8, freeze
-from recon.core.words import counted
 
 _RATIO: Final = 0.8
 """Lowe's ratio test: the best distance must be below this share of the second best."""

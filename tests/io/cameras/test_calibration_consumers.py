@@ -12,9 +12,8 @@ import yaml
 
 from recon.core.geometry.se3 import apply
 from recon.core.values import StereoCalibration
-from recon.io.cameras.camera_info import write_camera_info
-from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
+from recon.io.cameras.ros import write_camera_info, write_kalibr
 from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
 from tests.scenery.boards import Lens, board_rig
 

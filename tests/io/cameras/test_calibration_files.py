@@ -11,10 +11,15 @@ from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.camera_info import camera_info_paths, read_camera_info, write_camera_info
-from recon.io.cameras.kalibr import read_kalibr, write_kalibr
 from recon.io.cameras.opencv_yaml import read_opencv_calibration, write_opencv_calibration
 from recon.io.cameras.recon_yaml import read_recon_calibration, write_recon_calibration
+from recon.io.cameras.ros import (
+    camera_info_paths,
+    read_camera_info,
+    read_kalibr,
+    write_camera_info,
+    write_kalibr,
+)
 from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
 
 T_RIGHT_LEFT = make_transform(

@@ -14,10 +14,9 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.camera_info import write_camera_info
-from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.ros import write_camera_info, write_kalibr
 from recon.io.images.image import write_image
 from recon.sources.one_pair import read_pair_input
 from recon.sources.registry import open_source

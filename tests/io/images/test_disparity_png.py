@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from recon.core.errors import FormatError, OutputError
-from recon.io.images.disparity_png import (
+from recon.io.images.disparity import (
     fitting_scale,
     read_disparity_png,
     write_disparity_png,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from recon.core.errors import FormatError, ShapeError
-from recon.io.images.pfm import read_pfm, write_pfm
+from recon.io.images.disparity import read_pfm, write_pfm
 
 DISPARITIES = arrays(
     np.float32,

@@ -8,14 +8,16 @@ import pytest
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.projection import depth_from_disparity
 from recon.evaluation.middlebury.scenes import find_scenes, read_scored_scene
+from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
-from recon.io.images.pfm import write_pfm
-from recon.io.middlebury.layout import Layout, find_layout, units_of
-from recon.io.middlebury.scene import (
+from recon.io.middlebury import (
+    Layout,
     cross_check,
+    find_layout,
     nominal_camera_2005,
     read_middlebury_calib,
     read_middlebury_scene,
+    units_of,
 )
 
 CALIB = """cam0=[999.421 0 294.182; 0 999.421 252.932; 0 0 1]

@@ -11,7 +11,7 @@ import pytest
 
 from recon.core.values import TriangleMesh
 from recon.core.values.cloud import Frame
-from recon.io.models.glb import srgb_from_linear, write_glb
+from recon.io.models.mesh import srgb_from_linear, write_glb
 
 MESH = TriangleMesh(
     vertices=np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32),

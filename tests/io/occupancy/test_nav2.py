@@ -10,7 +10,7 @@ import yaml
 
 from recon.core.errors import FormatError, OutputError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from recon.io.occupancy.nav2 import read_nav2, write_nav2
+from recon.io.models.nav2 import read_nav2, write_nav2
 
 # Row 0 has the smallest y. An obstacle at the right of the lowest row, unknown at the top left.
 CELLS = np.array([[FREE, FREE, FREE, OCCUPIED], [FREE] * 4, [UNKNOWN, FREE, FREE, FREE]], np.int8)

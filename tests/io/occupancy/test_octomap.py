@@ -11,8 +11,7 @@ import pytest
 
 from recon.core.errors import FormatError, MappingError, OutputError
 from recon.core.values import OccupancyVoxels
-from recon.io.occupancy.octomap import octomap_pieces, read_octomap, write_octomap_tiles
-from recon.io.occupancy.octree import KEY_LIMIT
+from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
 from tests.scenery.octomaps import write_octomap
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from recon.core.errors import MappingError
-from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.projection import depth_sigma
-from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_cloud
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.map.fusion import part
 from recon.map.fusion.builder import CloudBuilder, FusionSettings, fusion_range_m

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import make_transform
+from recon.core.geometry.se3 import make_transform, transform_cloud
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, join_clouds
 from recon.core.values.arrays import Bool

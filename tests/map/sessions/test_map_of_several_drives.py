@@ -11,8 +11,7 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.core.errors import FormatError, SettingsError
-from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_cloud
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import PointCloud, RectifiedCamera, join_clouds, join_voxels
 from recon.core.values.arrays import Float64

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import EvaluationError, ReconError, RegistrationError
-from recon.core.geometry.interpolation import interpolate_poses
+from recon.core.geometry.alignment import interpolate_poses
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64

@@ -10,7 +10,7 @@ import pytest
 from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3
-from recon.io.middlebury.scene import read_middlebury_scene
+from recon.io.middlebury import read_middlebury_scene
 from recon.rig.uncalibrated import rectify_features, rectify_images
 from recon.stereo.rectify.features import PairFeatures, match_again, match_exactly
 from recon.stereo.rectify.grey import to_grey

@@ -14,7 +14,7 @@ import pytest
 
 import recon
 from recon.core.errors import FormatError
-from recon.io.lock import take_lock
+from recon.io.atomic import take_lock
 from recon.run.batch import process
 from recon.run.batch.job import Job, Outcome, is_done, last_outcome, log_file
 from recon.run.batch.process import run_job

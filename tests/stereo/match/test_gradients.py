@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import RectifiedPair
-from recon.io.middlebury.scene import stand_in_camera
+from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.search import clipped_gradients, texture
 
 HEIGHT, WIDTH = 23, 17

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.core import optional
+from recon.core import errors
 from recon.core.errors import FormatError, MatchingError, MissingDependencyError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.io.middlebury.scene import stand_in_camera
+from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 
 onnx = pytest.importorskip("onnx", reason="the package onnx builds the network: pip install onnx")
@@ -155,6 +155,6 @@ def test_without_the_extra_the_pip_line_is_reported(
     def absent(name: str) -> None:
         raise ModuleNotFoundError(name)
 
-    monkeypatch.setattr(optional, "import_module", absent)
+    monkeypatch.setattr(errors, "import_module", absent)
     with pytest.raises(MissingDependencyError, match=r"recon\[onnx\]"):
         match(difference, pair_of(1, 2))

@@ -8,7 +8,7 @@ import pytest
 
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.io.middlebury.scene import stand_in_camera
+from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 
 NAMES = ("opencv-bm", "opencv-sgbm")

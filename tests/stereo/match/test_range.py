@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import Disparity, RectifiedPair
-from recon.io.middlebury.scene import read_middlebury_scene, stand_in_camera
+from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.stereo.match.range import AutoRangeMatcher, estimate_ndisp
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher, settings_of
 from recon.stereo.match.sad import SadSettings

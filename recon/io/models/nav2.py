@@ -16,12 +16,12 @@ import yaml
 from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
+from recon.core.text import counted
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import UInt8
-from recon.core.words import counted
 from recon.io.atomic import atomic_path, write_text
+from recon.io.fields import read_yaml
 from recon.io.files import StrPath, read_bytes, reader
-from recon.io.yaml_file import read_yaml
 
 _OCCUPIED_THRESH: Final = 0.65
 # With the common 0.25, the grey level of unknown (205, occupancy 0.196…) would be read as free.

@@ -1,0 +1,91 @@
+"""Words that depend on a number."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Final
+
+
+def counted(number: int, one: str, many: str = "", *, form: str = "") -> str:
+    """Return a number of things, such as ``1 frame``, ``2 frames`` or, signed, ``-1 frame``.
+
+    Args:
+        number: How many.
+        one: What one of them is called.
+        many: What several are called, if that is not the same with an s.
+        form: How the number is written, such as ``,`` for commas between thousands.
+    """
+    return f"{number:{form}} {one if abs(number) == 1 else many or one + 's'}"
+
+
+def parse_number(text: str | bytes) -> float:
+    """Return the number that a text is; it may be ``nan`` or ``inf``."""
+    _check(text)
+    return float(text)
+
+
+def parse_numbers(words: Iterable[str | bytes]) -> list[float]:
+    """Return the numbers that texts are, see `parse_number`."""
+    return [parse_number(word) for word in words]
+
+
+def parse_integer(text: str | bytes) -> int:
+    """Return the whole number that a text is."""
+    _check(text)
+    return int(text)
+
+
+def is_count(text: str) -> bool:
+    """Return whether a text is ASCII digits and nothing else."""
+    return text.isascii() and text.isdecimal()
+
+
+def refuse_other_numbers(text: str) -> None:
+    """Refuse what is a number for Python alone; text that is none at all is not looked at."""
+    try:
+        float(text)
+    except ValueError:
+        return
+    parse_number(text)
+
+
+def _check(text: str | bytes) -> None:
+    """Refuse underscores, and digits of other scripts."""
+    plain = text.decode("latin-1") if isinstance(text, bytes) else text
+    if not plain.isascii() or "_" in plain:
+        raise ValueError(f"not a decimal number: {plain!r}")
+
+
+_UNITS: Final = {
+    "deg_per_100m": "°/100 m", "m_per_s": "m/s", "percent": "%", "deg": "°", "px": "px",
+    "mb": "MB", "hz": "Hz", "ms": "ms", "mm": "mm", "cm": "cm", "m": "m", "s": "s",
+}  # fmt: skip
+"""What the names of figures end in."""
+_NAMED_UNITS: Final = {
+    "bad": "%", "invalid": "%", "d1": "%", "infinite": "%",
+    "seconds": "s", "seconds_per_frame": "s", "fps": "frames/s",
+}  # fmt: skip
+"""Figures whose names do not tell it."""
+_ENDING: Final = re.compile(rf"_({'|'.join(_UNITS)})$")
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of a figure, by its name or that of the group it is in.
+
+    Args:
+        name: Such as ``peak_memory_mb``, ``disparity.bad.1.0`` or ``live.latency_ms.p50``.
+
+    Returns:
+        The unit; "" = it has none, as numbers of things, shares and texts.
+    """
+    for part in reversed(re.split(r"[. ]", name)):
+        ending = _ENDING.search(part)
+        if ending or part in _NAMED_UNITS:
+            return _UNITS[ending[1]] if ending else _NAMED_UNITS[part]
+    return ""
+
+
+def with_unit(text: str, name: str) -> str:
+    """Return the text of a figure with its unit, see `unit_of`."""
+    return f"{text} {unit_of(name)}".rstrip()

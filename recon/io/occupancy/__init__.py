@@ -1,1 +1,0 @@
-"""Occupancy maps for robots: Nav2 and OctoMap."""
