@@ -20,7 +20,7 @@ import checkout  # noqa: F401 - what is measured
 
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
-from recon.commands.evaluate_occupancy import run_evaluate_occupancy
+from recon.commands.evaluate import run_evaluate_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.run.summary import plain

@@ -1,9 +1,8 @@
 """The command line: parse, build the configuration, call one story of `commands/`, print one table.
 
-One file per command. What several of them take is in `options.py`, and for drives in
-`drive_options.py`: a dataclass is a group of options, which `takes_groups` spreads. `errors.py`
-says what an error looks like, `commands.py` what is a number, and `show/` has the tables and the
-progress.
+`options.py` and `drive_options.py` have what several commands take: a dataclass is a group of
+options, which `takes_groups` spreads. `errors.py` says what an error looks like, `commands.py`
+what is a number; `tables.py` and `progress.py` print.
 
 Nothing heavy is imported before a command runs, so ``recon --help`` answers at once.
 """
@@ -18,28 +17,18 @@ import typer
 
 from recon import __version__
 from recon.cli import datasets, evaluate
-from recon.cli.audit import audit
 from recon.cli.batch import batch
-from recon.cli.board import board
-from recon.cli.calibrate import calibrate
-from recon.cli.capture import capture
+from recon.cli.cameras import board, calibrate, rectify
 from recon.cli.commands import Commands
-from recon.cli.demo import demo
-from recon.cli.doctor import doctor
-from recon.cli.errors import report_unforeseen
-from recon.cli.export import export
-from recon.cli.interrupt import interrupt_on_signals
-from recon.cli.live import live
-from recon.cli.localize import localize
-from recon.cli.map import map_
+from recon.cli.errors import interrupt_on_signals, report_unforeseen
+from recon.cli.getting_started import demo, doctor, settings
+from recon.cli.live import live, localize
+from recon.cli.map import map_, piece
 from recon.cli.merge import merge
-from recon.cli.mesh import mesh
-from recon.cli.occupancy import occupancy
 from recon.cli.pair import disparity, pair
 from recon.cli.paper import paper
-from recon.cli.piece import piece
-from recon.cli.rectify import rectify
-from recon.cli.settings import settings
+from recon.cli.products import export, mesh, occupancy
+from recon.cli.recording import audit, capture
 
 app = Commands(
     name="recon",

@@ -9,7 +9,7 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
-from recon.cli.show.tables import print_batch, print_json
+from recon.cli.tables import print_batch, print_json
 
 _HELP = "Job file (TOML, YAML), or a command and the sources to run it on."
 What = Annotated[list[str] | None, typer.Argument(metavar="JOBS|COMMAND SOURCE...", help=_HELP)]
@@ -74,7 +74,7 @@ def batch(
         raise typer.BadParameter("give JOBS, or COMMAND and SOURCES, or --resume FOLDER")
     with one_line_errors(quiet=quiet):
         from recon.cli.program import plan_jobs
-        from recon.cli.show.progress import choose_viewer
+        from recon.cli.progress import choose_viewer
         from recon.commands.batch import run_batch
         from recon.run.batch.cluster import BatchOptions
         from recon.run.batch.job_file import SUFFIXES, jobs_of_sources, read_jobs, read_plan

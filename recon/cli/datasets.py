@@ -10,7 +10,7 @@ import typer
 from recon.cli import options as opt
 from recon.cli.commands import Commands
 from recon.cli.errors import one_line_errors
-from recon.cli.show.tables import print_datasets, print_json
+from recon.cli.tables import print_datasets, print_json
 
 app = Commands(
     no_args_is_help=True,
@@ -76,7 +76,7 @@ def fetch(
       recon datasets fetch euroc/vicon_room1 --address http://mirror.example/data
     """
     with one_line_errors(quiet=quiet):
-        from recon.cli.show.progress import choose_viewer
+        from recon.cli.progress import choose_viewer
         from recon.commands.datasets import run_fetch
 
         viewer = choose_viewer(quiet=quiet, verbose=verbose)

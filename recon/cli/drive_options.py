@@ -172,7 +172,7 @@ def open_drive(
 
 def announced(drive: StereoSource, options: MapOptions, shared: opt.Shared) -> MapOptions:
     """Say how a drive is read, and return the options of its run with a progress that is shown."""
-    from recon.cli.show.announce import announce
+    from recon.cli.progress import announce
 
     announce(drive, quiet=shared.quiet, verbose=shared.verbose)
     return replace(options, progress=shared.viewer())

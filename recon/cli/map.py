@@ -12,6 +12,8 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive_options import DriveOptions, Start, open_drive, open_workers
+from recon.cli.errors import one_line_errors
+from recon.cli.tables import print_json, print_run
 
 
 @opt.takes_groups
@@ -84,12 +86,11 @@ def map_(
     if into is not None and (workers or scheduler) is not None:
         raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
     with shared.one_line_errors():
-        from recon.cli.show.announce import warn
+        from recon.cli.progress import warn
         from recon.commands.config import load_config, run_settings
         from recon.commands.map import run_map
-        from recon.commands.map_options import MapOptions, MapRequest
+        from recon.commands.map_options import MapOptions, MapRequest, resumed
         from recon.commands.merge import run_map_into, run_remove
-        from recon.commands.resume import resumed
         from recon.run.memory import memory_overrides
 
         request = MapRequest(source, reading.kind, poses, prior, mesh)
@@ -142,3 +143,34 @@ def _check_folders(
         raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
     if source is None and resume is None and remove is None:
         raise typer.BadParameter("give SOURCE, or --resume FOLDER")
+
+
+def piece(
+    plan: Annotated[Path, typer.Argument(help="Plan of the pieces, in the folder of the run.")],
+    number: Annotated[int, typer.Argument(help="Number of the piece.")],
+    out: Annotated[Path | None, typer.Option(help="New folder of the piece.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Folder of one to go on with.")] = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
+) -> None:
+    """Map one piece of a drive, or go on with it.
+
+    The workers of recon map --workers run this. Its result is the map of the
+    piece, which that command joins with the others.
+
+    Examples:
+      recon piece outputs/long/.partial/.state/pieces.json 0 --out piece0
+    """
+    folder = resume or out
+    if folder is None:
+        raise typer.BadParameter("give --out FOLDER or --resume FOLDER")
+    with one_line_errors(quiet=quiet):
+        from recon.cli.progress import choose_viewer
+        from recon.commands.piece import run_piece
+
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        going_on = resume is not None
+        summary = run_piece(plan, number, folder, resume=going_on, threads=threads, progress=viewer)
+    print_json(summary) if json else print_run(summary, stages=verbose)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from recon.cli.errors import one_line_errors
-from recon.cli.show.tables import print_json, print_run
+from recon.cli.tables import print_json, print_run
 from recon.core.errors import SettingsError
 from recon.core.text import parse_number
 
@@ -164,7 +164,7 @@ class Shared:
 
     def viewer(self) -> Progress:
         """Choose what shows the progress."""
-        from recon.cli.show.progress import choose_viewer
+        from recon.cli.progress import choose_viewer
 
         return choose_viewer(quiet=self.quiet, verbose=self.verbose)
 

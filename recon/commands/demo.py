@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+import tempfile
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from recon.commands.config import ReconConfig
+import numpy as np
+
+from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.commands.occupancy import run_occupancy
+from recon.commands.pair import run_pair
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.kernels.cache import when_compiling
+from recon.core.values import StereoPair
 from recon.export.map_run import MapRun
+from recon.io.models.octomap import read_octomap
+from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.fusion.builder import fusion_range_m
+from recon.map.tiles import Tiles
+from recon.run.finished import OCTOMAP
 from recon.run.progress import SILENT, Progress
+from recon.sources.one_pair import PairInput
 from recon.sources.synthetic import SyntheticSource
+from recon.stereo.frame import FrameReconstructor
+from recon.stereo.match.registry import MATCHERS
 from recon.street.street import rig
 
 FARTHEST_M: Final = 30.0
@@ -52,3 +69,64 @@ def demo_source(config: ReconConfig) -> SyntheticSource:
     """
     range_m = fusion_range_m(rig(config.street), config.fusion)
     return SyntheticSource(config.street, surface_range_m=min(range_m, FARTHEST_M))
+
+
+_MATCHERS: Final = tuple(name for name in MATCHERS if name != "onnx")  # it needs a network
+_SMALL: Final = (
+    "street.frames=6",
+    "street.width_px=192",
+    "street.height_px=96",
+    "street.focal_px=120",
+    "submaps.length_m=2",
+)
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """What was compiled.
+
+    Attributes:
+        kernels: Number of kernels that were not in the cache.
+        seconds: Time that all of it took.
+    """
+
+    kernels: int
+    seconds: float
+
+
+def compile_kernels() -> WarmUp:
+    """Compile the kernels that pairs, drives and occupancy maps run, for all matchers of ours.
+
+    They run once on small rendered images.
+
+    The real stages run, so that a kernel that is added to one needs no mention here.
+    """
+    begun, compiled = time.perf_counter(), set[str]()
+    with when_compiling(compiled.add), tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        config = load_config(None, _SMALL)
+        source = demo_source(config)
+        run_map(
+            source,
+            config,
+            MapOptions(audit=False, command="demo", out=folder / "drive", mesh=False),
+        )
+        run_occupancy(folder / "drive", out=folder / "occupancy")
+        read_octomap(folder / "drive" / OCTOMAP)  # as an evaluation does
+        _move_submaps(map_sequence(source, config))
+        colour = next(iter(source))
+        grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
+        for kind, pair in {"colour": colour, "grey": grey}.items():
+            run_pair(PairInput(pair, source.calibration), out=folder / kind)
+            for matcher in _MATCHERS:
+                config = load_config(None, [f"matching.matcher={matcher}"], PAIR_DEFAULTS)
+                FrameReconstructor(source.calibration, config).reconstruct(pair)
+    return WarmUp(len(compiled), time.perf_counter() - begun)
+
+
+def _move_submaps(mapped: MappedSequence) -> None:
+    """Move the submaps as closed loops do; so small a drive has none."""
+    turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
+    submaps = mapped.session.submaps
+    turns = np.stack([turn] * len(submaps))
+    len(Tiles.of_submaps(submaps, mapped.config, mapped.T_map_world, turns))

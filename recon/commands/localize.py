@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
+from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
+from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.values import OccupancyGrid
+from recon.core.errors import MappingError, SettingsError
+from recon.core.values import OccupancyGrid, StereoPair
 from recon.export.trajectories import export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
+from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.sequence import StartPose, localize_sequence
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
 from recon.report.localize_page import write_localize_page
+from recon.rig.cameras import CameraSource
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
-from recon.sources.source import StereoSource
+from recon.sources.source import DerivedSource, StereoSource
 
 
 def run_localize(
@@ -76,3 +84,103 @@ def _grid_of(folder: Path | None) -> OccupancyGrid | None:
     if folder is None or not (folder / GRID).is_file():
         return None
     return read_nav2(folder / GRID)
+
+
+_SLOWEST: Final = 1e-3
+_FIRST: Final = 3
+"""Pairs that are worked on before the first one counts: the first use of a library takes long."""
+_PACE_S: Final = 0.1
+"""Time between them, whatever their own times are: a recording may begin with a gap."""
+
+
+def run_live(
+    source: StereoSource,
+    config: ReconConfig | None = None,
+    options: MapOptions | None = None,
+    *,
+    rate: float = 1.0,
+    map_path: StrPath | None = None,
+    start: StartPose | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Map a drive while its images arrive: what `recon live` does.
+
+    The pose of each frame comes first, from its features alone; matching follows as far as there
+    is time. Where even poses take too long, frames are dropped; the summary counts both (``live``).
+
+    Args:
+        source: Cameras, or a recording, which is played at its own time stamps.
+        config: The configuration; None = the defaults.
+        options: Options of the run; None = the defaults.
+        rate: How many times as fast as recorded a recording is played.
+        map_path: Find the drive in this map instead of making one: folder of a run, or map file.
+        start: Where the drive begins in it, roughly; None = anywhere.
+        stopped: Asked now and then; True ends the drive, whose map is then completed.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: As for `run_map` and `run_localize`; the rate is not positive, or the odometry
+            needs exact disparities.
+    """
+    if not _SLOWEST <= rate < float("inf"):
+        expected = f"{_SLOWEST:g} or more"
+        raise SettingsError("not a rate", where="--rate", got=f"{rate:g}", expected=expected)
+    config, options = config or load_config(), options or MapOptions(command="live")
+    _check_pose_first(config)
+    _warm_up(LiveSource(_Beginning(source), stopped=stopped), config, map_path)
+    live = isinstance(source, CameraSource) and source.live
+    played = LiveSource(source, None if live else rate, stopped)
+    options = replace(options, audit=False, progress=played.timed(options.progress))
+    if map_path is not None:
+        return run_localize(played, map_path, config, options, start=start).summary
+    try:
+        return run_map(played, config, options).summary
+    except MappingError as error:
+        raise _because_it_was_too_fast(error, played) from error
+
+
+def _because_it_was_too_fast(error: MappingError, played: LiveSource) -> MappingError:
+    """Say of a drive that gave no map what was left out of it, if anything was."""
+    if not played.warnings():
+        return error
+    why = "; ".join(played.warnings())
+    hint = "play it more slowly, such as --rate 0.5, or take a smaller image or a faster matcher"
+    return MappingError(error.what, where=error.where, got=why, hint=hint)
+
+
+class _Beginning(DerivedSource):
+    """The first pairs of a source, read once: a camera takes none again."""
+
+    def __init__(self, source: StereoSource) -> None:
+        super().__init__(source)
+        first = enumerate(islice(source.frames(), _FIRST))
+        self._pairs = [replace(pair, timestamp_s=n * _PACE_S) for n, pair in first]
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        return iter(self._pairs[start:])
+
+
+def _warm_up(source: LiveSource, config: ReconConfig, map_path: StrPath | None) -> None:
+    """Do once with the first pairs what comes, and forget it."""
+    if map_path is None:
+        with Map.temporary() as map_:
+            map_sequence(source, config, workspace=Workspace(map_))
+    else:
+        with Map.open(map_path) as map_:
+            localize_sequence(source, Workspace(map_), config)
+
+
+def _check_pose_first(config: ReconConfig) -> None:
+    """Refuse an odometry that needs exact disparities."""
+    if config.odometry.method == "kiss":
+        raise SettingsError(
+            "while images arrive, poses come before the points that kiss-icp needs",
+            where="odometry.method",
+            got="kiss",
+            expected="visual",
+        )

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.identity import identity_of
-from recon.commands.map_options import MapOptions
+from recon.commands.map_options import MapOptions, begin_or_resume, identity_of, with_resume_hint
 from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
-from recon.commands.resume import begin_or_resume, with_resume_hint
 from recon.core.text import counted
 from recon.evaluation.drive_errors import compare_with_truth
 from recon.export.make import make

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig
-from recon.commands.identity import identity_of
-from recon.commands.map_options import MapRequest
-from recon.commands.resume import begin_or_resume
+from recon.commands.map_options import MapRequest, begin_or_resume, identity_of
 from recon.io.atomic import write_text
 from recon.io.files import read_text, reading, resolved
 from recon.map.drive.pieces import Piece

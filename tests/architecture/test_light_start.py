@@ -47,5 +47,5 @@ def test_the_process_that_meshes_loads_nothing_that_it_does_not_use() -> None:
 
 def test_doctor_loads_nothing_whose_lack_it_reports() -> None:
     shell = {"typer", "rich", "typing_extensions"}  # without these there is no command line
-    found = loaded("import recon.cli.doctor, recon.commands.doctor")
+    found = loaded("import recon.cli.getting_started, recon.commands.doctor")
     assert found & set(PACKAGES.values()) <= shell

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import typer
 
 from recon.cli.errors import one_line_errors
+from recon.core.kernels.cache import announce
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.hostile.refusals import Ended, assert_refused, run, run_apart
@@ -237,3 +239,31 @@ def test_a_library_that_is_missing_is_no_interruption() -> None:
     with pytest.raises(typer.Exit) as ended, one_line_errors():
         raise ImportError("nothing of that name")
     assert ended.value.exit_code == 1
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def shown(
+    monkeypatch: pytest.MonkeyPatch, stream: io.StringIO, *, quiet: bool = False
+) -> list[str]:
+    """What standard error gets while a command meets two kernels that are not compiled."""
+    monkeypatch.setattr("sys.stderr", stream)
+    with one_line_errors(quiet=quiet):
+        announce("first")
+        announce("second")
+    return stream.getvalue().splitlines()
+
+
+def test_it_is_one_line_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = shown(monkeypatch, Terminal())
+    assert line.startswith("compiling kernels, once")
+
+
+def test_it_is_no_line_in_a_pipe_or_where_progress_is_not_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert shown(monkeypatch, io.StringIO()) == []
+    assert shown(monkeypatch, Terminal(), quiet=True) == []

@@ -9,8 +9,14 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from recon.cli import app
-from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
-from recon.commands.settings_list import SettingEntry, list_settings, settings_page
+from recon.commands.config import (
+    PAIR_DEFAULTS,
+    ReconConfig,
+    SettingEntry,
+    list_settings,
+    load_config,
+    settings_page,
+)
 from recon.core.settings import setting_names
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 import recon
-from recon.cli.show.tables import print_checks
+from recon.cli.tables import print_checks
 from recon.commands.doctor import check_kernels, examine
 from recon.run import installation
 from recon.run.installation import Check

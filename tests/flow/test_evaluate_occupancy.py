@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.commands.evaluate_occupancy import run_evaluate_occupancy
+from recon.commands.evaluate import run_evaluate_occupancy
 from recon.core.errors import EvaluationError, FormatError
 from recon.io.models.nav2 import read_nav2
 from recon.report.style import GRID_ERRORS, GRID_NOT_COUNTED

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.live import run_live
+from recon.commands.localize import run_live
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError, SourceError

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.evaluate_map import run_evaluate_map
-from recon.commands.evaluate_trajectory import run_evaluate_trajectory
+from recon.commands.evaluate import run_evaluate_map, run_evaluate_trajectory
 from recon.commands.export import run_export
 from recon.commands.localize import run_localize
 from recon.commands.map_options import MapOptions

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import run_settings
-from recon.commands.evaluate_occupancy import run_evaluate_occupancy
+from recon.commands.evaluate import run_evaluate_occupancy
 from recon.commands.occupancy import run_occupancy
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import OCCUPIED

@@ -10,8 +10,7 @@ import pytest
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
-from recon.commands.map_options import MapRequest
-from recon.commands.resume import resumed
+from recon.commands.map_options import MapRequest, resumed
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud, join_clouds, join_voxels

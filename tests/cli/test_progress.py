@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
+from recon.cli.progress import JsonLines, ProgressBar, announce, choose_viewer, warn
 from recon.evaluation.middlebury.bench import SceneDone
 from recon.map.drive.mapper import FrameResult
 from recon.map.localize.localizer import Located, State
@@ -19,6 +19,8 @@ from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult
 from recon.run.progress import SILENT, Progress, Silent, Step
 from recon.sources.datasets import _Megabyte
+from recon.sources.synthetic import SyntheticSource
+from recon.street.settings import StreetSettings
 from tests.run.batch.jobs import job
 
 
@@ -188,3 +190,39 @@ def test_frames_that_are_searched_are_not_called_untrusted() -> None:
     bar.on_finish()
     assert "searching: no place is recognised" in stream.getvalue()
     assert "not trusted" not in stream.getvalue()
+
+
+SOURCE = SyntheticSource(StreetSettings(frames=3, width_px=64, height_px=32, focal_px=36.0))
+
+
+@pytest.mark.parametrize("stream", [Terminal(), io.StringIO()])
+def test_nothing_is_said_where_quiet(stream: io.StringIO) -> None:
+    announce(SOURCE, quiet=True, stream=stream)
+    warn(["too dark"], quiet=True, stream=stream)
+    assert stream.getvalue() == ""
+
+
+def test_a_terminal_gets_text() -> None:
+    stream = Terminal()
+    announce(SOURCE, stream=stream)
+    warn(["too dark", "too late"], stream=stream)
+    first, *rest = stream.getvalue().splitlines()
+    assert first == f"{SOURCE.name}: {SOURCE.description}, 3 pairs"
+    assert rest == ["warning: too dark", "warning: too late"]
+
+
+def test_anything_else_gets_one_json_object_a_line_if_verbose() -> None:
+    stream = io.StringIO()
+    announce(SOURCE, verbose=True, stream=stream)
+    warn(["zu dunkel für alles"], verbose=True, stream=stream)
+    source, warning = (json.loads(line) for line in stream.getvalue().splitlines())
+    assert (source["event"], source["frames"]) == ("source", 3)
+    assert source["description"] == SOURCE.description
+    assert warning == {"event": "warning", "text": "zu dunkel für alles"}
+
+
+def test_anything_else_gets_nothing_unless_verbose() -> None:
+    stream = io.StringIO()
+    announce(SOURCE, stream=stream)
+    warn(["too dark"], stream=stream)
+    assert stream.getvalue() == ""

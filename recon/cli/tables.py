@@ -16,7 +16,7 @@ from rich.text import Text
 from recon.core.text import counted, with_unit
 
 if TYPE_CHECKING:
-    from recon.commands.settings_list import SettingEntry, SettingGroup
+    from recon.commands.config import SettingEntry, SettingGroup
     from recon.run.installation import Check
 
 

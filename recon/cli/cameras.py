@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.show.tables import print_json, print_run
+from recon.cli.errors import one_line_errors
+from recon.cli.tables import print_figures, print_json, print_run
 
 
 @opt.takes_groups
@@ -108,3 +109,96 @@ def calibrate(
         for finding in run.summary["findings"]:
             typer.echo(f"{finding['severity']}: {finding['text']}")
         typer.echo(f"verdict: {run.summary['verdict']}")
+
+
+def board(
+    pattern: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="BOARD",
+            help="chess:9x6:25mm (inner corners, square size) or "
+            "charuco:8x6:30mm:22mm:5x5_100 (squares, square size, marker size, dictionary).",
+        ),
+    ] = None,
+    same: Annotated[
+        str | None, typer.Option("--board", help="The board as an option, as in recon calibrate.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="PDF or PNG file to write.")] = Path(
+        "board.pdf"
+    ),
+    paper: Annotated[
+        str | None,
+        typer.Option(
+            help="a4, a3, a2, a1, a0, letter, legal, tabloid, or a size such as 600x400mm.",
+            show_default="smallest A size that fits",
+        ),
+    ] = None,
+    dpi: Annotated[
+        float,
+        typer.Option(min=30, max=2400, help="Approximate resolution of a PNG, in pixels per inch."),
+    ] = 300.0,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+) -> None:
+    """Draw a calibration board to scale, for printing.
+
+    Print it at 100 % and check the ruler on it before use.
+
+    Examples:
+      recon board chess:9x6:25mm --out board.pdf --paper a4
+      recon board charuco:8x6:30mm:22mm:5x5_100 --out charuco.png
+    """
+    wanted = pattern or same
+    if wanted is None or (pattern and same):
+        raise typer.BadParameter("name one board, such as chess:9x6:25mm")
+    with one_line_errors(quiet=quiet):
+        from recon.core.values.board import parse_board
+        from recon.rig.board_sheet import write_board
+
+        figures = write_board(out, parse_board(wanted), paper, dpi)
+    print_json(figures) if json else print_figures("", figures)
+
+
+@opt.takes_groups
+def rectify(
+    left: Annotated[
+        str, typer.Argument(help='Left image, folder, or pattern in quotes such as "left*.png".')
+    ],
+    right: Annotated[str, typer.Argument(help="Right image, folder or pattern.")],
+    calib: Annotated[
+        Path | None,
+        typer.Option(
+            help="Calibration of the raw cameras. Without one, homographies are estimated from "
+            "image features, and depth has no scale."
+        ),
+    ] = None,
+    unit_m: Annotated[
+        float, typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm.")
+    ] = 1.0,
+    out: opt.Out = None,
+    *,
+    shared: opt.Shared,
+) -> None:
+    """Rectify a pair or two folders of images, with or without a calibration.
+
+    Writes the rectified images, the remaining row error, and pictures with
+    epipolar lines.
+
+    Examples:
+      recon rectify left/ right/ --calib rig.yaml --out rectified
+      recon rectify left.png right.png
+    """
+    with shared.one_line_errors():
+        from recon.commands.config import load_config
+        from recon.commands.rectify import run_rectify
+
+        run = run_rectify(
+            left,
+            right,
+            load_config(shared.config, shared.changes),
+            calibration=calib,
+            metres_per_unit=unit_m,
+            out=out,
+            threads=shared.threads,
+        )
+    shared.show(run.summary)

@@ -1,0 +1,163 @@
+"""`recon export`: products of a finished run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli import options as opt
+from recon.cli.drive_options import open_workers
+
+
+@opt.takes_groups
+def export(
+    run: Annotated[Path, typer.Argument(help="Folder of a run of map, demo or pair.")],
+    to: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What to make: cloud, grid, octomap, mesh, and on request las or laz, the cloud "
+            "for surveying programs; several separated by commas. A pair has cloud and mesh.",
+            show_default="cloud, grid, octomap, mesh",
+        ),
+    ] = None,
+    out: opt.Out = None,
+    formats: opt.Formats = None,
+    resolution: Annotated[
+        float | None,
+        typer.Option(help="Cell size of grid and OctoMap in metres.", show_default="as in the run"),
+    ] = None,
+    georeference: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured positions, in whose coordinates las and laz are written: rows of time, "
+            "easting, northing and height (s, m), on the clock of the images.",
+            show_default="map coordinates",
+        ),
+    ] = None,
+    antenna: opt.Antenna = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(
+            help="Coordinate system of the positions, such as EPSG:25832.",
+            show_default="not stated",
+        ),
+    ] = None,
+    workers: opt.Workers = None,
+    scheduler: opt.Scheduler = None,
+    *,
+    shared: opt.Shared,
+) -> None:
+    """Make the cloud, grid, OctoMap or mesh of a run again, with other settings or formats.
+
+    Nothing is matched again: products are made from the cloud and the rays that
+    the run has kept, in one pass. Settings of occupancy, grid, ground, submaps
+    and mesh can be changed; all others are those of the run.
+
+    Examples:
+      recon export outputs/map/latest --to grid,mesh --format glb --out robot
+      recon export outputs/map/latest --to grid --set grid.max_height_m=3.2
+      recon export outputs/map/latest --to mesh --set mesh.depth=9
+      recon export outputs/site --to laz --georeference gnss.txt --crs EPSG:25832
+      recon export outputs/city --to grid,octomap --workers 4
+    """
+    with shared.one_line_errors():
+        from recon.commands.config import run_settings
+        from recon.commands.export import run_export
+
+        cells = [] if resolution is None else [f"occupancy.resolution_m={resolution}"]
+        summary = run_export(
+            run,
+            run_settings(run, shared.config, [*shared.changes, *cells]),
+            products=[name.strip() for text in to or () for name in text.split(",")],
+            formats=tuple(formats or ("ply",)),
+            out=out,
+            threads=shared.threads,
+            workers=open_workers(workers, scheduler, shared),
+            survey=opt.survey_of(georeference, antenna, crs),
+        )
+    shared.show(summary)
+
+
+@opt.takes_groups
+def mesh(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CLOUD|RUN",
+            help="PLY point cloud (normals and colours are used), or the folder of a run.",
+        ),
+    ],
+    out: opt.Out = None,
+    formats: opt.Formats = None,
+    *,
+    shared: opt.Shared,
+) -> None:
+    """Reconstruct a surface mesh from a PLY point cloud, or from a run of map or pair.
+
+    Screened Poisson reconstruction, trimmed where there are no points. The map
+    of a run is meshed in tiles, and surfaces in space that the cameras saw to
+    be free are removed. The cloud of a pair is meshed as recon pair does.
+
+    Examples:
+      recon mesh cloud.ply --format obj --format glb
+      recon mesh outputs/map/latest --set mesh.target_faces=500000
+    """
+    with shared.one_line_errors():
+        from recon.commands.config import PAIR_DEFAULTS, load_config
+        from recon.commands.mesh import run_mesh
+        from recon.run.finished import is_pair_run
+
+        defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
+        settings = load_config(shared.config, shared.changes, defaults)
+        summary = run_mesh(
+            source, settings, formats=tuple(formats or ("ply",)), out=out, threads=shared.threads
+        )
+    shared.show(summary)
+
+
+@opt.takes_groups
+def occupancy(
+    run: Annotated[Path, typer.Argument(help="Folder of a recon map or recon demo run.")],
+    out: opt.Out = None,
+    resolution: Annotated[
+        float | None, typer.Option(help="Cell size in metres.", show_default="as in the run")
+    ] = None,
+    min_height: Annotated[
+        float | None,
+        typer.Option(help="Lower end of the obstacle height band, in metres above ground."),
+    ] = None,
+    max_height: Annotated[
+        float | None, typer.Option(help="Upper end of the band, in metres.")
+    ] = None,
+    max_range: Annotated[
+        float | None,
+        typer.Option(help="Ignore obstacles farther than this from the camera, in metres."),
+    ] = None,
+    *,
+    shared: opt.Shared,
+) -> None:
+    """Make another Nav2 grid and OctoMap of a run: cell size, height band, range.
+
+    Uses the rays that the run has kept in map/map.recon, so that nothing is
+    matched again.
+
+    Examples:
+      recon occupancy outputs/map/latest --resolution 0.1
+      recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
+    """
+    with shared.one_line_errors():
+        from recon.commands.config import run_settings
+        from recon.commands.occupancy import run_occupancy
+
+        given = {
+            "occupancy.resolution_m": resolution,
+            "grid.min_height_m": min_height,
+            "grid.max_height_m": max_height,
+            "occupancy.max_range_m": max_range,
+        }
+        named = [f"{key}={value}" for key, value in given.items() if value is not None]
+        settings = run_settings(run, shared.config, [*shared.changes, *named])
+        summary = run_occupancy(run, settings, out=out, threads=shared.threads)
+    shared.show(summary)

@@ -1,0 +1,260 @@
+"""Shows the progress of a run: a bar for people, JSON lines for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, TextIO
+
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.progress import (
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.progress_bar import ProgressBar as Bar
+from rich.text import Text
+
+from recon.core.text import counted
+from recon.run.progress import Progress as Shown
+from recon.run.progress import Silent, Step
+from recon.sources.source import StereoSource
+
+# Weight of the newest item in the displayed rate: steady enough to read, yet responsive.
+_RATE_WEIGHT: Final = 0.2
+_SLOW_S: Final = 10.0
+"""From which on an item has seconds, instead of a second items."""
+
+
+def choose_viewer(
+    *, quiet: bool = False, verbose: bool = False, stream: TextIO | None = None
+) -> Shown:
+    """Choose a progress bar on a terminal, elsewhere JSON lines if verbose, else nothing.
+
+    Args:
+        quiet: Whether to show no progress.
+        verbose: Whether to write JSON lines where the stream is no terminal.
+        stream: Output stream; None = standard error, as standard output is for results.
+    """
+    out = sys.stderr if stream is None else stream
+    if quiet or not (out.isatty() or verbose):
+        return Silent()
+    return ProgressBar(Console(file=out)) if out.isatty() else JsonLines(out)
+
+
+class JsonLines:
+    """Writes one JSON object per event and line.
+
+    Args:
+        stream: Output stream; flushed after each line, so that a reader sees it at once.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def on_start(self, name: str, total: int, unit: str = "frames") -> None:
+        """Write the name of the source and its number of items."""
+        self._write({"event": "start", "name": name, unit: total})
+
+    def on_step(self, step: Step) -> None:
+        """Write the figures of an item."""
+        self._write(step.event)
+
+    def on_stage(self, name: str) -> None:
+        """Write the name of the stage that starts."""
+        self._write({"event": "stage", "name": name})
+
+    def on_finish(self) -> None:
+        """Write that all items are done."""
+        self._write({"event": "finish"})
+
+    def _write(self, event: Mapping[str, Any]) -> None:
+        self._stream.write(json.dumps(event, allow_nan=False, ensure_ascii=False) + "\n")
+        self._stream.flush()
+
+
+class ProgressBar:
+    """Shows a bar with the number of items, their rate, and the state of the last one."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._progress: Progress | None = None
+        self._seconds = math.nan
+        self._unit = ""
+        self._bad = 0
+
+    def on_start(self, name: str, total: int, unit: str = "frames") -> None:
+        """Draw an empty bar."""
+        self.on_finish()
+        self._seconds, self._unit, self._bad = math.nan, unit, 0
+        self._progress = Progress(
+            FittingColumn(
+                [MofNCompleteColumn(), TextColumn("{task.fields[bad]}", style="bold red")],
+                [
+                    TextColumn("{task.fields[rate]}"),
+                    TimeRemainingColumn(),
+                    TextColumn("{task.fields[state]}", markup=False),
+                ],
+            ),
+            console=self._console,
+        )
+        self._progress.add_task(name, total=total or None, rate="", state="", bad="")
+        self._progress.start()
+
+    def on_step(self, step: Step) -> None:
+        """Move the bar by one item."""
+        if self._progress is None:
+            return
+        self._bad += not step.ok
+        word = "failed" if self._unit in ("jobs", "pieces") else "not trusted"
+        bad = f"{self._bad} {word}" if self._bad else ""
+        task = self._progress.task_ids[0]
+        self._progress.update(task, advance=1, rate=self._rate(step), state=step.state, bad=bad)
+
+    def on_stage(self, name: str) -> None:
+        """Print the name of the stage that starts."""
+        self._console.print(f"{name} …", style="dim", markup=False, highlight=False)
+
+    def on_finish(self) -> None:
+        """Leave the bar as it is."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def _rate(self, step: Step) -> str:
+        if math.isnan(self._seconds):
+            self._seconds = step.seconds
+        self._seconds += _RATE_WEIGHT * (step.seconds - self._seconds)
+        if self._seconds >= _SLOW_S:
+            return f"{self._seconds:.0f} s each"
+        return f"{1.0 / self._seconds:.1f} {self._unit}/s" if self._seconds > 0 else ""
+
+
+_BAR: Final = range(5, 41)
+"""Cells of a bar; where there is less room there is none."""
+_NAME_SHARE: Final = 0.3
+"""Share of the line that a name gets at least, where it is that long."""
+
+
+class FittingColumn(ProgressColumn):
+    """All that is shown of a task: its name, a bar, and then texts.
+
+    Args:
+        always: Texts that are always shown.
+        if_room: Texts that follow where there is room, the most important one first.
+    """
+
+    def __init__(
+        self, always: Sequence[ProgressColumn], if_room: Sequence[ProgressColumn] = ()
+    ) -> None:
+        super().__init__()
+        self._always = always
+        self._if_room = if_room
+
+    def render(self, task: Task) -> RenderableType:
+        """Return the line of a task."""
+        bar = Bar(
+            total=task.total,
+            completed=task.completed,
+            pulse=not task.started or task.total is None,
+            animation_time=task.get_time(),
+        )
+        always, if_room = (
+            [text for column in columns if (text := _text(column(task)))]
+            for columns in (self._always, self._if_room)
+        )
+        return _Line(Text(task.description), bar, always, if_room)
+
+
+@dataclass
+class _Line:
+    """A line, which is laid out when its width is known."""
+
+    name: Text
+    bar: Bar
+    always: list[Text]
+    if_room: list[Text]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        room = (
+            options.max_width - 1
+        )  # the last cell of a line stays free: some terminals wrap there
+        name = min(self.name.cell_len, int(_NAME_SHARE * room))
+        shown = list(self.always)
+        for text in self.if_room:
+            if name + _width([*shown, text]) > room:
+                break
+            shown.append(text)
+        self.name.truncate(max(name, room - _width(shown)), overflow="ellipsis")
+        yield from self._joined(room, shown)
+
+    def _joined(self, room: int, shown: Sequence[Text]) -> RenderResult:
+        self.bar.width = min(room - self.name.cell_len - _width(shown) - 1, _BAR[-1])
+        # The column would fill up each part to its own width, were it not for the justification.
+        bar = self.bar.width >= _BAR[0]
+        yield Text.assemble(self.name, " " if bar else "", justify="default", end="")
+        if bar:
+            yield self.bar
+        yield Text.assemble(*(part for text in shown for part in (" ", text)), justify="default")
+
+
+def _text(shown: RenderableType) -> Text:
+    """Return what a column shows, which is text."""
+    return shown if isinstance(shown, Text) else Text(str(shown))
+
+
+def _width(texts: Sequence[Text]) -> int:
+    """Return the cells of texts, each with a space before it."""
+    return sum(1 + text.cell_len for text in texts)
+
+
+def announce(
+    source: StereoSource,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    stream: TextIO | None = None,
+) -> None:
+    """Write one line: text on a terminal, else a JSON object if verbose.
+
+    Args:
+        source: The source.
+        quiet: Whether to write nothing.
+        verbose: Whether to write JSON where the stream is no terminal.
+        stream: Output stream; None = standard error, as standard output is for results.
+    """
+    event = {
+        "event": "source",
+        "name": source.name,
+        "description": source.description,
+        "frames": len(source),
+    }
+    if not quiet:
+        many = f", {counted(len(source), 'pair')}" if len(source) else ""
+        _write(f"{source.name}: {source.description}{many}", event, verbose, stream)
+
+
+def warn(
+    lines: Iterable[str],
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    stream: TextIO | None = None,
+) -> None:
+    """Write warnings before the run starts, each in the form of `announce`."""
+    for line in lines:
+        if not quiet:
+            _write(f"warning: {line}", {"event": "warning", "text": line}, verbose, stream)
+
+
+def _write(text: str, event: dict[str, object], verbose: bool, stream: TextIO | None) -> None:
+    out = sys.stderr if stream is None else stream
+    if out.isatty() or verbose:
+        out.write((text if out.isatty() else json.dumps(event, ensure_ascii=False)) + "\n")
+        out.flush()

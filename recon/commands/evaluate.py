@@ -1,0 +1,314 @@
+"""`recon evaluate trajectory`: compare two trajectory files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from recon.commands.config import ReconConfig, run_settings
+from recon.commands.demo import demo_source
+from recon.core.errors import EvaluationError, SettingsError
+from recon.core.text import counted
+from recon.core.values import (
+    Disparity,
+    DisparityTruth,
+    OccupancyGrid,
+    OccupancyMetrics,
+    OccupancyTruth,
+    Reason,
+    Trajectory,
+)
+from recon.core.values.arrays import Float32
+from recon.evaluation.disparity import evaluate_disparity
+from recon.evaluation.doubts import doubts_of, doubts_of_file
+from recon.evaluation.drive_errors import LEAST_FRAMES, known_occupancy
+from recon.evaluation.map import evaluate_map
+from recon.evaluation.map_comparison import (
+    MapComparison,
+    ReferenceFrame,
+    add_within_reach,
+    doubt_axes,
+    place_by_icp,
+    place_cloud,
+    possible_frames,
+    read_mapped_cloud,
+)
+from recon.evaluation.middlebury.score import curve_figures, dense_map, named_figures
+from recon.evaluation.occupancy import evaluate_occupancy
+from recon.evaluation.segments import TOLERANCE_S, associate, interpolation_warnings
+from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
+from recon.io.atomic import check_targets
+from recon.io.files import naming
+from recon.io.images.disparity import read_disparity, read_pfm
+from recon.io.images.image import read_grey_levels, write_image
+from recon.io.models.nav2 import read_nav2
+from recon.io.models.octomap import read_octomap
+from recon.io.models.ply import read_ply
+from recon.io.trajectory import holds_times, read_trajectory, write_tum
+from recon.report.map_page import write_map_errors
+from recon.report.style import colour_grid_errors
+from recon.report.trajectory_page import write_trajectory_page
+from recon.run.directory import recorded_files
+from recon.run.finished import CLOUD, GRID, OCTOMAP, FinishedRun, open_run
+from recon.run.run import Run
+from recon.run.summary import plain
+from recon.sources.source import KnowsOccupancy
+from recon.sources.times import read_times
+
+
+def run_evaluate_trajectory(
+    estimate: Path,
+    truth: Path,
+    rules: TrajectoryRules,
+    *,
+    times: Path | None = None,
+    tolerance_s: float = TOLERANCE_S,
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Compare two trajectory files: what `recon evaluate trajectory` does.
+
+    Poses are associated by time if both files have timestamps, else in order; the paths are
+    aligned as the rules say. With a folder, the aligned paths and a report go there.
+
+    Args:
+        estimate: KITTI or TUM file.
+        truth: Ground truth, KITTI or TUM file.
+        rules: How the two are aligned and compared.
+        times: Timestamps of the poses of a KITTI file in seconds, one per line; None = unknown.
+        tolerance_s: Largest time difference of two associated poses.
+        out: Result folder; None = nothing is written.
+    """
+    ours, true, by_time = _read_paths(estimate, truth, times)
+    poses = {"estimate_poses": len(ours), "true_poses": len(true)}
+    if by_time:
+        ours, true = associate(ours, true, tolerance_s)
+    comparison = compare_paths(ours, true, rules)
+    summary = {
+        **plain(comparison.metrics),
+        "T_truth_estimate": comparison.motion.T_to_from.tolist(),
+        "rotation_deg": float(np.degrees(np.sqrt((comparison.rotation_errors_rad**2).mean()))),
+        "roll": "fixed" if comparison.roll_axis is None else "not observable on a straight path",
+        "associated": "by time" if by_time else "in order",
+        **poses,
+        "warnings": [
+            *doubts_of_file(estimate),
+            *_warnings(len(true), min(poses.values())),
+            *interpolation_warnings(comparison.truth, comparison.segments),
+        ],
+    }
+    if out is not None:
+        with Run("evaluate trajectory", out) as run:
+            write_tum(run.path("estimate_aligned_tum.txt"), comparison.estimate)
+            write_tum(run.path("truth_tum.txt"), comparison.truth)
+            with run.report(summary):
+                write_trajectory_page(TrajectoryRun(estimate, truth, comparison, summary), run)
+            inputs = [path for path in (estimate, truth, times) if path is not None]
+            run.finish(summary, source=str(estimate), inputs=inputs)
+    return summary
+
+
+def _read_paths(
+    estimate: Path, truth: Path, times: Path | None
+) -> tuple[Trajectory, Trajectory, bool]:
+    """Estimate and truth, and whether the times of both are known."""
+    stamped = [holds_times(path) for path in (estimate, truth)]
+    paths = [read_trajectory(path) for path in (estimate, truth)]
+    if times is not None:
+        for n, path in enumerate(paths):
+            if not stamped[n]:
+                paths[n] = Trajectory(path.T_world_camera, read_times(times, len(path)))
+        stamped = [True, True]
+    return paths[0], paths[1], all(stamped)
+
+
+def _warnings(compared: int, fewer: int) -> list[str]:
+    if 2 * compared >= fewer:
+        return []
+    return [f"a partner in time for only {compared} of {counted(fewer, 'pose')}; see --tolerance"]
+
+
+def run_evaluate_map(
+    run: Path,
+    reference: Path,
+    *,
+    frame: ReferenceFrame | None = None,
+    align_to: Path | None = None,
+    icp: bool = False,
+    thresholds_m: Sequence[float] = (0.2,),
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Compare a map with a reference cloud: what `recon evaluate map` does.
+
+    The map is brought into the axes of the reference, and aligned if that is asked for. Precision,
+    recall and F-score are those of each threshold; with the path of a run also those of the points
+    that the reference could have seen. With a folder, both clouds are coloured by their errors.
+
+    Args:
+        run: A run's folder, or a PLY file. A PLY inside a run's folder is in that run's map axes;
+            any other PLY is taken to be in the axes of the reference already.
+        reference: A PLY file.
+        frame: Axes of the reference: those of the first left camera, or the map's; None = those in
+            which ICP finds more, without it the camera's.
+        align_to: Ground-truth poses of the run's cameras, in the axes of the reference; the run's
+            path is aligned rigidly to them, and its map moves with it.
+        icp: Whether the cloud is then aligned to the reference by ICP.
+        thresholds_m: Distances below which a point counts as correct.
+        out: Result folder; None = nothing is written.
+
+    Returns:
+        The figures of the first threshold, those of each in ``by_threshold``, and how far the
+        alignment moved the cloud.
+    """
+    if not thresholds_m:
+        raise SettingsError("there is no threshold", where="--threshold")
+    mapped, truth = read_mapped_cloud(run), read_ply(reference)
+    with naming(f"{run}, {reference}"):
+        if icp:
+            reach_m, frames = max(thresholds_m), possible_frames(mapped, frame, align_to)
+            placed, moved, frame = place_by_icp(mapped, truth, frames, align_to, reach_m)
+        else:
+            frame = frame or "camera"
+            placed, moved = place_cloud(mapped, frame, align_to)
+        truth = replace(truth, frame=placed.cloud.frame)
+        by_threshold = [plain(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
+    beyond = add_within_reach(placed, truth, by_threshold)
+    aligned = icp or align_to is not None
+    doubts = doubt_axes(placed, truth, by_threshold[0], frame, aligned=aligned)
+    summary = {
+        **by_threshold[0],
+        **moved,
+        **beyond,
+        "by_threshold": by_threshold,
+        "warnings": [*placed.doubts, *doubts],
+    }
+    if out is not None:
+        cloud = run / CLOUD if run.is_dir() else run
+        inputs = [path for path in (cloud, reference, align_to) if path is not None]
+        result = MapComparison(placed.cloud, truth, tuple(thresholds_m), summary)
+        with Run("evaluate map", out) as written:
+            with written.report(summary):
+                write_map_errors(result, written)
+            written.finish(summary, source=str(run), inputs=inputs)
+    return summary
+
+
+_COUNTED: Final = 255
+
+
+def run_evaluate_disparity(
+    estimate: Path,
+    truth: Path,
+    mask: Path | None = None,
+    *,
+    scale: float = 1.0,
+    confidence: Path | None = None,
+) -> dict[str, Any]:
+    """Compare one disparity map file (PFM or 16-bit PNG) with another: `recon evaluate disparity`.
+
+    Args:
+        estimate: The map; holes are filled for the dense figures, KITTI's ``d1`` among them.
+        truth: Ground truth of the same size.
+        mask: An image that is 255 where pixels are compared; None = all with ground truth.
+        scale: Pixels of the size that figures are given in per pixel here.
+        confidence: PFM of the map's confidence, in [0, 1]; a pixel is correct if its error is at
+            most one pixel of the map.
+    """
+    values, true = read_disparity(estimate), read_disparity(truth)
+    counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == _COUNTED
+    if counted.shape != true.shape:
+        raise EvaluationError(
+            "mask and truth differ in size", where=mask, got=counted.shape, expected=true.shape
+        )
+    known = DisparityTruth(true, counted)
+    found = evaluate_disparity(values, known, scale=scale)
+    figures: dict[str, Any] = {"pixels": found.pixels, "invalid": found.invalid}
+    for name, metrics in (
+        ("sparse", found),
+        ("dense", evaluate_disparity(dense_map(values), known, scale=scale)),
+    ):
+        figures[name] = {**named_figures(metrics), "d1": metrics.d1}
+    if confidence is not None:
+        compared = np.where(counted, true, np.float32(np.nan))
+        rated = _rated(values, confidence)
+        figures["confidence"] = curve_figures(
+            rated, DisparityTruth(compared, np.isfinite(compared)), limit_px=1.0
+        )
+    return dict(plain(figures))
+
+
+def _rated(values: Float32, path: Path) -> Disparity:
+    """Return a disparity map with the confidence read from a file."""
+    confidence = read_pfm(path)
+    if confidence.shape != values.shape:
+        raise EvaluationError(
+            "confidence and map differ in size",
+            where=path,
+            got=confidence.shape,
+            expected=values.shape,
+        )
+    known = np.isfinite(values)
+    if not ((confidence[known] >= 0) & (confidence[known] <= 1)).all():
+        raise EvaluationError("confidence is not between 0 and 1", where=path)
+    return Disparity(
+        values=values,
+        confidence=np.where(known, confidence, np.float32(0)),
+        sigma_px=np.full(values.shape, np.nan, np.float32),
+        reason=np.where(known, np.uint8(Reason.VALID), np.uint8(Reason.AMBIGUOUS)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyComparison:
+    """The occupancy of a run and its ground truth.
+
+    Attributes:
+        metrics: The figures.
+        grid: The 2-D grid of the run.
+        truth: Ground truth, in the cells of the run.
+        doubts: What is not to be trusted in the map of the run.
+    """
+
+    metrics: OccupancyMetrics
+    grid: OccupancyGrid
+    truth: OccupancyTruth
+    doubts: list[str]
+
+
+def run_evaluate_occupancy(
+    folder: Path, least_frames: int = LEAST_FRAMES, *, image: Path | None = None
+) -> OccupancyComparison:
+    """Compare ``map/octomap.ot`` and ``map/grid.*`` of a run: `recon evaluate occupancy`.
+
+    The street is rendered again, and what its cameras can have known of each cell is the truth.
+
+    Args:
+        folder: A run of a rendered street: of ``recon demo``, or of ``recon occupancy`` on one.
+        least_frames: Number of frames that must have seen a cell for it to be compared.
+        image: PNG for the grid with its errors in colour; None = none is drawn.
+    """
+    if image is not None:
+        check_targets([image], (folder / name for name in recorded_files(folder)))
+    run, config = open_run(folder), run_settings(folder)
+    source = _source_that_knows(run, config)
+    voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
+    truth = known_occupancy(source, config, run.T_map_world, least_frames)
+    if image is not None:
+        write_image(image, colour_grid_errors(grid, truth))
+    metrics = evaluate_occupancy(voxels, grid, truth)
+    return OccupancyComparison(metrics, grid, truth, doubts_of(run))
+
+
+def _source_that_knows(run: FinishedRun, config: ReconConfig) -> KnowsOccupancy:
+    if run.mapped_by != "demo":
+        raise EvaluationError(
+            "the true occupancy of this run is not known",
+            where=run.folder,
+            got=f"a run of recon {run.mapped_by}",
+            expected="a run of recon demo, whose street can be rendered again",
+            hint="recon evaluate map compares a run with a reference cloud",
+        )
+    return demo_source(config)
