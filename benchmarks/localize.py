@@ -35,7 +35,7 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import localize_sequence
 from recon.map.localize.surroundings import Surroundings
-from recon.map.store.map_views import MapViews
+from recon.map.store.map_file import MapViews
 from recon.map.verbs import Map
 from recon.odometry.kiss import select_points
 from recon.odometry.protocol import OdometryFrame

@@ -18,8 +18,7 @@ from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
-from recon.map.localize.localize_run import LocalizeRun
-from recon.map.localize.sequence import StartPose, localize_sequence
+from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
 from recon.report.localize_page import write_localize_page

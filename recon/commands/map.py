@@ -16,7 +16,7 @@ from recon.export.trajectories import export_paths
 from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.sequence import MappedSequence, check_map, map_sequence
 from recon.map.drive.workspace import Workspace
-from recon.map.store.keep_map import keep_map
+from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
 from recon.odometry.health import health_warnings

@@ -16,7 +16,7 @@ from recon.io.files import resolved
 from recon.map.drive.sequence import check_map
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.measured import Survey
-from recon.map.store.keep_map import keep_map
+from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
 from recon.run.finished import open_run, refuse_as_target

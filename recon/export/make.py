@@ -14,7 +14,7 @@ from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import Made, Order, Product
 from recon.export.survey import survey_product
 from recon.map.sessions.placed import has_occupancy
-from recon.map.store.cast_submaps import check_rays
+from recon.map.store.finished import check_rays
 
 PRODUCTS: Final[Mapping[str, Product]] = {
     "cloud": Product(cloud_product),

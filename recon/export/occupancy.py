@@ -19,20 +19,19 @@ from recon.core.values.grid import log_odds
 from recon.export.product import Made, Order
 from recon.io.models.nav2 import write_nav2
 from recon.io.models.octomap import write_octomap_tiles
+from recon.map.cut import Rectangle, TileKey
 from recon.map.ground.axes import base_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
-from recon.map.ground.floor import add_floors
 from recon.map.ground.grid import drop_undecided, flatten, ground_depths
 from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,
+    add_floors,
     estimate_ground_surface,
     measure_camera_height,
 )
 from recon.map.occupancy.builder import MIN_PROBABILITY
 from recon.map.occupancy.part import OccupancyPart, free_part
-from recon.map.rectangle import Rectangle
-from recon.map.store.tile_parts import TileKey
 from recon.map.tiles import Tiles
 
 _MOST_CELLS: Final = 1_000_000_000

@@ -4,7 +4,8 @@
 - `submaps.py`: consecutive frames with their part of the cloud and of the occupancy;
 - `fusion/builder.py`, `occupancy/builder.py`: how frames become those parts;
 - `store/map_file.py`: the file that keeps them; `store/session.py`: what one drive puts into it;
-- `tiles.py`: the map in squares, from which all products are made: submaps are cut (`cut.py`), and
-  what a later drive saw counts more (`drive_chain.py`); `ground/grid.py`: the flat map;
-- `sessions/joining.py`: several drives in one map; `localize/localizer.py`: a drive found in a map.
+- `tiles.py`: the map in squares, from which all products are made; `cut.py`: submaps are cut into
+  them; `ground/grid.py`: the flat map;
+- `sessions/joining.py`: several drives in one map; `localize/localizer.py`: a drive found in a map;
+- `verbs.py`: `recon.Map`, the file with all that can be done with it.
 """

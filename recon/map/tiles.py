@@ -1,15 +1,17 @@
-"""The map of a drive in square tiles, from which everything that leaves the map is made.
+"""The map in square tiles, from which everything that leaves it is made.
 
-Each submap is read, moved to where the drive has put it, and cut at the borders of the tiles, once.
-A tile is fused and filtered when something first asks for it, and then kept: all products of the
-map take the same tiles, with a few of them in memory at a time.
+Each submap is moved to its corrected place and cut at the borders of the tiles, once. A tile is
+fused and filtered when it is first asked for, and then kept for all products.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import groupby
+from functools import reduce
+from heapq import merge
+from itertools import groupby, product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,18 +20,18 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from recon.core.geometry.se3 import apply, transform_cloud
+from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Bool, Float32, Float64
-from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter
-from recon.map.drive_chain import DriveChain
+from recon.core.values.grid import log_odds
+from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, TileParts
 from recon.map.fusion.part import KNOWABLE, FusedPart, join_fused
-from recon.map.ground.floor import find_floors
-from recon.map.occupancy.looks import Looks
-from recon.map.occupancy.moving import find_moved
-from recon.map.occupancy.part import OccupancyPart
-from recon.map.rectangle import Rectangle
+from recon.map.ground.surface import find_floors
+from recon.map.kernels.raycast import BLOCK_BITS
+from recon.map.occupancy.bodies import Looks
+from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
+from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
-from recon.map.store.tile_parts import TileKey, TileParts
 from recon.map.submaps import Submap
 from recon.stereo.cloud.filters import filter_cloud
 
@@ -41,12 +43,7 @@ _REMOVED: Final = "removed"
 
 @dataclass(frozen=True)
 class Tile:
-    """A square of the map, seen from above; its content is made when it is first asked for.
-
-    Attributes:
-        key: Its column and row.
-        tiles: The map.
-    """
+    """A square of the map, seen from above; its content is made when it is first asked for."""
 
     key: TileKey
     tiles: Tiles
@@ -68,15 +65,7 @@ class Tile:
 
 
 class Tiles:
-    """A map cut into tiles; iterating gives them along the drive.
-
-    `of_submaps` cuts a drive; `put_cloud` and `put_voxels` add what is fused already.
-
-    Args:
-        config: The configuration.
-        T_map_world: float64 (4, 4), from world to map axes.
-        halvings: How often the tiles of the configuration are halved.
-        path: File for what is in them; None = a temporary one.
+    """A map cut into tiles, made by `of_submaps`; iterating gives them along the drive.
 
     Attributes:
         config: The configuration.
@@ -120,10 +109,9 @@ class Tiles:
             submaps: The submaps, in order; read again where tiles are halved.
             config: The configuration.
             T_map_world: float64 (4, 4), from world to map axes.
-            T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = none is
-                corrected.
-            drives: Number of submaps of each drive, in the order of the drives: what a later one
-                saw counts more. Empty = all are of one.
+            T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = none.
+            drives: Number of submaps of each drive, in order: what a later drive saw counts more.
+                Empty = all are of one.
         """
         halvings, tiles = 0, cls(config, T_map_world)
         while not tiles._take(tiles._cutter.cut(submaps, tiles._parts, T_corrected_world), drives):
@@ -142,15 +130,9 @@ class Tiles:
         drives: Sequence[int] = (),
         path: Path | None = None,
     ) -> Tiles | None:
-        """Return the tiles of submaps that others have cut; None = the tiles are too large.
+        """Return the tiles of submaps that others cut, from their files in order; None = too large.
 
-        Args:
-            files: Parts of the submaps, in their order; a damaged one is a `FormatError`.
-            config: As for `of_submaps`, like all that is not listed here.
-            T_map_world: As before.
-            halvings: How often the tiles were halved.
-            drives: Number of submaps of each drive.
-            path: File for what is made of them.
+        The tiles were halved ``halvings`` times; what is made of them goes to ``path``.
         """
         tiles = cls(config, T_map_world, halvings, path)
         cut = Cut.joined([tiles._parts.adopt(file) for file in files])
@@ -162,11 +144,7 @@ class Tiles:
         return self._looks is not None
 
     def with_looks(self, looks: Looks | None) -> Self:
-        """Return the tiles, whose clouds leave out what frames show to have moved.
-
-        Args:
-            looks: What single frames saw; None = it is not known, and nothing is left out.
-        """
+        """Leave out of clouds what ``looks`` show to have moved; None = nothing."""
         self._looks = looks
         return self
 
@@ -224,9 +202,7 @@ class Tiles:
     ) -> OccupancyVoxels:
         """Return the observed voxels of a tile and of the margin that its grid cells depend on.
 
-        Args:
-            key: The tile.
-            after: What else was observed at the end of submaps, by their numbers.
+        ``after`` is what else was observed at the end of submaps, by their numbers.
         """
         if self._parts.numbers(OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
             joined = self._chain.joined(key, note=self.config.fusion.remove_moving)
@@ -275,7 +251,7 @@ class Tiles:
             self._parts.adopt(file)
 
     def _take(self, cut: Cut, drives: Sequence[int]) -> bool:
-        """Note what is known of all submaps, and of which drives they are; False = too large."""
+        """Take over what is known of all submaps; False = a tile is too large."""
         self.extent, self.submap_of_frame = cut.extent, cut.submap_of_frame(drives)
         self._chain.drive_of = np.repeat(np.arange(len(drives)), np.array(drives, np.int64))
         # Attributes missing in one submap are dropped, so that all tiles have the same fields.
@@ -301,7 +277,7 @@ class Tiles:
 
     @property
     def _least_frames(self) -> int:
-        """Return how many frames must see a point; a drive of fewer must still give a map."""
+        """How many frames must see a point; a drive of fewer must still give a map."""
         return min(self.config.fusion.min_count, len(self.submap_of_frame))
 
     def _placed(self, key: TileKey, cloud: PointCloud) -> PointCloud:
@@ -322,11 +298,101 @@ class Tiles:
 
 
 def _cloud_tree(cloud: PointCloud) -> dict[str, Any]:
-    """Return the arrays of a cloud by their names."""
     arrays = {f.name: getattr(cloud, f.name) for f in fields(cloud) if f.name != "frame"}
     return {name: array for name, array in arrays.items() if array is not None}
 
 
 def _voxel_tree(voxels: OccupancyVoxels) -> dict[str, Any]:
-    """Return the arrays of voxels by their names."""
     return {"keys": voxels.keys, "log_odds": voxels.log_odds}
+
+
+_EVIDENCE: Final = "evidence"
+_OLD: Final = log_odds(0.85)
+"""Most log-odds that earlier drives keep: five rays of a later one free what was occupied."""
+
+
+class DriveChain:
+    """Chains what submaps observed in a tile, drive by drive: a later drive counts more.
+
+    ``drive_of``, int64 (S,), is the drive of each submap; empty = all are of one.
+    """
+
+    def __init__(self, parts: TileParts) -> None:
+        self._parts = parts
+        self.drive_of: NDArray[np.int64] = np.zeros(0, np.int64)
+
+    def drive(self, numbered: tuple[int, Any]) -> int:
+        """Return the drive of what is numbered by submap."""
+        return int(self.drive_of[numbered[0]]) if len(self.drive_of) else 0
+
+    def joined(self, key: TileKey, *, note: bool) -> OccupancyPart:
+        """Join what all drives observed in a tile; ``note`` what each saw, for `evidence`."""
+        drives = self._drives(key)
+        return _outdone(self._noted(key, drives) if note else (part for _, part in drives))
+
+    def evidence(self, key: TileKey, drive: int) -> CellEvidence:
+        """Return the `cell_evidence` of a drive, noted when the tile was joined."""
+        for number, tree in self._parts.read(_EVIDENCE, key):
+            if number == drive:
+                return tree["cells"], tree["log_odds"]
+        return np.zeros(0, np.int64), np.zeros(0, np.float32)
+
+    def changed(
+        self, key: TileKey, seen: OccupancyVoxels, after: Mapping[int, OccupancyPart]
+    ) -> OccupancyVoxels:
+        """Make the voxels of a tile again where ``after`` the end of submaps more was observed."""
+        blocks = distinct_keys(np.concatenate([part.rows.blocks for part in after.values()]))
+        # Whether a surface crosses a voxel depends on what hit those that touch it.
+        changed, needed = _grown(blocks, 1), _grown(blocks, 2)
+        joined = _outdone(part for _, part in self._drives(key, after, needed))
+        anew = joined.voxels(seen.resolution_m)
+        return join_voxels(
+            [
+                seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed)),
+                anew.select(are_among(pack_keys(anew.keys >> BLOCK_BITS), changed)),
+            ],
+            seen.resolution_m,
+        )
+
+    def _noted(
+        self, key: TileKey, drives: Iterable[tuple[int, OccupancyPart]]
+    ) -> Iterator[OccupancyPart]:
+        """Return the parts of drives, with a note of what each saw."""
+        for drive, part in drives:
+            cells, seen = cell_evidence(part)
+            self._parts.put(_EVIDENCE, key, {"cells": cells, "log_odds": seen}, drive)
+            yield part
+
+    def _drives(
+        self,
+        key: TileKey,
+        after: Mapping[int, OccupancyPart] | None = None,
+        blocks: NDArray[np.int64] | None = None,
+    ) -> Iterator[tuple[int, OccupancyPart]]:
+        """Return what each drive observed in a tile, in their order.
+
+        ``after`` is what else was observed at the end of submaps, by their numbers; only packed
+        ``blocks`` are looked at, None = all.
+        """
+        own = ((n, OccupancyPart.from_tree(tree)) for n, tree in self._parts.read(OCCUPANCY, key))
+        # Of one number, that of the submap comes first.
+        numbered = merge(own, sorted((after or {}).items()), key=itemgetter(0))
+        for drive, parts in groupby(numbered, key=self.drive):
+            # Joined one by one, so that a place passed often takes no more memory than others.
+            yield drive, join_occupancy(_in_blocks(part, blocks) for _, part in parts)
+
+
+def _in_blocks(part: OccupancyPart, blocks: NDArray[np.int64] | None) -> OccupancyPart:
+    return part if blocks is None else part.select(are_among(part.rows.blocks, blocks))
+
+
+def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:
+    """Chain what drives observed; little of the older counts for a later one."""
+    return reduce(lambda old, new: join_occupancy([old, new.outdoing(_OLD)]), drives)
+
+
+def _grown(blocks: NDArray[np.int64], by: int) -> NDArray[np.int64]:
+    """Return packed blocks with those up to ``by`` blocks away from one on each axis."""
+    steps = np.array(list(product(range(-by, by + 1), repeat=3)))
+    around = unpack_keys(blocks)[:, None] + steps
+    return distinct_keys(pack_keys(around.reshape(-1, 3)))

@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.localizer import State
-from recon.map.localize.sequence import LocalizedDrive
+from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
 from recon.report.drive_figures import grid_figure, path_figure, seen_from_above
 from recon.report.page import write_page
 from recon.report.style import BAD, FAINT, TRUTH, WIDE_IN, styled, to_png

@@ -21,9 +21,8 @@ from recon.export.product import Order
 from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.map.ground.floor import add_floors, find_floors
 from recon.map.ground.grid import drop_undecided, flatten
-from recon.map.ground.surface import estimate_ground_surface
+from recon.map.ground.surface import add_floors, estimate_ground_surface, find_floors
 from recon.run.run import Run
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene

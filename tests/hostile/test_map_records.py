@@ -14,12 +14,10 @@ from recon.core.kernels.voxels import pack_keys
 from recon.core.values import RayCloud, RectifiedCamera
 from recon.map.fusion.part import FusedPart, join_fused
 from recon.map.kernels.clamped import CellRows
-from recon.map.occupancy.builder import OccupancySettings
-from recon.map.occupancy.part import OccupancyPart, join_occupancy
-from recon.map.occupancy.rays import ray_grain
-from recon.map.occupancy.surface_points import SurfacePoints
-from recon.map.store.links import Link
-from recon.map.store.map_views import MapViews
+from recon.map.occupancy.builder import OccupancySettings, ray_grain
+from recon.map.occupancy.part import OccupancyPart, SurfacePoints, join_occupancy
+from recon.map.store.map_file import MapViews
+from recon.map.store.record_values import Link
 from recon.map.store.records import Key, Store
 from recon.map.store.session import ALONE, BENT, SessionInfo
 from recon.map.submaps import Submap

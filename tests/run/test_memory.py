@@ -16,7 +16,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud, join_clouds, join_voxels
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.store.records import Store
-from recon.map.store.submaps import Submaps
+from recon.map.store.session import Submaps
 from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles
 from recon.run import memory

@@ -23,8 +23,8 @@ from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.product import Made, Order
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
-from recon.map.occupancy.free_space import looked_through
-from recon.map.rectangle import Rectangle
+from recon.map.cut import Rectangle
+from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory

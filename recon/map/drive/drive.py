@@ -13,7 +13,7 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.map_behind import Registered, poses_first
 from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.drive.workspace import Workspace, resuming
-from recon.map.occupancy.rays import thin_rays
+from recon.map.occupancy.builder import thin_rays
 from recon.map.settings import DriveSettings
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.lookahead import look_ahead

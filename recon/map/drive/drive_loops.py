@@ -13,7 +13,7 @@ import numpy as np
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.map.store.keyframes import Keyframes
+from recon.map.store.session import Keyframes
 from recon.places.closure import Closure, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.places import path_lengths

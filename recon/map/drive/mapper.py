@@ -16,7 +16,7 @@ from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
 from recon.map.fusion.builder import fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
-from recon.map.occupancy.rays import ray_grain, thin_rays
+from recon.map.occupancy.builder import ray_grain, thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import SubmapBuilder

@@ -22,7 +22,7 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
-from recon.map.store.rays import RAYS
+from recon.map.store.record_values import RAYS
 from recon.map.store.records import Key
 from recon.map.store.session import Session
 from recon.map.submaps import Submap

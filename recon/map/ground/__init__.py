@@ -1,6 +1,6 @@
 """The ground below the path, and the flat grid above it.
 
 - `axes.py`: map axes, from the ground plane in the first frame;
-- `surface.py`: the ground along the drive; `floor.py`: farther away; `driven.py`: under the wheels;
+- `surface.py`: the ground along the drive, and farther away; `driven.py`: under the wheels;
 - `grid.py`: voxels flattened to the grid that robots plan on.
 """

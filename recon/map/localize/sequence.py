@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.text import counted
-from recon.core.values import StereoPair, Trajectory
+from recon.core.values import OccupancyGrid, StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
-from recon.map.store.map_file import MapFile
-from recon.map.store.map_views import known_places
+from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
 from recon.run.lookahead import look_ahead
 from recon.run.progress import SILENT, Progress
@@ -260,3 +259,22 @@ def _turned_back(yaw_deg: float) -> Float64:
     """Return float64 (2, 2), that turns rows (x, y) back by a heading."""
     c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     return np.array([[c, -s], [s, c]])
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizeRun:
+    """Results of a run.
+
+    Attributes:
+        name: Display name of the source.
+        map_name: Display name of the map.
+        drive: Where its frames are in the map.
+        grid: The grid of the map; None = the run of the map has none.
+        summary: The figures of ``summary.json``.
+    """
+
+    name: str
+    map_name: str
+    drive: LocalizedDrive
+    grid: OccupancyGrid | None
+    summary: dict[str, Any] = field(default_factory=dict)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
@@ -12,7 +13,6 @@ from recon.core.geometry.se3 import adjoint, apply, as_step, as_transform, inver
 from recon.core.values.arrays import Float64
 from recon.io.files import reading
 from recon.map.localize.belief import MAX_SIGMA_DEG, MAX_SIGMA_M, Belief
-from recon.map.localize.gate import Correction, icp_covariance, is_worthwhile
 from recon.map.localize.surfaces import (
     Fit,
     Surfaces,
@@ -23,7 +23,9 @@ from recon.map.localize.surfaces import (
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
+from recon.odometry.prior import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame
+from recon.odometry.window import covariance_of, distance_in_sigmas, step_covariance
 from recon.places.places import SIGMAS
 
 _VOXEL_M: Final = 0.3
@@ -180,3 +182,78 @@ def _fit(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> Fi
     fit = fit_surfaces(apply(T_world_camera, xyz_camera), surfaces)
     turn = adjoint(T_world_camera)
     return replace(fit, information=turn.T @ fit.information @ turn)
+
+
+_MIN_OVERLAP: Final = 0.5
+"""Least share of points that lie in a cell of the map."""
+
+_MIN_RESIDUAL_GAIN: Final = 0.02
+"""Least relative decrease of the median residual."""
+
+_MIN_SHARE: Final = 0.1
+"""Least Kalman gain, in the direction in which it is largest: with less, ICP knows no more than the
+prior."""
+
+_ICP_INDEPENDENCE: Final = 0.05
+"""Share of the points whose errors count as independent."""
+
+_MIN_CONTRAST: Final = 2.0 * math.log(1000.0)
+"""Chi-square by which any pose that is wrong must fit worse: it is a thousand times less likely."""
+
+_ICP_FLOOR_M: Final = 0.02
+"""Standard deviation of ICP's translation that more points do not improve."""
+
+_ICP_FLOOR_DEG: Final = 0.05
+"""That of its rotation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """How ICP would move the prior, and how the frame fits the map with and without it.
+
+    Attributes:
+        step: float64 (6,), translation in metres and rotation vector in radians, in camera axes
+            of the prior; without the bias that all corrections share.
+        before: The frame against the map, at the prior.
+        after: The same at ICP's pose.
+        contrast: By how much the poses around ICP's fit worse, see `contrast`.
+    """
+
+    step: Float64
+    before: Fit
+    after: Fit
+    contrast: float
+
+
+def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
+    """Return whether ICP improves on its prior.
+
+    Args:
+        correction: How ICP would move the prior.
+        prior_covariance: float64 (6, 6) of a step of the prior, metres and radians.
+    """
+    before, after, step = correction.before, correction.after, correction.step
+    # A residual that is not known compares as False.
+    if not after.residual_m <= (1.0 - _MIN_RESIDUAL_GAIN) * before.residual_m:
+        return False
+    if _ICP_INDEPENDENCE * correction.contrast < _MIN_CONTRAST:
+        return False
+    both = prior_covariance + icp_covariance(after)
+    likely = distance_in_sigmas(step, both) <= MAX_SIGMAS
+    return after.overlap >= _MIN_OVERLAP and likely and _gain(prior_covariance, both) >= _MIN_SHARE
+
+
+def icp_covariance(fit: Fit) -> Float64:
+    """Return the covariance (6, 6) of ICP: from the surfaces that fix it, at least their bias."""
+    floor = step_covariance(_ICP_FLOOR_M, _ICP_FLOOR_DEG)
+    return covariance_of(_ICP_INDEPENDENCE * fit.information) + floor
+
+
+def _gain(prior: Float64, both: Float64) -> float:
+    """Return the Kalman gain in the direction in which it is largest.
+
+    Whitened by ``both = L·Lᵀ``, the gain ``prior·both⁻¹`` is symmetric.
+    """
+    L = np.linalg.cholesky(both)
+    white = np.linalg.solve(L, np.linalg.solve(L, prior).T)
+    return float(np.linalg.eigvalsh(white)[-1])

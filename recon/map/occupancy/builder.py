@@ -11,12 +11,11 @@ from pydantic import Field
 from recon.core.errors import MappingError
 from recon.core.kernels import voxels
 from recon.core.settings import Settings
-from recon.core.values import OccupancyVoxels, PointCloud
+from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, RayGrain
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.core.values.grid import log_odds
 from recon.map.kernels import clamped, raycast
-from recon.map.occupancy.part import OccupancyPart
-from recon.map.occupancy.surface_points import points_of, sum_points
+from recon.map.occupancy.part import OccupancyPart, points_of, sum_points
 
 _FIRST_POINTS: Final = 1 << 12
 _LEAST_SIGMA_CELLS: Final = 0.1
@@ -221,3 +220,58 @@ def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
             got=f"{np.abs(T_world_camera[:3, 3]).max():.0f} m",
             expected=f"at most {far_m:.0f} m",
         )
+
+
+_UNITS_PER_CELL: Final = 64
+_LARGEST: Final = np.iinfo(np.int16).max - 1
+_FIRST_ROWS: Final = 1 << 15
+
+
+def ray_grain(settings: OccupancySettings) -> RayGrain:
+    """Return the resolution of the rays that are kept for a map."""
+    cell_m = settings.resolution_m / settings.rays_per_voxel
+    # The farthest places must fit into 16 bits.
+    unit_m = max(cell_m / _UNITS_PER_CELL, (_beyond_m(settings) + cell_m) / _LARGEST)
+    return RayGrain(cell_m, unit_m, settings.max_range_m)
+
+
+def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
+    """Average the points of a frame in cubes; points without confidence are dropped.
+
+    A point out of the map's range is moved along its ray to just beyond it: it is still no hit, and
+    frees the same space.
+
+    Args:
+        cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1.
+        settings: Of the map.
+    """
+    check_camera_cloud(cloud)
+    grain = ray_grain(settings)
+    sigma_m, sure = sigma_and_confidence(cloud)
+    xyz, sigma_m = raycast.limit_points(
+        cloud.xyz,
+        sigma_m,
+        settings.max_range_m,
+        _beyond_m(settings),
+        FREE_MARGIN_SIGMAS,
+    )
+    points = voxels.VoxelPoints(
+        xyz, (sure > 0).astype(np.float32), np.stack([sigma_m, sure], axis=1)
+    )
+    found = voxels.add_points(voxels.make_sums(_FIRST_ROWS, 2), points, grain.cell_m, 0)
+    used = int(found.used[0])
+    number = found.sums[:used, 0]
+    mean = found.sums[:used, 1:] / number[:, None]
+    places = (voxels.unpack_keys(found.keys[:used]) + 0.5) * grain.cell_m + mean[:, :3]
+    return RayCloud(
+        places=np.rint(places / grain.unit_m).astype(np.int16),
+        sigma_m=mean[:, 3].astype(np.float16),
+        confidence=np.clip(np.rint(255 * mean[:, 4]), 1, 255).astype(np.uint8),
+        count=np.minimum(number, 255).astype(np.uint8),
+        unit_m=grain.unit_m,
+    )
+
+
+def _beyond_m(settings: OccupancySettings) -> float:
+    """Return where points out of range are moved to: never into a cube with one in range."""
+    return settings.max_range_m + 2 * settings.resolution_m / settings.rays_per_voxel

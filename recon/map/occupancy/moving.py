@@ -35,9 +35,8 @@ from recon.core.kernels.voxels import are_among, find_keys, pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.core.values.grid import log_odds
-from recon.map.occupancy.bodies import came_or_went
+from recon.map.occupancy.bodies import Looks, came_or_went
 from recon.map.occupancy.builder import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
-from recon.map.occupancy.looks import Looks
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))
@@ -180,3 +179,29 @@ def _in_reach(places: Float64, reach: Float32, keys: NDArray[np.int64]) -> Bool:
         close = np.flatnonzero(np.linalg.norm(gap, axis=1) <= reach)
         near[close] |= find_keys(pack_keys(cells[close] + step), keys)[1]
     return near
+
+
+_EVEN: Final = np.float32(0)
+
+
+def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
+    """Return which points are in free space: their voxel is free, and no occupied one touches it.
+
+    Neighbours count because a surface along occupied voxels lies half in free ones.
+
+    Args:
+        points: float32 (N, 3), map axes.
+        voxels: The observed voxels; unobserved space is not free.
+
+    Returns:
+        bool (N,).
+    """
+    cells = np.floor(points / np.float32(voxels.resolution_m)).astype(np.int64)
+    keys = pack_keys(voxels.keys)
+    _, through = find_keys(pack_keys(cells), np.sort(keys[voxels.log_odds <= _EVEN]))
+    occupied = np.sort(keys[voxels.log_odds > 0])
+    rows = np.flatnonzero(through)
+    for step in product((-1, 0, 1), repeat=3):
+        _, near = find_keys(pack_keys(cells[rows] + np.array(step)), occupied)
+        through[rows[near]] = False
+    return through

@@ -10,14 +10,11 @@ import numpy as np
 from recon.core.errors import FormatError, SettingsError
 from recon.core.text import counted
 from recon.map.settings import DriveSettings
-from recon.map.store.cast_submaps import check_rays
-from recon.map.store.frames import FRAMES
-from recon.map.store.keyframes import KEYFRAME
+from recon.map.store.finished import check_rays
 from recon.map.store.map_file import MapFile
-from recon.map.store.rays import RAYS
+from recon.map.store.record_values import FRAMES, RAYS
 from recon.map.store.records import Key
-from recon.map.store.session import AXES, LOOPS, SESSION, Session
-from recon.map.store.submaps import ENTRY, SUBMAP
+from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
 
 _KINDS = (SESSION, AXES, FRAMES, LOOPS, KEYFRAME, RAYS, SUBMAP, ENTRY)
 

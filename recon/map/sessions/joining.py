@@ -13,8 +13,8 @@ from recon.core.geometry.se3 import apply, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.sessions.linking import find_links, path_up_to
-from recon.map.store.links import Link
 from recon.map.store.map_file import MapFile
+from recon.map.store.record_values import Link
 from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
 from recon.places.closure import DrivePath, Tie, join_drives
 from recon.places.fixes import Held

@@ -9,9 +9,8 @@ import numpy as np
 
 from recon.core.values.arrays import Float64
 from recon.map.sessions.shared_frames import link_by_frame, shared_frames
-from recon.map.store.links import Link
-from recon.map.store.map_file import MapFile
-from recon.map.store.map_views import MapViews
+from recon.map.store.map_file import MapFile, MapViews
+from recon.map.store.record_values import Link
 from recon.map.store.session import Session
 from recon.odometry.health import stretches
 from recon.places.detector import KnownPlaces, KnownView

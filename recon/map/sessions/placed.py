@@ -9,14 +9,13 @@ import numpy as np
 
 from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
-from recon.map.occupancy.looks import Looks
+from recon.map.occupancy.bodies import Looks
 from recon.map.sessions.shared_frames import seen_before
 from recon.map.settings import DriveSettings
-from recon.map.store.cast_submaps import CastSubmaps, check_rays, looks_of
+from recon.map.store.finished import CastSubmaps, check_rays, looks_of
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Store
-from recon.map.store.session import Session
-from recon.map.store.submaps import Submaps
+from recon.map.store.session import Session, Submaps
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
 from recon.run.lookahead import side_by_side

@@ -17,11 +17,10 @@ from typing import Any, Final
 from recon.core.errors import MappingError
 from recon.core.values.arrays import Float64
 from recon.io.files import resolved
-from recon.map.cut import Cutter
+from recon.map.cut import Cutter, TileKey, TileParts
 from recon.map.sessions.placed import PlacedMap, PlacedSubmaps, looks_in, with_path
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
-from recon.map.store.tile_parts import TileKey, TileParts
 from recon.map.tiles import Tiles
 
 Each = Callable[[Callable[[Any], None], Sequence[Any]], None]

@@ -2,13 +2,11 @@
 
 From the map down to the file:
 
-- `map_file.py`: drives in one file; `session.py`: what one drive keeps in it;
-- `frames.py`, `rays.py`, `links.py`: values as records of their kind;
-- `submaps.py`, `keyframes.py`, `tile_parts.py`: lists of things that are read one at a time;
-- `records.py`: trees of arrays under a kind and a key; `arrays.py`: such a tree as bytes;
-- `values.py`: a value made of such a tree, its parts checked;
-- `database.py`: the SQLite file, its commits, and what a full disk means; `cache.py`: last reads.
+- `map_file.py`: drives in one file, and which of their frames have a place in it;
+- `session.py`: what one drive keeps: path, health, axes, submaps, keyframes, rays, loops;
+- `record_values.py`: values as records of their kind; `trees.py`: records as JSON and bytes;
+- `records.py`: trees of arrays under a kind and a key, with a cache of the last ones read;
+- `database.py`: the SQLite file, its commits, and what a full disk means.
 
-What is made of a finished drive: `keep_map.py` (the file that a run keeps), `cast_submaps.py`
-(occupancy from its rays again), `map_views.py` (its keyframes, to be recognised).
+`finished.py`: what a finished map keeps, and occupancy made from its rays again.
 """

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from recon.core.errors import FormatError, OutputError
-from recon.map.store.arrays import Bytes
+from recon.map.store.trees import Bytes
 
 FORMAT: Final = 1
 """Number of the format; it grows with every change that older versions cannot read."""

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, overload
 
+import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import Self
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, MappingError
 from recon.core.geometry.se3 import invert
 from recon.core.text import counted
+from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.io.files import StrPath, reading
-from recon.map.store.links import LINKS, Link
+from recon.map.store.record_values import LINKS, Link
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
-from recon.map.store.trust import doubts_of_drives, placed_frames
+from recon.odometry.health import doubt_about, name_frames, stretches
+from recon.places.detector import KnownPlaces, KnownView
 from recon.run.directory import refuse_links
 
 MAP_FILE: Final = "map/map.recon"
@@ -205,3 +209,131 @@ class MapFile:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+_Stretch = tuple[int, int]
+"""Number of a drive, and of a stretch of it."""
+
+_SURVEY: Final[_Stretch] = (-1, -1)
+_FEWEST_FIXES: Final = 2
+"""Measured positions that say where a stretch is, and which way it goes."""
+
+
+def placed_frames(sessions: Sequence[Session], links: Sequence[Link]) -> dict[int, Bool]:
+    """Return by number of the drive bool (N,), which frames have a place in the map.
+
+    Those whose pose is to be trusted; in a map of several drives only those of stretches that
+    loops, links or measured positions hold to the longest one of the first drive. Behind a lost
+    pose odometry guesses, and a guess does not enter what other drives saw.
+
+    Args:
+        sessions: The drives that share axes.
+        links: The links between them.
+    """
+    of = {session.number: stretches(session.health) for session in sessions}
+    if len(sessions) < 2:
+        return {number: stretch >= 0 for number, stretch in of.items()}
+    ties, first = [*_ties(sessions, links, of)], sessions[0].number
+    held = {(first, int(np.bincount(of[first] + 1)[1:].argmax()))}
+    while more := {b for tie in ties for a, b in (tie, tie[::-1]) if a in held} - held:
+        held |= more
+    return {
+        number: (stretch >= 0) & np.isin(stretch, [s for drive, s in held if drive == number])
+        for number, stretch in of.items()
+    }
+
+
+def doubts_of_drives(sessions: Sequence[Session], placed: Mapping[int, Bool]) -> list[str]:
+    """Return lines of poses that are not to be trusted, and of what has no place after them.
+
+    Args:
+        sessions: The drives that share axes.
+        placed: Which of their frames have a place, see `placed_frames`.
+    """
+    lines = []
+    for session in sessions:
+        of = f"session {session.number} ({session.info.source}): " if len(sessions) > 1 else ""
+        lines += [of + line for line in doubt_about(session.health)]
+        trusted = session.trusted
+        apart = np.flatnonzero(trusted & ~placed[session.number]).tolist()
+        if apart:
+            why = "follow a lost pose, and nothing that was seen again says where"
+            left_out = "not in cloud, grid, OctoMap and mesh, nor to be recognised"
+            lines.append(f"{of}{name_frames(apart)} {why}: {left_out}")
+    return lines
+
+
+def _ties(
+    sessions: Sequence[Session], links: Sequence[Link], of: Mapping[int, NDArray[np.int64]]
+) -> Iterator[tuple[_Stretch, _Stretch]]:
+    """Yield pairs of stretches that loops, links and measured positions hold together."""
+
+    def stretch(number: int, frame: int) -> _Stretch:
+        return number, int(of[number][frame])
+
+    for session in sessions:
+        number = session.number
+        for loop in session.loops.get("closed", ()):
+            yield stretch(number, loop["first"]), stretch(number, loop["last"])
+        measured, counts = np.unique(of[number][session.fixes.frames], return_counts=True)
+        for one in measured[(measured >= 0) & (counts >= _FEWEST_FIXES)].tolist():
+            yield (number, one), _SURVEY
+    for link in links:
+        if link.kept and set(link.sessions) <= set(of):
+            one, other = link.sessions
+            yield stretch(one, link.loop.first), stretch(other, link.loop.last)
+
+
+def known_places(map_: MapFile) -> KnownPlaces:
+    """Return all places of a map, to recognise them."""
+    views = MapViews(map_)
+    if not views:
+        raise MappingError(
+            "the map has no keyframes to be recognised by",
+            where=map_.store.name,
+            hint="map the drive again with this version",
+        )
+    return KnownPlaces(views)
+
+
+class MapViews(Sequence[KnownView]):
+    """What a map can recognise; each view is read when it is asked for.
+
+    Args:
+        map_: The map.
+        sessions: Numbers of the drives to take; None = those that share the axes of the map, as
+            far as they have a place in it.
+    """
+
+    def __init__(self, map_: MapFile, sessions: Collection[int] | None = None) -> None:
+        self._map = map_
+        self._keys: list[tuple[int, int]] = []
+        self._poses: dict[int, Float64] = {}
+        self._cameras: dict[int, RectifiedCamera] = {}
+        taken = map_.linked if sessions is None else map(map_.session, sorted(sessions))
+        placed = map_.placed if sessions is None else None
+        for session in taken:
+            frames = session.keyframes.frames
+            if placed is not None:
+                frames = [frame for frame in frames if placed[session.number][frame]]
+            if frames:
+                T_world_session = map_.T_world_session(session)
+                self._poses[session.number] = T_world_session @ session.trajectory.T_world_camera
+                self._cameras[session.number] = session.camera
+                self._keys.extend((session.number, frame) for frame in frames)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    @overload
+    def __getitem__(self, number: int) -> KnownView: ...
+    @overload
+    def __getitem__(self, number: slice) -> list[KnownView]: ...
+    def __getitem__(self, number: int | slice) -> KnownView | list[KnownView]:
+        """Return a view."""
+        if isinstance(number, slice):
+            return [self[n] for n in range(*number.indices(len(self)))]
+        session, frame = self._keys[number]
+        stored = self._map.session(session).keyframes.get(frame)
+        pose = self._poses[session][frame]
+        return KnownView(stored.keyframe, self._cameras[session], pose, session)

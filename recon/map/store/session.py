@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
@@ -14,17 +14,26 @@ from recon.core.text import counted
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in
 from recon.io.files import reading
-from recon.map.store.frames import FRAMES, frames_in, frames_record, path_of
-from recon.map.store.keyframes import Keyframes
-from recon.map.store.links import loop_in
-from recon.map.store.rays import RAY_BYTES, RAYS, rays_in, rays_record
+from recon.map.store.record_values import (
+    FRAMES,
+    RAY_BYTES,
+    RAYS,
+    frames_in,
+    frames_record,
+    loop_in,
+    path_of,
+    rays_in,
+    rays_record,
+)
 from recon.map.store.records import Store
-from recon.map.store.submaps import Submaps
-from recon.map.store.values import value_in
+from recon.map.store.trees import value_in
+from recon.map.submaps import Submap
 from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
+from recon.places.detector import StoredKeyframe
 from recon.places.fixes import NO_FIXES, Fixes
+from recon.places.keyframe import Keyframe
 
 SESSION: Final = "session"
 AXES: Final = "axes"
@@ -60,16 +69,9 @@ class SessionInfo:
 
 
 class Session:
-    """One drive in a map. What is added is kept by the next commit of the map.
+    """One drive in a map: its number, ``info``, ``submaps`` and ``keyframes``.
 
-    Args:
-        store: The records of the map.
-        number: Number of the session in the map.
-
-    Attributes:
-        info: What it is a drive of.
-        submaps: Its submaps.
-        keyframes: Its keyframes, for place recognition.
+    The next commit of the map keeps what is added.
     """
 
     def __init__(self, store: Store, number: int) -> None:
@@ -97,7 +99,6 @@ class Session:
         return Session(store, number)
 
     def __len__(self) -> int:
-        """Return the number of frames so far."""
         return len(self._poses)
 
     def __repr__(self) -> str:
@@ -254,3 +255,137 @@ class Session:
             loop = loop_in(tree)
             if not 0 <= loop.first < loop.last < len(self):
                 raise FormatError("a loop of the map is not between two frames", got=f"{loop}")
+
+
+SUBMAP: Final = "submap"
+ENTRY: Final = "submap_entry"
+_VOXEL_BYTES: Final = 60
+_CELL_BYTES: Final = 54
+"""Most of one cell: its values, its surface point, and a block of its own."""
+
+
+@dataclass(frozen=True)
+class SubmapEntry:
+    """What is known about a closed submap without reading it."""
+
+    index: int
+    first_frame: int
+    frames: int
+    voxels: int
+    cells: int
+
+    @property
+    def nbytes(self) -> int:
+        """Most bytes that its arrays take."""
+        return _VOXEL_BYTES * self.voxels + _CELL_BYTES * self.cells
+
+    @property
+    def middle(self) -> int:
+        """Index of the frame in its middle, whose correction the submap gets."""
+        return self.first_frame + self.frames // 2
+
+
+class Submaps:
+    """Closed submaps of one drive, in order; each is read when it is asked for."""
+
+    def __init__(self, store: Store, session: int = 0) -> None:
+        self._session = session
+        self.store = store
+        with reading(store.name):
+            found = store.numbers(ENTRY, session)
+            self._entries = [value_in(SubmapEntry, store.read(ENTRY, (session, n))) for n in found]
+            frames = 0
+            for index, entry in enumerate(self._entries):
+                if (entry.index, entry.first_frame) != (index, frames) or entry.frames < 1:
+                    raise FormatError("submaps of the drive are missing", got=f"{entry}")
+                frames += entry.frames
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @property
+    def entries(self) -> Sequence[SubmapEntry]:
+        """One for each submap."""
+        return tuple(self._entries)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames in all submaps."""
+        return sum(entry.frames for entry in self._entries)
+
+    def add(self, submap: Submap, *, compress: bool = False) -> None:
+        """Store the next submap."""
+        entry = _entry_of(submap)
+        key = (self._session, submap.index)
+        self.store.put(SUBMAP, key, submap.to_tree(), compress=compress)
+        self.store.put(ENTRY, key, asdict(entry))
+        self._entries.append(entry)
+
+    def __getitem__(self, index: int) -> Submap:
+        """Return a submap, read from the map: it is large, and used once."""
+        with reading(self.store.name):
+            most_bytes = self._entries[index].nbytes
+            record = self.store.read(SUBMAP, (self._session, index), most_bytes=most_bytes)
+            submap = Submap.from_tree(record)
+            if _entry_of(submap) != self._entries[index]:
+                raise FormatError("a submap of the map is another one", got=f"submap {index}")
+            return submap
+
+    def __iter__(self) -> Iterator[Submap]:
+        return map(self.__getitem__, range(len(self)))
+
+
+def _entry_of(submap: Submap) -> SubmapEntry:
+    fused, cells = len(submap.fused), len(submap.occupancy)
+    return SubmapEntry(submap.index, submap.first_frame, submap.frames, fused, cells)
+
+
+KEYFRAME: Final = "keyframe"
+_MOST_BYTES: Final = 1 << 24
+"""Hundreds of features, and every 64th disparity: of 100 megapixels 6 MB."""
+
+
+class Keyframes:
+    """Keyframes of one drive, by the number of their frame."""
+
+    def __init__(self, store: Store, session: int = 0) -> None:
+        self._store = store
+        self._session = session
+
+    def put(self, stored: StoredKeyframe) -> None:
+        """Keep a keyframe."""
+        content = {
+            "keyframe": asdict(stored.keyframe),
+            "T_world_camera": stored.T_world_camera,
+            "path_m": stored.path_m,
+            "loops": [asdict(loop) for loop in stored.loops],
+            "refused": list(stored.refused),
+        }
+        key = (self._session, stored.keyframe.frame)
+        self._store.put(KEYFRAME, key, content, compress=True)
+
+    def get(self, frame: int) -> StoredKeyframe:
+        """Return the keyframe of a frame, kept in the cache."""
+        key = (KEYFRAME, self._session, frame, "keyframe")
+        return self._store.cache.get(key, lambda: self._read(frame))
+
+    @property
+    def frames(self) -> list[int]:
+        """The numbers of the frames that are keyframes, in order."""
+        return self._store.numbers(KEYFRAME, self._session)
+
+    def __iter__(self) -> Iterator[StoredKeyframe]:
+        return map(self._read, self.frames)
+
+    def _read(self, frame: int) -> StoredKeyframe:
+        with reading(self._store.name):
+            content: dict[str, Any] = self._store.read(
+                KEYFRAME, (self._session, frame), most_bytes=_MOST_BYTES
+            )
+            return StoredKeyframe(
+                value_in(Keyframe, {**content["keyframe"], "frame": frame}),
+                array_in(content, "T_world_camera", np.float64, (4, 4)),
+                float(content["path_m"]),
+                tuple(loop_in(loop) for loop in content["loops"]),
+                tuple(content["refused"]),
+            )

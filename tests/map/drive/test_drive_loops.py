@@ -24,8 +24,8 @@ from recon.core.values import (
 )
 from recon.map.drive import drive_loops
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
-from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
+from recon.map.store.session import Keyframes
 from recon.places import places
 from recon.places.closure import close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe

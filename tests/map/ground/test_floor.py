@@ -7,8 +7,12 @@ import pytest
 
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.map.ground import surface as ground
-from recon.map.ground.floor import add_floors, find_floors
-from recon.map.ground.surface import GroundSettings, estimate_ground_surface
+from recon.map.ground.surface import (
+    GroundSettings,
+    add_floors,
+    estimate_ground_surface,
+    find_floors,
+)
 
 EDGE_M = 0.2
 SETTINGS = GroundSettings()

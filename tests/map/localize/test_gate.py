@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.map.localize.gate import Correction, is_worthwhile
 from recon.map.localize.surfaces import Fit, describe_surfaces, fit_surfaces
-from recon.map.localize.surroundings import contrast
+from recon.map.localize.surroundings import Correction, contrast, is_worthwhile
 from recon.odometry.window import step_covariance
 
 UNSURE = step_covariance(0.3, 1.0)

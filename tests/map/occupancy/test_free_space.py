@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from recon.core.values import OccupancyVoxels
-from recon.map.occupancy.free_space import looked_through
+from recon.map.occupancy.moving import looked_through
 
 RESOLUTION_M = 0.2
 

@@ -9,9 +9,8 @@ from recon.core.geometry import se3
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import PointCloud
 from recon.core.values.grid import log_odds
-from recon.map.occupancy.builder import MAX_PROBABILITY, OccupancyBuilder
-from recon.map.occupancy.looks import Looks
-from recon.map.occupancy.rays import thin_rays
+from recon.map.occupancy.bodies import Looks
+from recon.map.occupancy.builder import MAX_PROBABILITY, OccupancyBuilder, thin_rays
 
 SETTINGS = load_config().occupancy
 

@@ -9,8 +9,7 @@ from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSurface
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
-from recon.map.occupancy.rays import thin_rays
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings, thin_rays
 
 HEIGHT_M, WALL_M = 1.6, 20.0
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))

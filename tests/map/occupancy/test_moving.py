@@ -14,9 +14,9 @@ from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, join_clouds
 from recon.core.values.arrays import Bool
 from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.occupancy.looks import Looks
+from recon.map.occupancy.bodies import Looks
+from recon.map.occupancy.builder import thin_rays
 from recon.map.occupancy.moving import find_moved
-from recon.map.occupancy.rays import thin_rays
 from recon.map.submaps import Submap, SubmapBuilder
 from recon.map.tiles import Tiles
 

@@ -10,8 +10,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import OccupancyVoxels, PointCloud, RayCloud
 from recon.map.kernels import raycast
 from recon.map.occupancy import builder as occupancy
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
-from recon.map.occupancy.rays import ray_grain, thin_rays
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
 
 SETTINGS = OccupancySettings(resolution_m=0.2, max_range_m=20.0)
 POSE = make_transform(np.eye(3), np.array([0.11, 0.09, 0.1]))  # no ray along an edge of cells

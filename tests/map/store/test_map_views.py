@@ -7,8 +7,8 @@ import pytest
 
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera
-from recon.map.store.links import Link
-from recon.map.store.map_views import MapViews
+from recon.map.store.map_file import MapViews
+from recon.map.store.record_values import Link
 from recon.map.store.session import SessionInfo
 from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth

@@ -18,8 +18,7 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as some
 
 from recon.core.errors import FormatError, OutputError, ReconError
-from recon.map.store.cache import Cache
-from recon.map.store.records import Store
+from recon.map.store.records import Cache, Store
 
 KINDS = ("rays", "submap")
 TYPES = ("<f4", "<f8", "<i2", "<i8", "u1", "?", "<f2", ">f4")

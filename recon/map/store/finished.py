@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from recon.core.errors import FormatError, SettingsError
 from recon.core.values import RayCloud
 from recon.core.values.arrays import Float64
+from recon.map.kernels import clamped
+from recon.map.occupancy.bodies import Looks
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
-from recon.map.occupancy.looks import Looks
+from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
-from recon.map.store.session import Session
+from recon.map.store.map_file import MapFile
+from recon.map.store.record_values import RAYS
+from recon.map.store.session import AXES, KEYFRAME, LOOPS, Session
 from recon.map.submaps import Submap
 
 
@@ -113,3 +118,31 @@ def check_rays(session: Session, settings: DriveSettings) -> None:
             expected=f"at most {grain.max_range_m:g} m",
             hint="map the drive again with --set occupancy.max_range_m=",
         )
+
+
+def keep_map(mapped: MapFile, path: Path) -> None:
+    """Write the map of finished drives: path, rays, keyframes, loops, and fused submaps.
+
+    Occupancy is left out, since `place_map` makes it from the rays again.
+
+    Args:
+        mapped: The map as it was made.
+        path: The new file.
+    """
+    with MapFile.create(path) as kept:
+        for session in mapped.sessions:
+            new = kept.begin(replace(session.info, start={}))
+            for number, T_world_camera in enumerate(session.odometry.T_world_camera):
+                time_s = float(session.odometry.timestamps_s[number])
+                new.add_frame(T_world_camera, time_s, session.health[number])
+            for submap in session.submaps:
+                new.submaps.add(replace(submap, occupancy=_nothing()), compress=True)
+        for kind in (AXES, LOOPS, KEYFRAME, RAYS):
+            mapped.store.copy(kind, kept.store)
+        kept.commit()
+
+
+def _nothing() -> OccupancyPart:
+    """Return occupancy without a cell."""
+    blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
+    return OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))

@@ -6,12 +6,15 @@ import json
 import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from dataclasses import fields
+from functools import lru_cache
+from typing import Any, Final, NamedTuple, TypeVar, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, ShapeError
 
 Bytes = bytes | bytearray | memoryview
 _RAW: Final = "raw"
@@ -155,3 +158,32 @@ def _planes(array: NDArray[Any]) -> NDArray[np.uint8]:
     columns = array.reshape(-1, _columns(array.shape))
     split = columns.view(np.uint8).reshape(-1, columns.shape[1], size)
     return np.asarray(split.transpose(1, 2, 0))
+
+
+Value = TypeVar("Value")
+
+
+def value_in(kind: type[Value], tree: Mapping[str, Any]) -> Value:
+    """Return a dataclass of a tree of its fields; it checks shapes and ranges of arrays itself."""
+    return kind(**{name: _part(kind, name, part) for name, part in tree.items()})
+
+
+def _part(kind: Any, name: str, part: Any) -> Any:
+    adapter: TypeAdapter[Any] | None = _adapters(kind).get(name)
+    if adapter is None:
+        if not isinstance(part, np.ndarray):
+            raise ShapeError(f"{kind.__name__}.{name} is not an array", got=part)
+        return part
+    try:
+        return adapter.validate_python(part)
+    except ValidationError as error:
+        (first, *_), what = error.errors(), f"{kind.__name__}.{name} is wrong"
+        raise ShapeError(what, got=part, expected=first["msg"]) from error
+
+
+@lru_cache
+def _adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
+    """Return what checks each field that is no array."""
+    hints = get_type_hints(kind)
+    plain = (one.name for one in fields(kind) if get_origin(hints[one.name]) is not np.ndarray)
+    return {name: TypeAdapter(hints[name]) for name in plain}
