@@ -32,7 +32,7 @@ from recon.core.values.arrays import Float64
 from recon.evaluation.map import evaluate_map
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace
-from recon.map.fusion.builder import fusion_range_m
+from recon.map.fusion import fusion_range_m
 from recon.map.ground.grid import flatten
 from recon.map.ground.surface import add_floors, estimate_ground_surface, find_floors
 from recon.map.store.session import NO_LOOPS

@@ -38,7 +38,7 @@ from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_trajectory
-from recon.map.sessions.linking import find_links
+from recon.map.sessions.joining import find_links
 from recon.map.sessions.measured import Survey
 from recon.map.store.session import SessionInfo
 from recon.map.verbs import Map

@@ -26,7 +26,7 @@ from recon.core.geometry import se3
 from recon.core.values import PointCloud, StereoPair, join_clouds
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.map.fusion.builder import fusion_range_m
+from recon.map.fusion import fusion_range_m
 from recon.map.sessions.placed import place_map
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

@@ -168,7 +168,7 @@ def piece(
         raise typer.BadParameter("give --out FOLDER or --resume FOLDER")
     with one_line_errors(quiet=quiet):
         from recon.cli.progress import choose_viewer
-        from recon.commands.piece import run_piece
+        from recon.commands.map_pieces import run_piece
 
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
         going_on = resume is not None

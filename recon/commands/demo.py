@@ -21,7 +21,7 @@ from recon.core.values import StereoPair
 from recon.export.map_run import MapRun
 from recon.io.models.octomap import read_octomap
 from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.map.fusion.builder import fusion_range_m
+from recon.map.fusion import fusion_range_m
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
 from recon.run.progress import SILENT, Progress

@@ -54,8 +54,7 @@ from recon.report.style import colour_grid_errors
 from recon.report.trajectory_page import write_trajectory_page
 from recon.run.directory import recorded_files
 from recon.run.finished import CLOUD, GRID, OCTOMAP, FinishedRun, open_run
-from recon.run.run import Run
-from recon.run.summary import plain
+from recon.run.run import Run, plain
 from recon.sources.source import KnowsOccupancy
 from recon.sources.times import read_times
 

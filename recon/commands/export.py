@@ -16,8 +16,7 @@ from recon.io.models.las import SUFFIXES as SURVEYED
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.sessions.measured import Survey
-from recon.map.sessions.placed import PlacedMap, place_map
-from recon.map.sessions.spread import place_map_on
+from recon.map.sessions.placed import PlacedMap, place_map, place_map_on
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
 from recon.run.batch.cluster import BatchOptions

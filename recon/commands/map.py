@@ -22,8 +22,7 @@ from recon.map.verbs import Map
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
-from recon.run.run import Run
-from recon.run.summary import plain
+from recon.run.run import Run, plain
 from recon.sources.live import LiveSource
 from recon.sources.source import IncompleteSource, StereoSource
 

@@ -31,11 +31,10 @@ from recon.map.drive.workspace import ANEW, resuming, session_info
 from recon.map.verbs import Map
 from recon.run.batch.cluster import BatchOptions
 from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
-from recon.run.fingerprint import fingerprint
 from recon.run.machine import versions
 from recon.run.memory import memory_overrides
 from recon.run.progress import SILENT, Progress
-from recon.run.run import Run
+from recon.run.run import Run, fingerprint
 from recon.sources.live import LiveSource
 from recon.sources.prior import read_prior
 from recon.sources.registry import open_source

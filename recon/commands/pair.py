@@ -25,8 +25,7 @@ from recon.map.drive.sequence import check_cloud
 from recon.report.pair_page import write_disparity_images, write_pair_page
 from recon.rig.audit.audit import check_found, find_pair_faults
 from recon.run.progress import SILENT, Progress
-from recon.run.run import Run
-from recon.run.summary import plain
+from recon.run.run import Run, plain
 from recon.sources.one_pair import PairInput
 from recon.stereo.frame import (
     FrameReconstructor,

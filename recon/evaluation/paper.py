@@ -29,7 +29,7 @@ from recon.core.values import (
 from recon.core.values.arrays import Float32, Int32
 from recon.evaluation.disparity import evaluate_disparity
 from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
-from recon.run.summary import plain
+from recon.run.run import plain
 from recon.stereo.cloud.back_project import CloudSettings, back_project
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.match.protocol import Matcher

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.values import Trajectory
 from recon.export.make import Products
 from recon.io.trajectory import write_kitti_poses, write_tum
-from recon.map.sessions.lengths import doubts_of_lengths
+from recon.map.sessions.joining import doubts_of_lengths
 from recon.map.sessions.measured import doubts_of_positions, misfit_rms_m
 from recon.map.verbs import Map
 from recon.run.directory import RunDirectory

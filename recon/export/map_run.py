@@ -18,7 +18,7 @@ from recon.core.values import (
 from recon.export.make import Products
 from recon.map.drive.sequence import MappedSequence
 from recon.map.settings import DriveSettings
-from recon.run.summary import plain
+from recon.run.run import plain
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64
-from recon.map.fusion.part import KNOWABLE, FusedPart
+from recon.map.fusion import KNOWABLE, FusedPart
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.map.occupancy.moving import GROWTH_CELLS

@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from recon.core.settings import Settings
-from recon.map.fusion.builder import FusionSettings
+from recon.map.fusion import FusionSettings
 from recon.map.ground.axes import AxesSettings
 from recon.map.ground.grid import GridSettings
 from recon.map.ground.surface import GroundSettings

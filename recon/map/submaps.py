@@ -17,8 +17,7 @@ from recon.core.geometry.se3 import invert
 from recon.core.settings import Settings
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
-from recon.map.fusion.builder import CloudBuilder, FusionSettings
-from recon.map.fusion.part import FusedPart
+from recon.map.fusion import CloudBuilder, FusedPart, FusionSettings
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy.part import OccupancyPart
 

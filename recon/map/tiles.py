@@ -25,7 +25,7 @@ from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_vox
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.core.values.grid import log_odds
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, TileParts
-from recon.map.fusion.part import KNOWABLE, FusedPart, join_fused
+from recon.map.fusion import KNOWABLE, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.occupancy.bodies import Looks

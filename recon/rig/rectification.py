@@ -20,7 +20,7 @@ from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.fields import write_yaml
 from recon.rig.uncalibrated import UncalibratedRectification, rectify_images
 from recon.run.directory import RunDirectory
-from recon.run.summary import plain
+from recon.run.run import plain
 from recon.sources.image_names import ImagePairs
 from recon.sources.one_pair import read_pair
 from recon.stereo.rectify.features import match_exactly

@@ -2,6 +2,7 @@
 
 - `run.py`: one run of a command, with its configuration, summary and record;
 - `directory.py`: its folder, which is complete or not there; `finished.py`: what it has left;
-- `progress.py`: how far it is; `lookahead.py`: work that overlaps in threads;
+- `progress.py`: how far it is, and seconds per stage; `threads.py`: work that overlaps;
+- `machine.py`, `memory.py`: what the machine has, and how much of it a run may take;
 - `batch/`: many commands as jobs, on this machine or on a cluster.
 """

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, is_dataclass
 from datetime import datetime, timezone
 from functools import cached_property
 from pathlib import Path
@@ -17,10 +21,8 @@ from recon.core.settings import Settings
 from recon.io.fields import write_yaml
 from recon.io.files import StrPath, resolved
 from recon.run.directory import RECORD, RunDirectory, default_folder
-from recon.run.fingerprint import fingerprint
 from recon.run.machine import peak_memory_mb, versions
-from recon.run.progress import SILENT, Progress
-from recon.run.stopwatch import Stopwatch
+from recon.run.progress import SILENT, Progress, Stopwatch
 from recon.run.threads import use_threads
 
 CONFIG: Final = "config.yaml"
@@ -157,3 +159,42 @@ class WholeRun(Run):
     """A run whose folder appears, or takes the place of an earlier one, in one step."""
 
     whole = True
+
+
+_PIECE_BYTES: Final = 1 << 20
+
+
+def fingerprint(files: Iterable[Path], *, head_bytes: int | None = None) -> dict[str, Any]:
+    """Return the number, size and one SHA-256 of a list of files, in that order.
+
+    The hash covers each file's name and bytes, so a renamed frame changes it too.
+
+    Args:
+        files: The files.
+        head_bytes: Hash only the first bytes of each, to tell sources apart without the delay of
+            reading a large drive; None = all.
+    """
+    digest, count, size = hashlib.sha256(), 0, 0
+    for path in files:
+        length = path.stat().st_size
+        digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
+        # In pieces: a recording may be larger than memory.
+        with path.open("rb") as content:
+            while head_bytes is None and (piece := content.read(_PIECE_BYTES)):
+                digest.update(piece)
+            digest.update(content.read(head_bytes or 0))
+        count, size = count + 1, size + length
+    return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
+
+
+def plain(value: Any) -> Any:
+    """Convert a value for JSON: dataclasses to mappings, NaN and infinity to None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

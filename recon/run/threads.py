@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Final
+from typing import Final, TypeVar
 
 import cv2
 from threadpoolctl import threadpool_limits
@@ -44,3 +46,85 @@ def work_in_background() -> None:
     if sys.platform == "linux":  # elsewhere the priority is that of the process
         nice = os.getpriority(os.PRIO_PROCESS, 0) + _NICER
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def look_ahead(
+    function: Callable[[Item], Result], items: Iterable[Item], *, depth: int = 2
+) -> Iterator[Result]:
+    """Yield ``function(item)`` in order, computed up to ``depth`` items ahead in one thread.
+
+    The iterator is advanced in that thread too, so reading overlaps as well. At most ``depth + 1``
+    results exist at a time. An error in an item or in the function is raised at its turn.
+    """
+    source = iter(items)
+
+    def work() -> tuple[Result] | None:
+        try:
+            item = next(source)
+        except StopIteration:
+            return None
+        return (function(item),)
+
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="look-ahead") as pool:
+        waiting: deque[Future[tuple[Result] | None]] = deque(
+            pool.submit(work) for _ in range(depth)
+        )
+        while waiting:
+            done = waiting.popleft().result()
+            if done is None:
+                return
+            waiting.append(pool.submit(work))
+            yield done[0]
+
+
+def side_by_side(
+    function: Callable[[Item], Result], items: Iterable[Item], *, threads: int
+) -> Iterator[Result]:
+    """Yield ``function(item)`` in order, computed in several threads.
+
+    At most ``threads + 1`` results exist at a time. An error is raised at its item's turn. When
+    the caller stops early, running items are waited for and no others start.
+    """
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="side-by-side")
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class OneBehind:
+    """Runs jobs in one background thread, in order and one at a time.
+
+    `begin` blocks until the previous job has ended, so at most one job is running and only its
+    data stays in memory.
+    """
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="one-behind")
+        self._job: Future[None] | None = None
+
+    def begin(self, job: Callable[[], None]) -> None:
+        """Start a job once the previous one has ended."""
+        self.wait()
+        self._job = self._pool.submit(job)
+
+    def wait(self) -> None:
+        """Wait until the last job has ended."""
+        job, self._job = self._job, None
+        if job is not None:
+            job.result()
+
+    def abandon(self) -> None:
+        """Wait until the last job has ended, ignoring its errors; no other can start."""
+        self._job = None
+        self._pool.shutdown(wait=True)

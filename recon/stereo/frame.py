@@ -25,7 +25,7 @@ from recon.core.values import (
     StereoPair,
     TriangleMesh,
 )
-from recon.run.stopwatch import Stopwatch
+from recon.run.progress import Stopwatch
 from recon.stereo.cloud.back_project import CloudSettings, back_project, remove_flying_edges
 from recon.stereo.cloud.filters import FilterSettings, filter_cloud
 from recon.stereo.match.protocol import Matcher

@@ -15,7 +15,7 @@ from recon.commands.evaluate import run_evaluate_occupancy
 from recon.core.errors import EvaluationError, FormatError
 from recon.io.models.nav2 import read_nav2
 from recon.report.style import GRID_ERRORS, GRID_NOT_COUNTED
-from recon.run.summary import plain
+from recon.run.run import plain
 from tests.hostile import refusals
 
 

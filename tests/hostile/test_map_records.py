@@ -12,7 +12,7 @@ import pytest
 
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import RayCloud, RectifiedCamera
-from recon.map.fusion.part import FusedPart, join_fused
+from recon.map.fusion import FusedPart, join_fused
 from recon.map.kernels.clamped import CellRows
 from recon.map.occupancy.builder import OccupancySettings, ray_grain
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, join_occupancy

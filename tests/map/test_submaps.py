@@ -10,8 +10,7 @@ import pytest
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import PointCloud
 from recon.map import submaps as submaps_file
-from recon.map.fusion.builder import CloudBuilder, FusionSettings
-from recon.map.fusion.part import join_fused
+from recon.map.fusion import CloudBuilder, FusionSettings, join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy.part import OccupancyPart, join_occupancy

@@ -13,7 +13,7 @@ from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Float32, Float64
 from recon.map.cut import Rectangle
-from recon.map.fusion.part import join_fused
+from recon.map.fusion import join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.surface import find_floors
 from recon.map.occupancy.part import free_part, join_occupancy

@@ -11,8 +11,7 @@ from typing import Any
 
 from recon.odometry.health import doubt_about, health_warnings, stretches
 from recon.odometry.protocol import OdometryHealth
-from recon.run.run import Run
-from recon.run.summary import plain
+from recon.run.run import Run, plain
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from recon.evaluation.middlebury.score import (
 )
 from recon.io.files import naming
 from recon.io.images.disparity import read_pfm
-from recon.run.summary import plain
+from recon.run.run import plain
 from recon.stereo.frame import StereoSettings
 from recon.stereo.match.protocol import Matcher, name_of
 from recon.stereo.match.registry import check_matcher, make_matcher, searched_ndisp

@@ -28,8 +28,8 @@ from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
-from recon.run.lookahead import side_by_side
 from recon.run.machine import available_cores
+from recon.run.threads import side_by_side
 
 WHOLE: Final = "mesh/mesh.ply"
 LAYER: Final = "mesh/cloud.ply"

@@ -16,7 +16,7 @@ from recon.map.drive.workspace import Workspace, resuming
 from recon.map.occupancy.builder import thin_rays
 from recon.map.settings import DriveSettings
 from recon.odometry.protocol import OdometryFrame, OdometryResult
-from recon.run.lookahead import look_ahead
+from recon.run.threads import look_ahead
 from recon.sources.live import LiveSource
 from recon.sources.source import SourcePart, StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame

@@ -14,7 +14,7 @@ from recon.core.geometry.se3 import transform_cloud
 from recon.core.text import counted
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
-from recon.map.fusion.builder import fusion_range_m
+from recon.map.fusion import fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.occupancy.builder import ray_grain, thin_rays
 from recon.map.settings import DriveSettings
@@ -22,8 +22,8 @@ from recon.map.store.session import Session
 from recon.map.submaps import SubmapBuilder
 from recon.odometry.health import stretches
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
-from recon.run.lookahead import OneBehind
-from recon.run.stopwatch import Stopwatch
+from recon.run.progress import Stopwatch
+from recon.run.threads import OneBehind
 from recon.stereo.frame import ReconstructedFrame
 
 

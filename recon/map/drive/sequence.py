@@ -30,7 +30,7 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of
 from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace
-from recon.map.fusion.builder import fusion_range_m
+from recon.map.fusion import fusion_range_m
 from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session

@@ -14,7 +14,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
 from recon.map.verbs import Map
 from recon.run.machine import versions
-from recon.run.stopwatch import Stopwatch
+from recon.run.progress import Stopwatch
 from recon.sources.source import StereoSource
 
 ANEW: Final = "start the run anew, without --resume"

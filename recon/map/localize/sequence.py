@@ -19,9 +19,8 @@ from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
-from recon.run.lookahead import look_ahead
 from recon.run.progress import SILENT, Progress
-from recon.run.threads import serial_algebra
+from recon.run.threads import look_ahead, serial_algebra
 from recon.sources.live import LiveSource
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.errors import RegistrationError
-from recon.core.geometry.alignment import fit_upright
+from recon.core.geometry.alignment import fit_points, fit_upright
 from recon.core.geometry.se3 import apply, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.map.sessions.linking import find_links, path_up_to
-from recon.map.store.map_file import MapFile
+from recon.map.store.map_file import MapFile, MapViews
 from recon.map.store.record_values import Link
 from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
+from recon.odometry.health import stretches
 from recon.places.closure import DrivePath, Tie, join_drives
+from recon.places.detector import KnownPlaces, KnownView
 from recon.places.fixes import Held
-from recon.places.loop import Loop
+from recon.places.loop import Loop, agreeing_loops
+from recon.places.places import path_lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,3 +194,173 @@ def _place(map_: MapFile, session: Session, path: Trajectory) -> None:
     first = map_.sessions[0]
     if session is not first:
         session.set_axes(first.T_map_world @ T_world_session, session.camera)
+
+
+def find_links(map_: MapFile, new: Collection[int]) -> list[Link]:
+    """Return the places that new drives of a map and the drives before them saw.
+
+    Drives that have frames in common are linked by them. Besides, each keyframe of a new drive is
+    looked for among those of the others; what is recognised counts only where neighbouring
+    keyframes say the same and none of them anything else, so that streets that look alike give no
+    link.
+
+    Args:
+        map_: The map, with the drives that share its axes marked as linked.
+        new: Numbers of the drives that are new in it.
+    """
+    links = []
+    before = [session.number for session in map_.sessions if session.number not in new]
+    linked = {session.number for session in map_.linked}
+    for number in new:
+        together = [n for n in before if n in linked]
+        for group in (together, *([n] for n in before if n not in linked)):
+            links += _between(map_, group, map_.session(number)) if group else []
+        before.append(number)
+    return links
+
+
+def path_up_to(session: Session) -> Float64:
+    """Return float64 (N,), path of a drive up to each frame; lost frames count several times.
+
+    Of known poses it is 0 everywhere: odometry, whose drift grows with the path, had no part in it.
+    """
+    if all(record.known for record in session.health):
+        return np.zeros(len(session))
+    return path_lengths(session.odometry.T_world_camera, session.trusted)
+
+
+def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
+    """Return the links from drives that share axes to a new one."""
+    links, theirs, own = [], set(), set()
+    for number in group:
+        other = map_.session(number)
+        shared = shared_frames(other, new).tolist()
+        ones, news = stretches(other.health), stretches(new.health)
+        # One for each two stretches: nothing else may say where those behind a lost pose are.
+        last = {(int(ones[first]), int(news[last])): (first, last) for first, last in shared}
+        links += [Link((number, new.number), link_by_frame(other, *pair)) for pair in last.values()]
+        theirs |= {(number, first) for first, _ in shared}
+        own |= {last for _, last in shared}
+    views = MapViews(map_, group)
+    # What a frame that both have shows again is a loop of either drive alone, which knows it.
+    loops = [
+        loop for loop in _recognised(views, new, own) if _frame_of(views[loop.first]) not in theirs
+    ]
+    return links + _confirmed(loops, views, new)
+
+
+def _recognised(views: MapViews, new: Session, without: Collection[int]) -> list[Loop]:
+    """Return what keyframes of a drive show of the places of others; ``first`` is a view."""
+    known = KnownPlaces(views)
+    loops: list[Loop] = []
+    if len(known):
+        for stored in new.keyframes:
+            if stored.keyframe.frame not in without:
+                loops += known.recognise(stored.keyframe, new.camera).loops
+    return loops
+
+
+def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Link]:
+    """Return links by the loops that neighbouring ones confirm."""
+    if not loops:
+        return []
+    path_m, poses = path_up_to(new), new.odometry.T_world_camera
+    # The other drives are finished: what they drifted is corrected as far as it is known.
+    firsts = {loop.first: (views[loop.first].T_world_camera, 0.0) for loop in loops}
+    lasts = {loop.last: (poses[loop.last], float(path_m[loop.last])) for loop in loops}
+    return [
+        Link((views[loop.first].session, new.number), _of_frames(loop, views))
+        for loop in agreeing_loops(loops, firsts, lasts)
+    ]
+
+
+def _frame_of(view: KnownView) -> tuple[int, int]:
+    """Return the drive and the frame of a view."""
+    return view.session, view.keyframe.frame
+
+
+def _of_frames(loop: Loop, views: MapViews) -> Loop:
+    """Return a loop from a view as one from its frame."""
+    return replace(loop, first=views[loop.first].keyframe.frame)
+
+
+_INFORMATION: Final = 1e8
+"""Of what is the same: 0.1 mm and 0.1 mrad, as no covariance may be zero."""
+
+
+def shared_frames(one: Session, other: Session) -> NDArray[np.intp]:
+    """Return int (K, 2), the frames that two drives of one map share, by number in either."""
+    times_s, others_s = one.odometry.timestamps_s, other.odometry.timestamps_s
+    _, firsts, lasts = np.intersect1d(times_s, others_s, return_indices=True)
+    pairs = zip(firsts.tolist(), lasts.tolist(), strict=True)
+    same = [(first, last) for first, last in pairs if one.same_rays(first, other, last)]
+    return np.array(same, np.intp).reshape(-1, 2)
+
+
+def link_by_frame(one: Session, first: int, last: int) -> Loop:
+    """Return the link from a drive to another one that has its frame ``first`` as ``last``."""
+    points = len(one.rays(first)[0].sigma_m)
+    return Loop(first, last, np.eye(4), _INFORMATION * np.eye(6), points, 1.0, same_frame=True)
+
+
+def seen_before(map_: MapFile, session: Session) -> frozenset[int]:
+    """Return the frames of a drive that an earlier one has in the map: no evidence of its own."""
+    linked = map_.linked
+    earlier, placed = linked[: linked.index(session)], map_.placed
+    return frozenset(
+        last
+        for one in earlier
+        for first, last in shared_frames(one, session).tolist()
+        if placed[one.number][first]
+    )
+
+
+_FEWEST: Final = 5
+"""Links from which a scale is estimated, besides six parameters of the place."""
+_LARGEST: Final = 0.02
+"""Difference that drift explains: twice what odometry is expected to be off by in each drive."""
+_SIGMAS: Final = 4.0
+
+
+def doubts_of_lengths(map_: MapFile) -> list[str]:
+    """Return a line for each two drives, one of which finds the same street longer."""
+    kept = sorted((link for link in map_.links if link.kept), key=lambda link: link.sessions)
+    lines = []
+    for (one, other), links in groupby(kept, key=lambda link: link.sessions):
+        paths = (map_.session(one).odometry, map_.session(other).odometry)
+        longer = times_as_long(*paths, [link.loop for link in links])
+        if longer is not None and abs(longer[0] - 1.0) > max(_LARGEST, _SIGMAS * longer[1]):
+            lines.append(
+                f"between the places that both saw, session {one} is {longer[0]:.3f} times as long "
+                f"as session {other}: the baseline of one rig is off, or a drive has drifted"
+            )
+    return lines
+
+
+def times_as_long(
+    one: Trajectory, other: Trajectory, links: Sequence[Loop]
+) -> tuple[float, float] | None:
+    """Return how many times as long one drive is as another, and the standard deviation of that.
+
+    Args:
+        one: Its path by odometry, in which links have their ``first``.
+        other: That of the other drive, in which they have their ``last``.
+        links: Places that both saw.
+
+    Returns:
+        None where there are too few links, or all are at one place.
+    """
+    if len(links) < _FEWEST:
+        return None
+    others_m = other.positions_m[[link.last for link in links]]
+    ones_m = np.array(
+        [(one.T_world_camera[link.first] @ link.T_first_last)[:3, 3] for link in links]
+    )
+    spread_m = float(np.sqrt(np.sum((others_m - others_m.mean(axis=0)) ** 2)))
+    if spread_m < 1.0:
+        return None
+    fitted = fit_points(others_m, ones_m, scaled=True)
+    left_m = apply(fitted.T_to_from, fitted.scale * others_m) - ones_m
+    freedom = 3 * len(links) - 7
+    sigma_m = float(np.sqrt(np.sum(left_m**2) / freedom))
+    return fitted.scale, sigma_m / spread_m

@@ -31,7 +31,7 @@ from recon.rig.audit.row_alignment import RowAlignment, correct_rig
 from recon.rig.audit.sample import Geometry, Look, Sample, measure_geometry, take_sample
 from recon.rig.audit.seen_motion import SeenMotion, measure_turn, turn_figures
 from recon.rig.settings import AuditedSettings
-from recon.run.summary import plain
+from recon.run.run import plain
 from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import IncompleteSource, StereoSource
 from recon.stereo.match.registry import MatchingSettings, settings_of

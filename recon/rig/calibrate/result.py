@@ -21,7 +21,7 @@ from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.stereo import StereoFit
 from recon.rig.calibrate.verdict import TILT_DEG
 from recon.rig.settings import CalibratedSettings
-from recon.run.summary import plain
+from recon.run.run import plain
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]

@@ -1,7 +1,6 @@
 """Many commands as jobs, on this machine or on a cluster.
 
 - `job_file.py`: what the user asks for; `recon.cli.program` makes checked jobs of it;
-- `job.py`: a job, how it ended, and its log;
-- `process.py`: one try of a job on its worker, in a process of its own (`guard.py`);
+- `job.py`: a job, how it ended, its log, and one try of it in a process of its own (`guard.py`);
 - `cluster.py`: the workers, by Dask; `results.py`: what comes back, and what is unusual in it.
 """

@@ -14,8 +14,7 @@ from typing import Any, Final
 from uuid import uuid4
 
 from recon.core.errors import ClusterError, ReconError, SettingsError, require
-from recon.run.batch.job import Job, Outcome, last_outcome
-from recon.run.batch.process import run_job
+from recon.run.batch.job import Job, Outcome, last_outcome, run_job
 from recon.run.machine import available_cores
 from recon.run.progress import SILENT, Progress
 

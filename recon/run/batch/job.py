@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Mapping
+import math
+import os
+import platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import IO, Any, Final, Literal
 
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked
 
+from recon.core.errors import OutputError
+from recon.io.atomic import is_locked
 from recon.io.files import reading
-from recon.run.directory import RECORD, STARTED, state_folder
-from recon.run.run import SUMMARY
+from recon.run.directory import RECORD, STARTED, lock_file, refuse_links, state_folder
+from recon.run.run import SUMMARY, Run
 
 State = Literal["not run", "succeeded", "failed", "broken"]
 """``failed``: by its input, so that another try would fail too. ``broken``: by anything else."""
@@ -125,3 +139,154 @@ def last_outcome(folder: Path, name: str) -> Outcome:
 def is_done(out: Path) -> bool:
     """Return whether the result of a job is there; the record is the last file of a run."""
     return (out / RECORD).is_file() and (out / SUMMARY).is_file()
+
+
+Asked = Callable[[], bool]
+_PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")
+_LOOK_S: Final = 0.2
+_OTHERS_S: Final = 90.0
+_LOG_S: Final = 10.0
+"""The log of a job has so many seconds between two of its frames."""
+_LEAST_FREE_BYTES: Final = 32_000_000
+_INPUT: Final = (1, 2)
+"""Exit codes of bad input and of wrong usage."""
+_LONGEST: Final = 400
+
+
+def run_job(job: Job, folder: Path, worker: str = "", stopped: Asked = lambda: False) -> Outcome:
+    """Run the command of a job in a process of its own, into a folder of its own.
+
+    The process ends with this one. A result that is there is not made again; what an earlier try
+    of `recon map` has committed is gone on with, unless that has failed already.
+
+    Args:
+        job: The job.
+        folder: Folder of the batch, seen by all workers.
+        worker: Address of the worker.
+        stopped: Asked whether nobody waits for the job any more; its process is then killed.
+    """
+    out, last = folder / job.name, last_outcome(folder, job.name)
+    if last.state == "succeeded":
+        return last
+    _wait_for_others(out, stopped)
+    path, begun = log_file(folder, job.name), time.monotonic()
+    path.parent.mkdir(exist_ok=True)
+    refuse_links(path.parent)
+    resume = job.resumes(out) and not last.stale
+    line = job.command_line(out, resume=resume)
+    where = worker or f"{platform.node()}:{os.getpid()}"
+    tried = Outcome("broken", "its worker died", worker=where, tries=last.tries + 1)
+    with path.open("ab", buffering=0) as log:
+        log.write(tried.line() + f"{shlex.join(['recon', *line])}\n".encode(errors="replace"))
+        code, error = _run(job, line, out, log, stopped)
+        full = code != 0 and any(map(_is_full, (folder, Path(tempfile.gettempdir()))))
+        state = _state(job, out, code, full=full)
+        ended = replace(
+            tried,
+            state=state,
+            error="" if state == "succeeded" else error,
+            seconds=round(time.monotonic() - begun, 3),
+            full=full,
+            stale=resume and code > 0 and not full,
+        )
+        with contextlib.suppress(OSError):  # a full disk, of which the outcome tells
+            log.write(ended.line())
+    return ended
+
+
+def _wait_for_others(out: Path, stopped: Asked) -> None:
+    """Wait for an earlier try, whose worker does not know yet that its scheduler is gone."""
+    late = time.monotonic() + _OTHERS_S
+    while is_locked(lock_file(out)) and time.monotonic() < late and not stopped():
+        time.sleep(_LOOK_S)
+
+
+def _state(job: Job, out: Path, code: int, *, full: bool) -> State:
+    if code == 0 and is_done(out):
+        return "succeeded"
+    return "failed" if code in _INPUT and not job.resumes(out) and not full else "broken"
+
+
+def _is_full(folder: Path) -> bool:
+    return shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
+
+
+def _run(job: Job, line: list[str], out: Path, log: IO[bytes], stopped: Asked) -> tuple[int, str]:
+    """Run the process to its end; returns its exit code and the line in which it says why."""
+    said = [""]
+    try:
+        with tempfile.TemporaryFile() as printed:
+            process = subprocess.Popen(
+                [*_PROGRAM, *line],
+                cwd=job.folder,
+                stdin=subprocess.PIPE,
+                stdout=printed,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+                env=_environment(),
+            )
+            listener = threading.Thread(
+                target=_listen, args=(process.stderr, log, said), daemon=True
+            )
+            listener.start()
+            why = _wait(process, job.timeout_s or math.inf, stopped)
+            listener.join(timeout=10.0)
+            if process.returncode == 0 and not job.writes:
+                printed.seek(0)
+                with Run(job.command, out) as run:
+                    run.finish(json.loads(printed.read()), source=job.source, inputs=())
+    except (OSError, OutputError, ValueError) as failure:
+        return -1, str(failure)
+    code, error = process.returncode, said[0].removeprefix("error: ")[:_LONGEST]
+    return (-1, why) if why else (code, error or _died(code))
+
+
+def _listen(stream: IO[bytes], log: IO[bytes], said: list[str]) -> None:
+    """Keep what a process says in its log; ``said`` gets the line in which it says why it ended."""
+    shown_s = -math.inf
+    for line in stream:
+        if line.startswith((b'{"event": "frame"', b'{"event": "scene"')):
+            if time.monotonic() < shown_s + _LOG_S:
+                continue
+            shown_s = time.monotonic()
+        with contextlib.suppress(OSError, ValueError):  # a full disk; a log that was closed
+            log.write(line)
+        text = line.decode("utf-8", "replace").strip().strip("│ ")  # a box around it
+        is_plain = any(map(str.isalnum, text)) and not text.startswith("{")
+        if text.startswith("error: ") or (is_plain and not said[0].startswith("error: ")):
+            said[0] = text
+
+
+def _wait(process: subprocess.Popen[bytes], timeout_s: float, stopped: Asked) -> str:
+    """Wait for the end of a process, or end it with all it started; returns why, or ""."""
+    late, why = time.monotonic() + timeout_s, ""
+    try:
+        while process.poll() is None and not why:
+            if time.monotonic() > late:
+                why = f"took more than {timeout_s:g} s"
+            elif stopped():
+                why = "was stopped"
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_LOOK_S)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
+    return why
+
+
+def _environment() -> dict[str, str]:
+    """Return the environment, in which the folder of the job cannot hide this program."""
+    paths = (str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH"))
+    # From Python 3.11 on, the second keeps it from searching the working folder.
+    path = os.pathsep.join(filter(None, paths))
+    return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+
+
+def _died(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}"
+    memory = "; out of memory?" if -code == signal.SIGKILL else ""
+    return f"its process was killed by signal {-code}{memory}"

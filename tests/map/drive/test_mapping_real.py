@@ -10,7 +10,7 @@ import pytest
 
 from recon.core.geometry.se3 import apply
 from recon.core.values import FREE, OCCUPIED, PointCloud
-from recon.map.fusion.builder import CloudBuilder, FusionSettings
+from recon.map.fusion import CloudBuilder, FusionSettings
 from recon.map.ground.axes import AxesSettings, estimate_ground, map_axes
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSettings, estimate_ground_surface

@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import Trajectory
-from recon.map.sessions.lengths import times_as_long
+from recon.map.sessions.joining import times_as_long
 from recon.places.loop import Loop
 
 T_THERE = make_transform(exp_so3(np.array([0.0, 2.5, 0.0])), np.array([30.0, 1.0, -80.0]))

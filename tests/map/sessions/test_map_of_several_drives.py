@@ -18,9 +18,8 @@ from recon.core.values.arrays import Float64
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.occupancy.builder import ray_grain, thin_rays
 from recon.map.sessions.copying import check_session, copy_sessions
-from recon.map.sessions.joining import join_new, join_sessions
+from recon.map.sessions.joining import join_new, join_sessions, seen_before, shared_frames
 from recon.map.sessions.placed import PlacedSubmaps, place_map
-from recon.map.sessions.shared_frames import seen_before, shared_frames
 from recon.map.store.record_values import Link
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder

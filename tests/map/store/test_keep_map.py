@@ -11,7 +11,7 @@ from recon.commands.config import load_config
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import PointCloud, RectifiedCamera
-from recon.map.fusion.part import FusedPart, join_fused
+from recon.map.fusion import FusedPart, join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.occupancy.builder import ray_grain, thin_rays
 from recon.map.occupancy.part import join_occupancy

@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.errors import FormatError, ShapeError
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera
-from recon.map.sessions.linking import path_up_to
+from recon.map.sessions.joining import path_up_to
 from recon.map.store.session import Session, SessionInfo
 from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from recon.run.batch import process
+from recon.run.batch import job as process
 from recon.run.batch.job import Job
 
 #: What `recon` would do, without what it needs to start: `… map WHAT --out FOLDER …`.

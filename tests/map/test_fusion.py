@@ -9,8 +9,8 @@ from recon.core.errors import MappingError
 from recon.core.geometry.projection import depth_sigma
 from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_cloud
 from recon.core.values import PointCloud, RectifiedCamera
-from recon.map.fusion import part
-from recon.map.fusion.builder import CloudBuilder, FusionSettings, fusion_range_m
+from recon.map import fusion
+from recon.map.fusion import CloudBuilder, FusionSettings, fusion_range_m, join_fused
 
 
 def _cloud(xyz: np.ndarray, **fields: np.ndarray) -> PointCloud:
@@ -52,9 +52,9 @@ def test_precise_voxels_need_one_frame_less(monkeypatch: pytest.MonkeyPatch) -> 
     cloud = _cloud(xyz, sigma_m=np.array([0.1, 0.15], np.float32))
     builder = _build(cloud, cloud, min_count=3)
     for limit_m, exported in ((0.08, 1), (0.07, 0), (0.11, 2)):
-        monkeypatch.setattr(part, "PRECISE_SIGMA_M", limit_m)
+        monkeypatch.setattr(fusion, "PRECISE_SIGMA_M", limit_m)
         assert len(builder.cloud()) == exported
-    monkeypatch.setattr(part, "PRECISE_SIGMA_M", 10.0)
+    monkeypatch.setattr(fusion, "PRECISE_SIGMA_M", 10.0)
     once = _build(cloud, min_count=3)
     assert len(once.cloud()) == 0
     assert len(once.cloud(min_count=1)) == 2
@@ -218,6 +218,6 @@ def test_frames_fused_in_one_session_and_in_two_give_the_same_points() -> None:
     there = [transform_cloud(cloud, invert(T), frame="world") for cloud in frames[1::2]]
     odd = _build(*there).part().moved(T, 0.1)
     one = _build(*frames).cloud().xyz
-    two = part.join_fused([_build(*frames[::2]).part(), odd]).cloud(0.1, 3).xyz
+    two = join_fused([_build(*frames[::2]).part(), odd]).cloud(0.1, 3).xyz
     assert len(two) == pytest.approx(len(one), rel=0.02)
     assert max(_farthest_m(one, two, 0.95), _farthest_m(two, one, 0.95)) < 0.1

@@ -15,9 +15,8 @@ import pytest
 import recon
 from recon.core.errors import FormatError
 from recon.io.atomic import take_lock
-from recon.run.batch import process
-from recon.run.batch.job import Job, Outcome, is_done, last_outcome, log_file
-from recon.run.batch.process import run_job
+from recon.run.batch import job as process
+from recon.run.batch.job import Job, Outcome, is_done, last_outcome, log_file, run_job
 from recon.run.directory import lock_file
 from tests.run.batch.jobs import job, stand_in, tries
 from tests.scenery.patience import LONG_S

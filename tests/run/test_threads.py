@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.run import lookahead
-from recon.run.lookahead import OneBehind, look_ahead, side_by_side
+from recon.run import threads as lookahead
+from recon.run.threads import OneBehind, look_ahead, side_by_side
 from tests.run.pools import observed_pool
 from tests.scenery.patience import LONG_S
 
