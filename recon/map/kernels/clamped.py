@@ -11,7 +11,7 @@ Adding up clamped log-odds would not: a car that was seen ten times in one part,
 ten times in the next, would stay.
 
 The reference implementations in plain Python are in
-`tests/map/kernels/clamped_reference.py`.
+`tests/map/kernels/reference.py`.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ many hits is more precise than each: a plane through the points in and around a 
 their precision, tells whether the surface is in this cell or in the one before or behind it.
 
 All lengths are in cells. The reference implementation in plain Python is in
-`tests/map/kernels/facets_reference.py`.
+`tests/map/kernels/reference.py`.
 
 Ref: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.2
 (the tangent plane from the covariance of the neighbourhood).

@@ -8,7 +8,7 @@ A measurement is a normal distribution along its ray, not a point: a cell is hit
 distribution that lies in it, and only what lies well before it is free.
 
 All lengths are in cells, except those of the points given. The reference implementations in
-plain Python are in `tests/map/kernels/raycast_reference.py`.
+plain Python are in `tests/map/kernels/reference.py`.
 
 Ref: J. Amanatides and A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics
 1987; A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on

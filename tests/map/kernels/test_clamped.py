@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels import voxels
 from recon.map.kernels import clamped, raycast
-from tests.map.kernels.clamped_reference import (
+from tests.map.kernels.reference import (
     Cell,
     Clamped,
     apply_evidence_reference,

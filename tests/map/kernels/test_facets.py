@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from recon.core.kernels import voxels
 from recon.map.kernels import facets
-from tests.map.kernels.facets_reference import crossed_cells_reference
+from tests.map.kernels.reference import crossed_cells_reference
 
 
 def _summed(xyz: np.ndarray, weights: np.ndarray) -> voxels.VoxelSums:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from recon.core.kernels import voxels
 from recon.map.kernels import clamped, raycast
-from tests.map.kernels.clamped_reference import apply_evidence_reference
-from tests.map.kernels.raycast_reference import (
+from tests.map.kernels.reference import (
+    apply_evidence_reference,
     cast_rays_reference,
     limit_points_reference,
     measure_points_reference,

@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.errors import EvaluationError, ReconError, RegistrationError
 from recon.core.geometry.alignment import interpolate_poses
-from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.ground.axes import AXES_MAP_WORLD
@@ -17,6 +17,7 @@ from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.joining import join_new
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.verbs import Map
+from recon.places.loop import Loop
 from tests.map.sessions.test_map_of_several_drives import TRUE, _drive, _off_m
 
 T_SURVEY_WORLD = make_transform(
@@ -150,3 +151,57 @@ def test_positions_that_no_drift_explains_are_refused(
     hold(map_, Survey(winding(tmp_path, 8.0, 0.02, numbers), ANTENNA))
     with pytest.raises(RegistrationError, match="bend a path more than its drift explains"):
         join_new(map_, [])
+
+
+T_THERE = make_transform(exp_so3(np.array([0.0, 2.5, 0.0])), np.array([30.0, 1.0, -80.0]))
+
+
+def bend(longer: float) -> Trajectory:
+    """A drive of 40 frames around a bend, as long as a rig measures it."""
+    turns = 0.04 * np.arange(40)
+    poses = [
+        make_transform(
+            exp_so3(np.array([0.0, turn, 0.0])),
+            longer * 20.0 * np.array([1.0 - np.cos(turn), 0.0, np.sin(turn)]),
+        )
+        for turn in turns
+    ]
+    return Trajectory(np.stack(poses), 0.1 * np.arange(40))
+
+
+def links_of(frames: range, noise_m: float = 0.02) -> list[Loop]:
+    """Places that both saw, a frame apart: the link is measured by the first rig."""
+    path, random = bend(1.0).T_world_camera, np.random.default_rng(5)
+    found = []
+    for frame in frames:
+        T = invert(path[frame]) @ path[frame + 1]
+        T[:3, 3] += random.normal(0.0, noise_m, 3)
+        found.append(Loop(frame, frame + 1, T, np.eye(6), 100, 0.9))
+    return found
+
+
+@pytest.mark.parametrize("longer", [0.9, 1.0, 1.03])
+def test_the_ratio_of_two_rigs_is_found_within_its_deviation(longer: float) -> None:
+    other = bend(longer)
+    moved = Trajectory(T_THERE @ other.T_world_camera, other.timestamps_s)
+    found = times_as_long(bend(1.0), moved, links_of(range(0, 39, 3)))
+    assert found is not None
+    scale, sigma = found
+    assert 0.0002 < sigma < 0.002
+    assert abs(scale - 1.0 / longer) < 4 * sigma
+
+
+def test_noisy_links_say_little_and_how_little() -> None:
+    found = times_as_long(bend(1.0), bend(1.0), links_of(range(0, 39, 3), noise_m=0.5))
+    assert found is not None
+    assert 0.01 < found[1] < 0.05
+    assert abs(found[0] - 1.0) < 4 * found[1]
+
+
+def test_few_links_say_nothing() -> None:
+    assert times_as_long(bend(1.0), bend(1.03), links_of(range(0, 39, 10))) is None
+
+
+def test_links_at_one_place_say_nothing() -> None:
+    still = Trajectory(np.tile(np.eye(4), (40, 1, 1)), 0.1 * np.arange(40))
+    assert times_as_long(bend(1.0), still, links_of(range(0, 39, 3))) is None

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.map.kernels.facets import LEAST
 from recon.map.kernels.raycast import MIN_DEPTH_M, Rays
 from tests.core.kernels.voxels_reference import Cell
 
@@ -106,3 +108,75 @@ def _below(value: float, mean: float, sigma: float) -> float:
     if sigma <= 0:
         return float(value > mean)
     return 0.5 * (1.0 + math.erf((value - mean) / (sigma * math.sqrt(2.0))))
+
+
+Clamped = tuple[float, float, float]
+"""Sum, low, high: stands for ``x → min(max(x + sum, low), high)``."""
+
+
+def apply_evidence_reference(
+    log_odds: dict[Cell, float], evidence: dict[Cell, float], lowest: float, highest: float
+) -> None:
+    """Add a frame's evidence to the log-odds of a map and clamp: what a part stands for."""
+    for cell, change in evidence.items():
+        log_odds[cell] = min(max(log_odds.get(cell, 0.0) + change, lowest), highest)
+
+
+def chain_reference(first: dict[Cell, Clamped], then: dict[Cell, Clamped]) -> dict[Cell, Clamped]:
+    """What two parts of a drive did to each cell, one after the other."""
+    both = {**first, **then}
+    for cell in first.keys() & then.keys():
+        total, low, high = first[cell]
+        change, lowest, highest = then[cell]
+        both[cell] = (
+            total + change,
+            min(max(low + change, lowest), highest),
+            min(max(high + change, lowest), highest),
+        )
+    return both
+
+
+def move_reference(cells: dict[Cell, Clamped], T_new_old: NDArray[Any]) -> dict[Cell, Clamped]:
+    """Each new cell takes what the old cell at its centre has."""
+    centres = np.array(list(cells), dtype=np.float64).reshape(-1, 3) + 0.5
+    T_old_new = np.linalg.inv(T_new_old)
+    moved: dict[Cell, Clamped] = {}
+    for centre in centres @ T_new_old[:3, :3].T + T_new_old[:3, 3]:
+        home = np.floor(centre).astype(int)
+        for offset in np.ndindex(3, 3, 3):
+            i, j, k = (home + np.array(offset) - 1).tolist()
+            x, y, z = (T_old_new[:3, :3] @ [i + 0.5, j + 0.5, k + 0.5] + T_old_new[:3, 3]).tolist()
+            old = (math.floor(x), math.floor(y), math.floor(z))
+            if old in cells:
+                moved[i, j, k] = cells[old]
+    return moved
+
+
+def crossed_cells_reference(
+    cells: list[Cell], points: dict[Cell, tuple[float, NDArray[Any]]]
+) -> list[bool]:
+    """Which cells are crossed, as `recon.map.kernels.facets.crossed_cells` defines it.
+
+    Args:
+        cells: The cells asked about.
+        points: Of each cell that holds points, the sum of their weights and their mean, float64
+            (3,), as a place in space.
+    """
+    return [_crossed(cell, points) for cell in cells]
+
+
+def _crossed(cell: Cell, points: dict[Cell, tuple[float, NDArray[Any]]]) -> bool:
+    """Whether the surface crosses one cell."""
+    steps = product((-1, 0, 1), repeat=3)
+    around = [points.get((cell[0] + i, cell[1] + j, cell[2] + k)) for i, j, k in steps]
+    known = [point for point in around if point is not None]
+    if len(known) < LEAST:
+        return cell in points
+    weights = np.array([weight for weight, _ in known])
+    places = np.array([place for _, place in known]) - (np.array(cell) + 0.5)
+    spread = np.cov(places.T, aweights=weights, ddof=0)
+    normal = np.linalg.eigh(spread)[1][:, 0]
+    along = places @ normal
+    beside = (places**2).sum(axis=1) - along**2
+    distance = np.average(along, weights=weights * np.exp(-beside))
+    return bool(abs(distance) <= 0.5 * np.abs(normal).sum())
