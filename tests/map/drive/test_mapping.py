@@ -15,6 +15,7 @@ from recon.core.values import FREE, OCCUPIED, PointCloud, RectifiedCamera, Recti
 from recon.core.values.arrays import Float64
 from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.map_behind import MapBehind, Registered
+from recon.map.fusion import CloudBuilder, FusionSettings
 from recon.map.ground.axes import AxesSettings, estimate_ground, map_axes
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSettings, estimate_ground_surface

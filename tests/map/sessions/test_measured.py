@@ -14,7 +14,7 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.sessions.copying import copy_sessions
-from recon.map.sessions.joining import join_new
+from recon.map.sessions.joining import join_new, times_as_long
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.verbs import Map
 from recon.places.loop import Loop
