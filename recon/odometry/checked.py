@@ -1,4 +1,9 @@
-"""An odometry whose poses are checked: uncertain and contradicted ones are marked."""
+"""An odometry whose poses are checked: uncertain and contradicted ones are marked.
+
+Features may agree on a motion that is not the camera's: that of a lorry ahead, or none at all where
+they slide along the edge of a road. Then the rest of the image contradicts: its patches, moved
+accordingly, do not match what is seen there.
+"""
 
 from __future__ import annotations
 
@@ -24,17 +29,10 @@ from recon.odometry.protocol import (
     tree_of,
 )
 
-_MAX_SIGMA_M: Final = 0.05
-"""Largest standard deviation of a trusted motion."""
-
-_MAX_SIGMA_SHARE: Final = 0.05
-"""Share of the motion's length that is added to it."""
-
-_MIN_TELLING: Final = 8
-"""With fewer usable patches the images say nothing."""
-
-MIN_SHARE: Final = 0.6
-"""Least share of patches that must agree with a trusted motion."""
+_MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion
+_MAX_SIGMA_SHARE: Final = 0.05  # share of the motion's length that is added to it
+_MIN_TELLING: Final = 8  # with fewer usable patches the images say nothing
+MIN_SHARE: Final = 0.6  # least share of patches that must agree with a trusted motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +62,6 @@ class CheckedOdometry:
         self._state: CheckedState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame, and check the result."""
         result, state = self._odometry.register(frame), self._state
         sight = Sight(frame.pair.left, frame.disparity)
         self._state = CheckedState(sight, result.T_world_camera)
@@ -77,7 +74,6 @@ class CheckedOdometry:
         return replace(result, health=replace(result.health, ok=not doubts, notes=notes))
 
     def state(self) -> dict[str, Any]:
-        """Return everything that later poses depend on."""
         last = self._state
         if last is None:
             return {"odometry": self._odometry.state(), "last": None}
@@ -91,7 +87,6 @@ class CheckedOdometry:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
         self._odometry.restore(state["odometry"])
         last, self._state = state["last"], None
         if last is not None:
@@ -105,7 +100,7 @@ class CheckedOdometry:
         T_before_now: Float64,
         camera: RectifiedCamera,
     ) -> list[str]:
-        """Return what speaks against a motion; empty where it is to be trusted."""
+        """What speaks against a motion; empty where it is to be trusted."""
         length_m = float(np.linalg.norm(T_before_now[:3, 3]))
         if health.sigma_m > _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m:
             return [f"the motion is known to {health.sigma_m:.2f} m only"]
@@ -128,25 +123,17 @@ def _contradiction(share: float, informative: int) -> list[str]:
 
 Int64 = NDArray[np.int64]
 
-_LEAST_NOISE = 0.5
-"""Grey values: rounding alone leaves 0.3."""
+_LEAST_NOISE = 0.5  # grey values: rounding alone leaves 0.3
 
 
-_STRIDE_PX: Final = 5
-"""Every n-th row and column is sampled."""
-
-_PATCH_PX: Final = 48
-"""Edge of a patch."""
-
-_MIN_PIXELS: Final = 24
-"""Least number of samples with a disparity in a patch."""
-
+_STRIDE_PX: Final = 5  # every n-th row and column is sampled
+_PATCH_PX: Final = 48  # edge of a patch
+_MIN_PIXELS: Final = 24  # least number of samples with a disparity in a patch
 _MIN_TEXTURE: Final = 3.0
 """A patch is used if its mean squared gradient, in the direction in which it is smallest, exceeds
 that of the noise by this factor."""
 
-_MIN_CORRELATION: Final = 0.6
-"""Least correlation of a patch that agrees."""
+_MIN_CORRELATION: Final = 0.6  # least correlation of a patch that agrees
 
 
 @dataclass(frozen=True)
@@ -209,12 +196,6 @@ def explain_motion(
     with those seen there, corrected for noise; brightness and contrast may change. Patches without
     texture, or with edges in one direction alone, match after many motions and are not counted; in
     an image that is dark by now no patch is.
-
-    Args:
-        before: The last frame.
-        now: This one.
-        T_before_now: float64 (4, 4), the motion in question.
-        camera: The rectified camera.
     """
     samples = _sample(before, now.left, T_before_now, camera)
     count = np.bincount(samples.patch)
@@ -229,12 +210,11 @@ def explain_motion(
 
 
 def noise_sigma(grey: UInt8) -> float:
-    """Return the standard deviation of the noise of an image, grey values.
+    """The standard deviation of the noise of an image, grey values.
 
     From the median of mixed fourth differences, in which gradients and straight edges cancel.
 
-    Ref:
-        Immerkær, "Fast noise variance estimation", CVIU 1996.
+    Ref: Immerkær, "Fast noise variance estimation", CVIU 1996.
     """
     # Every fourth column and row: some ten thousand values give a median to one per cent.
     columns = [grey[:, k : k + grey.shape[1] - 2 : 4].astype(np.int16) for k in range(3)]
@@ -253,7 +233,7 @@ def _sample(
     T_before_now: Float64,
     camera: RectifiedCamera,
 ) -> _Samples:
-    """Return every n-th pixel with a disparity that stays in the image."""
+    """Every n-th pixel with a disparity that stays in the image."""
     step, (height, width) = _STRIDE_PX, left.shape
     # Slopes need a neighbour on either side.
     row, column = np.nonzero(before.disparity.valid[1:-1:step, 1:-1:step])
@@ -275,7 +255,7 @@ def _sample(
 
 
 def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
-    """Return grey values (N,) between pixels."""
+    """Grey values (N,) between pixels."""
     if not len(u):
         return np.zeros(0)
     # OpenCV refuses maps of more than 32767 rows, so the points are wrapped into rows.
@@ -286,7 +266,7 @@ def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
 
 
 def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_]:
-    """Return bool (P,), patches with gradients in every direction that exceed the noise."""
+    """Patches (P,) with gradients in every direction that exceed the noise."""
     x, y = samples.slope.T
     xx, yy, xy = (_mean(samples, values, count) for values in (x * x, y * y, x * y))
     least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
@@ -295,7 +275,7 @@ def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_
 
 
 def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) -> Float64:
-    """Return the correlation (P,) of each patch between the two images, corrected for noise."""
+    """The correlation (P,) of each patch between the two images, corrected for noise."""
     one, other = samples.before, samples.now
     mean, mean_other = (_mean(samples, values, count) for values in (one, other))
     both = _mean(samples, one * other, count) - mean * mean_other
@@ -308,10 +288,10 @@ def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) ->
 
 
 def _power(samples: _Samples, values: Float64, count: Int64) -> Float64:
-    """Return the variance of values (N,) in each patch, noise included."""
+    """The variance of values (N,) in each patch, noise included."""
     return _mean(samples, values**2, count) - _mean(samples, values, count) ** 2
 
 
 def _mean(samples: _Samples, values: Float64, count: Int64) -> Float64:
-    """Return the mean of values (N,) in each patch; 0 in empty ones."""
+    """The mean of values (N,) in each patch; 0 in empty ones."""
     return np.asarray(np.bincount(samples.patch, values) / np.maximum(count, 1))

@@ -20,8 +20,7 @@ from recon.odometry.window import TrackWindow
 from recon.stereo.match.sad import halve
 from recon.stereo.rectify.features import exposed_as
 
-MIN_DISPARITY_PX: Final = 0.5
-"""Features with less disparity count as without depth."""
+MIN_DISPARITY_PX: Final = 0.5  # features with less disparity count as without depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class VisualState:
 
 
 def follow_points(state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
-    """Return column and row (N, 2) in the new frame of the points of the window, tracked."""
+    """The points of the window in the new frame, tracked: column and row (N, 2), NaN where lost."""
     window = state.window
     there = np.full((len(window.xyz_world), 2), np.nan)
     alive = np.flatnonzero(window.seen[-1])
@@ -59,13 +58,10 @@ def follow_points(state: VisualState, frame: OdometryFrame, predicted: Float64) 
 def observe_points(
     state: VisualState, frame: OdometryFrame, followed: Float64, T_world_camera: Float64
 ) -> Float64:
-    """Return column, row and disparity (N, 3) in a frame of known pose of the window's points.
+    """Column, row and disparity (N, 3) of the window's points in a frame of known pose.
 
-    Args:
-        state: The frames before.
-        frame: The frame.
-        followed: float64 (N, 2), where tracking has found the points; NaN = nowhere.
-        T_world_camera: float64 (4, 4), about its pose.
+    They are looked for near where tracking found them (``followed`` (N, 2), NaN = nowhere), or else
+    where the pose puts them, and as they look from there.
     """
     window, camera = state.window, frame.pair.camera
     uvd = np.full((len(window.xyz_world), 3), np.nan)
@@ -87,7 +83,7 @@ def observe_points(
 
 
 def feature_disparity(frame: OdometryFrame, uv: Float32) -> Float64:
-    """Return the disparity (N,) of features of a frame, measured anew where the frame is rough.
+    """The disparity (N,) of features, measured anew where the frame is rough.
 
     NaN as in `known_disparity`.
     """
@@ -105,7 +101,7 @@ def known_disparity(disparity: Disparity, camera: RectifiedCamera, uv: Float32) 
 
 
 def replenish(window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
-    """Return the window with as many points in each part of the newest frame: some new."""
+    """The window with new points in those parts of the newest frame that have few."""
     window = window.without_newest(in_crowd(window.uvd[-1, :, :2], frame.pair.left.shape))
     taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
     uv = (find_fewer_corners if frame.rough else find_corners)(frame.pair.left, taken)
@@ -115,57 +111,40 @@ def replenish(window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
 
 
 def points_of(uvd: Float64, T_world_camera: Float64, camera: RectifiedCamera) -> Float64:
-    """Return the world points (N, 3) of features with a disparity."""
+    """The world points (N, 3) of features with a disparity."""
     depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
     return apply(T_world_camera, unproject(uvd[:, 0], uvd[:, 1], depth, camera))
 
 
 def empty_window(T_world_camera: Float64) -> TrackWindow:
-    """Return a window of one frame without points."""
+    """A window of one frame without points."""
     return TrackWindow(T_world_camera[None], np.zeros((1, 0, 3)), np.zeros((0, 3)))
 
 
 def _seen_from(T_world_camera: Float64, xyz_world: Float64, camera: RectifiedCamera) -> Float64:
-    """Return column and row (N, 2) of points seen from a pose; NaN behind the camera."""
+    """Column and row (N, 2) of points seen from a pose; NaN behind the camera."""
     u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
     return np.stack([u, v], axis=1)
 
 
-_WINDOW_PX: Final = 17
-"""Edge of the tracked patch."""
-
-_LEVELS: Final = 3
-"""Pyramid levels above full resolution."""
-
+_WINDOW_PX: Final = 17  # edge of the tracked patch
+_LEVELS: Final = 3  # pyramid levels above full resolution
 _MAX_EXPOSURE_CHANGE: Final = 0.05
 """Relative change of brightness or contrast above which an image is adapted to the exposure of the
 last one before tracking."""
 
-_NEIGHBOUR_PX: Final = 2
-"""Half width of the neighbourhood whose median is the disparity."""
-
-_MAX_DISPARITY_STEP_PX: Final = 1.0
-"""Largest difference between a disparity and that median."""
-
-_MIN_EIGENVALUE: Final = 1e-4
-"""Least texture of a patch that is tracked, OpenCV's scale."""
+_NEIGHBOUR_PX: Final = 2  # half width of the neighbourhood whose median is the disparity
+_MAX_DISPARITY_STEP_PX: Final = 1.0  # largest difference between a disparity and that median
+_MIN_EIGENVALUE: Final = 1e-4  # least texture of a patch that is tracked, OpenCV's scale
 
 
 def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tuple[Float32, Bool]:
     """Track features to another image, roughly: as patches that look the same.
 
-    Args:
-        source: Image in which the features are known.
-        target: Image to which they are tracked.
-        uv: float32 (N, 2), columns and rows in ``source``.
-        guess_uv: float32 (N, 2), predicted columns and rows in ``target``.
+    Returns their columns and rows (N, 2) in the target, and bool (N,), where something was found;
+    part of it is wrong. ``guess_uv`` is where they are expected.
 
-    Returns:
-        float32 (N, 2), columns and rows in ``target``, and bool (N,), True where something was
-        found; part of it is wrong.
-
-    Ref:
-        Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001.
+    Ref: Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001.
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
@@ -188,24 +167,17 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
 
 
 def _comparable(source: UInt8, target: UInt8) -> UInt8:
-    """Return the target, adapted to the exposure of the source if the two differ."""
+    """The target, adapted to the exposure of the source if the two differ."""
     ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
     same = np.abs(theirs - ours) <= _MAX_EXPOSURE_CHANGE * ours
     return target if same.all() else exposed_as(source, target)
 
 
 def sample_disparity(disparity: Disparity, uv: Float32) -> Float32:
-    """Return the matcher's disparity of features: the median around each, where that is consistent.
+    """The median (N,) of the disparities around features; NaN = none, or inconsistent.
 
-    Tracking features into the right image instead gave two to four times the drift on real
-    drives, probably because patches at the edge of an object contain the background, too.
-
-    Args:
-        disparity: The matcher's result.
-        uv: float32 (N, 2), features of the left image.
-
-    Returns:
-        float32 (N,), pixels; NaN where there is no match, or one unlike its neighbours.
+    Tracking features into the right image instead gave two to four times the drift on real drives,
+    probably because patches at the edge of an object contain the background, too.
     """
     height, width = disparity.values.shape
     column, row = np.rint(uv).astype(np.int64).T
@@ -221,45 +193,23 @@ def sample_disparity(disparity: Disparity, uv: Float32) -> Float32:
     return sampled
 
 
-_CELL_PX: Final = 40
-"""Edge of a cell of the image."""
-
-_PER_CELL: Final = 3
-"""Corners that a cell may hold."""
-
-_DISTANCE_PX: Final = 6
-"""Least distance between two corners."""
-
-_BLOCK_PX: Final = 5
-"""Edge of the neighbourhood that the corner score is computed in."""
-
-_MIN_SCORE: Final = 2e-4
-"""Least eigenvalue of the gradients' covariance, OpenCV's scale."""
-
-_BORDER_PX: Final = 8
-"""Corners nearer to the border are not used."""
+_CELL_PX: Final = 40  # edge of a cell of the image
+_PER_CELL: Final = 3  # corners that a cell may hold
+_DISTANCE_PX: Final = 6  # least distance between two corners
+_BLOCK_PX: Final = 5  # edge of the neighbourhood that the corner score is computed in
+_MIN_SCORE: Final = 2e-4  # least eigenvalue of the gradients' covariance, OpenCV's scale
+_BORDER_PX: Final = 8  # corners nearer to the border are not used
 
 
 def find_corners(
     grey: UInt8, taken_uv: Float32, *, cell_px: int = _CELL_PX, per_cell: int = _PER_CELL
 ) -> Float32:
-    """Return the best corners of each cell of an image, away from those already tracked.
+    """The best corners (M, 2) of each cell of an image, away from those taken.
 
     Cells keep one strongly textured region from taking all features: only features spread over the
-    image determine the motion well.
+    image determine the motion well. Those already tracked count towards the limit of their cell.
 
-    Args:
-        grey: uint8 (H, W).
-        taken_uv: float32 (N, 2), columns and rows of features already tracked; they count
-            towards the limit of their cell.
-        cell_px: Edge of a cell of the image.
-        per_cell: Corners that a cell may hold.
-
-    Returns:
-        float32 (M, 2), columns and rows, pixels.
-
-    Ref:
-        Shi and Tomasi, "Good features to track", CVPR 1994.
+    Ref: Shi and Tomasi, "Good features to track", CVPR 1994.
     """
     score = cv2.cornerMinEigenVal(grey, _BLOCK_PX, ksize=3)
     # Over a whole image, `nonzero` takes six times as long.
@@ -273,17 +223,10 @@ def find_corners(
 
 
 def in_crowd(uv: Float64, shape: tuple[int, ...]) -> Bool:
-    """Return which features are more than their cell may hold; those that come first stay.
+    """Which features (N, 2) are more than their cell may hold; those that come first stay.
 
     Where a camera drives backwards, or turns away, features that are followed gather far ahead, and
-    would outnumber those that are near.
-
-    Args:
-        uv: float64 (N, 2), columns and rows; NaN = not seen.
-        shape: Height and width of the image.
-
-    Returns:
-        bool (N,), False where not seen.
+    would outnumber those that are near. Features that are not seen (NaN) are in no crowd.
     """
     crowd, seen = np.zeros(len(uv), np.bool_), np.flatnonzero(np.isfinite(uv[:, 0]))
     cells = _cell_of(uv[seen], shape, _CELL_PX)
@@ -293,7 +236,7 @@ def in_crowd(uv: Float64, shape: tuple[int, ...]) -> Bool:
 
 
 def find_fewer_corners(grey: UInt8, taken_uv: Float32) -> Float32:
-    """Return corners like `find_corners`, a third as many, found at half size.
+    """Corners like `find_corners`, a third as many, found at half size.
 
     Finding and using them takes a quarter of the time: for drives that are mapped live.
     """
@@ -304,7 +247,7 @@ def find_fewer_corners(grey: UInt8, taken_uv: Float32) -> Float32:
 
 
 def _peaks(score: Float32) -> Bool:
-    """Return local maxima of the score that are good enough and away from the border."""
+    """Local maxima of the score that are good enough and away from the border."""
     size = 2 * _DISTANCE_PX + 1
     peak = score >= cv2.dilate(score, np.ones((size, size), np.uint8))
     peak &= score > _MIN_SCORE
@@ -315,7 +258,7 @@ def _peaks(score: Float32) -> Bool:
 
 
 def _free(shape: tuple[int, ...], taken_uv: Float32) -> Bool:
-    """Return pixels away from every feature already tracked."""
+    """Pixels away from every feature already tracked."""
     free = np.ones(shape, np.uint8)
     for u, v in np.rint(taken_uv).astype(int).tolist():
         cv2.circle(free, (u, v), _DISTANCE_PX, 0, -1)
@@ -323,7 +266,6 @@ def _free(shape: tuple[int, ...], taken_uv: Float32) -> Bool:
 
 
 def _cell_of(uv: NDArray[np.generic], shape: tuple[int, ...], size: int) -> NDArray[np.int64]:
-    """Return the number of the cell of each pixel (N, 2)."""
     columns = -(-shape[1] // size)
     u = np.clip(np.rint(uv[:, 0]).astype(np.int64), 0, shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(np.int64), 0, shape[0] - 1)
@@ -337,7 +279,7 @@ def _count_per_cell(uv: Float32, shape: tuple[int, ...], size: int) -> NDArray[n
 
 
 def _rank_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the position of each element within its run of equal values."""
+    """The position of each element within its run of equal values."""
     index = np.arange(len(groups))
     starts = np.r_[True, groups[1:] != groups[:-1]] if len(groups) else np.zeros(0, np.bool_)
     rank: NDArray[np.int64] = index - np.maximum.accumulate(np.where(starts, index, 0))

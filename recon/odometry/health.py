@@ -17,8 +17,7 @@ from recon.odometry.protocol import OdometryHealth
 _MANY: Final = 0.1
 """Share of frames without a trusted pose above which the whole drive is in question."""
 
-_NAMED: Final = 3
-"""Stretches of frames that a line names."""
+_NAMED: Final = 3  # stretches of frames that a line names
 
 
 def trusted_poses(health: Sequence[OdometryHealth]) -> Bool:
@@ -27,10 +26,10 @@ def trusted_poses(health: Sequence[OdometryHealth]) -> Bool:
 
 
 def stretches(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:
-    """Return int64 (N,), the stretch of each frame: in one, poses are measured from one another.
+    """The stretch (N,) of each frame: in one, poses are measured from one another; -1 = untrusted.
 
     A new one begins after a pose that is not to be trusted, unless that was skipped: where it lies
-    beside the one before is a guess. -1 = the pose itself is not to be trusted.
+    beside the one before is a guess.
     """
     found, number, lost = [], 0, False
     for record in health:
@@ -43,7 +42,7 @@ def stretches(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:
 
 
 def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:
-    """Return one line about a drive with poses that are not to be trusted; empty = it has none."""
+    """One line about a drive with poses that are not to be trusted; empty = it has none."""
     bad = [index for index, record in enumerate(health) if not record.ok]
     if len(bad) > _MANY * len(health):
         poses = f"the poses of {len(bad)} of {counted(len(health), 'frame')} are not"
@@ -59,13 +58,13 @@ def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:
 
 
 def name_frames(indices: Sequence[int]) -> str:
-    """Return the stretches of numbers in words, the first three of them."""
+    """The stretches of numbers in words, the first three of them."""
     named = [_frames(first, last) for first, last in _stretches(indices)]
     return ", ".join([*named[:_NAMED], *(["…"] if len(named) > _NAMED else [])])
 
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
-    """Return one line per distinct warning, and per stretch of frames without a trusted pose."""
+    """One line per distinct warning, and per stretch of frames without a trusted pose."""
     texts = dict.fromkeys(line for record in health for line in record.warnings)
     lines = [f"{_named(health, line)}: {line}" for line in texts]
     bad = [index for index, record in enumerate(health) if not record.ok]
@@ -77,7 +76,7 @@ def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
 
 
 def _named(health: Sequence[OdometryHealth], line: str) -> str:
-    """Return the range of frames that a warning is about, first to last."""
+    """The range of frames that a warning is about, first to last."""
     about = [index for index, record in enumerate(health) if line in record.warnings]
     return _frames(about[0], about[-1])
 
@@ -87,7 +86,7 @@ def _frames(first: int, last: int) -> str:
 
 
 def _stretches(indices: Sequence[int]) -> list[tuple[int, int]]:
-    """Return runs of consecutive numbers as (first, last)."""
+    """Runs of consecutive numbers as (first, last)."""
     stretches: list[tuple[int, int]] = []
     for index in indices:
         if stretches and index == stretches[-1][1] + 1:
@@ -103,16 +102,12 @@ RIG_DISPARITY_PX: Final = 0.1
 RIG_YAW_DEG: Final = 0.02
 """That of the angle between the cameras, which shifts all disparities, too."""
 
-RIG_BASELINE: Final = 0.002
-"""That of the baseline, as a share of it."""
-
+RIG_BASELINE: Final = 0.002  # that of the baseline, as a share of it
 _SEGMENT_M: Final = 100.0
 """Length over which the drift is stated, or the path if it is shorter: errors of the heading make
 it grow with the length."""
 
-_SIGMAS: Final = 1.96
-"""Half width of a 95 % interval, in standard deviations."""
-
+_SIGMAS: Final = 1.96  # half width of a 95 % interval, in standard deviations
 _MOST_PERCENT: Final = 3.0
 """Half width of that interval above which the length of a path is in question."""
 
@@ -137,7 +132,7 @@ class ExpectedDrift:
         return _SIGMAS * self.percent / 100.0
 
     def warnings(self) -> list[str]:
-        """Return what the user should know: that the length of the path is not certain."""
+        """A warning if the length of the path is not certain."""
         half_width = _SIGMAS * self.rig_percent
         if half_width <= _MOST_PERCENT:
             return []
@@ -148,14 +143,9 @@ class ExpectedDrift:
 def expected_drift(
     path: Trajectory, health: Sequence[OdometryHealth], camera: RectifiedCamera
 ) -> ExpectedDrift | None:
-    """Return how far a path may be off; None where no motion was measured.
+    """How far a path by odometry may be off; None where no motion was measured.
 
     Frames without a trusted pose do not count: `health_warnings` names them.
-
-    Args:
-        path: The path by odometry.
-        health: The health of each pose.
-        camera: The rectified camera.
     """
     steps_m = np.linalg.norm(np.diff(path.positions_m, axis=0), axis=1)
     figures = np.array([(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]])
@@ -178,13 +168,13 @@ def expected_drift(
 
 
 def _scale_share(scale_px: Float64, camera: RectifiedCamera) -> Float64:
-    """Return what an error of all disparities does to the lengths (N,) of steps, as a share."""
+    """What an error of all disparities does to the lengths (N,) of steps, as a share."""
     yaw_px = camera.focal_px * np.deg2rad(RIG_YAW_DEG)
     return np.asarray(np.hypot(RIG_DISPARITY_PX, yaw_px) / scale_px)
 
 
 def _random_share(step_m: float, length_m: float, sigma_m: Float64, sigma_rad: Float64) -> float:
-    """Return what errors of single steps add up to over a segment, as a share of its length.
+    """What errors of single steps add up to over a segment, as a share of its length.
 
     Translations add as they are; a turn moves all that follows, on average a third of its square.
     """

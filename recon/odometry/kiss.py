@@ -1,4 +1,4 @@
-"""kiss-icp alone, on the points that stereo measures well."""
+"""kiss-icp: as an odometry, on the points that stereo measures well; and in a map that is there."""
 
 from __future__ import annotations
 
@@ -28,11 +28,8 @@ from recon.core.values import Disparity, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 
-_VOXEL_M: Final = 0.2
-"""Edge of a voxel of the map."""
-
-_MIN_POINTS: Final = 300
-"""Frames with fewer points are skipped."""
+_VOXEL_M: Final = 0.2  # edge of a voxel of the map
+_MIN_POINTS: Final = 300  # frames with fewer points are skipped
 
 
 class KissOdometry:
@@ -62,11 +59,9 @@ class KissOdometry:
         return self._keep(alignment.T_world_camera, health)
 
     def state(self) -> dict[str, Any]:
-        """Return everything that later poses depend on."""
         return {"icp": self._icp.state(), "poses": [{"T": pose} for pose in self._poses]}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
         self._icp.restore(state["icp"])
         self._poses = [pose_in(pose, "T") for pose in state["poses"]]
 
@@ -75,21 +70,16 @@ class KissOdometry:
         return OdometryResult(T_world_camera, health)
 
     def _extrapolated(self) -> Float64:
-        """Return the last pose, moved by the last motion."""
+        """The last pose, moved by the last motion."""
         if len(self._poses) < 2:
             return self._poses[-1] if self._poses else np.eye(4)
         before, last = self._poses
         return np.asarray(last @ invert(before) @ last)
 
 
-_POINTS_PER_VOXEL: Final = 20
-"""Most points that a voxel of the map keeps."""
-
-_INITIAL_THRESHOLD_M: Final = 2.0
-"""First value of the adaptive threshold."""
-
-_MIN_MOTION_M: Final = 0.1
-"""Smaller deviations from the motion model do not change the threshold."""
+_POINTS_PER_VOXEL: Final = 20  # most points that a voxel of the map keeps
+_INITIAL_THRESHOLD_M: Final = 2.0  # first value of the adaptive threshold
+_MIN_MOTION_M: Final = 0.1  # smaller deviations from the motion model do not change the threshold
 
 
 @dataclass(frozen=True)
@@ -127,9 +117,6 @@ class KissIcp:
 
     Points are in OpenCV's camera axes, poses are those of the camera. It runs in one thread, so
     that sums have a fixed order and equal input gives equal output.
-
-    Args:
-        options: Range, voxels, and when to stop.
     """
 
     def __init__(self, options: KissIcpOptions) -> None:
@@ -137,11 +124,7 @@ class KissIcp:
         self._icp = _new(options)
 
     def register(self, xyz_camera: NDArray[np.floating]) -> IcpAlignment:
-        """Register a frame with kiss-icp's own motion model, threshold and map update.
-
-        Args:
-            xyz_camera: (N, 3), metres, finite; not empty.
-        """
+        """Register points (N, 3) with kiss-icp's own motion model, threshold and map update."""
         points = _points(xyz_camera)
         with _our_errors():
             _, source = self._icp.register_frame(points, np.zeros(0))
@@ -153,12 +136,10 @@ class KissIcp:
         T_world_guess: NDArray[np.floating],
         threshold_m: float,
     ) -> IcpAlignment:
-        """Align a frame to the map without changing it: to one that was set.
+        """Align points (N, 3) to the map from a guess of the pose, without changing the map.
 
-        Args:
-            xyz_camera: (N, 3), metres, finite; not empty.
-            T_world_guess: (4, 4), initial guess of the camera's pose.
-            threshold_m: Scale of the robust kernel; correspondences are at most three times as far.
+        ``threshold_m`` is the scale of the robust kernel; correspondences are at most three times
+        as far.
         """
         points = _points(xyz_camera)
         guess, icp = _pose(T_world_guess), self._icp
@@ -219,7 +200,7 @@ class _AdaptiveThreshold:
         self._count = 1
 
     def get_threshold(self) -> float:
-        """Return the root mean square of the deviations so far, metres."""
+        """The root mean square of the deviations so far, metres."""
         return math.sqrt(self._sum_m2 / self._count)
 
     def update_model_deviation(self, model_deviation: Float64) -> None:
@@ -243,7 +224,7 @@ class _AdaptiveThreshold:
 
 
 def _new(options: KissIcpOptions) -> KissICP:
-    """Return kiss-icp with an empty map, and a threshold of which the state can be saved."""
+    """kiss-icp with an empty map, and a threshold of which the state can be saved."""
     with _our_errors():
         icp = KissICP(_config(options))
     icp.adaptive_threshold = _AdaptiveThreshold(options.max_range_m)
@@ -251,7 +232,7 @@ def _new(options: KissIcpOptions) -> KissICP:
 
 
 def _config(options: KissIcpOptions) -> KISSConfig:
-    """Return the configuration of kiss-icp; ``model_construct`` ignores environment variables."""
+    """Its configuration; ``model_construct`` ignores environment variables."""
     return KISSConfig.model_construct(
         out_dir="",
         data=DataConfig(max_range=options.max_range_m, min_range=0.0, deskew=False),
@@ -281,7 +262,7 @@ def _points(xyz: NDArray[np.floating]) -> Float64:
 
 
 def _pose(T: NDArray[np.floating]) -> Float64:
-    """Return a writable orthonormal copy: kiss-icp aborts the process if the rotation is not."""
+    """A writable orthonormal copy: kiss-icp aborts the process if the rotation is not."""
     pose = np.array(T, dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise RegistrationError("pose for ICP is not a finite 4x4 matrix", got=pose.shape)
@@ -296,31 +277,19 @@ def _our_errors() -> Iterator[None]:
         raise RegistrationError("kiss-icp failed", got=str(error)) from error
 
 
-_MIN_GRADIENT: Final = 100.0
-"""Least horizontal gradient, 3x3 Sobel of grey values."""
-
+_MIN_GRADIENT: Final = 100.0  # least horizontal gradient, 3x3 Sobel of grey values
 _MAX_DISPARITY_STEP_PX: Final = 0.5
 """Largest difference between a disparity and the median around it."""
 
-_MIN_RANGE_M: Final = 1.0
-"""Nearer points are not used."""
-
-_MAX_SIGMA_M: Final = 1.0
-"""Points with a less certain depth are not used."""
+_MIN_RANGE_M: Final = 1.0  # nearer points are not used
+_MAX_SIGMA_M: Final = 1.0  # points with a less certain depth are not used
 
 
 def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
-    """Return near, textured points whose disparity agrees with its neighbours.
+    """Near, textured points (camera axes) whose disparity agrees with its neighbours.
 
     Dense stereo clouds are smeared along the rays where there is little texture, and extend the
     ground towards the camera; ICP on all points underestimates forward motion.
-
-    Args:
-        frame: Images and disparity.
-        max_range_m: Farther points are not used.
-
-    Returns:
-        Points in camera axes with ``sigma_m``; perhaps none.
     """
     camera = frame.pair.camera
     depth = depth_from_disparity(frame.disparity.values, camera)
@@ -334,13 +303,13 @@ def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
 
 
 def textured(grey: UInt8, min_gradient: float) -> Bool:
-    """Return bool (H, W), where the image changes along the row: only that fixes a disparity."""
+    """Where the image (H, W) changes along the row: only that fixes a disparity."""
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3)
     return np.asarray(np.abs(gradient) > min_gradient)
 
 
 def consistent(disparity: Disparity, max_step_px: float) -> Bool:
-    """Return bool (H, W), where a disparity is close to the median of its 5×5 neighbours.
+    """Where a disparity (H, W) is close to the median of its 5×5 neighbours.
 
     Pixels without a match count as far away, so the rims of matched regions fall out too.
     """

@@ -13,17 +13,10 @@ from recon.core.geometry.se3 import apply, exp_so3, invert, log_so3, make_transf
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 
-REPROJECTION_PX: Final = 2.0
-"""RANSAC's inlier limit."""
-
-_ITERATIONS: Final = 200
-"""RANSAC's samples at most."""
-
-MIN_INLIERS: Final = 15
-"""Fewer agreeing tracks give no pose."""
-
-_MIN_INLIER_SHARE: Final = 0.3
-"""A smaller share of agreeing tracks gives no pose."""
+REPROJECTION_PX: Final = 2.0  # RANSAC's inlier limit
+_ITERATIONS: Final = 200  # RANSAC's samples at most
+MIN_INLIERS: Final = 15  # fewer agreeing tracks give no pose
+_MIN_INLIER_SHARE: Final = 0.3  # a smaller share of agreeing tracks gives no pose
 
 
 def locate_camera(
@@ -35,16 +28,7 @@ def locate_camera(
     """Locate a camera that sees known points, from the largest set of them that agrees.
 
     The pose is fitted to that set from the guess and from RANSAC's pose; the fit with more inliers
-    wins.
-
-    Args:
-        xyz_world: float64 (N, 3), the points.
-        uv: float64 (N, 2), where the camera sees them.
-        camera: The rectified camera.
-        T_world_guess: float64 (4, 4), the predicted pose.
-
-    Returns:
-        The pose; None where too few points agree on one.
+    wins. None where too few points agree on one.
     """
     consensus = find_consensus(
         xyz_world,
@@ -66,7 +50,7 @@ def locate_camera(
 
 
 def enough_agree(agreeing: int, tracks: int) -> bool:
-    """Return whether so many of the tracks agree that the pose counts as measured."""
+    """Whether so many of the tracks agree that the pose counts as measured."""
     return agreeing >= max(MIN_INLIERS, _MIN_INLIER_SHARE * tracks)
 
 
@@ -76,7 +60,7 @@ def _agreement(
     uv: Float64,
     camera: RectifiedCamera,
 ) -> LocatedCamera:
-    """Return which points agree with a pose; none, where it is not finite."""
+    """Which points agree with a pose; none, where it is not finite."""
     u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
     error_px = np.hypot(u - uv[:, 0], v - uv[:, 1])
     # A point behind the camera has a NaN error, which compares as False.
@@ -105,22 +89,13 @@ def find_consensus(
     iterations: int,
     min_inliers: int,
 ) -> LocatedCamera | None:
-    """Find the largest set of points that agree on one pose (RANSAC).
+    """Find the largest set of points (N, 3), seen at (N, 2), that agree on one pose (RANSAC).
 
     The pose that comes with it is a closed-form fit (EPnP) that one point near the horizon throws
     off by metres or kilometres: fit it again with `fit_pose`. RANSAC seeds its own generator, so
     equal input gives equal output.
 
-    Args:
-        xyz_world: float64 (N, 3), the points.
-        uv: float64 (N, 2), where the camera sees them.
-        camera: The rectified camera.
-        limit_px: Largest reprojection error of a point that agrees.
-        iterations: Samples at most.
-        min_inliers: Fewer points that agree give no pose.
-
-    Ref:
-        Fischler and Bolles, "Random sample consensus", CACM 1981.
+    Ref: Fischler and Bolles, "Random sample consensus", CACM 1981.
     """
     if len(xyz_world) < min_inliers:
         return None
@@ -147,11 +122,7 @@ def fit_pose(
 ) -> Float64:
     """Fit the pose (4, 4) of least squared reprojection error (Levenberg-Marquardt).
 
-    Args:
-        xyz_world: float64 (N, 3), points that agree.
-        uv: float64 (N, 2), where the camera sees them.
-        camera: The rectified camera.
-        T_world_start: float64 (4, 4), initial pose; None = in closed form from the points.
+    From an initial pose, or else in closed form from the points.
     """
     if T_world_start is None:
         _, rotation, translation = cv2.solvePnP(
@@ -168,7 +139,7 @@ def fit_pose(
 
 
 def _pose(rotation: Float64, translation: Float64) -> Float64:
-    """Return T_world_camera from OpenCV's rotation vector and translation."""
+    """T_world_camera from OpenCV's rotation vector and translation."""
     R, _ = cv2.Rodrigues(rotation)
     return invert(make_transform(R, translation))
 
@@ -194,7 +165,7 @@ class Motion:
     interval_s: float = 0.0
 
     def predict(self, timestamp_s: float) -> Float64:
-        """Return the pose (4, 4) at a time: with constant velocity, where times are known."""
+        """The pose (4, 4) at a time: with constant velocity, where times are known."""
         passed_s = timestamp_s - self.timestamp_s
         share = passed_s / self.interval_s if self.interval_s > 0.0 else 1.0
         if not 0.0 < share <= _LONGEST_GAP:
@@ -202,18 +173,18 @@ class Motion:
         return orthonormalise(self.T_world_camera @ part_of(self.T_before_camera, share))
 
     def moved(self, T_world_camera: Float64, timestamp_s: float) -> Motion:
-        """Return the model after a measured pose, which gives a new motion."""
+        """The model after a measured pose, which gives a new motion."""
         motion = invert(self.T_world_camera) @ T_world_camera
         return Motion(T_world_camera, timestamp_s, motion, timestamp_s - self.timestamp_s)
 
     def drifted(self, timestamp_s: float) -> Motion:
-        """Return the model after a frame without a measured pose: the same motion continues."""
+        """The model after a frame without a measured pose: the same motion continues."""
         T = self.predict(timestamp_s)
         return Motion(T, timestamp_s, self.T_before_camera, self.interval_s)
 
 
 def part_of(T: Float64, share: float) -> Float64:
-    """Return a fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
+    """A fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
     if share == 1.0:
         return T
     return make_transform(exp_so3(share * log_so3(T[:3, :3])), share * T[:3, 3])

@@ -19,12 +19,8 @@ from recon.odometry.kernels.patches import Placing, place_patches
 _PLACING: Final = Placing(radius=6, steps=10, close=0.03, reach=3.0)
 """Patches of 13 pixels, within 3 pixels of where the motion says."""
 
-_MIN_CORRELATION: Final = 0.75
-"""Least correlation of a patch with the one it is found as."""
-
-_ROW_PX: Final = 1.0
-"""Largest difference between the rows of a feature in the two images of a pair."""
-
+_MIN_CORRELATION: Final = 0.75  # least correlation of a patch with the one it is found as
+_ROW_PX: Final = 1.0  # largest difference between the rows of a feature in the two images of a pair
 _SLOPE_PX: Final = 6
 """Half width of the neighbourhood whose disparities give the slope of a surface; of which every
 second row and column is taken, as neighbours share their windows anyhow."""
@@ -32,27 +28,17 @@ second row and column is taken, as neighbours share their windows anyhow."""
 _ON_SURFACE_PX: Final = 1.0
 """Largest difference between the disparity of a feature's surface and that of a neighbour on it."""
 
-_MIN_NEIGHBOURS: Final = 6
-"""With fewer neighbours on the surface it counts as upright."""
-
-_ROUNDS: Final = 3
-"""Fits of a surface, each to the neighbours that are on the last."""
+_MIN_NEIGHBOURS: Final = 6  # with fewer neighbours on the surface it counts as upright
+_ROUNDS: Final = 3  # fits of a surface, each to the neighbours that are on the last
 
 
 def find_again(
     source: UInt8, target: UInt8, uv: Float64, warp: Float64, guess_uv: Float64
 ) -> Float64:
-    """Find warped patches of one image in another, near a guess.
+    """Find warped patches of one image in another, near a guess; NaN where nothing is alike.
 
-    Args:
-        source: uint8 (H, W), the image in which the features are known.
-        target: uint8 (H, W), the image in which they are looked for.
-        uv: float64 (N, 2), columns and rows in ``source``.
-        warp: float64 (N, 2, 2), what becomes of a small offset in ``target``.
-        guess_uv: float64 (N, 2), columns and rows where they should be in ``target``.
-
-    Returns:
-        float64 (N, 2), columns and rows in ``target``; NaN where nothing alike is found.
+    ``warp`` (N, 2, 2) says what becomes of a small offset; ``guess_uv`` (N, 2) where they should
+    be.
     """
     place, correlation = place_patches(source, target, uv, warp, guess_uv, _PLACING)
     with np.errstate(invalid="ignore"):
@@ -63,20 +49,13 @@ def find_again(
 def warp_of(
     uv: Float64, xyz: Float64, slope: Float64, T_target_source: Float64, camera: RectifiedCamera
 ) -> Float64:
-    """Return what a motion makes of small offsets around features: float64 (N, 2, 2).
+    """What a motion makes of small offsets around features: float64 (N, 2, 2).
 
     A surface of which the disparity changes linearly is a plane, and its image after a motion is a
-    homography of the one before; this is its derivative.
+    homography of the one before; this is its derivative. ``slope`` (N, 2) is the change of the
+    surface's disparity per pixel to the right and down, ``xyz`` (N, 3) in the axes of the source.
 
-    Args:
-        uv: float64 (N, 2), columns and rows of the features in the source.
-        xyz: float64 (N, 3), their places in the axes of the source.
-        slope: float64 (N, 2), change of their surface's disparity per pixel to the right and down.
-        T_target_source: float64 (4, 4), the motion.
-        camera: The rectified camera.
-
-    Ref:
-        Hartley and Zisserman, "Multiple view geometry", 2nd ed., section 13.1.
+    Ref: Hartley and Zisserman, "Multiple view geometry", 2nd ed., section 13.1.
     """
     moved = apply(T_target_source, xyz) / xyz[:, 2:]
     R, t = T_target_source[:3, :3], T_target_source[:3, 3]
@@ -89,16 +68,9 @@ def warp_of(
 
 
 def measure_disparity(pair: RectifiedPair, uv: Float64, near: Float64, slope: Float64) -> Float64:
-    """Return the disparity (N,) of features, measured in the images near a guess.
+    """The disparity (N,) of features, measured in the images near a guess, which may be NaN.
 
-    Args:
-        pair: The images.
-        uv: float64 (N, 2), columns and rows in the left one.
-        near: float64 (N,), rough disparities; NaN = unknown.
-        slope: float64 (N, 2), change of their surface's disparity per pixel to the right and down.
-
-    Returns:
-        float64 (N,), pixels; NaN where nothing alike is found on that row.
+    NaN where nothing alike is found on that row; ``slope`` as in `warp_of`.
     """
     there = find_in_right(pair, uv, near, slope)
     with np.errstate(invalid="ignore"):
@@ -107,14 +79,14 @@ def measure_disparity(pair: RectifiedPair, uv: Float64, near: Float64, slope: Fl
 
 
 def find_in_right(pair: RectifiedPair, uv: Float64, near: Float64, slope: Float64) -> Float64:
-    """Return columns and rows (N, 2) of features in the right image; see `measure_disparity`."""
+    """Columns and rows (N, 2) of features in the right image; see `measure_disparity`."""
     warp = np.tile(np.eye(2), (len(uv), 1, 1))
     warp[:, 0] -= slope
     return find_again(pair.left, pair.right, uv, warp, uv - near[:, None] * [1.0, 0.0])
 
 
 def surface_slopes(disparity: Disparity, uv: Float64) -> Float64:
-    """Return slopes of the disparity around features: float64 (N, 2), per pixel right and down.
+    """Slopes of the disparity around features: float64 (N, 2), per pixel right and down.
 
     A plane is fitted to the neighbours that lie on it; 0 where there are too few.
     """
@@ -135,7 +107,7 @@ def surface_slopes(disparity: Disparity, uv: Float64) -> Float64:
 
 
 def _refitted(plane: Float64, A: Float64, around: Float64) -> Float64:
-    """Return planes (N, 3), fitted to the neighbours (N, K) on the last ones; upright if few."""
+    """Planes (N, 3), fitted to the neighbours (N, K) on the last ones; upright if few."""
     with np.errstate(invalid="ignore"):
         on = (np.abs(around - plane @ A.T) <= _ON_SURFACE_PX).astype(np.float64)
     enough = on.sum(axis=1) >= _MIN_NEIGHBOURS

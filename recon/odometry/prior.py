@@ -42,11 +42,7 @@ class MotionPrior:
             )
 
     def check_covers(self, stamps_s: Float64) -> None:
-        """Refuse a path that gives no motion of a drive.
-
-        Args:
-            stamps_s: float64 (N,), times of its frames.
-        """
+        """Refuse a path that gives no motion between the frames of a drive, taken at times (N,)."""
         known = np.array([self.knows(float(t)) for t in stamps_s])
         if len(stamps_s) < 2 or (known[1:] & known[:-1]).any():
             return
@@ -59,11 +55,10 @@ class MotionPrior:
         )
 
     def knows(self, time_s: float) -> bool:
-        """Return whether the path has a pose at a time."""
         return self._pose_at(time_s) is not None
 
     def motion(self, from_s: float, to_s: float) -> Float64 | None:
-        """Return T_from_to (4, 4) of the camera between two times; None = a gap in the path."""
+        """T_from_to (4, 4) of the camera between two times; None = a gap in the path."""
         start, end = self._pose_at(from_s), self._pose_at(to_s)
         if start is None or end is None or not to_s > from_s:
             return None
@@ -74,12 +69,12 @@ class MotionPrior:
         return orthonormalise(T)
 
     def sigmas(self, T_from_to: Float64) -> tuple[float, float]:
-        """Return standard deviations of a motion: translation in metres, rotation in degrees."""
+        """Standard deviations of a motion: translation in metres, rotation in degrees."""
         s, length_m = self.settings, float(np.linalg.norm(T_from_to[:3, 3]))
         return s.sigma_m + s.sigma_share * length_m, s.sigma_deg
 
     def _pose_at(self, time_s: float) -> Float64 | None:
-        """Return the pose (4, 4) at a time, interpolated; None = outside the path or in a gap."""
+        """The pose (4, 4) at a time, interpolated; None = outside the path or in a gap."""
         times_s = self.path.timestamps_s
         if not times_s[0] <= time_s <= times_s[-1]:
             return None

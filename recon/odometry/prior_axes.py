@@ -24,10 +24,8 @@ Axes = Literal["camera", "body"]
 
 _CLEAR: Final = 10.0
 """Standard deviations of a prior that a motion must exceed to distinguish two sets of axes."""
-_ENOUGH: Final = 5
-"""Motions compared; their median is not spoiled by two that are wrong."""
-_MOST_FRAMES: Final = 100
-"""Frames looked at; matching them takes about ten seconds."""
+_ENOUGH: Final = 5  # motions compared; their median is not spoiled by two that are wrong
+_MOST_FRAMES: Final = 100  # frames looked at; matching them takes about ten seconds
 
 
 @dataclass(frozen=True)
@@ -48,15 +46,10 @@ class FoundAxes:
 def find_axes(
     prior: Trajectory, frames: Iterable[OdometryFrame], settings: PriorSettings
 ) -> FoundAxes | None:
-    """Compare a prior in the axes that it may have with the visual motion of some frames.
+    """The axes in which a prior agrees with the visual motion of some frames.
 
-    Args:
-        prior: Path of the rig by other sensors.
-        frames: Frames in order; as many are read as are needed.
-        settings: The accuracy of the prior, and its axes; auto = all supported ones are tried.
-
-    Returns:
-        The axes; None if the cameras do not see enough motion to decide.
+    As many frames are read as are needed; ``settings.axes`` = auto tries all supported axes. None
+    if the cameras do not see enough motion to decide.
     """
     tried: Sequence[Axes] = get_args(Axes) if settings.axes == "auto" else (settings.axes,)
     priors = {axes: MotionPrior(prior, _in_axes(settings, axes)) for axes in tried}
@@ -80,7 +73,7 @@ def find_axes(
 
 
 def first_moving(prior: Trajectory, stamps_s: Float64, settings: PriorSettings) -> int:
-    """Return the last frame before a prior moves; 0 if it never does."""
+    """The last frame before a prior moves; 0 if it never does."""
     path = MotionPrior(prior, _in_axes(settings, "camera"))
     start: float | None = None
     for index, stamp_s in enumerate(stamps_s.tolist()):
@@ -109,14 +102,14 @@ def _in_axes(settings: PriorSettings, axes: Axes) -> PriorSettings:
 
 
 def _in_sigmas(T: Float64, settings: PriorSettings) -> float:
-    """Return the size of a motion in standard deviations of a short one."""
+    """The size of a motion in standard deviations of a short one."""
     step = as_step(T)
     turned_deg = float(np.rad2deg(np.linalg.norm(step[3:])))
     return max(float(np.linalg.norm(step[:3])) / settings.sigma_m, turned_deg / settings.sigma_deg)
 
 
 def _visual_motions(prior: MotionPrior, frames: Iterable[OdometryFrame]) -> list[_VisualMotion]:
-    """Return visual motions that are long enough, one after the other, where the prior is known."""
+    """Visual motions that are long enough, one after the other, where the prior is known."""
     odometry, motions = VisualOdometry(), []
     start: tuple[int, float, Float64] | None = None
     covariance = np.zeros((6, 6))
@@ -142,7 +135,7 @@ def _visual_motions(prior: MotionPrior, frames: Iterable[OdometryFrame]) -> list
 
 
 def _distances(priors: Mapping[Axes, MotionPrior], seen: _VisualMotion) -> dict[Axes, float]:
-    """Return how far each prior is from a visual motion, in standard deviations."""
+    """How far each prior is from a visual motion, in standard deviations."""
     return {axes: _distance(prior, seen) for axes, prior in priors.items()}
 
 

@@ -27,12 +27,10 @@ ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odo
 def make_odometry(
     name: str, settings: OdometrySettings | None = None, prior: Trajectory | None = None
 ) -> Odometry:
-    """Make the odometry of a name; its poses are checked (`CheckedOdometry`).
+    """Make the odometry of a name in `ODOMETRIES`; its poses are checked (`CheckedOdometry`).
 
-    Args:
-        name: A key of `ODOMETRIES`.
-        settings: The settings of all odometries; each uses its own part.
-        prior: Path of the rig by other sensors, on the clock of the frames; None = not known.
+    Each odometry uses its own part of the settings; ``prior`` is the path of the rig by other
+    sensors, on the clock of the frames.
     """
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))
@@ -60,7 +58,6 @@ class KnownPoses:
         self._begun = False
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Return the known pose of the frame."""
         index = frame.pair.index
         if not 0 <= index < len(self._poses):
             raise RegistrationError(
@@ -76,9 +73,7 @@ class KnownPoses:
         return OdometryResult(self._T_first_world @ self._poses[index], OdometryHealth(known=True))
 
     def state(self) -> dict[str, Any]:
-        """Return everything that later poses depend on."""
         return {"T_first_world": self._T_first_world, "begun": self._begun}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
         self._T_first_world, self._begun = pose_in(state, "T_first_world"), bool(state["begun"])

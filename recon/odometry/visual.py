@@ -39,11 +39,8 @@ from recon.odometry.window import (
 )
 from recon.stereo.rectify.features import match_features
 
-_FRAMES: Final = 6
-"""Frames adjusted together."""
-
-_RELOCATE_FEATURES: Final = 2000
-"""Features matched over the whole image where tracking fails."""
+_FRAMES: Final = 6  # frames adjusted together
+_RELOCATE_FEATURES: Final = 2000  # features matched over the whole image where tracking fails
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +80,6 @@ class VisualOdometry:
         self._state: VisualState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame; without a visual motion, the last one is continued."""
         return self.track(frame).result
 
     def track(self, frame: OdometryFrame) -> VisualEstimate:
@@ -128,7 +124,6 @@ class VisualOdometry:
         return empty_window(np.eye(4)) if self._state is None else self._state.window
 
     def state(self) -> dict[str, Any]:
-        """Return everything that later poses depend on."""
         last = self._state
         if last is None:
             return {"last": None}
@@ -136,7 +131,6 @@ class VisualOdometry:
         return {"last": {**parts, "left": last.left, "seen_s": last.seen_s}}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
         last, self._state = state["last"], None
         if last is not None:
             for name in ("T_world_camera", "T_before_camera"):
@@ -150,17 +144,15 @@ class VisualOdometry:
             )
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
-        """Return a new window that starts at a pose."""
         window = replenish(empty_window(motion.T_world_camera), frame)
         time_s = frame.pair.timestamp_s
         return VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
 
     def _prior_motion(self, from_s: float, to_s: float) -> Float64 | None:
-        """Return the motion between two times by the prior; None = not known."""
         return None if self._prior is None else self._prior.motion(from_s, to_s)
 
     def _contradicts(self, state: VisualState, seen: _Seen, frame: OdometryFrame) -> bool:
-        """Return whether the visual motion since the last registration contradicts the prior."""
+        """Whether the visual motion since the last registration contradicts the prior."""
         prior_motion = self._prior_motion(state.seen_s, frame.pair.timestamp_s)
         if prior_motion is None or self._prior is None:
             return False
@@ -173,7 +165,7 @@ class VisualOdometry:
     def _by_tracking(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """Return the frame, registered by tracking; None = that fails.
+        """The frame, registered by tracking; None = that fails.
 
         The features that are followed give a pose, and the pose says where all of them are and how
         they look from there: those that were lost are found, and the others more closely.
@@ -190,7 +182,7 @@ class VisualOdometry:
     def _by_matching(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """Return the frame, registered by matching over the whole image; None = that fails."""
+        """The frame, registered by matching over the whole image; None = that fails."""
         # Who is in a hurry would lose more frames to SIFT than it saves.
         found = match_features(
             state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=not frame.rough
@@ -210,7 +202,7 @@ class VisualOdometry:
     def _register(
         self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """Return the window with the new frame added, if enough features agree on one motion."""
+        """The window with the new frame added, if enough features agree on one motion."""
         camera = frame.pair.camera
         tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
         found = locate_camera(window.xyz_world[tracks], uvd[tracks, :2], camera, predicted)

@@ -18,15 +18,9 @@ from recon.core.values.arrays import Bool, Float64, frozen_array
 from recon.odometry.kernels import bundle
 from recon.odometry.protocol import OdometryHealth
 
-_ITERATIONS: Final = 6
-"""Levenberg-Marquardt steps at most."""
-
-_MIN_GAIN: Final = 1e-3
-"""Relative decrease of the cost below which a step is the last."""
-
-SIGMA_UV_PX: Final = 0.3
-"""Standard deviation of a tracked column or row, as it is assumed."""
-
+_ITERATIONS: Final = 6  # Levenberg-Marquardt steps at most
+_MIN_GAIN: Final = 1e-3  # relative decrease of the cost below which a step is the last
+SIGMA_UV_PX: Final = 0.3  # standard deviation of a tracked column or row, as it is assumed
 SIGMA_D_PX: Final = 1.5
 """Standard deviation of a disparity; larger than that of a single match, because its error stays
 with a feature from frame to frame and does not average out."""
@@ -42,8 +36,7 @@ _DOUBTED_SIGMAS: Final = 3.0
 """The same where only the certainty of a pose is asked for: there an observation that fits as
 stated counts in full."""
 
-_MAX_SIGMAS: Final = 3.0
-"""Residual above which an observation ends its track."""
+_MAX_SIGMAS: Final = 3.0  # residual above which an observation ends its track
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +69,6 @@ class TrackWindow:
         return np.isfinite(self.uvd[:, :, 0])
 
     def with_frame(self, T_world_camera: Float64, uvd: Float64) -> TrackWindow:
-        """Return the window with one more frame."""
         return replace(
             self,
             T_world_camera=np.concatenate([self.T_world_camera, T_world_camera[None]]),
@@ -84,7 +76,7 @@ class TrackWindow:
         )
 
     def with_points(self, uvd: Float64, xyz_world: Float64) -> TrackWindow:
-        """Return the window with more points, first seen in the newest frame."""
+        """The window with more points, first seen in the newest frame."""
         unseen = np.full((len(self.uvd) - 1, len(uvd), 3), np.nan)
         return replace(
             self,
@@ -93,21 +85,21 @@ class TrackWindow:
         )
 
     def trimmed(self, frames: int) -> TrackWindow:
-        """Return the newest frames, and the points still tracked or seen twice in them."""
+        """The newest frames, and the points still tracked or seen twice in them."""
         uvd = self.uvd[-frames:]
         seen = np.isfinite(uvd[:, :, 0])
         keep = seen[-1] | (seen.sum(axis=0) >= 2)
         return TrackWindow(self.T_world_camera[-frames:], uvd[:, keep], self.xyz_world[keep])
 
     def without_newest(self, wrong: Bool) -> TrackWindow:
-        """Return the window without the newest observations of masked points: their tracks end."""
+        """The window without the newest observations of masked points: their tracks end."""
         uvd = self.uvd.copy()
         uvd[-1, wrong] = np.nan
         return replace(self, uvd=uvd)
 
 
 def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
-    """Return observed minus predicted column, row, disparity (W, N, 3); NaN = unseen."""
+    """Observed minus predicted column, row, disparity (W, N, 3); NaN = unseen."""
     xyz = np.stack([apply(T, window.xyz_world) for T in invert(window.T_world_camera)])
     z = np.maximum(xyz[:, :, 2], bundle.MIN_DEPTH_M)
     f = camera.focal_px
@@ -123,12 +115,9 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
 
 
 def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
-    """Return residuals in standard deviations, and the weight of each observation.
+    """Residuals (W, N, 3) in standard deviations, 0 where unseen, and Cauchy weights (W, N).
 
     As `adjust` weighs them in its kernel; for the audit of a rig (`recon/rig/audit/`) alone.
-
-    Returns:
-        float64 (W, N, 3), 0 where nothing is seen; float64 (W, N), Cauchy weights, likewise.
     """
     sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
     residual = np.nan_to_num(reprojection(window, camera) / sigmas)
@@ -137,7 +126,7 @@ def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Flo
 
 
 def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
-    """Return bool (N,), points whose newest observation is an outlier."""
+    """Points (N,) whose newest observation is an outlier."""
     residual = np.nan_to_num(reprojection(window, camera)[-1])
     sigmas = [SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX]
     square = np.square(residual / np.array(sigmas)).sum(axis=1)
@@ -179,16 +168,10 @@ def adjust(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
 def pose_information(
     window: TrackWindow, camera: RectifiedCamera, sigma_uv_px: float = SIGMA_UV_PX
 ) -> Float64:
-    """Return information of the newest frame's observations on its pose, given the frames before.
+    """Information (6, 6) of the newest observations on the newest pose.
 
-    Args:
-        window: The frames.
-        camera: The rectified camera.
-        sigma_uv_px: Standard deviation of a tracked column or row.
-
-    Returns:
-        float64 (6, 6), information of a step (translation in metres, rotation vector in radians)
-        in the axes of the newest frame.
+    Given the frames before; of a step (translation in metres, rotation vector in radians) in the
+    axes of the newest frame.
     """
     usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
@@ -201,7 +184,7 @@ def pose_information(
 
 
 def normal_equations(window: TrackWindow, camera: RectifiedCamera) -> bundle.NormalEquations:
-    """Return the normal equations of all poses and points of a window, as `bundle.linearise`.
+    """The normal equations of all poses and points of a window, as `bundle.linearise`.
 
     For the audit of a rig (`recon/rig/audit/`) alone, which has one more unknown than `adjust`.
     """
@@ -218,7 +201,7 @@ def _cost(window: TrackWindow, model: bundle.BundleModel) -> float:
 
 
 def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> TrackWindow:
-    """Return a window after a step; poses step by translation and rotation in their own axes."""
+    """A window after a step; poses step by translation and rotation in their own axes."""
     poses = np.stack(
         [T @ as_transform(step) for T, step in zip(window.T_world_camera, step_pose, strict=True)]
     )
@@ -238,9 +221,7 @@ def _model(camera: RectifiedCamera) -> bundle.BundleModel:
     )
 
 
-_INDEPENDENCE: Final = 0.25
-"""Share of the tracks whose errors count as independent."""
-
+_INDEPENDENCE: Final = 0.25  # share of the tracks whose errors count as independent
 _BEST_PX: Final = 0.05
 """However well features fit, they count as no better: on planes with exact truth they are off by
 0.03 px to 0.12 px."""
@@ -252,21 +233,14 @@ _MEDIAN: Final = 1.18
 def newest_information(
     window: TrackWindow, camera: RectifiedCamera, sigma_uv_px: float = SIGMA_UV_PX
 ) -> Float64:
-    """Return information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
+    """Information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
     return _INDEPENDENCE * pose_information(window, camera, sigma_uv_px)
 
 
 def newest_health(
     window: TrackWindow, camera: RectifiedCamera, tracks: int, note: str = ""
 ) -> OdometryHealth:
-    """Return the health of the newest pose of a window.
-
-    Args:
-        window: The frames, the newest one registered.
-        camera: The rectified camera.
-        tracks: Number of features that were followed to it, those that do not agree included.
-        note: How it was registered, if that is worth telling.
-    """
+    """The health of the newest pose, to which so many ``tracks`` were followed."""
     newest = window.seen[-1]
     error = reprojection(window, camera)[-1, newest, :2]
     reprojection_px = float(np.median(np.linalg.norm(error, axis=1)))
@@ -285,9 +259,9 @@ def newest_health(
 
 
 def _scale_px(disparity: Float64, camera: RectifiedCamera) -> float:
-    """Return the disparity that fixes the length of a motion, from those (N,) of the features.
+    """The disparity that fixes the length of a motion, from those (N,) of the features.
 
-    A disparity gives a share of the depth, so a feature tells as much as the square of its own.
+    A disparity gives a share of the depth, so a feature counts as much as the square of its own.
     """
     d = disparity[np.isfinite(disparity)] + camera.doffs_px
     return float(d @ d / d.sum()) if len(d) else float("nan")
@@ -298,15 +272,15 @@ _LEAST_INFORMATION: Final = 1e-4
 
 
 def covariance_of(information: Float64) -> Float64:
-    """Return the covariance (6, 6) of an information matrix (6, 6), which may be singular."""
+    """The covariance (6, 6) of an information matrix (6, 6), which may be singular."""
     return np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)))
 
 
 def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:
-    """Return the covariance (6, 6) of a step that is equally uncertain in all directions."""
+    """The covariance (6, 6) of a step that is equally uncertain in all directions."""
     return np.diag(np.repeat([sigma_m**2, np.deg2rad(sigma_deg) ** 2], 3))
 
 
 def distance_in_sigmas(step: Float64, covariance: Float64) -> float:
-    """Return the length of a step (6,) in standard deviations (Mahalanobis distance)."""
+    """The length of a step (6,) in standard deviations (Mahalanobis distance)."""
     return float(np.sqrt(step @ np.linalg.solve(covariance, step)))

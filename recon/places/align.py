@@ -14,21 +14,11 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.locate_camera import find_consensus, fit_pose
 
-_ITERATIONS: Final = 500
-"""RANSAC's samples at most."""
-
-_REPROJECTION_PX: Final = 2.5
-"""RANSAC's inlier limit."""
-
-MIN_INLIERS: Final = 20
-"""Least number of matches that agree in both directions."""
-
-_SIGMA_UV_PX: Final = 1.0
-"""Standard deviation of a feature's column or row."""
-
-_SIGMA_D_PX: Final = 1.0
-"""Standard deviation of its disparity."""
-
+_ITERATIONS: Final = 500  # RANSAC's samples at most
+_REPROJECTION_PX: Final = 2.5  # RANSAC's inlier limit
+MIN_INLIERS: Final = 20  # least number of matches that agree in both directions
+_SIGMA_UV_PX: Final = 1.0  # standard deviation of a feature's column or row
+_SIGMA_D_PX: Final = 1.0  # standard deviation of its disparity
 _STEPS: Final = 15
 _CAUCHY_SIGMAS: Final = 2.0
 _SHARED: Final = 0.5  # both directions see the same matches, so together they count once
@@ -87,13 +77,7 @@ def locate(points: Float64, seen: Seen) -> Float64 | None:
 
 
 def refine(first: Seen, last: Seen, T_first_last: Float64) -> Alignment:
-    """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights.
-
-    Args:
-        first: The matches in the earlier frame.
-        last: The same in the later frame.
-        T_first_last: float64 (4, 4), initial motion.
-    """
+    """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights."""
     T = T_first_last
     for _ in range(_STEPS):
         H, g = _normal_equations(first, last, T)

@@ -24,28 +24,18 @@ _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round
 _KEPT: Final = 0.25  # least weight of a loop that is believed
 
 
-_NODE_M: Final = 5.0
-"""Path between two nodes of the graph."""
-
-_MAX_NODES: Final = 400
-"""Longer drives get nodes farther apart: time is cubic."""
-
-_LOOP_SIGMA_M: Final = 0.05
-"""Standard deviation of a loop that more matches do not improve."""
-
+_NODE_M: Final = 5.0  # path between two nodes of the graph
+_MAX_NODES: Final = 400  # longer drives get nodes farther apart: time is cubic
+_LOOP_SIGMA_M: Final = 0.05  # standard deviation of a loop that more matches do not improve
 _LOOP_SHARE: Final = 0.03
 """Standard deviation that is added per distance between its two frames: features that moved farther
 match worse, and not evenly."""
 
-_LOOP_SIGMA_DEG: Final = 0.1
-"""As the first, of its rotation."""
-
+_LOOP_SIGMA_DEG: Final = 0.1  # as the first, of its rotation
 _MAX_CHI2: Final = 22.5
 """Chi-square at which the weight of a loop is a quarter: 0.1 % of right ones are beyond."""
 
-_MAX_BEND_CHI2: Final = 6.0
-"""Mean chi-square of the odometry edges above which no loop is believed."""
-
+_MAX_BEND_CHI2: Final = 6.0  # mean chi-square of the odometry edges above which no loop is believed
 _USUAL: Final = 0.3
 """What odometry usually drifts, as a share of what it may: measured positions, whose errors do not
 grow, would make a path as rough as they are if it counted for less."""
@@ -115,12 +105,9 @@ class JoinedDrives:
 
 
 def close_loops(trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop]) -> Closure:
-    """Correct a path so that its loops close, by `join_drives`.
+    """Correct a path by odometry so that its loops close, by `join_drives`.
 
-    Args:
-        trajectory: By odometry.
-        path_m: float64 (N,), path up to each frame, by `path_lengths`.
-        loops: Loops between frames of it.
+    ``path_m`` (N,) is the path up to each frame, by `path_lengths`.
     """
     ties = [Tie((0, 0), loop) for loop in loops]
     joined = join_drives([DrivePath(trajectory, path_m)], ties) if ties else None
@@ -138,18 +125,13 @@ def join_drives(
 ) -> JoinedDrives | None:
     """Correct the paths of drives so that their ties hold; None = the ties are not believed.
 
-    Nodes are spaced along the paths; odometry edges link each to the next, ties link distant ones.
-    The optimiser may switch ties off. It starts with a tolerance that admits every tie and tightens
-    it step by step, so that a right one is not refused because of the very drift that it corrects.
-    If the ties deform the odometry of a drive more than its drift explains, none is believed.
+    The first pose of the first drive is fixed. Nodes are spaced along the paths; odometry edges
+    link each to the next, ties link distant ones. The optimiser may switch ties off. It starts with
+    a tolerance that admits every tie and tightens it step by step, so that a right one is not
+    refused because of the very drift that it corrects. If the ties deform the odometry of a drive
+    more than its drift explains, none is believed.
 
-    Args:
-        drives: The drives; the first pose of the first one is fixed.
-        ties: What holds them together.
-        held: Positions that were measured along them; None = none.
-
-    Ref:
-        Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
+    Ref: Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
     nodes = _spaced(drives)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
@@ -179,7 +161,7 @@ def join_drives(
 
 
 def _begun_at(T_world_camera: Float64, path: Trajectory) -> Trajectory:
-    """Return a path with its first pose put back, which rounding has moved."""
+    """A path with its first pose put back, which rounding has moved."""
     poses = path.T_world_camera.copy()
     poses[0] = T_world_camera
     return replace(path, T_world_camera=poses)
@@ -249,13 +231,9 @@ def _solve_held(
 def _odometry_edges(
     drive: DrivePath, nodes: NDArray[np.intp], begin: int, share: float
 ) -> list[PoseEdge]:
-    """Return the edges along a drive, whose nodes are numbered from ``begin``.
+    """The edges along a drive, with a share of the drift that is possible.
 
-    Args:
-        drive: The drive.
-        nodes: Its frames that are nodes.
-        begin: Number of the first.
-        share: Of the drift that is possible, what is assumed.
+    Its nodes are numbered from ``begin``.
     """
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []

@@ -30,12 +30,8 @@ CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""
 
 
-_DISTANCE_M: Final = 1.5
-"""Distance from the last keyframe at which a new one is taken."""
-
-_ANGLE_DEG: Final = 10.0
-"""Rotation since the last keyframe at which a new one is taken."""
-
+_DISTANCE_M: Final = 1.5  # distance from the last keyframe at which a new one is taken
+_ANGLE_DEG: Final = 10.0  # rotation since the last keyframe at which a new one is taken
 _MIN_LIKENESS: Final = 0.3
 """Least likeness of a candidate, as a share of that of two neighbouring keyframes."""
 
@@ -91,7 +87,6 @@ class LoopDetector:
         self.refused: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        """Return the number of keyframes."""
         return len(self._places)
 
     def add(
@@ -106,14 +101,8 @@ class LoopDetector:
     ) -> tuple[Loop, ...]:
         """Add the next frame; return its verified loops, which ``loops`` keeps as well.
 
-        Args:
-            frame: Its number.
-            pair: Its images.
-            disparity: Of its left view.
-            T_world_camera: float64 (4, 4), by odometry.
-            path_m: Path up to it, by `path_lengths`.
-            trusted: False where the pose is extrapolated; such a frame is no keyframe, nor is one
-                that was not matched.
+        A frame with a pose that is not trusted is no keyframe, nor is one that was not matched.
+        ``path_m`` is the path up to it, by `path_lengths`.
         """
         if not trusted or not disparity.valid.any() or not self._is_due(T_world_camera):
             return ()
@@ -152,7 +141,7 @@ class LoopDetector:
         return moved or float(np.rad2deg(angle_rad(T))) >= _ANGLE_DEG
 
     def _compared(self, new: StoredKeyframe, camera: RectifiedCamera) -> StoredKeyframe:
-        """Return the keyframe with the loop to the first candidate that is verified, if any is."""
+        """The keyframe with the loop to the first candidate that is verified, if any is."""
         place, refused = self._place(new), []
         for old in self._candidates(place):
             known = self._store.get(self._places.frames[old]).keyframe
@@ -166,7 +155,7 @@ class LoopDetector:
         return replace(new, refused=tuple(refused))
 
     def _candidates(self, place: Place) -> list[int]:
-        """Return numbers of old keyframes that may be near, most similar first."""
+        """Numbers of old keyframes that may be near, most similar first."""
         near = self._places.near(place)
         if not near.any():
             return []
@@ -175,14 +164,13 @@ class LoopDetector:
         return most_alike(likeness, worth, self._places.path_m[:, None])
 
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
-        """Return whether drift explains the difference between a loop and odometry."""
+        """Whether drift explains the difference between a loop and odometry."""
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
         drift = drift_over(new.path_m - float(self._places.path_m[old]))
         return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS)
 
 
-_TURN_M: Final = 4.0
-"""Two views in opposite directions count as twice this far apart."""
+_TURN_M: Final = 4.0  # two views in opposite directions count as twice this far apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,20 +232,14 @@ class KnownPlaces:
         self._stands = np.hstack([self.T_world_camera[:, :3, 3], _TURN_M * ahead])
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self._views)
 
     def recognise(
         self, keyframe: Keyframe, camera: RectifiedCamera, among: Bool | None = None
     ) -> Recognised:
-        """Return the views that show the same place as a frame, and where it is seen from there.
+        """The views, of those given, that show the same place as a frame, and their loops.
 
         One such view alone proves little: `agreeing_loops` says which of several frames agree.
-
-        Args:
-            keyframe: The frame.
-            camera: That took it.
-            among: bool (N,), the views that may be compared; None = all.
         """
         likeness = self._words.likeness(words_of(keyframe.descriptors))
         worth = likeness > 0 if among is None else among & (likeness > 0)

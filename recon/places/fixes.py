@@ -15,8 +15,7 @@ from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64, Int32, freeze, frozen_array
 
-_NO_TURN: Final = 1e-9
-"""Information of a rotation that was not measured; the optimiser needs some."""
+_NO_TURN: Final = 1e-9  # information of a rotation that was not measured; the optimiser needs some
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,16 +77,11 @@ class Held:
     def edges(
         self, drives: Sequence[Trajectory], nodes: Sequence[NDArray[np.intp]], T_world_node: Float64
     ) -> list[PoseEdge]:
-        """Return an edge from the survey to each node near which something was measured.
+        """An edge from the survey to each node near which something was measured.
 
         It says where the node is, and not how it is turned. What is near one node counts as one
-        measurement: neighbours are off by the same.
-
-        Args:
-            drives: Their paths.
-            nodes: Frames of each that are nodes of the graph.
-            T_world_node: float64 (K, 4, 4), about where these are, and last the survey: an antenna
-                beside the camera moves as it turns.
+        measurement: neighbours are off by the same. The last of the poses ``T_world_node`` is the
+        survey's; an antenna beside the camera moves as it turns.
         """
         survey, begin, edges = len(T_world_node) - 1, 0, list[PoseEdge]()
         R_survey_world = T_world_node[survey, :3, :3].T
@@ -135,18 +129,11 @@ class PoseEdge:
 def optimise_poses(
     T_world_node: Float64, edges: Sequence[PoseEdge], half_chi2: float
 ) -> tuple[Float64, Float64]:
-    """Optimise a pose graph; the first node is fixed.
+    """Optimise a pose graph whose first node is fixed: its poses, and the weight of each edge.
 
-    Args:
-        T_world_node: float64 (N, 4, 4), initial poses.
-        edges: The constraints.
-        half_chi2: Misfit at which the weight of a doubtful edge has dropped to a quarter.
+    ``half_chi2`` is the misfit at which the weight of a doubtful edge has dropped to a quarter.
 
-    Returns:
-        The poses, float64 (N, 4, 4), and the weight of each edge, float64, in [0, 1].
-
-    Ref:
-        Choi, Zhou, Koltun, "Robust reconstruction of indoor scenes", CVPR 2015.
+    Ref: Choi, Zhou, Koltun, "Robust reconstruction of indoor scenes", CVPR 2015.
     """
     registration = o3d.pipelines.registration
     graph = registration.PoseGraph()

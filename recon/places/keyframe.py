@@ -26,35 +26,18 @@ _SCALE_STEP: Final = 1.3
 _SCALES: Final = 5
 
 
-FEATURES: Final = 500
-"""Features of a keyframe."""
-
-_CELL_PX: Final = 48
-"""Edge of the cells that features are spread over."""
-
-_FAST_THRESHOLD: Final = 10
-"""Threshold of the FAST corner detector."""
-
-_MIN_DISPARITY_PX: Final = 1.0
-"""Features with less disparity have no usable depth."""
-
-_MAX_DISPARITY_STEP_PX: Final = 1.0
-"""Largest difference between a disparity and its neighbours."""
-
-_COARSE_PX: Final = 8
-"""Every n-th disparity of a row and column is kept."""
-
+FEATURES: Final = 500  # features of a keyframe
+_CELL_PX: Final = 48  # edge of the cells that features are spread over
+_FAST_THRESHOLD: Final = 10  # threshold of the FAST corner detector
+_MIN_DISPARITY_PX: Final = 1.0  # features with less disparity have no usable depth
+_MAX_DISPARITY_STEP_PX: Final = 1.0  # largest difference between a disparity and its neighbours
+_COARSE_PX: Final = 8  # every n-th disparity of a row and column is kept
 _SAME_SCALE: Final = 0.1
 """Share by which a scale may differ before features look different: half a step of the scales."""
 
-_MOST_ZOOM: Final = 4.0
-"""Images of a still larger or smaller scale are described as they are."""
-
-WORDS: Final = 4
-"""Words per descriptor (hash tables)."""
-
-_BITS: Final = 20
-"""Bits of a descriptor per word."""
+_MOST_ZOOM: Final = 4.0  # images of a still larger or smaller scale are described as they are
+WORDS: Final = 4  # words per descriptor (hash tables)
+_BITS: Final = 20  # bits of a descriptor per word
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,15 +80,10 @@ def make_keyframe(
 ) -> Keyframe:
     """Describe a frame for recognition.
 
-    Args:
-        frame: Its number.
-        pair: Its images.
-        disparity: What the matcher found in them.
-        focal_px: Focal length of the frames that it will be compared with: features are described
-            as they look at that scale. None = its own.
+    With the focal length of the frames that it will be compared with, features are described as
+    they look at that scale; None = its own.
 
-    Ref:
-        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
+    Ref: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
     """
     orb = cv2.ORB.create(
         nfeatures=_SURPLUS * FEATURES,
@@ -129,7 +107,7 @@ def make_keyframe(
 
 
 def _at_focal_length(pair: RectifiedPair, focal_px: float | None) -> tuple[UInt8, Float32]:
-    """Return the left image as seen with a focal length, and the zoom (2,) along row and column."""
+    """The left image as seen with a focal length, and the zoom (2,) along row and column."""
     height, width = pair.left.shape
     zoom = 1.0 if focal_px is None else focal_px / pair.camera.focal_px
     if abs(zoom - 1.0) <= _SAME_SCALE or not 1 / _MOST_ZOOM <= zoom <= _MOST_ZOOM:
@@ -141,16 +119,12 @@ def _at_focal_length(pair: RectifiedPair, focal_px: float | None) -> tuple[UInt8
 
 
 def words_of(descriptors: UInt8) -> NDArray[np.uint32]:
-    """Return the distinct words of an image, sorted.
+    """The distinct words of an image's descriptors (N, 32), sorted.
 
     A word is the value of some fixed bits of a descriptor: similar descriptors are likely to share
     one, different ones are not, and no vocabulary has to be trained.
 
-    Args:
-        descriptors: uint8 (N, 32).
-
-    Ref:
-        Gionis, Indyk, Motwani, "Similarity search in high dimensions via hashing", VLDB 1999.
+    Ref: Gionis, Indyk, Motwani, "Similarity search in high dimensions via hashing", VLDB 1999.
     """
     bits = np.unpackbits(descriptors, axis=1)[:, _chosen_bits()]
     values = bits.reshape(len(bits), WORDS, _BITS) @ (1 << np.arange(_BITS, dtype=np.uint32))
@@ -160,13 +134,13 @@ def words_of(descriptors: UInt8) -> NDArray[np.uint32]:
 
 @lru_cache
 def _chosen_bits() -> NDArray[np.intp]:
-    """Return which bits form the words; tables share none while there are enough bits."""
+    """Which bits form the words; tables share none while there are enough bits."""
     shuffled = np.random.default_rng(0).permutation(8 * _DESCRIPTOR_BYTES)
     return np.resize(shuffled, WORDS * _BITS)
 
 
 def _spread(corners: Sequence[Any], shape: tuple[int, ...]) -> Any:
-    """Return the strongest corners of all cells, rank after rank, until there are enough."""
+    """The strongest corners of all cells, rank after rank, until there are enough."""
     uv = _places_of(corners)
     strength = np.array([corner.response for corner in corners], np.float32)
     octave = np.array([corner.octave for corner in corners], np.int32)
@@ -180,12 +154,12 @@ def _spread(corners: Sequence[Any], shape: tuple[int, ...]) -> Any:
 
 
 def _places_of(corners: Sequence[Any]) -> Float32:
-    """Return columns and rows (N, 2) of corners, of which there may be none."""
+    """Columns and rows (N, 2) of corners, of which there may be none."""
     return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2)
 
 
 def _disparity(disparity: Disparity, uv: Float32, camera: RectifiedCamera) -> Float32:
-    """Return the disparity (N,) at features; NaN where unknown, small, or unlike neighbours."""
+    """The disparity (N,) at features; NaN where unknown, small, or unlike neighbours."""
     height, width = disparity.values.shape
     column, row = np.rint(uv).astype(np.int64).T
     step = np.arange(-1, 2)

@@ -47,12 +47,8 @@ Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
 LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
 """Standard deviation of a verified loop, added to the drift: small, but never zero."""
 
-_MIN_AGREEING: Final = 3
-"""Loops that must agree, no two between the same keyframes."""
-
-_NEAR_M: Final = 12.0
-"""Path within which neighbouring loops are compared."""
-
+_MIN_AGREEING: Final = 3  # loops that must agree, no two between the same keyframes
+_NEAR_M: Final = 12.0  # path within which neighbouring loops are compared
 _MAJORITY: Final = 2  # loops that confirm one, for each that contradicts it
 
 
@@ -63,19 +59,14 @@ def agreeing_loops(
     *,
     keyframes: int = _MIN_AGREEING,
 ) -> list[Loop]:
-    """Return the loops that enough others confirm, and few contradict.
+    """The verified loops that enough others confirm, and few contradict.
 
-    Two loops and the odometry between their ends form a cycle that must close within the drift
-    over its two odometry sections. False loops would have to be wrong in the same way several
-    times. Where a row of similar houses makes them so, right loops nearby contradict them: without
-    a clear majority none is accepted.
-
-    Args:
-        loops: Verified loops.
-        firsts: For each keyframe in which a loop begins its pose by odometry, and the path up to
-            it; in a map without drift of its own, always 0.
-        lasts: The same for those in which one ends; those of another drive may have other axes.
-        keyframes: Least number of later keyframes among the loops that agree.
+    Two loops and the odometry between their ends form a cycle that must close within the drift over
+    its two odometry sections. False loops would have to be wrong in the same way several times.
+    Where a row of similar houses makes them so, right loops nearby contradict them: without a clear
+    majority none is accepted. ``firsts`` and ``lasts`` give pose and path of the keyframes in which
+    loops begin and end, which may have different axes; the path is 0 in a map without drift of its
+    own. ``keyframes`` is the least number of later keyframes among loops that agree.
     """
     poses = (firsts, lasts)
     paths_m = np.array([(firsts[loop.first][1], lasts[loop.last][1]) for loop in loops])
@@ -94,7 +85,7 @@ def agreeing_loops(
 
 
 def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses]) -> bool:
-    """Return whether two loops agree within the drift of the odometry between them."""
+    """Whether two loops agree within the drift of the odometry between them."""
     firsts, lasts = poses
     T_lasts, lasts_m = _between(one.last, other.last, lasts)
     T_firsts, firsts_m = _between(one.first, other.first, firsts)
@@ -104,6 +95,6 @@ def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses]) -> bool:
 
 
 def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:
-    """Return ``T_first_last`` by odometry, and the path between the two."""
+    """``T_first_last`` by odometry, and the path between the two."""
     (T_world_first, from_m), (T_world_last, to_m) = poses[first], poses[last]
     return invert(T_world_first) @ T_world_last, abs(to_m - from_m)

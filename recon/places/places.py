@@ -19,20 +19,11 @@ from recon.core.values.arrays import Bool, Float64
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
 
 
-_MIN_PATH_M: Final = 25.0
-"""Least path between two places that are compared."""
-
-VIEW_M: Final = 8.0
-"""Largest distance at which two places see enough in common."""
-
-VIEW_DEG: Final = 45.0
-"""Largest such angle between their viewing directions."""
-
-_MOST: Final = 3
-"""Most candidates that are verified."""
-
-_APART_M: Final = 4.0
-"""Least distance between two candidates."""
+_MIN_PATH_M: Final = 25.0  # least path between two places that are compared
+VIEW_M: Final = 8.0  # largest distance at which two places see enough in common
+VIEW_DEG: Final = 45.0  # largest such angle between their viewing directions
+_MOST: Final = 3  # most candidates that are verified
+_APART_M: Final = 4.0  # least distance between two candidates
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +96,7 @@ class Places:
 
 
 def most_alike(likeness: Float64, worth: NDArray[np.intp], stands_m: Float64) -> list[int]:
-    """Return the numbers of the few most similar images, each at some distance from the others.
-
-    Args:
-        likeness: float64 (N,), similarity of each image.
-        worth: Numbers of those that may be chosen.
-        stands_m: float64 (N, K), where each was taken.
-    """
+    """The few most similar images that are ``worth`` it, each at some distance from the others."""
     chosen: list[int] = []
     for number in worth[np.argsort(-likeness[worth], kind="stable")].tolist():
         gaps_m = np.linalg.norm(stands_m[chosen] - stands_m[number], axis=1)
@@ -187,18 +172,10 @@ class WordIndex:
         return np.divide(shared, sizes, out=np.zeros(len(shared)), where=sizes > 0)
 
 
-_LOST_FACTOR: Final = 20.0
-"""Metres that one metre of extrapolated path counts as."""
-
-_LOST_M: Final = 2.0
-"""Path that is added for each frame without a measurement."""
-
-SIGMAS: Final = 3.5
-"""Largest possible deviation from odometry, in standard deviations."""
-
-SHARE: Final = 0.02
-"""Standard deviation of a position, as a share of the path."""
-
+_LOST_FACTOR: Final = 20.0  # metres that one metre of extrapolated path counts as
+_LOST_M: Final = 2.0  # path that is added for each frame without a measurement
+SIGMAS: Final = 3.5  # largest possible deviation from odometry, in standard deviations
+SHARE: Final = 0.02  # standard deviation of a position, as a share of the path
 TURN_DEG: Final = 0.15
 """Standard deviation of the heading after 1 m; it grows with the root of the path."""
 
@@ -222,15 +199,7 @@ class Drift:
 
 
 def path_lengths(T_world_camera: Float64, trusted: Bool) -> Float64:
-    """Return length of the path up to each frame, in which extrapolated metres count several times.
-
-    Args:
-        T_world_camera: float64 (N, 4, 4).
-        trusted: bool (N,), False where a pose is not, as it is extrapolated.
-
-    Returns:
-        float64 (N,), metres.
-    """
+    """The path (N,) up to each frame; metres without a trusted pose count several times."""
     step_m = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     lost = ~trusted[1:]
     step_m = np.where(lost, _LOST_FACTOR * step_m + _LOST_M, step_m)
@@ -238,7 +207,7 @@ def path_lengths(T_world_camera: Float64, trusted: Bool) -> Float64:
 
 
 def drift_over(path_m: float) -> Drift:
-    """Return the drift over a path.
+    """The drift over a path.
 
     The scale error is constant and the heading a random walk. The position error of the latter is
     that of a straight drive, the worst case: ``turn·√(path³/3)``.
@@ -255,12 +224,9 @@ def spread_over(path_m: Float64) -> tuple[Float64, Float64]:
 
 
 def is_possible(T_difference: NDArray[np.float64], drift: Drift, other: Drift) -> bool:
-    """Return whether a motion differs from odometry's by no more than drift explains.
+    """Whether a motion differs from odometry's by no more than drift explains.
 
-    Args:
-        T_difference: float64 (4, 4), inverse of odometry's motion times the other one.
-        drift: Of odometry over that motion.
-        other: Standard deviations of the other motion.
+    ``T_difference`` is the inverse of odometry's motion times the other one.
     """
     off_m = float(np.linalg.norm(T_difference[:3, 3]))
     off_rad = float(angle_rad(T_difference))
@@ -276,8 +242,7 @@ _OTHER_UNIT: Final = 3.0
 """A foot, the unit of surveys that is nearest to a metre, is 3.28 times shorter."""
 
 _TINY: Final = 1e-12
-_SHORTEST_M: Final = 0.1
-"""Path below which nothing is a share of it."""
+_SHORTEST_M: Final = 0.1  # path below which nothing is a share of it
 
 
 @dataclass(frozen=True)
@@ -326,13 +291,9 @@ class PathFit:
 def fit_to_path(
     ours_m: Float64, position_m: Float64, drift_m: float, sigma_m: float = RECEIVER_M
 ) -> PathFit:
-    """Return how positions fit those of a path.
+    """How measured positions (N, 3), in other axes, fit those of a path.
 
-    Args:
-        ours_m: float64 (N, 3), by the path, in the order of time.
-        position_m: float64 (N, 3), as they were measured, in other axes.
-        drift_m: By how much the path may be off at its end, standard deviation.
-        sigma_m: Standard deviation of a measured coordinate.
+    ``drift_m`` is by how much the path may be off at its end, standard deviation.
     """
     rigid, scaled = (fit_points(ours_m, position_m, scaled=scaled) for scaled in (False, True))
     path_m = float(np.linalg.norm(np.diff(ours_m, axis=0), axis=1).sum())
@@ -350,12 +311,9 @@ def fit_to_path(
 def drift_at_end(
     path: Trajectory, trusted: Bool | None = None, stated_percent: float | None = None
 ) -> float:
-    """Return by how much a path may be off at its end, standard deviation in metres.
+    """By how much a path may be off at its end, standard deviation in metres.
 
-    Args:
-        path: The path.
-        trusted: bool (N,), False where a pose is not; None = all are.
-        stated_percent: What its odometry states of its drift, per cent of the path; None = nothing.
+    ``stated_percent`` is what its odometry states of its drift.
     """
     good = np.ones(len(path), np.bool_) if trusted is None else trusted
     length_m = float(path_lengths(path.T_world_camera, good)[-1])
@@ -363,5 +321,5 @@ def drift_at_end(
 
 
 def _apart_m(ones: Float64, others: Float64) -> float:
-    """Return how far points (N, 3) are from others, root mean square."""
+    """How far points (N, 3) are from others, root mean square."""
     return float(np.sqrt(np.mean(np.sum((ones - others) ** 2, axis=-1))))

@@ -19,35 +19,18 @@ from recon.places.loop import Loop
 _CELLS = 4
 
 
-_MAX_HAMMING: Final = 64
-"""Largest Hamming distance of a match."""
-
-_MIN_INLIER_SHARE: Final = 0.3
-"""Least share of the matches that agree."""
-
-_SPREAD_CELLS: Final = 5
-"""Of 4 by 4 cells of each image, how many must hold inliers."""
-
-_BOTH_WAYS_M: Final = 0.5
-"""Largest distance between the poses found in either direction."""
-
-_BOTH_WAYS_DEG: Final = 2.0
-"""Largest angle between them."""
-
-_MAX_SIGMA_M: Final = 0.3
-"""Loops less certain than this in any direction are refused."""
-
+_MAX_HAMMING: Final = 64  # largest Hamming distance of a match
+_MIN_INLIER_SHARE: Final = 0.3  # least share of the matches that agree
+_SPREAD_CELLS: Final = 5  # of 4 by 4 cells of each image, how many must hold inliers
+_BOTH_WAYS_M: Final = 0.5  # largest distance between the poses found in either direction
+_BOTH_WAYS_DEG: Final = 2.0  # largest angle between them
+_MAX_SIGMA_M: Final = 0.3  # loops less certain than this in any direction are refused
 _DENSE_TOLERANCE_PX: Final = 1.0
 """Largest difference between a predicted and a seen disparity that agree."""
 
-_DENSE_TOLERANCE_SHARE: Final = 0.03
-"""Share of the disparity that is added to it."""
-
-_MIN_DENSE_SHARE: Final = 0.75
-"""Least share of the dense points that agree."""
-
-_MIN_DENSE_POINTS: Final = 50
-"""Least number of dense points that both frames see."""
+_DENSE_TOLERANCE_SHARE: Final = 0.03  # share of the disparity that is added to it
+_MIN_DENSE_SHARE: Final = 0.75  # least share of the dense points that agree
+_MIN_DENSE_POINTS: Final = 50  # least number of dense points that both frames see
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +52,11 @@ def verify(
     camera: RectifiedCamera,
     first_camera: RectifiedCamera | None = None,
 ) -> Verdict:
-    """Return whether two keyframes show the same place.
+    """Whether two keyframes show the same place.
 
     Matches must be mutually best. The motions found in either direction must be inverse to each
     other. The inliers must be many, a fair share of the matches, spread over both images, and
     determine the motion in all directions. The coarse disparities must agree with it, too.
-
-    Args:
-        first: The earlier one.
-        last: The later one.
-        camera: That took the later one.
-        first_camera: That took the earlier one; None = the same.
     """
     cameras = (first_camera or camera, camera)
     aligned = _aligned(*match_keyframes(first, last, *cameras))
@@ -94,7 +71,7 @@ def verify(
 
 
 def _aligned(first: Seen, last: Seen) -> Alignment | str:
-    """Return the motion between the frames, or why it is not verified."""
+    """The motion between the frames, or why it is not verified."""
     T_there = locate(first.xyz, last)
     if T_there is None:
         return "no common motion"
@@ -124,7 +101,6 @@ def match_keyframes(
 
 
 def _seen(uvd: Float32, camera: RectifiedCamera) -> Seen:
-    """Return features as a frame sees them."""
     return Seen(uvd.astype(np.float64), points_of(uvd, camera), camera)
 
 
@@ -135,7 +111,7 @@ def dense_agreement(
     first_camera: RectifiedCamera,
     last_camera: RectifiedCamera,
 ) -> float:
-    """Return the share of coarse disparities that the other frame confirms, in the worse direction.
+    """The share of coarse disparities that the other frame confirms, in the worse direction.
 
     A smaller disparity than predicted means seeing through the other's surface: a contradiction. A
     larger one means that something is in front of it, which does not count. 0 where the two frames
@@ -154,7 +130,7 @@ def _confirmed(
     T_target_source: Float64,
     camera: RectifiedCamera,
 ) -> float:
-    """Return the share of points of another frame that the target sees where they should be."""
+    """The share of points of another frame that the target sees where they should be."""
     u, v, d = project(apply(T_target_source, xyz), camera)
     step, half = _grid(target, camera)
     off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
@@ -167,7 +143,7 @@ def _confirmed(
 
 
 def _interpolated(values: Float32, column: Float64, row: Float64) -> Float64:
-    """Return values (N,) between samples; NaN beyond them, or where one of the four is unknown."""
+    """Values (N,) between samples; NaN beyond them, or where one of the four is unknown."""
     rows, columns = values.shape
     with np.errstate(invalid="ignore"):
         inside = (column >= 0) & (column < columns - 1) & (row >= 0) & (row < rows - 1)
@@ -181,14 +157,14 @@ def _interpolated(values: Float32, column: Float64, row: Float64) -> Float64:
 
 
 def _grid(keyframe: Keyframe, camera: RectifiedCamera) -> tuple[int, int]:
-    """Return pixels between coarse samples, and the place of the first."""
+    """Pixels between coarse samples, and the place of the first."""
     rows = keyframe.coarse.shape[0]
     step = max(1, round(camera.height_px / rows)) if rows else 1
     return step, step // 2
 
 
 def _coarse_points(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
-    """Return points (N, 3) in camera axes of the coarse samples that have a disparity."""
+    """Points (N, 3) in camera axes of the coarse samples that have a disparity."""
     row, column = np.nonzero(keyframe.coarse + camera.doffs_px > 1.0)
     step, half = _grid(keyframe, camera)
     d = keyframe.coarse[row, column]
@@ -197,7 +173,7 @@ def _coarse_points(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
 
 
 def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
-    """Return rows (M, 2) of descriptors that are each other's nearest."""
+    """Rows (M, 2) of descriptors that are each other's nearest."""
     if not len(ours) or not len(theirs):
         return np.zeros((0, 2), np.intp)
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
@@ -206,7 +182,7 @@ def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
 
 
 def _inverse(T_there: Float64, T_back: Float64) -> bool:
-    """Return whether the two poses are inverse to each other."""
+    """Whether the two poses are inverse to each other."""
     around = T_there @ T_back
     off_deg = float(np.rad2deg(angle_rad(around)))
     off_m = float(np.linalg.norm(around[:3, 3]))
@@ -219,7 +195,7 @@ def _weakness(
     aligned: Alignment,
     matches: int,
 ) -> str:
-    """Return why the inliers are not enough; "" where they are."""
+    """Why the inliers are not enough; "" where they are."""
     inliers = int(aligned.agree.sum())
     if inliers < max(MIN_INLIERS, _MIN_INLIER_SHARE * matches):
         return "few inliers"
@@ -239,7 +215,7 @@ def _spread(seen: Seen) -> int:
 
 
 def _sigma_m(information: Float64) -> float:
-    """Return the deviation of the translation in its worst direction; infinity = unknown."""
+    """The deviation of the translation in its worst direction; infinity = unknown."""
     values = np.linalg.eigvalsh(information)
     if values[0] <= 1e-9 * values[-1]:
         return float("inf")
