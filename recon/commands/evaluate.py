@@ -24,7 +24,6 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32
 from recon.evaluation.disparity import evaluate_disparity
-from recon.evaluation.doubts import doubts_of, doubts_of_file
 from recon.evaluation.drive_errors import LEAST_FRAMES, known_occupancy
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.map_comparison import (
@@ -37,6 +36,7 @@ from recon.evaluation.map_comparison import (
     possible_frames,
     read_mapped_cloud,
 )
+from recon.evaluation.map_of_run import doubts_of_file, map_of_run
 from recon.evaluation.middlebury.score import curve_figures, dense_map, named_figures
 from recon.evaluation.occupancy import evaluate_occupancy
 from recon.evaluation.segments import TOLERANCE_S, associate, interpolation_warnings
@@ -53,7 +53,7 @@ from recon.report.map_page import write_map_errors
 from recon.report.style import colour_grid_errors
 from recon.report.trajectory_page import write_trajectory_page
 from recon.run.directory import recorded_files
-from recon.run.finished import CLOUD, GRID, OCTOMAP, FinishedRun, open_run
+from recon.run.finished import CLOUD, GRID, OCTOMAP, command_of_map
 from recon.run.run import Run, plain
 from recon.sources.source import KnowsOccupancy
 from recon.sources.times import read_times
@@ -291,22 +291,23 @@ def run_evaluate_occupancy(
     """
     if image is not None:
         check_targets([image], (folder / name for name in recorded_files(folder)))
-    run, config = open_run(folder), run_settings(folder)
-    source = _source_that_knows(run, config)
+    config = run_settings(folder)
+    source, map_ = _source_that_knows(folder, config), map_of_run(folder)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
-    truth = known_occupancy(source, config, run.T_map_world, least_frames)
+    truth = known_occupancy(source, config, map_.T_map_world, least_frames)
     if image is not None:
         write_image(image, colour_grid_errors(grid, truth))
     metrics = evaluate_occupancy(voxels, grid, truth)
-    return OccupancyComparison(metrics, grid, truth, doubts_of(run))
+    return OccupancyComparison(metrics, grid, truth, list(map_.doubts))
 
 
-def _source_that_knows(run: FinishedRun, config: ReconConfig) -> KnowsOccupancy:
-    if run.mapped_by != "demo":
+def _source_that_knows(folder: Path, config: ReconConfig) -> KnowsOccupancy:
+    command = command_of_map(folder)
+    if command != "demo":
         raise EvaluationError(
             "the true occupancy of this run is not known",
-            where=run.folder,
-            got=f"a run of recon {run.mapped_by}",
+            where=folder,
+            got=f"a run of recon {command}",
             expected="a run of recon demo, whose street can be rendered again",
             hint="recon evaluate map compares a run with a reference cloud",
         )

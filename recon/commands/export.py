@@ -23,8 +23,8 @@ from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,
     MAPPED_BY,
+    command_of_map,
     is_pair_run,
-    open_run,
     refuse_as_target,
 )
 from recon.run.run import Run
@@ -80,10 +80,10 @@ def run_export(
             got=", ".join(wanted),
             hint="drop --workers and --scheduler; a mesh uses --threads",
         )
-    mapped = None if pair else open_run(source)
+    mapped_by = None if pair else command_of_map(source)
     ran = run_settings(source)
     settings = config or ran
-    if mapped is None:
+    if mapped_by is None:
         with Run(command, out, settings, threads=threads) as run:
             return export_pair(source, settings.mesh, wanted, run, formats)
     check_changes(ran, settings, (*(REMADE if need_rays(wanted) else ()), "mesh"))
@@ -99,7 +99,7 @@ def run_export(
             "T_map_world": T_map_world,
             "warnings": [*doubts, *made.warnings],
         }
-        record = {MAPPED_BY: mapped.mapped_by, "T_map_world": T_map_world, DOUBTS: doubts}
+        record = {MAPPED_BY: mapped_by, "T_map_world": T_map_world, DOUBTS: doubts}
         run.finish(figures, source=str(source), inputs=[source / MAP_FILE], record=record)
     return figures
 

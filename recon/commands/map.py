@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions, begin_or_resume, identity_of, with_resume_hint
 from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
 from recon.core.text import counted
-from recon.evaluation.drive_errors import compare_with_truth
-from recon.export.make import make
-from recon.export.map_run import MapRun
+from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
+from recon.evaluation.drive_errors import DriveErrors, compare_with_truth
+from recon.export.make import Products, make
 from recon.export.product import Order
 from recon.export.trajectories import export_paths
 from recon.map.drive.drive_odometry import doubt_poses
@@ -25,6 +26,53 @@ from recon.rig.audit.audit import quick_warnings
 from recon.run.run import Run, plain
 from recon.sources.live import LiveSource
 from recon.sources.source import IncompleteSource, StereoSource
+
+
+@dataclass(frozen=True, eq=False)
+class MapRun:
+    """The results of a run.
+
+    Attributes:
+        mapped: The drive: its map, and what it cost.
+        made: What is left in memory of what was made of the map.
+        errors: Errors against the truth, as far as the source knows it.
+        summary: The figures of ``summary.json``.
+    """
+
+    mapped: MappedSequence
+    made: Products
+    errors: DriveErrors
+    summary: dict[str, Any]
+
+    @property
+    def cloud(self) -> PointCloud:
+        """Even sample of the fused cloud; all points of a small one. Frame ``map``."""
+        return self.made.cloud
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The flat grid."""
+        return self.made.grid
+
+    @property
+    def mesh(self) -> TriangleMesh | None:
+        """The surface in map axes; None = not wanted, not possible, or too large for memory."""
+        return self.made.mesh
+
+    @property
+    def metrics(self) -> TrajectoryMetrics | None:
+        """Errors against the true path; None = it is not known."""
+        return self.errors.path
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Problems that did not stop the run."""
+        return tuple(self.summary["warnings"])
+
+    def __repr__(self) -> str:
+        made = f"{self.mapped}, {self.grid}, {self.mesh}"
+        name, warnings = self.summary["source"], counted(len(self.warnings), "warning")
+        return f"MapRun({name!r}, {made}, {warnings})"
 
 
 def run_map(
@@ -66,23 +114,14 @@ def run_map(
         with run.stage("compare"):
             given = options.known_poses is not None
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
-        result = MapRun(
-            name=source.name,
-            config=config,
-            mapped=mapped,
-            made=made,
-            truth=source.truth,
-            metrics=errors.path,
-            map_metrics=errors.surface,
-            occupancy_metrics=errors.occupancy,
-            warnings=(*findings, *_warnings(source, mapped), *made.warnings, *errors.warnings),
-        )
-        result.summary.update(_summary(source, result, options))
+        warnings = [*findings, *_warnings(source, mapped), *made.warnings, *errors.warnings]
+        result = MapRun(mapped, made, errors, {})
+        result.summary.update(_summary(source, result, warnings, options))
         with run.stage("write"):
-            export_paths(mapped, made.camera_height_m, run)
+            export_paths(map_.first, made.camera_height_m, run)
             keep_map(map_, run.path(MAP_FILE))
         with run.report(result.summary):
-            write_map_page(result, run)
+            write_map_page(map_, made, errors, mapped.sample, result.summary, run)
         config.memory.check("report")
         record = {
             "source_description": source.description,
@@ -120,11 +159,30 @@ def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
     ]
 
 
-def _summary(source: StereoSource, result: MapRun, options: MapOptions) -> dict[str, Any]:
-    given, prior = options.known_poses is not None, result.mapped.prior
+def _summary(
+    source: StereoSource, result: MapRun, warnings: list[str], options: MapOptions
+) -> dict[str, Any]:
+    """Return the figures of path, map and errors."""
+    mapped, errors, given = result.mapped, result.errors, options.known_poses is not None
+    frames, drift, prior = len(mapped.trajectory), mapped.expected_drift, mapped.prior
+    known = {"trajectory": errors.path, "map": errors.surface, "occupancy": errors.occupancy}
     return {
-        "odometry": "known poses" if given else result.config.odometry.method,
-        **result.figures(),
+        "odometry": "known poses" if given else mapped.config.odometry.method,
+        "source": source.name,
+        "frames": frames,
+        "fps": frames / mapped.seconds if mapped.seconds > 0 else None,
+        "path_length_m": mapped.trajectory.path_length_m,
+        "expected_drift_percent": None if drift is None else drift.percent,
+        "expected_drift_rig_percent": None if drift is None else drift.rig_percent,
+        "frames_not_trusted": int((~mapped.trusted).sum()),
+        "focal_px": mapped.camera.focal_px,
+        "field_of_view_deg": mapped.camera.field_of_view_deg,
+        "T_map_world": mapped.T_map_world.tolist(),
+        "faces": 0,
+        **result.made.figures,
+        "warnings": warnings,
+        **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
+        **{name: plain(found) for name, found in known.items() if found is not None},
         **({"frames_left_out": source.left_out} if isinstance(source, IncompleteSource) else {}),
         **({"live": source.figures()} if isinstance(source, LiveSource) else {}),
         **({} if prior is None else {"prior": {"from": options.prior_origin, **plain(prior)}}),

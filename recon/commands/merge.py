@@ -19,7 +19,7 @@ from recon.map.sessions.measured import Survey
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
-from recon.run.finished import open_run, refuse_as_target
+from recon.run.finished import command_of_map, refuse_as_target
 from recon.run.run import Run
 from recon.sources.source import StereoSource
 
@@ -57,7 +57,7 @@ def run_merge(
     _refuse_twice(runs)
     settings = joined_settings(runs[0], config)
     for run in runs:
-        open_run(run)
+        command_of_map(run)
         refuse_as_target(run, options.out)
 
     def fill(run: Run, map_: Map) -> list[int]:

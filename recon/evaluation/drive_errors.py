@@ -40,12 +40,14 @@ class DriveErrors:
         surface: Errors against the true surface.
         occupancy: Errors against the true occupancy.
         warnings: What could not be compared.
+        true_path: The true path, to be drawn.
     """
 
     path: TrajectoryMetrics | None
     surface: MapMetrics | None
     occupancy: OccupancyMetrics | None
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    true_path: Trajectory | None = None
 
 
 def compare_with_truth(
@@ -65,7 +67,8 @@ def compare_with_truth(
     path = None if poses_given else _compare_paths(mapped.trajectory, truth, warnings)
     surface = _compare_surfaces(mapped, truth, warnings)
     occupancy = _compare_occupancy(source, mapped, grid, warnings)
-    return DriveErrors(path, surface, occupancy, tuple(warnings))
+    true_path = None if truth is None else truth.trajectory
+    return DriveErrors(path, surface, occupancy, tuple(warnings), true_path)
 
 
 def _compare_paths(

@@ -15,14 +15,14 @@ from recon.core.geometry.se3 import angle_rad, invert, transform_cloud
 from recon.core.text import counted
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
-from recon.evaluation.doubts import doubts_of
 from recon.evaluation.map import evaluate_map, register_cloud, within_reach
+from recon.evaluation.map_of_run import map_of_run
 from recon.evaluation.segments import TOLERANCE_S, associate
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory
 from recon.places.places import drift_at_end, fit_to_path
 from recon.run.directory import RECORD
-from recon.run.finished import CLOUD, open_run
+from recon.run.finished import CLOUD
 
 ReferenceFrame = Literal["camera", "map"]
 # From half of either cloud near the other it is a fit; below a tenth of both it is none.
@@ -53,14 +53,12 @@ class MappedCloud:
     Attributes:
         cloud: The cloud; as read, in map axes if it is of a run.
         path: The path of the cameras; as read, in world axes; None = unknown.
-        folder: Folder of the run; None = no run.
         T_map_world: float64 (4, 4), from world to map axes; None = no run.
         doubts: What is not to be trusted in the map of the run.
     """
 
     cloud: PointCloud
     path: Trajectory | None = None
-    folder: Path | None = None
     T_map_world: Float64 | None = None
     doubts: Sequence[str] = ()
 
@@ -74,10 +72,8 @@ def read_mapped_cloud(run: Path) -> MappedCloud:
     folder = run if run.is_dir() else run.parent.parent
     if not run.is_dir() and (run.parent.name != "map" or not (folder / RECORD).is_file()):
         return MappedCloud(read_ply(run))
-    mapped = open_run(folder)
-    cloud = read_ply(run / CLOUD if run.is_dir() else run)
-    path = read_trajectory(mapped.path_file) if mapped.path_file.is_file() else None
-    return MappedCloud(cloud, path, folder, mapped.T_map_world, doubts_of(mapped))
+    map_, cloud = map_of_run(folder), read_ply(run / CLOUD if run.is_dir() else run)
+    return MappedCloud(cloud, map_.path, map_.T_map_world, map_.doubts)
 
 
 def place_cloud(
@@ -221,9 +217,9 @@ def doubt_axes(
 
 def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
     """Return the rigid motion that brings the run's path closest to ground truth."""
-    if mapped.folder is None:
-        raise EvaluationError("a cloud without a run has no path to align")
-    path, truth = read_trajectory(open_run(mapped.folder).path_file), read_trajectory(poses)
+    path, truth = mapped.path, read_trajectory(poses)
+    if path is None:
+        raise EvaluationError("the run has no path to align", hint="give one that has its map")
     if holds_times(poses):
         path, truth = associate(path, truth, TOLERANCE_S)
     if len(path) != len(truth):

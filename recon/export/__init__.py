@@ -4,6 +4,5 @@
 - `product.py`: what a product gets, and what it gives back;
 - `cloud.py`, `occupancy.py`, `survey.py`, `mesh/pieces.py`: one kind of product each, from tiles;
 - `trajectories.py`: the paths of drives; `pair.py`: what is made of a single pair, or of a cloud;
-- `map_run.py`, `joined.py`: the results of `recon map`, and of a map of several drives;
 - `mesh/poisson.py`: the surface of a cloud.
 """

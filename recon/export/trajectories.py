@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -12,9 +12,12 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
 from recon.io.trajectory import write_kitti_poses, write_tum
-from recon.map.drive.sequence import MappedSequence
 from recon.map.ground.axes import base_axes
 from recon.map.localize.sequence import LocalizedDrive, LocalizedFrame
+from recon.map.store.map_file import MapFile
+from recon.map.store.record_values import loop_in
+from recon.map.store.session import Session
+from recon.places.loop import Loop
 from recon.run.directory import RunDirectory
 
 _AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
@@ -29,22 +32,41 @@ HEADER: Final = (
 )
 
 
-def export_paths(mapped: MappedSequence, camera_height_m: float | None, run: RunDirectory) -> None:
-    """Write ``trajectory_*.txt``, and ``loops.json`` if loops were closed.
+def export_paths(session: Session, camera_height_m: float | None, run: RunDirectory) -> None:
+    """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed.
 
     Args:
-        mapped: The mapped drive.
+        session: The drive.
         camera_height_m: Height of the camera above the ground; None = unknown.
         run: The run.
     """
-    path, T_map_world = mapped.trajectory, mapped.T_map_world
+    path = session.trajectory
     write_kitti_poses(run.path("trajectory_kitti.txt"), path)
     write_tum(run.path("trajectory_tum.txt"), path)
-    based = _of_base(path, T_map_world, camera_height_m)
+    based = _of_base(path, session.T_map_world, camera_height_m)
     write_tum(run.path("trajectory_map_base_tum.txt"), based)
-    if mapped.loops is not None and mapped.loops.closure.closed:
-        write_tum(run.path("trajectory_odometry_tum.txt"), mapped.loops.odometry)
-        run.write_json("loops.json", mapped.loops.edges())
+    if session.loops.get("closed"):
+        write_tum(run.path("trajectory_odometry_tum.txt"), session.odometry)
+        kinds = ("closed", "refused")
+        loops = {kind: [*map(_edge, map(loop_in, session.loops[kind]))] for kind in kinds}
+        run.write_json("loops.json", loops)
+
+
+def _edge(loop: Loop) -> dict[str, Any]:
+    return {
+        "first": loop.first,
+        "last": loop.last,
+        "inliers": loop.inliers,
+        "dense_share": round(loop.dense_share, 4),
+        "T_first_last": loop.T_first_last.tolist(),
+    }
+
+
+def export_sessions(map_: MapFile, run: RunDirectory) -> None:
+    """Write ``sessions/<number>/trajectory_*.txt`` of the linked drives, in the map's world."""
+    for number, path in map_.paths.items():
+        write_kitti_poses(run.path(f"sessions/{number}/trajectory_kitti.txt"), path)
+        write_tum(run.path(f"sessions/{number}/trajectory_tum.txt"), path)
 
 
 def export_localized(

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from recon.core.geometry.se3 import apply
-from recon.core.values import PointCloud
+from recon.core.values import PointCloud, Trajectory
+from recon.core.values.arrays import Float64
+from recon.evaluation.drive_errors import DriveErrors
 from recon.evaluation.map import nearest_distances
 from recon.evaluation.map_comparison import MapComparison
-from recon.export.joined import JoinedMap
-from recon.export.map_run import MapRun
+from recon.export.make import Products
 from recon.io.models.ply import write_ply
+from recon.map.store.map_file import MapFile
+from recon.map.store.session import Session
+from recon.odometry.health import expected_drift
 from recon.report.drive_figures import (
     drift_figure,
     grid_figure,
@@ -27,77 +31,78 @@ from recon.report.pair_page import stereo_figures
 from recon.report.scene import Json, Scene, plot_scene
 from recon.report.style import ERROR_SCALE, colour_values
 from recon.run.directory import RunDirectory
+from recon.stereo.frame import ReconstructedFrame
 
 
-def write_map_page(result: MapRun, run: RunDirectory) -> None:
-    """Write ``report.html`` of a drive."""
-    write_page("map", run, **map_content(result))
+def write_map_page(
+    map_: MapFile,
+    made: Products,
+    errors: DriveErrors,
+    sample: ReconstructedFrame,
+    summary: Json,
+    run: RunDirectory,
+) -> None:
+    """Write ``report.html`` of a map of one drive, with a frame of it in full."""
+    write_page("map", run, **map_content(map_, made, errors, sample, summary))
 
 
-def map_content(result: MapRun) -> Json:
+def map_content(
+    map_: MapFile, made: Products, errors: DriveErrors, sample: ReconstructedFrame, summary: Json
+) -> Json:
     """Return what the page of a drive shows: map and path first, then the data behind them."""
-    sample = result.mapped.sample
-    return {
-        "run": result,
-        "warnings": result.warnings,
-        "figures": _figures(result),
-        "view": _view(result),
-        "sample": stereo_figures(sample.pair, sample.disparity),
-    }
-
-
-def _figures(result: MapRun) -> dict[str, bytes | None]:
-    path, health, T_map_world = (
-        result.mapped.trajectory,
-        result.mapped.health,
-        result.mapped.T_map_world,
-    )
-    truth = None if result.truth is None else result.truth.trajectory
-    drift = result.mapped.expected_drift
+    session, truth = map_.first, errors.true_path
+    path, health, T_map_world = session.trajectory, session.health, session.T_map_world
+    drift = expected_drift(path, health, session.camera)
     radius_share = 0.0 if drift is None else drift.radius_share
+    true_path = {} if truth is None else {"true path": truth}
     return {
-        "grid": grid_figure(result.grid, {"path": seen_from_above(path, T_map_world)}),
-        "path": path_figure(path, truth, T_map_world, health, radius_share),
-        "loops": _loops(result),
-        "drift": None if truth is None else drift_figure(path, truth, health),
-        "health": health_figure(health) if health else None,
+        **_map_content(made, {"path": path}, true_path, T_map_world, summary),
+        "path": path,
+        "health": health,
+        "metrics": errors.path,
+        "figures": {
+            "path": path_figure(path, truth, T_map_world, health, radius_share),
+            "loops": _loops(session),
+            "drift": None if truth is None else drift_figure(path, truth, health),
+            "health": health_figure(health) if health else None,
+        },
+        "sample": stereo_figures(sample.pair, sample.disparity),
+        "sample_frame": sample.pair.index,
     }
 
 
-def _loops(result: MapRun) -> bytes | None:
-    loops = result.mapped.loops
-    if loops is None or not loops.closure.closed:
-        return None
-    pairs = [(loop.first, loop.last) for loop in loops.closure.closed]
-    return loops_figure(loops.odometry, loops.closure.trajectory, pairs, result.mapped.T_map_world)
-
-
-def _view(result: MapRun) -> Json | None:
-    drives = [("path", result.mapped.trajectory)]
-    if result.truth is not None and result.truth.trajectory is not None:
-        drives.append(("true path", result.truth.trajectory))
-    paths = [
-        (name, np.asarray(apply(result.mapped.T_map_world, path.positions_m)))
-        for name, path in drives
-    ]
-    return plot_scene(Scene(np.eye(4), result.cloud, result.mesh, paths))
-
-
-def write_joined_page(joined: JoinedMap, summary: dict[str, Any], run: RunDirectory) -> None:
+def write_joined_page(map_: MapFile, made: Products, summary: Json, run: RunDirectory) -> None:
     """Write ``report.html`` of a map of several drives: all paths on one grid."""
-    T_map_world, made = joined.map.first.T_map_world, joined.made
-    named = {f"session {number}": path for number, path in joined.paths.items()}
-    from_above = {name: seen_from_above(path, T_map_world) for name, path in named.items()}
-    ways = [(name, np.asarray(apply(T_map_world, p.positions_m))) for name, p in named.items()]
-    write_page(
-        "joined",
-        run,
-        run=summary,
-        warnings=summary["warnings"],
-        grid=grid_figure(made.grid, from_above),
-        resolution_m=made.grid.resolution_m,
-        view=plot_scene(Scene(np.eye(4), made.cloud, made.mesh, ways)),
-    )
+    paths = {f"session {number}": path for number, path in map_.paths.items()}
+    write_page("joined", run, **_map_content(made, paths, {}, map_.first.T_map_world, summary))
+
+
+def _map_content(
+    made: Products,
+    paths: dict[str, Trajectory],
+    only_in_3d: dict[str, Trajectory],
+    T_map_world: Float64,
+    summary: Json,
+) -> Json:
+    """Return what the pages of all maps show: paths on the grid, and with others in 3-D."""
+    from_above = {name: seen_from_above(path, T_map_world) for name, path in paths.items()}
+    ways = [
+        (name, apply(T_map_world, path.positions_m)) for name, path in (paths | only_in_3d).items()
+    ]
+    return {
+        "found": summary,
+        "warnings": summary["warnings"],
+        "grid": grid_figure(made.grid, from_above),
+        "resolution_m": made.grid.resolution_m,
+        "view": plot_scene(Scene(np.eye(4), made.cloud, made.mesh, ways)),
+    }
+
+
+def _loops(session: Session) -> bytes | None:
+    pairs = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
+    if not pairs:
+        return None
+    return loops_figure(session.odometry, session.trajectory, pairs, session.T_map_world)
 
 
 _SCALE_THRESHOLDS: Final = 2.0

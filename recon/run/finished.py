@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,9 +11,8 @@ import numpy as np
 
 from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import check_rigid
-from recon.core.text import is_count
 from recon.core.values import RectifiedCamera
-from recon.core.values.arrays import Float64, freeze
+from recon.core.values.arrays import Float64
 from recon.io.files import StrPath, read_text, reader, reading, resolved
 from recon.run.directory import RECORD, RECORD_BYTES, refuse_links
 from recon.run.run import SUMMARY
@@ -30,52 +27,33 @@ DOUBTS: Final = "doubts"
 """Record key of a run made from another run, without a map of its own: what was doubted there."""
 
 
-@dataclass(frozen=True, eq=False)
-class FinishedRun:
-    """A finished run with maps.
+def command_of_map(folder: Path) -> str:
+    """Return the command that mapped the drive of a finished run, such as ``demo``.
 
-    Attributes:
-        folder: Its folder.
-        mapped_by: The command that mapped the drive, such as ``demo``.
-        T_map_world: float64 (4, 4), from world to map axes.
-        doubts: What was doubted in the map that a run without one was made from.
+    Raises:
+        FormatError: The folder has no finished run, or one that made no map.
     """
-
-    folder: Path
-    mapped_by: str
-    T_map_world: Float64
-    doubts: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        freeze(self, "T_map_world", np.float64, (4, 4))
-
-    @property
-    def path_file(self) -> Path:
-        """The path of the drive, or of the one that began the map; it may be missing."""
-        alone = self.folder / "trajectory_tum.txt"
-        drives = self.folder.glob("sessions/*/trajectory_tum.txt")
-        return alone if alone.is_file() else min(drives, key=_session_of, default=alone)
+    record = _record_of_map(folder)
+    command = record.get(MAPPED_BY, record.get("command"))
+    if not isinstance(command, str):
+        raise FormatError("record of the run does not name its command", where=folder / RECORD)
+    return command
 
 
-def _session_of(path_file: Path) -> int:
-    """Return the number of the drive whose folder a file is in."""
-    return int(path_file.parent.name) if is_count(path_file.parent.name) else sys.maxsize
+def made_from(folder: Path) -> tuple[Float64, list[str]]:
+    """Return axes and doubts of the map that a run without a map of its own was made from.
 
-
-def open_run(folder: Path) -> FinishedRun:
-    """Read the record of a run with maps."""
-    path = folder / RECORD
-    record = _read_record(path)
-    if "T_map_world" not in record:
-        raise FormatError("the run made no map: its record has no T_map_world", where=folder)
+    Returns:
+        ``T_map_world``, float64 (4, 4), and what was doubted in the map.
+    """
+    path, record = folder / RECORD, _record_of_map(folder)
     with reading(path):
         T_map_world = np.array(record["T_map_world"], dtype=np.float64)
     check_rigid("T_map_world", T_map_world, path)
-    mapped_by = record.get(MAPPED_BY, record.get("command"))
     doubts = record.get(DOUBTS, [])
     if not isinstance(doubts, list) or not all(isinstance(line, str) for line in doubts):
         raise FormatError(f"record of the run has no valid {DOUBTS}", where=path)
-    return FinishedRun(folder, str(mapped_by), T_map_world, tuple(doubts))
+    return T_map_world, doubts
 
 
 def is_pair_run(folder: Path) -> bool:
@@ -111,6 +89,13 @@ def refuse_as_target(run: Path, out: StrPath | None) -> None:
     """Refuse to write derived results into the folder of the run, which would replace it."""
     if out is not None and resolved(out) == resolved(run):
         raise SettingsError("the results would replace the run", where=out, hint="another --out")
+
+
+def _record_of_map(folder: Path) -> dict[str, Any]:
+    record = _read_record(folder / RECORD)
+    if "T_map_world" not in record:
+        raise FormatError("the run made no map: its record has no T_map_world", where=folder)
+    return record
 
 
 @reader

@@ -16,12 +16,11 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.map import run_map
+from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError, RegistrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
-from recon.export.map_run import MapRun
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.map import run_map
+from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.values import SequenceTruth, StereoPair
-from recon.export.map_run import MapRun
 from recon.io.trajectory import read_tum
 from recon.map.drive.mapper import FrameResult
 from recon.run.progress import Silent
@@ -110,9 +109,8 @@ def test_a_drive_around_a_block_closes_to_a_fifth_of_a_percent(
     closed: tuple[Path, MapRun, int],
 ) -> None:
     folder, run, _ = closed
-    assert run.truth is not None
-    assert run.truth.trajectory is not None
-    truth = run.truth.trajectory
+    truth = run.errors.true_path
+    assert truth is not None
     before_m, after_m = (
         np.linalg.norm(read_tum(folder / name).positions_m[-1] - truth.positions_m[-1])
         for name in ("trajectory_odometry_tum.txt", "trajectory_tum.txt")

@@ -24,7 +24,6 @@ from recon.io.trajectory import read_trajectory
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.sessions.measured import Survey
 from recon.map.verbs import Map
-from recon.run.finished import open_run
 from recon.sources.source import SourcePart, StereoSource
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film
@@ -96,7 +95,7 @@ def test_one_run_is_held_at_measured_positions(runs: Path, tmp_path: Path) -> No
     found = run_merge([runs / "first"], None, MapOptions("merge", out, mesh=False), survey)
     assert found["sessions"][0]["positions"] == FRAMES
     assert found["positions_misfit_rms_m"] < 0.03
-    held = read_trajectory(open_run(out).path_file)
+    held = read_trajectory(out / "sessions/0/trajectory_tum.txt")
     assert 1.005 < held.path_length_m / before.path_length_m < 1.012
     page = (out / "report.html").read_text()
     assert "Map of 1 drive" in page

@@ -151,8 +151,8 @@ def test_the_map_can_have_its_origin_on_the_ground(tmp_path: Path) -> None:
     # One frame's ground plane against the ground of the whole drive: some centimetres apart.
     assert abs(base.positions_m[0, 2]) < 0.1
     assert np.array(run.summary["T_map_world"])[2, 3] == pytest.approx(1.65, abs=0.1)
-    assert run.occupancy_metrics is not None
-    assert run.occupancy_metrics.voxels.precision > 0.8
+    assert run.errors.occupancy is not None
+    assert run.errors.occupancy.voxels.precision > 0.8
     _check_start(out)
 
 

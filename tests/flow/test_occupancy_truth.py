@@ -20,9 +20,9 @@ STREETS = {
 def _map(overrides: list[str], out) -> OccupancyMetrics:
     config = load_config(None, ["street.frames=30", *overrides])
     run = run_map(demo_source(config), config, MapOptions(audit=False, out=out, mesh=False))
-    assert run.occupancy_metrics is not None
-    assert run.summary["occupancy"]["voxels"]["recall"] == run.occupancy_metrics.voxels.recall
-    return run.occupancy_metrics
+    assert run.errors.occupancy is not None
+    assert run.summary["occupancy"]["voxels"]["recall"] == run.errors.occupancy.voxels.recall
+    return run.errors.occupancy
 
 
 @pytest.mark.slow

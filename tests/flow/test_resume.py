@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map import run_map
+from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
-from recon.export.map_run import MapRun
 from recon.map.drive.mapper import FrameResult
 from recon.map.store.records import Store
 from recon.map.verbs import Map

@@ -21,7 +21,7 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.core.values.arrays import Float64
-from recon.odometry.health import ExpectedDrift
+from recon.evaluation.drive_errors import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 
 HEIGHT_PX, WIDTH_PX = 24, 60
@@ -114,25 +114,28 @@ def drive(
     cloud: PointCloud,
     mesh: TriangleMesh,
 ) -> SimpleNamespace:
-    """A `MapRun` with everything but loops."""
-    mapped = SimpleNamespace(
+    """What the page of a drive is made from, with everything but loops."""
+    session = SimpleNamespace(
         trajectory=trajectory,
+        odometry=trajectory,
         T_map_world=T_map_world,
         health=health,
-        sample=SimpleNamespace(pair=pair, disparity=disparity),
-        loops=None,
-        expected_drift=ExpectedDrift(0.8, 0.7, 12.0),
+        camera=pair.camera,
+        loops={},
     )
     return SimpleNamespace(
-        name="drives/drive <1>",
-        mapped=mapped,
-        cloud=cloud,
-        grid=grid,
-        mesh=mesh,
-        truth=SimpleNamespace(trajectory=trajectory),
-        metrics=METRICS,
-        summary={"fps": 4.25, "points": 2000, "stages": {"match": 1.0}, "nested": {"a": [1, None]}},
-        warnings=("frame 5: lost",),
+        map_=SimpleNamespace(first=session),
+        made=SimpleNamespace(cloud=cloud, grid=grid, mesh=mesh),
+        errors=DriveErrors(METRICS, None, None, true_path=trajectory),
+        sample=SimpleNamespace(pair=pair, disparity=disparity),
+        summary={
+            "source": "drives/drive <1>",
+            "fps": 4.25,
+            "points": 2000,
+            "stages": {"match": 1.0},
+            "nested": {"a": [1, None]},
+            "warnings": ["frame 5: lost"],
+        },
     )
 
 

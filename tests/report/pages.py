@@ -74,7 +74,7 @@ def rows(block: str) -> list[tuple[str, ...]]:
 
 
 def map_html(run: SimpleNamespace) -> str:
-    return render_page("map", **map_content(run))  # type: ignore[arg-type]
+    return render_page("map", **map_content(**vars(run)))
 
 
 def pair_html(run: SimpleNamespace) -> str:

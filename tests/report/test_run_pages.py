@@ -13,12 +13,9 @@ from recon.core.values import (
     Disparity,
     DisparityTruth,
     PointCloud,
-    Trajectory,
 )
-from recon.map.drive.drive_loops import DriveLoops
+from recon.evaluation.drive_errors import DriveErrors
 from recon.odometry.protocol import OdometryHealth
-from recon.places.closure import Closure
-from recon.places.loop import Loop
 from recon.report.map_page import map_content, write_map_page
 from recon.report.pair_page import write_pair_page
 from recon.run.directory import RunDirectory
@@ -38,17 +35,16 @@ def test_page_of_a_drive_puts_the_main_figures_first(drive: SimpleNamespace) -> 
 
 
 def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
-    drive: SimpleNamespace, trajectory: Trajectory
+    drive: SimpleNamespace,
 ) -> None:
-    moved = np.array(trajectory.T_world_camera)
-    moved[:, 0, 3] += np.linspace(0.0, 2.5, len(moved))
-    bent = Trajectory(moved, trajectory.timestamps_s)
-    right, wrong = (Loop(0, last, np.eye(4), np.eye(6), 50, 0.9) for last in (9, 10))
-    drive.mapped.loops = DriveLoops(trajectory, Closure(bent, (right,), (wrong,)), 11, 3, {})
+    session, figures = drive.map_.first, {"found": 3, "keyframes": 11, "largest_correction_m": 2.5}
+    session.loops = {"closed": [{"first": 0, "last": 9}]}
+    drive.summary["loops"] = {**figures, "closed": 1}
     page = map_html(drive)
     assert key_figures(page)["Loops closed, path moved by"] == "1 of 3, 2.50 m"
     assert "1 loop closed, with 11 keyframes" in blocks(page)["Loops"]
-    drive.mapped.loops = DriveLoops(trajectory, Closure(trajectory, (), (wrong,)), 11, 3, {})
+    session.loops = {"closed": []}
+    drive.summary["loops"] = {**figures, "closed": 0, "largest_correction_m": 0.0}
     page = map_html(drive)
     assert key_figures(page)["Loops closed, path moved by"] == "0 of 3, 0.00 m"
     assert "Loops" not in blocks(page)
@@ -56,7 +52,9 @@ def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
 
 def test_notes_of_the_odometry_are_listed_by_frame(drive: SimpleNamespace) -> None:
     assert rows(blocks(map_html(drive))["Notes of the odometry"]) == [("5", "too few <tracks>")]
-    drive.mapped.health = [OdometryHealth(ok=False)] * 23
+    poses = np.tile(np.eye(4), (23, 1, 1))
+    drive.map_.first.trajectory = Trajectory(poses, np.arange(23.0))
+    drive.map_.first.health = [OdometryHealth(ok=False)] * 23
     notes = blocks(map_html(drive))["Notes of the odometry"]
     assert len(rows(notes)) == 20
     assert "The first 20 of 23." in notes
@@ -75,7 +73,7 @@ def test_a_map_compared_with_the_truth_is_tabulated(drive: SimpleNamespace) -> N
 
 
 def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> None:
-    plot: dict[str, Any] = map_content(drive)["view"]  # type: ignore[arg-type]
+    plot: dict[str, Any] = map_content(**vars(drive))["view"]
     assert [trace["name"] for trace in plot["data"]][-2:] == ["path", "true path"]
     low, high = plot["layout"]["scene"]["xaxis"]["range"]
     # Both run from 0 to 10 m forward in map axes.
@@ -84,8 +82,8 @@ def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> N
 
 
 def test_page_of_a_drive_with_nothing_but_path_and_grid_is_made(drive: SimpleNamespace) -> None:
-    drive.truth = drive.metrics = drive.cloud = drive.mesh = None
-    drive.summary, drive.mapped.health = {}, ()
+    drive.errors, drive.made.cloud, drive.made.mesh = DriveErrors(None, None, None), None, None
+    drive.summary, drive.map_.first.health = {"source": "drive", "warnings": []}, ()
     page = map_html(drive)
     assert "Path from above" in blocks(page)
     assert not {"In 3-D", "Notes of the odometry"} & blocks(page).keys()
@@ -116,7 +114,7 @@ def test_truth_of_another_size_gives_no_error_map(view: SimpleNamespace) -> None
 
 def test_drive_leaves_its_page(drive: SimpleNamespace, tmp_path: Path) -> None:
     with RunDirectory(tmp_path / "run") as directory:
-        write_map_page(drive, directory)  # type: ignore[arg-type]
+        write_map_page(**vars(drive), run=directory)
         directory.write_json("run.json", {})
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "Map of drive &lt;1&gt;" in page

@@ -60,22 +60,6 @@ class DriveLoops:
             "largest_correction_m": float(self.corrections_m.max(initial=0.0)),
         }
 
-    def edges(self) -> dict[str, Any]:
-        """Return the loops, for ``loops.json``."""
-        return {
-            name: [
-                {
-                    "first": loop.first,
-                    "last": loop.last,
-                    "inliers": loop.inliers,
-                    "dense_share": round(loop.dense_share, 4),
-                    "T_first_last": loop.T_first_last.tolist(),
-                }
-                for loop in loops
-            ]
-            for name, loops in (("closed", self.closure.closed), ("refused", self.closure.refused))
-        }
-
     def record(self) -> dict[str, Any]:
         """Return what a map keeps of it: the loops, and the path after closure if any closed."""
         closed, refused = self.closure.closed, self.closure.refused

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, overload
 
@@ -13,7 +14,7 @@ from typing_extensions import Self
 from recon.core.errors import FormatError, MappingError
 from recon.core.geometry.se3 import invert
 from recon.core.text import counted
-from recon.core.values import RectifiedCamera
+from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.files import StrPath, reading
 from recon.map.store.record_values import LINKS, Link
@@ -150,6 +151,16 @@ class MapFile:
         if not (linked := self.linked):
             raise FormatError("the map has no drive", where=self.store.name)
         return linked[0]
+
+    @property
+    def paths(self) -> dict[int, Trajectory]:
+        """The path of each linked drive by its number, in the world of the map."""
+        return {
+            session.number: replace(
+                path, T_world_camera=self.T_world_session(session) @ path.T_world_camera
+            )
+            for session, path in ((session, session.trajectory) for session in self.linked)
+        }
 
     @property
     def placed(self) -> dict[int, Bool]:
