@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import (
+    Trajectory,
     Disparity,
     DisparityTruth,
     PointCloud,
