@@ -41,21 +41,13 @@ correspond, does not change from frame to frame."""
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedFrame:
-    """The results of one stereo pair.
+    """The results of one stereo pair."""
 
-    Attributes:
-        pair: The rectified images.
-        disparity: Its disparity, with flying edges removed.
-        cloud: Its points in camera axes, filtered.
-        warnings: Problems of the images that did not prevent a result.
-        rays: Its rays for the occupancy map; None if no map is made.
-    """
-
-    pair: RectifiedPair
-    disparity: Disparity
-    cloud: PointCloud
-    warnings: tuple[str, ...] = ()
-    rays: RayCloud | None = None
+    pair: RectifiedPair  # the rectified images
+    disparity: Disparity  # its disparity, with flying edges removed
+    cloud: PointCloud  # its points in camera axes, filtered
+    warnings: tuple[str, ...] = ()  # problems of the images that did not prevent a result
+    rays: RayCloud | None = None  # its rays for the occupancy map; None if no map is made
 
     def unmapped(self) -> ReconstructedFrame:
         """Return the frame with nothing for a map, only for odometry and place recognition."""
@@ -65,11 +57,7 @@ class ReconstructedFrame:
 class FrameReconstructor:
     """Reconstructs pairs: rectify, inspect, match, remove edges, back-project, filter.
 
-    Args:
-        calibration: Calibration of the cameras.
-        config: The configuration.
-        threads: Threads for the matcher; None = all cores. Does not change results.
-        stopwatch: Records the time per stage.
+    ``threads`` are those of the matcher (None = all cores); results do not depend on them.
     """
 
     def __init__(
@@ -180,31 +168,19 @@ class StereoSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class PairRun:
-    """Results of a run, from which its report is made.
+    """Results of a run, from which its report is made."""
 
-    Attributes:
-        name: Display name of the pair.
-        config: The configuration.
-        pair: The rectified images.
-        disparity: Their disparity.
-        summary: The figures of ``summary.json``.
-        cloud: The points in camera axes, or None if only the disparity was requested.
-        mesh: The surface in camera axes, or None.
-        truth: True disparity, or None.
-        metrics: Errors against it, or None.
-        warnings: Problems that did not stop the run.
-    """
-
-    name: str
-    config: StereoSettings
-    pair: RectifiedPair
-    disparity: Disparity
-    summary: dict[str, Any]
+    name: str  # display name of the pair
+    config: StereoSettings  # the configuration
+    pair: RectifiedPair  # the rectified images
+    disparity: Disparity  # their disparity
+    summary: dict[str, Any]  # the figures of ``summary.json``
+    #: The points in camera axes, or None if only the disparity was requested.
     cloud: PointCloud | None = None
-    mesh: TriangleMesh | None = None
-    truth: DisparityTruth | None = None
-    metrics: DisparityMetrics | None = None
-    warnings: tuple[str, ...] = ()
+    mesh: TriangleMesh | None = None  # the surface in camera axes, or None
+    truth: DisparityTruth | None = None  # true disparity, or None
+    metrics: DisparityMetrics | None = None  # errors against it, or None
+    warnings: tuple[str, ...] = ()  # problems that did not stop the run
 
     def __repr__(self) -> str:
         parts = (self.disparity, self.cloud, self.mesh)

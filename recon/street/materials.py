@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Float64, Int32
-from recon.street.kernels.noise import fractal_noise, lattice_values
-from recon.street.kernels.surface import SurfaceHits
+from recon.street.kernels.surface import SurfaceHits, fractal_noise, lattice_values
 from recon.street.shapes import Material, TriangleSoup
 
 GAMMA: Final = 2.2

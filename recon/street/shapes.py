@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.geometry import se3
 from recon.core.values.arrays import Float64, Int32, UInt8, freeze
-from recon.street.kernels.noise import value_noise
+from recon.street.kernels.surface import value_noise
 
 FAR_UV = 100.0
 
@@ -189,7 +189,7 @@ class TriangleSoup:
     normals: Float64  # (F, 3, 3), unit normals at the corners, only for shading
     uv: Float64  # (F, 3, 2), texture coordinates of the corners, metres
     rgb: Float64  # (F, 3), base colour
-    material: UInt8  # uint8 (F,), a `Material`
+    material: UInt8  # (F,), a `Material`
     part: Int32  # (F,), number of the object
 
     def __post_init__(self) -> None:

@@ -26,16 +26,9 @@ _QUARTERS: Final = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.
 def true_surface(
     camera: StreetCamera, *, range_m: float = 30.0, voxel_m: float = 0.05
 ) -> PointCloud:
-    """Return points on the surfaces that the left camera saw.
+    """Return points on the surfaces that the left camera saw within a range, in frame ``world``.
 
-    Args:
-        camera: The rig in its street.
-        range_m: Pixels with a larger depth are left out.
-        voxel_m: Of the pixels in a voxel one is kept, unmoved, so that every point lies exactly
-            on a surface.
-
-    Returns:
-        Cloud in frame ``world``.
+    Of the pixels in a voxel one is kept, unmoved, so that every point lies exactly on a surface.
     """
     T_street_camera = camera.world.T_street_camera
     kept = np.empty((0, 3), dtype=np.float32)
@@ -60,14 +53,10 @@ def true_occupancy(
 ) -> OccupancyTruth:
     """Return the true surfaces and obstacles on the part of the street that was seen.
 
-    Args:
-        camera: The rig in its street.
-        resolution_m: Cell size; cell borders are at multiples of it.
-        band_m: Heights above the road between which a surface is an obstacle. The pavement is
-            0.12 m high, so a lower band makes it an obstacle.
-        range_m: Largest distance from the camera that a frame sees.
-        least_frames: Least number of frames that must have seen a cell of the grid.
-        T_map_world: The map axes to use; by default those of the street world.
+    A surface is an obstacle between the heights of the band above the road; the pavement is 0.12 m
+    high. A frame sees as far as ``range_m``; cells of the grid, with borders at multiples of the
+    resolution, are known where ``least_frames`` have seen them. Axes are those of the street world,
+    or ``T_map_world``.
     """
     world = camera.world
     T = world.T_map_world if T_map_world is None else T_map_world

@@ -12,7 +12,7 @@ from recon.core.errors import SettingsError
 from recon.core.geometry.projection import disparity_from_depth
 from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float64, UInt8
-from recon.street.kernels.noise import fractal_noise
+from recon.street.kernels.surface import fractal_noise
 from recon.street.render import View, stereo_views
 
 _CONTRAST_DN = 90.0

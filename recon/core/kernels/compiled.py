@@ -7,12 +7,23 @@ import os
 from collections.abc import Callable
 from typing import Any, Final, Literal, TypeVar, overload
 
+import numpy as np
 from numba import config, njit
 from numba.core.caching import FunctionCache
+from numpy.typing import NDArray
 
 from recon.core.kernels.cache import announce, cache_folder, cache_parent
 
 KernelT = TypeVar("KernelT", bound=Callable[..., Any])
+
+# As in `recon.core.values.arrays`, which kernels do not know.
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+UInt16 = NDArray[np.uint16]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 
 _CACHE: Final = str(cache_folder(cache_parent()))
 

@@ -65,18 +65,10 @@ class CloudSettings(Settings):
 def back_project(
     disparity: Disparity, pair: RectifiedPair, settings: CloudSettings, *, normals: bool = True
 ) -> PointCloud:
-    """Return points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``.
+    """Return points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``, in row order.
 
-    Args:
-        disparity: The disparity of ``pair``.
-        pair: Provides the camera, the colours and the pixels valid after rectification.
-        settings: Range, confidence and thinning.
-        normals: Whether points get normals, which takes as long as the rest.
-
-    Returns:
-        A cloud in camera axes with colours, ``sigma_m`` (``sigma_z = Z²·sigma_d / (f·b)``),
-        confidence and, if asked for, normals towards the camera; points in row order. It may
-        be empty.
+    The cloud is in camera axes, with colours, ``sigma_m`` (``sigma_z = Z²·sigma_d / (f·b)``),
+    confidence and, if asked for, normals towards the camera, which take as long as the rest.
     """
     if disparity.values.shape != pair.left.shape:
         raise ShapeError(
@@ -140,7 +132,7 @@ _MIN_SUPPORT: Final = 0.36
 
 
 def remove_flying_edges(disparity: Disparity) -> Disparity:
-    """Drop pixels that too few of their neighbours could share a surface with.
+    """Drop pixels that too few of their neighbours could share a surface with (`Reason.EDGE`).
 
     Depth noise grows with distance, disparity noise does not, so disparities are tested. A
     surface that both cameras see changes by less than one pixel per pixel (the disparity
@@ -149,9 +141,6 @@ def remove_flying_edges(disparity: Disparity) -> Disparity:
     ramp between the sides keep little more than their own column. Pixels without a disparity
     support none; the image is mirrored at its border.
 
-    Returns:
-        The disparity without those pixels; their reason is `Reason.EDGE`.
-
     Ref: Burt & Julesz, "A disparity gradient limit for binocular fusion", Science 208 (1980).
     """
     needed = _MIN_SUPPORT * (2 * _RADIUS_PX + 1) ** 2
@@ -159,7 +148,7 @@ def remove_flying_edges(disparity: Disparity) -> Disparity:
 
 
 def _support(values: Float32) -> UInt8:
-    """Return uint8 (H, W), how many pixels of each window support its centre, with itself."""
+    """Return how many pixels of each window support its centre, with itself."""
     r = _RADIUS_PX
     height, width = values.shape
     padded = cv2.copyMakeBorder(values, r, r, r, r, cv2.BORDER_REFLECT_101)

@@ -52,13 +52,10 @@ ANY_SCALE: Final = FilterSettings(statistical_neighbours=20)
 
 
 def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
-    """Thin a cloud and drop its outliers.
+    """Thin a cloud, which makes the searches for neighbours cheap, then drop its outliers.
 
-    Downsampling comes first, which makes the neighbour searches cheap and evenly spaced.
-
-    Returns:
-        A cloud in the same frame. In a voxel every attribute is averaged (``sigma_m`` too: the
-        errors of neighbouring pixels are not independent), and normals are renormalised.
+    In a voxel every attribute is averaged (``sigma_m`` too: the errors of neighbouring pixels are
+    not independent), and normals are renormalised.
     """
     if settings.voxel_m is not None and len(cloud):
         cloud = voxel_downsample(cloud, settings.voxel_m)

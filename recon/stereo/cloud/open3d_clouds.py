@@ -18,16 +18,7 @@ _SEARCHABLE_M: Final = 1e18
 def voxel_downsample(
     xyz: NDArray[Any], attributes: NDArray[Any], voxel_m: float
 ) -> tuple[Float32, Float32]:
-    """Return one point per occupied voxel: the mean of its points and of their attributes.
-
-    Args:
-        xyz: (N, 3), metres, finite.
-        attributes: (N, K) attributes of the points; K may be 0.
-        voxel_m: Voxel size.
-
-    Returns:
-        float32 (M, 3) and float32 (M, K).
-    """
+    """Return one point per occupied voxel, (M, 3), and the means of attributes (N, K), (M, K)."""
     # Open3D averages three attributes per point (as colours), so they are passed in groups of
     # three; the order of its voxels depends only on positions and is the same for each group.
     groups = [attributes[:, k : k + 3] for k in range(0, attributes.shape[1], 3)]
@@ -45,15 +36,9 @@ def voxel_downsample(
 
 
 def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bool:
-    """Return points whose mean distance to their neighbours is not unusually large.
+    """Return bool (N,), points whose mean distance to their neighbours is not unusually large.
 
-    Args:
-        xyz: (N, 3), metres, finite.
-        neighbours: Number of nearest neighbours.
-        sigmas: Limit, in standard deviations above the mean over the cloud.
-
-    Returns:
-        bool (N,), True = keep.
+    ``sigmas`` is the limit, in standard deviations above the mean over the cloud.
     """
     if len(xyz) <= neighbours:
         return np.ones(len(xyz), dtype=bool)
@@ -63,16 +48,7 @@ def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bo
 
 
 def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
-    """Return points that have at least ``neighbours`` others within ``radius_m``.
-
-    Args:
-        xyz: (N, 3), metres, finite.
-        neighbours: Minimum number of other points within the radius.
-        radius_m: The radius.
-
-    Returns:
-        bool (N,), True = keep.
-    """
+    """Return bool (N,), points that have at least ``neighbours`` others within ``radius_m``."""
     if len(xyz) <= neighbours:
         return np.zeros(len(xyz), dtype=bool)
     # Open3D's own filter finds all points within the radius: of a wide one it never ends.
@@ -81,15 +57,7 @@ def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
 
 
 def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
-    """Return unit normals of the planes fitted to each point's neighbours, of arbitrary sign.
-
-    Args:
-        xyz: (N, 3), metres, finite.
-        neighbours: Number of nearest neighbours, including the point itself.
-
-    Returns:
-        float32 (N, 3).
-    """
+    """Return unit normals (N, 3) of planes fitted to each point's neighbours, of arbitrary sign."""
     cloud = _legacy(xyz)
     with _quiet():
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
@@ -98,14 +66,6 @@ def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
 
 def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> Float32:
     """Orient normals consistently between neighbours, along a minimum spanning tree.
-
-    Args:
-        xyz: (N, 3), metres, finite.
-        normals: (N, 3), unit.
-        neighbours: Number of nearest neighbours that the tree may connect.
-
-    Returns:
-        float32 (N, 3).
 
     Ref: Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992.
     """
@@ -117,7 +77,6 @@ def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> 
 
 
 def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
-    """Let Open3D flip the normals."""
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals, dtype=np.float64))
     with _quiet():
         cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(cloud.points) - 1))
@@ -134,16 +93,9 @@ def _joggled(xyz: NDArray[Any]) -> Float64:
 def nearest(
     query: NDArray[Any], reference: NDArray[Any], neighbours: int = 1
 ) -> tuple[Int32, Float32]:
-    """Return the nearest reference points of each query point.
+    """Return the nearest reference points of each query point, nearest first.
 
-    Args:
-        query: (N, 3), metres, finite.
-        reference: (M, 3), metres, finite, ``M >= neighbours``.
-        neighbours: Number of neighbours.
-
-    Returns:
-        int32 (N, neighbours), rows of ``reference``, and float32 (N, neighbours), distances in
-        metres, nearest first.
+    They are rows of ``reference``, int32 (N, neighbours), and distances in metres.
     """
     if len(reference) < neighbours:
         raise ShapeError(
@@ -171,7 +123,6 @@ def nearest(
 
 
 def _voxelised(cloud: Any, voxel_m: float) -> Any:
-    """Let Open3D thin a cloud."""
     try:
         with _quiet():
             return cloud.voxel_down_sample(voxel_m)
@@ -187,7 +138,6 @@ def _legacy(xyz: NDArray[Any]) -> Any:
 
 
 def _finite(xyz: NDArray[Any]) -> Float64:
-    """Return the points as float64, checked to be finite."""
     points = np.asarray(xyz, dtype=np.float64)
     if not np.isfinite(points).all():
         raise ShapeError("a point of the cloud is not finite")

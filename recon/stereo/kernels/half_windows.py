@@ -18,9 +18,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
-from recon.stereo.kernels.borders import continue_row
-from recon.stereo.kernels.simd import (
+from recon.core.kernels.compiled import Bool, Int64, UInt8, UInt16, kernel
+from recon.stereo.kernels.minima import continue_row
+from recon.stereo.kernels.simd.vectors import (
     LANES,
     absolute_difference,
     load,
@@ -42,80 +42,51 @@ BLOCK: Final = 1024
 
 
 class Search(NamedTuple):
-    """What is searched, and over which windows.
+    """What is searched, and over which windows."""
 
-    Attributes:
-        ndisp: Number of candidates.
-        minimum: Disparity of candidate 0, pixels.
-        radius: Half width of the window, pixels: it is ``2·radius + 1`` wide.
-        rows_radius: Half height of the window, pixels.
-        cost_cap: Largest cost of one pixel; times the pixels of both halves it is < 65535.
-        slant: By how many candidates the lower half of the slanted window is moved up and its upper
-            half down; 0 = there is no such window.
-    """
-
-    ndisp: int
-    minimum: int
-    radius: int
-    rows_radius: int
-    cost_cap: int
+    ndisp: int  # number of candidates
+    minimum: int  # disparity of candidate 0, pixels
+    radius: int  # half width of the window, pixels: it is ``2·radius + 1`` wide
+    rows_radius: int  # half height of the window, pixels
+    cost_cap: int  # largest cost of one pixel; times the pixels of both halves it is < 65535
+    #: By how many candidates the lower half of the slanted window is moved up and its upper half
+    #: down; 0 = there is no such window.
     slant: int
 
 
 class Views(NamedTuple):
-    """Both images, continued by their border pixels.
+    """Both images, continued by their border pixels."""
 
-    Attributes:
-        left: uint8 (H, C); column ``c`` is column ``c - radius`` of the image.
-        right: uint8 (H, C + n - 1), n = ndisp + 2·abs(slant); column ``c`` sees candidate
-            ``k`` at column ``c + n - 1 - abs(slant) - k``.
-        width: Columns of the image.
-    """
-
-    left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
-    width: int
+    left: UInt8  # (H, C); column ``c`` is column ``c - radius`` of the image
+    #: (H, C + n - 1), n = ndisp + 2·abs(slant); column ``c`` sees candidate ``k`` at column
+    #: ``c + n - 1 - abs(slant) - k``.
+    right: UInt8
+    width: int  # columns of the image
 
 
 class Scratch(NamedTuple):
-    """Scratch memory; its content does not matter.
+    """Scratch memory; its content does not matter."""
 
-    Attributes:
-        columns: uint8 or uint16 (n·S + ...,), sums over one column of a half, place by place.
-        pairs: uint8 or uint16 (CHUNK·S + ...,), sums over two columns.
-        fours: uint16 (CHUNK·S + ...,), sums over four columns.
-        halves: uint16 (rows_radius + 1, n·S), a ring of rows: sums over a half.
-        alive: bool (n,), whether the column sums of a place are up to date.
-        runs: int64 (N, 2), first place and the one after the last of each run of places that are
-            summed; unused rows are 0.
-        offers: As ``runs``, the candidates that are offered.
-        found: uint16 (5·LANES,), results of the last vector of a row, which may be cut short.
-        stride: Columns of a block including those that only its windows reach, S.
-    """
-
+    #: uint8 or uint16 (n·S + ...,), sums over one column of a half, place by place.
     columns: NDArray[Any]
-    pairs: NDArray[Any]
-    fours: NDArray[np.uint16]
-    halves: NDArray[np.uint16]
-    alive: NDArray[np.bool_]
-    runs: NDArray[np.int64]
-    offers: NDArray[np.int64]
-    found: NDArray[np.uint16]
-    stride: int
+    pairs: NDArray[Any]  # uint8 or uint16 (CHUNK·S + ...,), sums over two columns
+    fours: UInt16  # (CHUNK·S + ...,), sums over four columns
+    halves: UInt16  # (rows_radius + 1, n·S), a ring of rows: sums over a half
+    alive: Bool  # (n,), whether the column sums of a place are up to date
+    #: (N, 2), first place and the one after the last of each run of places that are summed;
+    #: unused rows are 0.
+    runs: Int64
+    offers: Int64  # as ``runs``, the candidates that are offered
+    found: UInt16  # (5·LANES,), results of the last vector of a row, which may be cut short
+    stride: int  # columns of a block including those that only its windows reach, S
 
 
 class Halves(NamedTuple):
-    """Sums over both halves of the windows of a row.
+    """Sums over both halves of the windows of a row."""
 
-    Attributes:
-        upper: uint16 (n·S,), over the rows above a pixel and its own.
-        lower: uint16 (n·S,), over its own row and those below.
-        stride: As in `Scratch`, S.
-    """
-
-    upper: NDArray[np.uint16]
-    lower: NDArray[np.uint16]
-    stride: int
+    upper: UInt16  # (n·S,), over the rows above a pixel and its own
+    lower: UInt16  # (n·S,), over its own row and those below
+    stride: int  # as in `Scratch`, S
 
 
 def empty_views(search: Search, block: int, height: int, width: int) -> Views:
@@ -126,13 +97,7 @@ def empty_views(search: Search, block: int, height: int, width: int) -> Views:
 
 
 @kernel
-def lay_out(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
-    search: Search,
-    first: int,
-    views: Views,
-) -> None:
+def lay_out(left: UInt8, right: UInt8, search: Search, first: int, views: Views) -> None:
     """Copy some rows of both images to where the search reads them.
 
     Args:
@@ -229,7 +194,7 @@ def offer_candidates(
 
 
 @kernel
-def _list_runs(now: Offer, soon: Offer, ndisp: int, more: int, runs: NDArray[np.int64]) -> None:
+def _list_runs(now: Offer, soon: Offer, ndisp: int, more: int, runs: Int64) -> None:
     """Write the runs of what is offered now or soon, each ``more`` places longer."""
     count = 0
     runs[:] = 0
@@ -274,14 +239,7 @@ def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, scratch: Scra
 
 @kernel
 def _slide_row(
-    views: Views,
-    n0: int,
-    n1: int,
-    cost_cap: int,
-    come: int,
-    gone: int,
-    x0: int,
-    scratch: Scratch,
+    views: Views, n0: int, n1: int, cost_cap: int, come: int, gone: int, x0: int, scratch: Scratch
 ) -> None:
     """Subtract the costs of row ``gone`` from the column sums and add those of row ``come``."""
     sums, stride, cap = scratch.columns, scratch.stride, splat(np.uint8(cost_cap))
@@ -297,9 +255,7 @@ def _slide_row(
 
 
 @kernel
-def _sum_columns(
-    scratch: Scratch, first: int, end: int, window: int, sums: NDArray[np.uint16]
-) -> None:
+def _sum_columns(scratch: Scratch, first: int, end: int, window: int, sums: UInt16) -> None:
     """Write the sums over ``window`` neighbours, an odd number, to ``sums``, (n·S,).
 
     Places follow one another in memory: the last sums of each reach into the next, and are unused.

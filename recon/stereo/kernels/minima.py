@@ -8,27 +8,21 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import UInt8, UInt16, kernel
 
 NO_COST: Final = 65535
 """Stands for the cost of a candidate that does not exist; real costs stay below it."""
 
 
 class Minima(NamedTuple):
-    """What a search finds.
+    """What a search finds."""
 
-    Attributes:
-        winner: uint16 (H, W), best candidate of each pixel of the left view; ndisp = none.
-        costs: uint16 (4, H, W), costs of the best, of the ones before and after it, and of the
-            best that is at least two candidates away; `NO_COST` = does not exist.
-        right_winner: uint16 (H, W), best candidate of each pixel of the right view; ndisp = none.
-    """
-
-    winner: NDArray[np.uint16]
-    costs: NDArray[np.uint16]
-    right_winner: NDArray[np.uint16]
+    winner: UInt16  # (H, W), best candidate of each pixel of the left view; ndisp = none
+    #: (4, H, W), costs of the best, of the ones before and after it, and of the best that is
+    #: at least two candidates away; `NO_COST` = does not exist.
+    costs: UInt16
+    right_winner: UInt16  # (H, W), best candidate of each pixel of the right view; ndisp = none
 
 
 def empty_minima(height: int, width: int) -> Minima:
@@ -44,13 +38,6 @@ def write_right_winners(ndisp: int, minimum: int, y: int, minima: Minima) -> Non
 
     The left pixel of the least cost gets it, of equal ones the leftmost. The check is weaker than
     with a search of the right view among all costs, but takes a hundredth of the time.
-
-    Args:
-        ndisp: Number of candidates.
-        minimum: Disparity of candidate 0, pixels.
-        y: The row.
-        minima: Read: row ``y`` of ``winner`` and the best costs. Written: row ``y`` of
-            ``right_winner``.
     """
     best = np.full(minima.winner.shape[1], NO_COST, np.uint16)
     winners, costs, chosen = minima.winner[y], minima.costs[0, y], minima.right_winner[y]
@@ -62,3 +49,18 @@ def write_right_winners(ndisp: int, minimum: int, y: int, minima: Minima) -> Non
             right = np.uint64(x - minimum - k)
             if costs[x] < best[right]:
                 best[right], chosen[right] = costs[x], k
+
+
+@kernel
+def continue_row(row: UInt8, at: int, longer: UInt8) -> None:
+    """Copy a row into a longer one, from place ``at`` on; beyond it the nearest value goes on.
+
+    ``at`` may lie outside.
+    """
+    start = min(max(at, 0), longer.size)
+    end = min(max(at + row.size, 0), longer.size)
+    longer[:start] = row[0]
+    longer[end:] = row[-1]
+    shown, inside = row[start - at :], longer[start:end]
+    for c in range(inside.size):
+        inside[c] = shown[c]

@@ -4,7 +4,11 @@ A row of costs is an array (candidates, W). The pixels of a candidate lie side b
 view as in the right, so vector registers are filled along the row and only its end needs padding.
 Sums over the window's width are kept for as many rows as the window is high.
 
-The reference implementation is in `tests/stereo/kernels/semi_global_reference.py`.
+The census, one bit per neighbour that is darker, is invariant under any change of brightness that
+keeps the order of grey levels.
+
+Ref: R. Zabih, J. Woodfill, "Non-parametric local transforms for computing visual
+correspondence", ECCV 1994.
 """
 
 from __future__ import annotations
@@ -14,9 +18,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
-from recon.stereo.kernels.census import PLANES, Descriptor, write_planes
-from recon.stereo.kernels.simd import (
+from recon.core.kernels.compiled import UInt8, UInt16, kernel
+from recon.stereo.kernels.minima import continue_row
+from recon.stereo.kernels.simd.vectors import (
     LANES,
     Vector,
     absolute_difference,
@@ -26,8 +30,18 @@ from recon.stereo.kernels.simd import (
     smaller,
     splat,
     store_row,
+    where_less,
     widen,
 )
+
+GRADIENT_CAP: Final = 127
+"""Horizontal gradients (Sobel units) are clipped to plus or minus this."""
+
+CENSUS_RADIUS: Final = 2
+"""Half the square of the census, in pixels: its 24 bits fill three planes."""
+
+PLANES: Final = 4
+"""One of gradients, and three of bits."""
 
 ALIGNMENT: Final = 64
 """Bytes of a cache line."""
@@ -37,18 +51,11 @@ BLOCK: Final = 16
 
 
 class Views(NamedTuple):
-    """Both images, as the costs compare them.
+    """Both images, as the costs compare them."""
 
-    Attributes:
-        grey: uint8 (H, W), the left image.
-        left: uint8 (H, 1 + B, R), its planes: the gradient, and B planes of census bits. Columns
-            are shifted by `column_offsets`.
-        right: uint8 (H, 1 + B, R + P - 1), those of the right image.
-    """
-
-    grey: NDArray[np.uint8]
-    left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
+    grey: UInt8  # (H, W), the left image
+    left: UInt8  # (H, PLANES, R), its planes, written by `write_views`
+    right: UInt8  # (H, PLANES, R + P - 1), those of the right image
 
 
 class Window(NamedTuple):
@@ -56,24 +63,15 @@ class Window(NamedTuple):
 
     The sum over the width is shifted right by ``row_shift``; the sum of those over the height is
     multiplied by ``factor`` and shifted right by ``shift``. `scaled_window` chooses the three.
-
-    Attributes:
-        radius: Half width of the window, pixels: it is ``2·radius + 1`` wide.
-        rows_radius: Half height of the window, pixels.
-        gradient_cap: Largest difference of gradients that counts.
-        row_shift: Bits; the shifted sum over the width fits into uint8.
-        factor: The sum over the height times this fits into uint16.
-        shift: Bits.
-        top: The largest cost; at most 253.
     """
 
-    radius: int
-    rows_radius: int
-    gradient_cap: int
-    row_shift: int
-    factor: int
-    shift: int
-    top: int
+    radius: int  # half width of the window, pixels: it is ``2·radius + 1`` wide
+    rows_radius: int  # half height of the window, pixels
+    gradient_cap: int  # largest difference of gradients that counts
+    row_shift: int  # bits; the shifted sum over the width fits into uint8
+    factor: int  # the sum over the height times this fits into uint16
+    shift: int  # bits
+    top: int  # the largest cost; at most 253
 
     @property
     def levels(self) -> float:
@@ -83,17 +81,11 @@ class Window(NamedTuple):
 
 
 class CostRows(NamedTuple):
-    """Scratch memory for the sums over a window of C columns.
+    """Scratch memory for the sums over a window of C columns."""
 
-    Attributes:
-        pixels: uint8 (BLOCK, R + LANES), costs of single pixels.
-        rows: uint8 (2·rows_radius + 1, BLOCK, C), a ring: sums over the width, of each row.
-        sums: uint16 (BLOCK, C), sums of those over the height.
-    """
-
-    pixels: NDArray[np.uint8]
-    rows: NDArray[np.uint8]
-    sums: NDArray[np.uint16]
+    pixels: UInt8  # (BLOCK, R + LANES), costs of single pixels
+    rows: UInt8  # (2·rows_radius + 1, BLOCK, C), a ring: sums over the width, of each row
+    sums: UInt16  # (BLOCK, C), sums of those over the height
 
 
 def padded(number: int) -> int:
@@ -114,12 +106,7 @@ def scaled_window(
 ) -> Window:
     """Return a window whose costs are about ``levels`` times the mean cost of its pixels.
 
-    Args:
-        radius: As in `Window`.
-        rows_radius: As in `Window`.
-        gradient_cap: As in `Window`.
-        largest: Largest cost of one pixel.
-        levels: Steps of a path cost for one step of a pixel's cost.
+    ``largest`` is the largest cost of one pixel.
     """
     width, height = 2 * radius + 1, 2 * rows_radius + 1
     row_shift = max(0, (width * largest).bit_length() - 8)
@@ -133,43 +120,23 @@ def scaled_window(
     )
 
 
-def empty_planes(
-    height: int, width: int, planes: int, radius: int, ndisp: int
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return memory for `Views.left` and `Views.right`, with so many planes each."""
+def empty_planes(height: int, width: int, radius: int, ndisp: int) -> tuple[UInt8, UInt8]:
+    """Return memory for `Views.left` and `Views.right`."""
     # A band may start at any column, and its last vector reads beyond its end.
     reach = padded(width + 2 * radius) + LANES
-    left, right = (height, planes, reach), (height, planes, reach + ndisp - 1)
+    left, right = (height, PLANES, reach), (height, PLANES, reach + ndisp - 1)
     return np.empty(left, np.uint8), np.empty(right, np.uint8)
 
 
-def write_views(
-    right: NDArray[np.uint8],
-    descriptor: Descriptor,
-    offsets: tuple[int, int],
-    rows: range,
-    views: Views,
-) -> None:
-    """Write the planes of some rows of both images.
-
-    Args:
-        right: uint8 (H, W), the right image; the left one is in ``views``.
-        descriptor: How pixels are described.
-        offsets: From `column_offsets`.
-        rows: The rows.
-        views: Written.
-    """
-    write_planes(views.grey, descriptor, offsets[0], rows.start, rows.stop, views.left)
-    write_planes(right, descriptor, offsets[1], rows.start, rows.stop, views.right)
-
-
-def column_offsets(window: Window, ndisp: int, minimum: int) -> tuple[int, int]:
-    """Return column of the planes that holds column 0 of the image, of the left and the right one.
+def write_views(right: UInt8, radius: int, minimum: int, rows: range, views: Views) -> None:
+    """Write the planes of some rows of both images, for windows of a half width.
 
     Column ``x`` of the left planes is compared, as candidate ``k``, with column ``x - k + P - 1``
     of the right ones.
     """
-    return window.radius, ndisp - 1 + window.radius + minimum
+    place = radius + minimum + views.right.shape[2] - views.left.shape[2]
+    write_planes(views.grey, radius, rows.start, rows.stop, views.left)
+    write_planes(right, place, rows.start, rows.stop, views.right)
 
 
 def empty_cost_rows(columns: int, window: Window) -> CostRows:
@@ -189,18 +156,11 @@ def write_costs(
     top: int,
     bottom: int,
     rows: CostRows,
-    costs: NDArray[np.uint8],
+    costs: UInt8,
 ) -> None:
-    """Write the costs of some columns of rows ``top`` to ``bottom - 1``.
+    """Write the costs of some columns of rows ``top`` to ``bottom - 1``, to uint8 (N, P, C).
 
-    Args:
-        views: The images.
-        window: What a cost sums up.
-        columns: First column and the one after the last.
-        top: First row.
-        bottom: The row after the last.
-        rows: Memory to work in.
-        costs: Written: uint8 (N, P, C), a ring; row ``y`` goes to ``costs[y % N]``.
+    ``costs`` is a ring: row ``y`` goes to ``costs[y % N]``.
     """
     if top >= bottom:
         return
@@ -224,7 +184,7 @@ def _write_block(
     end: int,
     y: int,
     rows: CostRows,
-    costs: NDArray[np.uint8],
+    costs: UInt8,
 ) -> None:
     """Move the window down to row ``y`` (clamped to the image), and write its costs (P, C).
 
@@ -238,24 +198,22 @@ def _write_block(
     # Candidate 0 of the first column.
     place = start + costs.shape[0] - 1
     _compare(left, right, start, place, reach, first, end, window.gradient_cap, rows.pixels)
-    for plane in range(1 + PLANES, left.shape[0], PLANES):
-        _add_bits(left, right, plane, start, place, reach, first, end, rows.pixels)
     _slide_window(rows.pixels, window, oldest, rows.sums, first, end, costs)
 
 
 @kernel
 def _compare(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
+    left: UInt8,
+    right: UInt8,
     start: int,
     place: int,
     reach: int,
     first: int,
     end: int,
     gradient_cap: int,
-    pixels: NDArray[np.uint8],
+    pixels: UInt8,
 ) -> None:
-    """Write the differences of gradients plus the differing bits of the first census planes."""
+    """Write the differences of gradients plus the differing bits of the census."""
     cap = splat(np.uint8(gradient_cap))
     for x in range(0, reach, LANES):
         here, there = start + x, place + x
@@ -271,29 +229,7 @@ def _compare(
 
 
 @kernel
-def _add_bits(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
-    plane: int,
-    start: int,
-    place: int,
-    reach: int,
-    first: int,
-    end: int,
-    pixels: NDArray[np.uint8],
-) -> None:
-    """Add the differing bits of the next `PLANES` census planes."""
-    for x in range(0, reach, LANES):
-        for k in range(first, end):
-            cost, there = load_row(pixels, k - first, x), place + x - k
-            for n in range(plane, plane + PLANES):
-                bits = differing_bits(load_row(left, n, start + x), load_row(right, n, there))
-                cost = cost + bits
-            store_row(pixels, k - first, x, cost)
-
-
-@kernel
-def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Vector:
+def _sum_across(pixels: UInt8, n: int, x: int, radius: int) -> Vector:
     """Sum the costs over the window's width; the sums fit into uint8."""
     total = load_row(pixels, n, x)
     for d in range(x + 1, x + 2 * radius + 1):
@@ -302,9 +238,7 @@ def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Vecto
 
 
 @kernel
-def _sum_across_wide(
-    pixels: NDArray[np.uint8], n: int, x: int, window: Window, sums: NDArray[np.uint16]
-) -> Vector:
+def _sum_across_wide(pixels: UInt8, n: int, x: int, window: Window, sums: UInt16) -> Vector:
     """Return the same in uint16, shifted to fit into uint8."""
     total = widen(load_row(pixels, n, x), sums)
     for d in range(x + 1, x + 2 * window.radius + 1):
@@ -314,13 +248,7 @@ def _sum_across_wide(
 
 @kernel
 def _slide_window(
-    pixels: NDArray[np.uint8],
-    window: Window,
-    oldest: NDArray[np.uint8],
-    sums: NDArray[np.uint16],
-    first: int,
-    end: int,
-    costs: NDArray[np.uint8],
+    pixels: UInt8, window: Window, oldest: UInt8, sums: UInt16, first: int, end: int, costs: UInt8
 ) -> None:
     """Replace the oldest row of a block's sums by the newest; write the scaled sums."""
     factor, shift = splat(np.uint16(window.factor)), splat(np.uint16(window.shift))
@@ -335,3 +263,61 @@ def _slide_window(
             total = load_row(sums, n, x) - widen(out, sums) + widen(across, sums)
             store_row(sums, n, x, total)
             store_row(costs, first + n, x, narrow(total * factor >> shift))
+
+
+@kernel
+def write_planes(grey: UInt8, place: int, first: int, end: int, planes: UInt8) -> None:
+    """Write the gradients and the census of some rows, continued by those of the border pixels.
+
+    Plane 0 is the gradient plus the cap. Bit ``n % 8`` of plane ``1 + n // 8`` is set where
+    neighbour ``n`` (row by row, the middle left out) is darker than the pixel. Column 0 of the
+    image goes to column ``place`` of the planes, (H, PLANES, R), or outside them.
+    """
+    height, width = grey.shape
+    # Row y is at place y % N of the rows around, column x at radius + x.
+    radius = CENSUS_RADIUS
+    around = np.empty((2 * radius + 1, radius + width + radius + LANES), np.uint8)
+    row = np.empty((PLANES, width + LANES), np.uint8)
+    for y in range(first - 2 * radius, end):
+        line = min(max(y + radius, 0), height - 1)
+        continue_row(grey[line], radius, around[(y + radius) % around.shape[0]])
+        if y >= first:
+            _write_gradient(around, y, row[0, :width])
+            _write_census(around, y, width, row)
+            for n in range(row.shape[0]):
+                continue_row(row[n, :width], place, planes[y, n])
+
+
+@kernel
+def _write_gradient(around: UInt8, y: int, gradient: UInt8) -> None:
+    """Write the clipped Sobel gradient of a row."""
+    rows, radius, most = around.shape[0], CENSUS_RADIUS, np.int16(GRADIENT_CAP)
+    above, same, below = around[(y - 1) % rows], around[y % rows], around[(y + 1) % rows]
+    above_left, above_right = above[radius - 1 :], above[radius + 1 :]
+    same_left, same_right = same[radius - 1 :], same[radius + 1 :]
+    below_left, below_right = below[radius - 1 :], below[radius + 1 :]
+    for x in range(gradient.size):
+        middle = np.int16(np.int16(same_right[x]) - np.int16(same_left[x]))
+        upper = np.int16(np.int16(above_right[x]) - np.int16(above_left[x]))
+        lower = np.int16(np.int16(below_right[x]) - np.int16(below_left[x]))
+        slope = np.int16(np.int16(upper + lower) + np.int16(middle + middle))
+        gradient[x] = np.uint8(np.int16(min(max(slope, np.int16(-most)), most) + most))
+
+
+@kernel
+def _write_census(around: UInt8, y: int, width: int, planes: UInt8) -> None:
+    """Write the bits of a row."""
+    rows, none, first = around.shape[0], splat(np.uint8(0)), splat(np.uint8(1))
+    for x in range(0, width, LANES):
+        middle = load_row(around, y % rows, CENSUS_RADIUS + x)
+        n, bits, bit = 0, none, first
+        for dy in range(-CENSUS_RADIUS, CENSUS_RADIUS + 1):
+            line = (y + dy) % rows
+            for dx in range(-CENSUS_RADIUS, CENSUS_RADIUS + 1):
+                if dy != 0 or dx != 0:
+                    neighbour = load_row(around, line, CENSUS_RADIUS + dx + x)
+                    bits, bit = where_less(neighbour, middle, bits + bit, bits), bit + bit
+                    n += 1
+                    if n % 8 == 0:
+                        store_row(planes, n // 8, x, bits)
+                        bits, bit = none, first

@@ -1,7 +1,6 @@
 """The best candidate of each pixel of a row, from costs (candidates, W) in uint8.
 
-Every pixel is a lane: one candidate of many pixels at a time is compared with the best so far of
-each.
+Every pixel is a lane: one candidate of many pixels is compared with the best so far of each.
 """
 
 from __future__ import annotations
@@ -9,19 +8,11 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import UInt8, UInt16, kernel
 from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.path_costs import aligned, padded
-from recon.stereo.kernels.simd import (
-    LANES,
-    load_row,
-    smaller,
-    splat,
-    store_row,
-    where_less,
-)
+from recon.stereo.kernels.simd.vectors import LANES, load_row, smaller, splat, store_row, where_less
 
 NONE: Final = 255
 """Stands for the cost of a candidate that does not exist; real costs stay below it."""
@@ -46,37 +37,24 @@ lowest cost of the earlier blocks.
 
 
 class Band(NamedTuple):
-    """Columns of the left view that are done together.
+    """Columns of the left view that are done together."""
 
-    Attributes:
-        start: The first column with costs.
-        end: The column after the last with costs.
-        first: The first column that is kept; the others are overlap.
-        last: The column after the last that is kept.
-    """
-
-    start: int
-    end: int
-    first: int
-    last: int
+    start: int  # the first column with costs
+    end: int  # the column after the last with costs
+    first: int  # the first column that is kept; the others are overlap
+    last: int  # the column after the last that is kept
 
 
 class Best(NamedTuple):
-    """The best so far, for bands of C columns of an image of W columns.
+    """The best so far, for bands of C columns of an image of W columns."""
 
-    Attributes:
-        left: uint8 (8, C), what is known of the columns of the left view, `LOWEST` to `EARLIER`.
-        left_which: uint16 (C), candidate of the lowest cost.
-        right: uint8 (8, at least W), as ``left`` for the right view; only `LOWEST`, `WHICH` and
-            `EARLIER` are used.
-        right_lowest: uint8 (N, at least W), lowest cost in N rows of the right view over the bands
-            done so far.
-    """
-
-    left: NDArray[np.uint8]
-    left_which: NDArray[np.uint16]
-    right: NDArray[np.uint8]
-    right_lowest: NDArray[np.uint8]
+    left: UInt8  # (8, C), what is known of the columns of the left view, `LOWEST` to `EARLIER`
+    left_which: UInt16  # (C), candidate of the lowest cost
+    #: (8, at least W), as ``left`` for the right view; only `LOWEST`, `WHICH` and `EARLIER`
+    #: are used.
+    right: UInt8
+    #: (N, at least W), lowest cost in N rows of the right view over the bands done so far.
+    right_lowest: UInt8
 
 
 def empty_best(columns: int, width: int, rows: int) -> Best:
@@ -93,29 +71,17 @@ def empty_best(columns: int, width: int, rows: int) -> Best:
 
 @kernel
 def choose_row(
-    costs: NDArray[np.uint8],
-    minimum: int,
-    y: int,
-    place: int,
-    band: Band,
-    best: Best,
-    minima: Minima,
+    costs: UInt8, minimum: int, y: int, place: int, band: Band, best: Best, minima: Minima
 ) -> None:
-    """Choose the best candidate of each pixel of a row of a band, in both views.
+    """Choose the best candidate of each pixel of row ``y`` of a band, in both views.
 
-    Candidates whose right pixel lies outside the image do not exist; of equal costs the
-    smaller candidate wins. The bands of a row are done from left to right.
+    Candidates whose right pixel lies outside the image do not exist; of equal costs the smaller
+    candidate wins. The bands of a row are done from left to right; right winners stay unless they
+    are beaten. The costs of `Minima` are these, multiplied by `PARTS`.
 
-    Args:
-        costs: uint8 (P, MARGIN + C + MARGIN), costs of the candidates, below `NONE`; the margins
-            are `NONE`. Overwritten with `NONE` where a candidate does not exist or is not kept.
-        minimum: Disparity of candidate 0, pixels.
-        y: The row.
-        place: Its number among the rows of ``best.right_lowest``.
-        band: The columns.
-        best: Memory to work in, and what earlier bands found in the right view.
-        minima: Written: the kept columns of the row, costs multiplied by `PARTS`. Right winners
-            stay unless they are beaten.
+    ``costs`` are uint8 (P, MARGIN + C + MARGIN), below `NONE`; the margins are `NONE`, with which
+    what does not exist or is not kept is overwritten. ``place`` is the number of the row among
+    those of ``best.right_lowest``.
     """
     ndisp, width = costs.shape[0], minima.winner.shape[1]
     for k in range(ndisp):
@@ -136,27 +102,20 @@ def choose_row(
 
 
 @kernel
-def _close(costs: NDArray[np.uint8], first: int, end: int) -> None:
+def _close(costs: UInt8, first: int, end: int) -> None:
     """Mark the columns outside ``first`` to ``end - 1``."""
     costs[: min(first, costs.size)] = np.uint8(NONE)
     costs[max(end, 0) :] = np.uint8(NONE)
 
 
 @kernel
-def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[np.uint8]) -> None:
+def _search_left(costs: UInt8, first: int, end: int, known: UInt8) -> None:
     """Compare a block of candidates with the best so far, and note the costs around it."""
     one = splat(np.uint8(1))
     for x in range(0, costs.shape[1] - 2 * MARGIN, LANES):
-        lowest, which, index = (
-            load_row(known, LOWEST, x),
-            load_row(known, WHICH, x),
-            splat(np.uint8(0)),
-        )
-        before, after, second = (
-            load_row(known, BEFORE, x),
-            load_row(known, AFTER, x),
-            load_row(known, SECOND, x),
-        )
+        lowest, which = load_row(known, LOWEST, x), load_row(known, WHICH, x)
+        before, after = load_row(known, BEFORE, x), load_row(known, AFTER, x)
+        second, index = load_row(known, SECOND, x), splat(np.uint8(0))
         last, prior = load_row(known, LAST, x), load_row(known, PRIOR, x)
         for k in range(first, end):
             cost = load_row(costs, k, x + MARGIN)
@@ -179,12 +138,7 @@ def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[
 
 @kernel
 def _search_right(
-    costs: NDArray[np.uint8],
-    minimum: int,
-    first: int,
-    end: int,
-    band: Band,
-    known: NDArray[np.uint8],
+    costs: UInt8, minimum: int, first: int, end: int, band: Band, known: UInt8
 ) -> None:
     """Compare a block of candidates with the best so far, for columns of the right view."""
     one, columns = splat(np.uint8(1)), costs.shape[1] - 2 * MARGIN
@@ -204,7 +158,7 @@ def _search_right(
 
 
 @kernel
-def _merge_block(known: NDArray[np.uint8], first: int, which: NDArray[np.uint16]) -> None:
+def _merge_block(known: UInt8, first: int, which: UInt16) -> None:
     """Take over the winners of a block that beat those of the blocks before."""
     lowest, earlier, place = known[LOWEST], known[EARLIER], known[WHICH]
     for x in range(which.size):
@@ -227,7 +181,7 @@ def _write_row(best: Best, ndisp: int, y: int, band: Band, minima: Minima) -> No
 
 
 @kernel
-def _write_costs(known: NDArray[np.uint8], costs: NDArray[np.uint16]) -> None:
+def _write_costs(known: UInt8, costs: UInt16) -> None:
     """Write costs as `Minima` has them."""
     for x in range(costs.size):
         parts = np.uint16(np.uint16(known[x]) * np.uint16(PARTS))

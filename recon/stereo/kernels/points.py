@@ -2,11 +2,8 @@
 
 With focal length f, a plane ``n·X = 1`` is ``d + doffs = p·(u - cx) + q·(v - cy) + r`` in the
 disparity map, and ``n`` is parallel to ``(p·f, q·f, r)``. So a least-squares plane through the
-disparities of a window gives the normal, with its sign, without a search for neighbours. The sums
-over a window are made down its columns first, then along its rows, by loops that the compiler
-vectorises.
-
-The reference implementation is in `tests/stereo/kernels/points_reference.py`.
+disparities of a window gives the normal, with its sign, without a search for neighbours. Sums over
+a window are made down its columns, then along its rows, by loops that the compiler vectorises.
 """
 
 from __future__ import annotations
@@ -14,11 +11,8 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
-
-Float32 = NDArray[np.float32]
+from recon.core.kernels.compiled import Bool, Float32, UInt8, kernel
 
 MIN_SPREAD: Final = 1e-6
 """Known pixels of a window that spread by less lie on a line, and determine no plane."""
@@ -28,69 +22,39 @@ _WINDOW_SUMS: Final = 9
 
 
 class PointRules(NamedTuple):
-    """Which pixels become points, and how.
+    """Which pixels become points, and how."""
 
-    Attributes:
-        focal: Focal length, pixels.
-        cx: Column of the principal point.
-        cy: Row of the principal point.
-        fb: Focal length times baseline.
-        doffs: Difference of the principal points, pixels.
-        nearest: Least depth.
-        farthest: Largest depth; may be infinite.
-        relative_sigma: Largest error of a depth, divided by it; may be infinite.
-        confidence: Least confidence.
-        stride: Every n-th row and column is used.
-        radius: Half width of the window that gives a normal; 0 = no normals.
-    """
-
-    focal: float
-    cx: float
-    cy: float
-    fb: float
-    doffs: float
-    nearest: float
-    farthest: float
-    relative_sigma: float
-    confidence: float
-    stride: int
-    radius: int
+    focal: float  # focal length, pixels
+    cx: float  # column of the principal point
+    cy: float  # row of the principal point
+    fb: float  # focal length times baseline
+    doffs: float  # difference of the principal points, pixels
+    nearest: float  # least depth
+    farthest: float  # largest depth; may be infinite
+    relative_sigma: float  # largest error of a depth, divided by it; may be infinite
+    confidence: float  # least confidence
+    stride: int  # every n-th row and column is used
+    radius: int  # half width of the window that gives a normal; 0 = no normals
 
 
 class Maps(NamedTuple):
-    """What is known of each pixel.
+    """What is known of each pixel."""
 
-    Attributes:
-        values: float32 (H, W), disparity; NaN = unknown.
-        confidence: float32 (H, W).
-        sigma: float32 (H, W), standard deviation of the disparity.
-        colours: uint8 (H, W, C), one value or three.
-        usable: bool (H, W), False = makes no point; (0, 0) = all may.
-    """
-
-    values: Float32
-    confidence: Float32
-    sigma: Float32
-    colours: NDArray[np.uint8]
-    usable: NDArray[np.bool_]
+    values: Float32  # (H, W), disparity; NaN = unknown
+    confidence: Float32  # (H, W)
+    sigma: Float32  # (H, W), standard deviation of the disparity
+    colours: UInt8  # (H, W, C), one value or three
+    usable: Bool  # (H, W), False = makes no point; (0, 0) = all may
 
 
 class Points(NamedTuple):
-    """Points in row order.
+    """Points in row order."""
 
-    Attributes:
-        xyz: float32 (N, 3), camera axes.
-        normals: float32 (N, 3), towards the camera; (0, 3) where none were asked for.
-        sigma: float32 (N,), standard deviation of the depth.
-        confidence: float32 (N,).
-        colours: uint8 (N, 3).
-    """
-
-    xyz: Float32
-    normals: Float32
-    sigma: Float32
-    confidence: Float32
-    colours: NDArray[np.uint8]
+    xyz: Float32  # (N, 3), camera axes
+    normals: Float32  # (N, 3), towards the camera; (0, 3) where none were asked for
+    sigma: Float32  # (N,), standard deviation of the depth
+    confidence: Float32  # (N,)
+    colours: UInt8  # (N, 3)
 
 
 def make_points(maps: Maps, rules: PointRules) -> Points:

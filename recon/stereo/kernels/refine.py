@@ -1,24 +1,16 @@
-"""From the minima of a search to disparities: checks, sub-pixel fit, confidence and sigma.
-
-Works on the result of any search over whole disparities (`recon.stereo.kernels.minima.Minima`).
-The reference implementation is in `tests/stereo/kernels/refine_reference.py`.
-"""
+"""From the `Minima` of any search to disparities: checks, sub-pixel fit, confidence and sigma."""
 
 from __future__ import annotations
 
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Bool, Float32, Int32, UInt8, UInt16, kernel
 from recon.stereo.kernels.minima import NO_COST, Minima
 
 VALID, LOW_TEXTURE, AMBIGUOUS, LEFT_RIGHT, OCCLUDED, OUT_OF_RANGE, BORDER = range(7)
 """The codes of `recon.core.values.Reason`; a test holds them equal."""
-
-NO_FIT, EQUIANGULAR, PARABOLA = range(3)
-"""Sub-pixel fits of the minimum between candidates."""
 
 SIGMA_LARGEST_PX: Final = 2.0
 """Standard deviation at a flat minimum; none is larger."""
@@ -31,52 +23,33 @@ ODDS: Final = 2.2
 
 
 class Rules(NamedTuple):
-    """Thresholds of the checks, and what costs mean.
+    """Thresholds of the checks, and what costs mean."""
 
-    Attributes:
-        ndisp: Number of candidates.
-        minimum: Disparity of candidate 0, pixels.
-        fit: NO_FIT, EQUIANGULAR or PARABOLA.
-        texture: Least texture of a pixel, in the unit of the texture given.
-        uniqueness: By how many per cent the second best cost must exceed the best.
-        left_right: Largest difference between the two views, candidates; negative = unchecked.
-        window_pixels: Number of pixels that a cost sums up.
-        sigma_floor_px: Smallest standard deviation.
-        odds: Odds that a pixel of margin 1 and a standard deviation of 1 px is right.
-    """
-
-    ndisp: int
-    minimum: int
-    fit: int
-    texture: float
-    uniqueness: int
-    left_right: int
-    window_pixels: int
-    sigma_floor_px: float
-    odds: float = ODDS
+    ndisp: int  # number of candidates
+    minimum: int  # disparity of candidate 0, pixels
+    texture: float  # least texture of a pixel, in the unit of the texture given
+    uniqueness: int  # by how many per cent the second best cost must exceed the best
+    left_right: int  # largest difference between the two views, candidates; negative = unchecked
+    window_pixels: int  # number of pixels that a cost sums up
+    sigma_floor_px: float  # smallest standard deviation
+    odds: float = ODDS  # odds that a pixel of margin 1 and a standard deviation of 1 px is right
+    fit: bool = True  # whether the minimum is placed between whole disparities
 
 
 class Refined(NamedTuple):
-    """Disparities, as in `recon.core.values.Disparity`, all (H, W).
+    """Disparities, as in `recon.core.values.Disparity`, all (H, W)."""
 
-    Attributes:
-        values: float32, pixels; NaN = none.
-        confidence: float32 in [0, 1].
-        sigma_px: float32; NaN = none.
-        reason: uint8.
-    """
-
-    values: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    sigma_px: NDArray[np.float32]
-    reason: NDArray[np.uint8]
+    values: Float32  # pixels; NaN = none
+    confidence: Float32  # float32 in [0, 1]
+    sigma_px: Float32  # float32; NaN = none
+    reason: UInt8  # uint8
 
 
 REFINED_BYTES: Final = 13
 """What a pixel of `Refined` takes."""
 
 
-def refined_in(memory: NDArray[np.uint8], height: int, width: int) -> Refined:
+def refined_in(memory: UInt8, height: int, width: int) -> Refined:
     """Arrays for `refine_minima` to write to, in memory of `REFINED_BYTES` for each pixel."""
     reason = memory[12 * height * width :].reshape(height, width)
     floats = memory[: 12 * height * width].view(np.float32)
@@ -86,22 +59,18 @@ def refined_in(memory: NDArray[np.uint8], height: int, width: int) -> Refined:
 
 @kernel
 def refine_minima(
-    minima: Minima,
-    texture: NDArray[np.float32],
-    rules: Rules,
-    first: int,
-    end: int,
-    refined: Refined,
+    minima: Minima, texture: Float32, rules: Rules, first: int, end: int, refined: Refined
 ) -> None:
-    """Check the minima of some rows, and refine those that pass.
+    """Check the minima of rows ``first`` to ``end - 1``, and refine those that pass.
 
-    The first of these that applies is the reason of a pixel: no candidate, or one that ends at
-    the border of the right image (BORDER); too little texture (LOW_TEXTURE); the minimum at
-    an end of what was searched (OUT_OF_RANGE); the right view disagrees, and none of its pixels is
-    matched here (OCCLUDED) or one is (LEFT_RIGHT); a second best that is too good (AMBIGUOUS).
+    The first of these that applies is the reason of a pixel: no image (``texture``, which is that
+    of these rows, is NaN) or no candidate, or one that ends at the border of the right image
+    (BORDER); too little texture (LOW_TEXTURE); the minimum at an end of what was searched
+    (OUT_OF_RANGE); the right view disagrees, and none of its pixels is matched here (OCCLUDED) or
+    one is (LEFT_RIGHT); a second best that is too good (AMBIGUOUS).
 
-    The sub-pixel offset is that of two equally steep lines (EQUIANGULAR, the shape of a sum of
-    absolute differences) or of a parabola. The standard deviation is that of a displacement
+    The sub-pixel offset is that of two equally steep lines, the shape of a sum of absolute
+    differences. The standard deviation is that of a displacement
     estimated from N pixels with gradient g and noise n, here in its least-absolute form,
     ``pi/2 · mean|n| / (mean|g| · sqrt(N))``; the cost at the vertex of the lines is N·mean|n|,
     their slope is N·mean|g|. A floor is added in quadrature for what the model leaves out.
@@ -115,15 +84,6 @@ def refine_minima(
     The standard deviation returned is that of a mixture of right and wrong disparities: its square
     is ``c·sigma² + (1 - c)·max(sigma, WRONG_PX)²``. Noise alone explains the errors on smooth
     surfaces; that windows across depth steps are often wrong only shows in the confidence.
-
-    Args:
-        minima: What the search found.
-        texture: float32 (end - first, W), of those rows, in the unit of ``rules.texture``; NaN = no
-            image there (BORDER).
-        rules: Thresholds.
-        first: First row to do.
-        end: The row after the last.
-        refined: Written: the rows ``first`` to ``end - 1``.
 
     Ref: H. Hirschmüller, "Stereo processing by semiglobal matching and mutual information",
     PAMI 30, 2008, section 2.6 (occluded or mismatched); M. Shimizu, M. Okutomi, "Sub-pixel
@@ -143,14 +103,8 @@ def refine_minima(
 
 
 @kernel
-def reject(mask: NDArray[np.bool_], code: int, refined: Refined) -> None:
-    """Invalidate the pixels of a mask, in place.
-
-    Args:
-        mask: bool (H, W).
-        code: The reason code that they get.
-        refined: Changed.
-    """
+def reject(mask: Bool, code: int, refined: Refined) -> None:
+    """Invalidate the pixels of a mask (H, W), in place; ``code`` becomes their reason."""
     height, width = mask.shape
     for y in range(height):
         for x in range(width):
@@ -160,7 +114,7 @@ def reject(mask: NDArray[np.bool_], code: int, refined: Refined) -> None:
 
 
 @kernel
-def _mark_chosen(right_winner: NDArray[np.uint16], rules: Rules, chosen: NDArray[np.uint8]) -> None:
+def _mark_chosen(right_winner: UInt16, rules: Rules, chosen: UInt8) -> None:
     """Mark the columns of the left view where a pixel of the right view has its best match."""
     width = right_winner.size
     chosen[:] = 0
@@ -171,12 +125,7 @@ def _mark_chosen(right_winner: NDArray[np.uint16], rules: Rules, chosen: NDArray
 
 
 @kernel
-def _compare_views(
-    winner: NDArray[np.uint16],
-    right_winner: NDArray[np.uint16],
-    rules: Rules,
-    apart: NDArray[np.int32],
-) -> None:
+def _compare_views(winner: UInt16, right_winner: UInt16, rules: Rules, apart: Int32) -> None:
     """Write by how many candidates the right view disagrees with each winner; -1 = no winner."""
     for x in range(winner.size):
         k = np.int64(winner[x])
@@ -186,12 +135,12 @@ def _compare_views(
 @kernel
 def _judge(
     minima: Minima,
-    texture: NDArray[np.float32],
-    chosen: NDArray[np.uint8],
-    apart: NDArray[np.int32],
+    texture: Float32,
+    chosen: UInt8,
+    apart: Int32,
     rules: Rules,
     y: int,
-    reason: NDArray[np.uint8],
+    reason: UInt8,
 ) -> None:
     """Write the reasons of one row; without branches, so the first reason is selected last."""
     winner, best_cost, cost_before = minima.winner[y], minima.costs[0, y], minima.costs[1, y]
@@ -231,7 +180,6 @@ def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
     cost_after, second_cost = minima.costs[2, y], minima.costs[3, y]
     values, confidences, sigmas = refined.values[y], refined.confidence[y], refined.sigma_px[y]
     reasons = refined.reason[y]
-    lines, parabola = rules.fit == EQUIANGULAR, rules.fit == PARABOLA
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
     largest, nan = np.float32(SIGMA_LARGEST_PX), np.float32(np.nan)
     variance_floor = np.float32(rules.sigma_floor_px) * np.float32(rules.sigma_floor_px)
@@ -241,14 +189,11 @@ def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
         best, second = np.float32(best_cost[x]), np.float32(second_cost[x])
         before, after = np.float32(cost_before[x]), np.float32(cost_after[x])
         slope = max(before, after) - best
-        bend = before + after - best - best
-        steepness = bend if parabola else slope
-        fits = (lines or parabola) and steepness > zero
-        offset = half * (before - after) / (steepness if fits else one)
-        offset = offset if fits else zero
+        sloped = slope > zero
+        offset = half * (before - after) / (slope if sloped else one)
+        offset = offset if sloped and rules.fit else zero
 
         vertex = max(best - half * abs(before - after), zero)
-        sloped = slope > zero
         noise = noise_of_one * vertex / (slope if sloped else one)
         sigma = min(np.sqrt(variance_floor + noise * noise), largest)
         sigma = sigma if sloped else largest

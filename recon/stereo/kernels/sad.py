@@ -3,12 +3,8 @@
 Why it is fast: a tile of the image is offered only some candidates (`tiles`). The inner loops
 work on `LANES` neighbouring columns at once (`simd`), with the best so far in registers. A window
 consists of two halves (`half_windows`), each of which is summed once for two rows, in blocks of
-columns that stay in a core's own cache.
-
-Two halves that are shifted against each other make a slanted window, which costs one more addition
-than the upright one, not another search.
-
-The reference implementation is in `tests/stereo/kernels/sad_reference.py`.
+columns that stay in a core's own cache. Two halves that are shifted against each other make a
+slanted window, which costs one more addition than the upright one, not another search.
 
 Ref: K. Mühlmann et al., "Calculating dense disparity maps from color stereo images, an efficient
 implementation", IJCV 47, 2002; N. Einecke, J. Eggert, "A multi-block-matching approach for
@@ -20,9 +16,8 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Int64, kernel
 from recon.stereo.kernels.half_windows import (
     Halves,
     Scratch,
@@ -32,7 +27,7 @@ from recon.stereo.kernels.half_windows import (
     offer_candidates,
 )
 from recon.stereo.kernels.minima import NO_COST, Minima, write_right_winners
-from recon.stereo.kernels.simd import (
+from recon.stereo.kernels.simd.vectors import (
     LANES,
     Vector,
     load,
@@ -59,7 +54,7 @@ def sad_minima(
     scratch: Scratch,
     minima: Minima,
 ) -> None:
-    """Find the best candidate of each pixel of some rows.
+    """Find the best candidate of each pixel of rows ``first`` to ``end - 1``.
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the sum of
     ``min(|left - right|, cost_cap)`` over both halves of the window (the middle row is in both,
@@ -70,15 +65,6 @@ def sad_minima(
     disparity wins. The costs before and after the best are those of the window that won, the
     upright one if both did. A pixel of the right view is matched to the left pixel that chose it
     at the least cost.
-
-    Args:
-        views: The images, from `lay_out`.
-        search: What is searched.
-        tiles: Which candidates are offered where.
-        first: First row to do.
-        end: The row after the last. The rows of a call depend on no other call.
-        scratch: Memory from `empty_scratch`; not shared with another thread.
-        minima: Written: the rows ``first`` to ``end - 1``.
     """
     reach, height = search.rows_radius, tiles.height
     for column in range(tiles.offered.shape[1]):
@@ -125,7 +111,7 @@ def _choose(
 
 @kernel
 def _search(
-    halves: Halves, search: Search, offers: NDArray[np.int64], x: int, column: int, width: int
+    halves: Halves, search: Search, offers: Int64, x: int, column: int, width: int
 ) -> tuple[Vector, Vector, Vector, Vector, Vector]:
     """Search a vector of columns from ``x`` on: winners, and the four costs of `Minima`."""
     # Candidate k exists in the columns from x + k + ahead to x + k + ahead + width - 1.
@@ -208,18 +194,12 @@ def _weigh(
     prior: Vector,
     found: Found,
 ) -> Found:
-    """Update the best so far by one candidate.
+    """Update the best so far by candidate ``number``.
 
-    Args:
-        upright: Its costs.
-        slanted: Those of the slanted window.
-        upright_last: Costs of the candidate before; `NO_COST` = was not offered.
-        slanted_last: Those of the slanted window.
-        number: Its number.
-        prior: The lowest cost of all candidates before the previous one.
-        found: The best so far: its number, its cost, the lowest cost two or more candidates away,
-            its cost by the upright window; the costs of the candidate before it and of the one
-            after it, each by the upright and by the slanted window.
+    ``prior`` is the lowest cost of all candidates before the previous one, whose own costs are the
+    last. ``found`` is the best so far: its number, its cost, the lowest cost two or more candidates
+    away, its cost by the upright window; the costs of the candidate before it and of the one after
+    it, each by the upright and by the slanted window.
     """
     winner, best, second, upright_best = found[:4]
     upright_before, slant_before, upright_after, slant_after = found[4:]

@@ -10,8 +10,6 @@ The sweep down goes on from block to block; the sweep up starts afresh some rows
 and a band is wider than the part of it that is kept. After this overlap a path hardly depends on
 where it started.
 
-The reference implementation is in `tests/stereo/kernels/semi_global_reference.py`.
-
 Ref: H. Hirschmüller, "Stereo processing by semiglobal matching and mutual information", PAMI 30,
 2008, equations 13 and 14.
 """
@@ -21,11 +19,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import UInt8, kernel
 from recon.stereo.kernels.minima import Minima
-from recon.stereo.kernels.path_along import RowScratch, empty_row_scratch, follow_row
 from recon.stereo.kernels.path_costs import (
     CostRows,
     Views,
@@ -35,11 +31,20 @@ from recon.stereo.kernels.path_costs import (
     padded,
     write_costs,
 )
-from recon.stereo.kernels.path_rows import DOWN, UP, WARM_UP, PathRow, Paths, advance, begin
-from recon.stereo.kernels.plane_minima import MARGIN, NONE, Band, Best, choose_row, empty_best
-from recon.stereo.kernels.simd import (
-    LANES,
+from recon.stereo.kernels.paths import (
+    DOWN,
+    UP,
+    WARM_UP,
+    PathRow,
+    Paths,
+    RowScratch,
+    advance,
+    begin,
+    empty_row_scratch,
+    follow_row,
 )
+from recon.stereo.kernels.plane_minima import MARGIN, NONE, Band, Best, choose_row, empty_best
+from recon.stereo.kernels.simd.vectors import LANES
 
 ROWS: Final = 32
 """Rows of a block: many, compared with the overlap below it that is swept in vain."""
@@ -49,34 +54,22 @@ SCRATCH_BYTES: Final = 4 << 20
 
 
 class Scratch(NamedTuple):
-    """Scratch memory for a strip; its content does not matter.
+    """Scratch memory for a strip; its content does not matter."""
 
-    Attributes:
-        memory: uint8 (N,), enough for a band.
-        columns: Columns of a band; the last one may have fewer.
-    """
-
-    memory: NDArray[np.uint8]
-    columns: int
+    memory: UInt8  # (N,), enough for a band
+    columns: int  # columns of a band; the last one may have fewer
 
 
 class BandScratch(NamedTuple):
-    """Scratch memory for a band of C columns, all uint8.
+    """Scratch memory for a band of C columns, all uint8."""
 
-    Attributes:
-        costs: (ROWS + overlap, P, C), cost of each candidate at each pixel.
-        means: (ROWS, P, MARGIN + C + MARGIN), means of the path costs of the sweep down; the
-            margins are `NONE`.
-        above: Paths from above.
-        under: Paths from below.
-        along: Horizontal paths.
-    """
-
-    costs: NDArray[np.uint8]
-    means: NDArray[np.uint8]
-    above: PathRow
-    under: PathRow
-    along: RowScratch
+    costs: UInt8  # (ROWS + overlap, P, C), cost of each candidate at each pixel
+    #: (ROWS, P, MARGIN + C + MARGIN), means of the path costs of the sweep down; the margins are
+    #: `NONE`.
+    means: UInt8
+    above: PathRow  # paths from above
+    under: PathRow  # paths from below
+    along: RowScratch  # horizontal paths
 
 
 def empty_scratch(width: int, paths: Paths) -> Scratch:
@@ -123,20 +116,12 @@ def _band_scratch(scratch: Scratch, columns: int, paths: Paths) -> BandScratch:
 def semi_global_minima(
     views: Views, window: Window, paths: Paths, strip: range, scratch: Scratch, minima: Minima
 ) -> None:
-    """Find the best candidate of each pixel of a strip, in the left and the right view.
+    """Find the best candidate of each pixel of a strip of rows, in the left and the right view.
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the mean of the costs
     of the paths that end there. A path starts at the border of the image or, if that is nearer,
     ``overlap`` rows above the strip (from above), ``overlap`` rows below each block (from below) or
     ``side_overlap`` columns beside each band (from the sides).
-
-    Args:
-        views: The images.
-        window: What the cost of a pixel sums up.
-        paths: Candidates and penalties.
-        strip: The rows.
-        scratch: Memory from `empty_scratch`; not shared with another thread.
-        minima: Written: the rows of the strip.
     """
     width = views.grey.shape[1]
     rows = empty_cost_rows(scratch.columns, window)
@@ -194,7 +179,7 @@ def _search_band(
 
 @kernel
 def _sweep_down(
-    grey: NDArray[np.uint8], paths: Paths, band: Band, first: int, end: int, buffers: BandScratch
+    grey: UInt8, paths: Paths, band: Band, first: int, end: int, buffers: BandScratch
 ) -> None:
     """Follow the paths from above through a block, and write their means."""
     for y in range(first, end):
@@ -205,7 +190,7 @@ def _sweep_down(
 
 @kernel
 def _sweep_up(
-    grey: NDArray[np.uint8],
+    grey: UInt8,
     paths: Paths,
     band: Band,
     bottom: int,

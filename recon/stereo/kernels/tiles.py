@@ -1,7 +1,6 @@
 """Which candidates are searched in which tile of an image.
 
 A search at half size costs an eighth and shows which disparities occur in each part of an image.
-Only those are worth searching at full size.
 """
 
 from __future__ import annotations
@@ -9,83 +8,49 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Bool, Float32, Int64, kernel
 
 GROUP: Final = 8
 """Candidates that are offered or left out together."""
 
-Offer = NDArray[np.bool_]
+Offer = Bool
 """bool (G,), which groups of candidates are offered."""
 
 
 class Tiles(NamedTuple):
-    """Which candidates are offered where.
+    """Which candidates are offered where."""
 
-    Attributes:
-        offered: bool (I, J, G), by tile and group of candidates.
-        height: Rows of a tile, at least the half height of a window.
-        width: Columns of a tile.
-    """
-
-    offered: NDArray[np.bool_]
-    height: int
-    width: int
+    offered: Bool  # (I, J, G), by tile and group of candidates
+    height: int  # rows of a tile, at least the half height of a window
+    width: int  # columns of a tile
 
 
 class Support(NamedTuple):
-    """How much support by matches at half size offers a group of candidates to a tile.
+    """How much support by matches at half size offers a group of candidates to a tile."""
 
-    Attributes:
-        margin_x: Columns beside a tile whose matches count too, pixels at full size.
-        margin_y: Rows above and below a tile whose matches count too, pixels at full size.
-        margin: A match supports candidates up to this far from it.
-        matched: Least share of matched pixels; with fewer, all candidates are offered.
-        share: Least share of the matches that support an offered group.
-        least: Least number of matches that support an offered group.
-    """
-
-    margin_x: int
-    margin_y: int
-    margin: int
-    matched: float
-    share: float
-    least: int
+    margin_x: int  # columns beside a tile whose matches count too, pixels at full size
+    margin_y: int  # rows above and below a tile whose matches count too, pixels at full size
+    margin: int  # a match supports candidates up to this far from it
+    matched: float  # least share of matched pixels; with fewer, all candidates are offered
+    share: float  # least share of the matches that support an offered group
+    least: int  # least number of matches that support an offered group
 
 
 def make_tiles(shape: tuple[int, int], size: tuple[int, int], ndisp: int) -> Tiles:
-    """Return tiles that are offered every candidate.
-
-    Args:
-        shape: Rows and columns of the image.
-        size: Rows and columns of a tile.
-        ndisp: Number of candidates.
-    """
+    """Return tiles of some size (rows, columns) that are offered every candidate."""
     across, down = -(-shape[0] // size[0]), -(-shape[1] // size[1])
     return Tiles(np.ones((across, down, -(-ndisp // GROUP)), np.bool_), *size)
 
 
 @kernel
 def offer_supported(
-    halved: NDArray[np.float32],
-    minimum: int,
-    ndisp: int,
-    support: Support,
-    first: int,
-    end: int,
-    tiles: Tiles,
+    halved: Float32, minimum: int, ndisp: int, support: Support, first: int, end: int, tiles: Tiles
 ) -> None:
     """Offer the tiles of some rows those groups of candidates that matches at half size support.
 
-    Args:
-        halved: float32 (h, w), disparities of the images at half size; NaN = no match.
-        minimum: Disparity of candidate 0 at full size.
-        ndisp: Number of candidates at full size.
-        support: How much support is needed.
-        first: First row of tiles to do.
-        end: The row after the last.
-        tiles: ``offered`` is written.
+    ``halved`` has the disparities (h, w) at half size, NaN = no match; the rest is in pixels at
+    full size, and ``first`` to ``end - 1`` are rows of tiles.
     """
     counts = np.empty(ndisp, np.int64)
     _, columns, groups = tiles.offered.shape
@@ -111,7 +76,7 @@ def _reach(tile: int, size: int, margin: int, halved: int) -> tuple[int, int]:
 
 
 @kernel
-def _count(halved: NDArray[np.float32], minimum: int, counts: NDArray[np.int64]) -> int:
+def _count(halved: Float32, minimum: int, counts: Int64) -> int:
     """Count the matches at each candidate of full size; return their number."""
     matched = 0
     for y in range(halved.shape[0]):

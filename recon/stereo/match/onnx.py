@@ -72,12 +72,7 @@ class OnnxSettings(Settings):
 
 
 class OnnxMatcher:
-    """Lets a network find the disparity; a `Matcher`. The network is loaded at the first pair.
-
-    Args:
-        settings: The network, and what it expects.
-        threads: Threads that it may use; None = onnxruntime decides.
-    """
+    """Lets a network find the disparity; a `Matcher`. The network is loaded at the first pair."""
 
     def __init__(self, settings: OnnxSettings, threads: int | None = None) -> None:
         self._settings = settings
@@ -177,12 +172,7 @@ def _tensor(image: UInt8, channels: int, s: OnnxSettings) -> Float32:
 
 
 class OnnxNetwork:
-    """A loaded network, run on the CPU.
-
-    Args:
-        path: An ``.onnx`` file.
-        threads: Threads per operator; None = onnxruntime's default.
-    """
+    """A loaded network, run on the CPU; ``threads`` per operator, None = onnxruntime's default."""
 
     def __init__(self, path: Path, threads: int | None = None) -> None:
         runtime = require("onnxruntime", extra="onnx")
@@ -211,14 +201,7 @@ class OnnxNetwork:
         )
 
     def run(self, inputs: Sequence[Float32]) -> list[Float32]:
-        """Run the network once.
-
-        Args:
-            inputs: float32 arrays, in the order of the network's inputs.
-
-        Returns:
-            The outputs, in the order of the network.
-        """
+        """Run the network once, from float32 arrays in the order of its inputs."""
         wanted = self._session.get_inputs()
         if len(wanted) != len(inputs):
             raise MatchingError(

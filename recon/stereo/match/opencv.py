@@ -71,13 +71,9 @@ class OpencvSettings(SearchSettings):
 
 
 class OpencvMatcher:
-    """A matcher of OpenCV; a `Matcher`.
+    """A matcher of OpenCV, ``cv2.StereoBM`` or ``cv2.StereoSGBM``; a `Matcher`.
 
     It has no number of threads: OpenCV has one for the whole process, which the commands set.
-
-    Args:
-        settings: What to search and what to believe.
-        semi_global: ``cv2.StereoSGBM``; else ``cv2.StereoBM``.
     """
 
     def __init__(self, settings: OpencvSettings, *, semi_global: bool) -> None:
@@ -147,10 +143,9 @@ class _Margins:
 
 
 def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margins) -> Disparity:
-    """Let OpenCV match, and say of each pixel without a value why, as far as that is known.
+    """Let OpenCV match; pixels without a value are AMBIGUOUS.
 
-    OpenCV does not report which of its own checks (texture, uniqueness, left against right) a pixel
-    failed: such pixels are AMBIGUOUS.
+    OpenCV does not report which of its checks (texture, uniqueness, left against right) failed.
     """
     try:
         raw = engine.compute(margins.widen(pair.left), margins.widen(pair.right))

@@ -30,12 +30,8 @@ class Matcher(Protocol):
 def unrated_disparity(values: Float32, reason: UInt8, pair: RectifiedPair) -> Disparity:
     """Return a disparity map whose matches all have the assumed confidence and uncertainty.
 
-    A match where there is no image, or that lies outside the right image, becomes BORDER.
-
-    Args:
-        values: float32 (H, W), pixels; read where ``reason`` is VALID.
-        reason: uint8 (H, W).
-        pair: What was matched.
+    Values are read where the reason is VALID. A match where there is no image, or that lies outside
+    the right image, becomes BORDER.
     """
     width = values.shape[1]
     with np.errstate(invalid="ignore"):

@@ -32,10 +32,6 @@ class AutoRangeMatcher:
     The range is a function of the pair alone, never of the frames before it, so that a resumed run
     gives the same result. It is never narrower than `usual_ndisp`, so from frame to frame it
     changes only where something is nearer than that allows.
-
-    Args:
-        matcher: The matcher; it must take its range from the camera.
-        minimum_px: The first disparity that it searches.
     """
 
     def __init__(self, matcher: Matcher, minimum_px: int = 0) -> None:
@@ -51,14 +47,12 @@ class AutoRangeMatcher:
 
 
 def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
-    """Return the number of disparities that a pair needs, from matching it at a small size.
+    """Return the number of disparities that a pair needs, a multiple of 16.
 
-    The small pair is searched up to half its width. Its trusted disparities show how near the scene
-    is; a tenth and one pixel of the small pair are added, because small objects may be nearer.
-
-    Returns:
-        A multiple of 16: at least `usual_ndisp`, which it is where too little can be trusted, and
-        at most the image's width (rounded up).
+    The pair is matched at a small size, searched up to half its width. Its trusted disparities show
+    how near the scene is; a tenth and one pixel of the small pair are added, because small objects
+    may be nearer. It is at least `usual_ndisp`, also where too little can be trusted, and at most
+    the image's width (rounded up).
     """
     height, width = pair.left.shape
     factor = max(1, width // _COARSE_WIDTH_PX)
@@ -87,7 +81,7 @@ def _shrunk(image: UInt8, factor: int, size: tuple[int, int]) -> UInt8:
 
 
 def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    """Return float32 (N,), disparities in pixels of the small pair."""
+    """Return disparities (N,) in pixels of the small pair."""
     settings = SadSettings(window_px=7, uniqueness_percent=10)
     found = SadMatcher(settings, threads=1, average=False).match(small)
     return found.values[found.valid & (found.confidence >= _CONFIDENCE)]
@@ -103,11 +97,7 @@ class HalfSizeMatcher:
     """Matches with `sad` at half size; a `Matcher` whose disparities are those of the full size.
 
     They are as dense as those of the full size and cost about a fifth of the time, but are off by
-    a quarter of a pixel or more.
-
-    Args:
-        searched: The range at full size.
-        threads: Strips of rows worked on at once. The result does not depend on it.
+    a quarter of a pixel or more. ``searched`` is the range at full size.
     """
 
     def __init__(self, searched: SearchSettings, threads: int | None = None) -> None:

@@ -55,13 +55,10 @@ class MatchingSettings(Settings):
 def make_matcher(
     matcher: str | Matcher, settings: MatchingSettings | None = None, threads: int | None = None
 ) -> Matcher:
-    """Make the matcher of a name, or make sure that an object can be used as one.
+    """Make the matcher of a name, ours or one that an installed package registers.
 
-    Args:
-        matcher: A key of `MATCHERS`, a name that an installed package registers, or an object
-            with the methods of `Matcher`. What a matcher returns that is not ours is checked.
-        settings: The settings of all matchers; it takes its own part.
-        threads: Threads that a matcher of ours may use; all cores by default.
+    An object with the methods of `Matcher` is taken too; what a matcher that is not ours returns is
+    checked. ``settings`` are those of all matchers; threads (None = all cores) are for ours.
     """
     settings = settings or MatchingSettings()
     if not isinstance(matcher, str) or matcher not in MATCHERS:
@@ -105,8 +102,7 @@ def searched_ndisp(
 ) -> int | None:
     """Return how many disparities a matcher searches in a pair, before it rounds them.
 
-    Returns:
-        Their number, or None of a matcher that searches no range, or is not ours.
+    None of a matcher that searches no range, or is not ours.
     """
     own = settings_of(matcher, settings)
     if not isinstance(own, SearchSettings):

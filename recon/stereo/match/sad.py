@@ -24,7 +24,6 @@ from recon.stereo.kernels.half_windows import (
 )
 from recon.stereo.kernels.minima import empty_minima
 from recon.stereo.kernels.refine import (
-    NO_FIT,
     REFINED_BYTES,
     Refined,
     Rules,
@@ -101,12 +100,8 @@ class SadMatcher:
     """Compares windows of gradients and checks what it finds; a `Matcher`.
 
     Every pixel is searched, those at the left border as far as the right image reaches.
-
-    Args:
-        settings: What to search and what to believe.
-        threads: Strips of rows worked on at once, all cores by default. The result does not
-            depend on it.
-        average: Whether disparities are averaged with their neighbours.
+    ``threads`` strips of rows are worked on at once (None = all cores), without effect on the
+    result; ``average`` = disparities are averaged with their neighbours.
     """
 
     def __init__(
@@ -161,11 +156,7 @@ class SadMatcher:
 
 
 class _StripSearch:
-    """Searches pairs of images, one strip of rows per thread, and keeps its memory between pairs.
-
-    Args:
-        threads: Strips worked on at once. The result does not depend on it.
-    """
+    """Searches images, one strip of rows per thread, and keeps its memory between pairs."""
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
@@ -183,16 +174,7 @@ class _StripSearch:
         rules: Rules,
         texture: Callable[[range], Float32],
     ) -> Refined:
-        """Search, check and refine.
-
-        Args:
-            pool: Where to work.
-            images: Left and right, uint8 (H, W).
-            search: What is searched.
-            tiles: Which candidates are offered where.
-            rules: What the checks ask for.
-            texture: Gives the texture of some rows of the left image, float32 (N, W).
-        """
+        """Search, check and refine; ``texture`` gives that of some rows of the left image."""
         height, width = images[0].shape
         results = self._results.lend(REFINED_BYTES * height * width)
         refined = refined_in(results, height, width)
@@ -237,7 +219,7 @@ def half_rules(search: Search) -> Rules:
     return Rules(
         ndisp=search.ndisp,
         minimum=search.minimum,
-        fit=NO_FIT,
+        fit=False,
         texture=0.0,
         uniqueness=UNIQUENESS_PERCENT,
         left_right=LEFT_RIGHT_PX,

@@ -18,13 +18,8 @@ from recon.core.errors import MatchingError
 from recon.core.settings import Settings
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, UInt8
-from recon.stereo.kernels.opposite import average_opposite
-from recon.stereo.kernels.refine import EQUIANGULAR, ODDS, Refined, Rules, reject
-from recon.stereo.kernels.speckle import find_speckles
-
-FIT: Final = EQUIANGULAR
-"""How the minimum is placed between whole disparities: the best of the fits for sums of absolute
-differences, whose minimum is pointed."""
+from recon.stereo.kernels.finish import average_opposite, find_speckles
+from recon.stereo.kernels.refine import ODDS, Refined, Rules, reject
 
 LEFT_RIGHT_PX: Final = 1
 """Largest difference between the disparities of the left and the right view."""
@@ -124,7 +119,6 @@ def rules_of(
     return Rules(
         ndisp=ndisp,
         minimum=settings.min_disparity_px,
-        fit=FIT,
         texture=min_texture,
         uniqueness=settings.uniqueness_percent,
         left_right=LEFT_RIGHT_PX,
@@ -144,12 +138,7 @@ def finish(
 ) -> Disparity:
     """Return the disparity of what was refined: no small regions (reason SPECKLE), averaged.
 
-    Args:
-        refined: Overwritten; a copy of each array would cost more than the search for speckles.
-        settings: Says what a speckle is.
-        pool: Where to average.
-        threads: Strips of rows averaged at once. The result does not depend on it.
-        average: Whether to average; else the disparities stay as measured.
+    ``refined`` is overwritten: a copy of each array would cost more than the search for speckles.
     """
     if settings.speckle_size_px >= 2:
         small = find_speckles(refined.values, _SPECKLE_STEP_PX, settings.speckle_size_px)
@@ -161,7 +150,6 @@ def finish(
 
 
 def _averaged(values: Float32, pool: Executor, threads: int) -> Float32:
-    """Return float32 (H, W), values without the noise that neighbours do not share."""
     averages, radius = np.empty_like(values), _AVERAGE_PX // 2
 
     def average(rows: range) -> None:
@@ -174,12 +162,7 @@ def _averaged(values: Float32, pool: Executor, threads: int) -> Float32:
 def in_strips(pool: Executor, threads: int, work: Callable[[range], None], rows: int) -> None:
     """Work on all rows, in one strip per thread.
 
-    Args:
-        pool: Where to work on all strips but the last, which is left to the thread that calls:
-            to hand work over takes time.
-        threads: Most strips.
-        work: What to do with some rows.
-        rows: How many there are, at least 1.
+    The last strip is left to the thread that calls: to hand work over takes time.
     """
     edges = np.linspace(0, rows, min(threads, rows) + 1).astype(int).tolist()
     *strips, last = itertools.starmap(range, itertools.pairwise(edges))
@@ -198,12 +181,7 @@ T = TypeVar("T")
 
 
 class ScratchPool(Generic[T]):
-    """Lends scratch memory of one kind, also to several threads at once.
-
-    Args:
-        make: Makes scratch memory of a size, when there is none to lend.
-        most: How many pieces are kept.
-    """
+    """Lends scratch memory of one kind, also to several threads at once; keeps ``most`` pieces."""
 
     def __init__(self, make: Callable[..., T], most: int) -> None:
         self._make = make
@@ -211,11 +189,7 @@ class ScratchPool(Generic[T]):
 
     @contextmanager
     def borrow(self, *size: Hashable) -> Iterator[T]:
-        """Lend scratch memory for a ``with`` block; its content is undefined.
-
-        Args:
-            size: Arguments of ``make``. A kept piece of another size is given up.
-        """
+        """Lend what ``make`` makes of a size for a ``with`` block; its content is undefined."""
         try:
             kept, scratch = self._free.pop()
         except IndexError:
@@ -228,11 +202,7 @@ class ScratchPool(Generic[T]):
 
 
 class ResultPool:
-    """Lends memory for results, which returns when the last reference to it is gone.
-
-    Args:
-        most: How many returned blocks are kept.
-    """
+    """Lends memory for results, which returns when the last reference to it is gone."""
 
     def __init__(self, most: int) -> None:
         self._free: deque[UInt8] = deque(maxlen=most)
@@ -267,11 +237,7 @@ _GAIN_OF_SOBEL: Final = 8.0
 
 
 def clipped_gradients(image: UInt8, rows: range) -> UInt8:
-    """Return what windows compare in some rows of an image (H, W): clipped horizontal gradients.
-
-    Returns:
-        uint8 (N, W) of N consecutive rows, Sobel units, plus the cap.
-    """
+    """Return what windows compare in N rows of an image: clipped Sobel gradients plus the cap."""
     gradients = _sobel(image, rows)
     np.clip(gradients, -_GRADIENT_CAP, _GRADIENT_CAP, out=gradients)
     gradients += _GRADIENT_CAP
@@ -281,13 +247,7 @@ def clipped_gradients(image: UInt8, rows: range) -> UInt8:
 def texture(pair: RectifiedPair, window_px: int, rows: range) -> Float32:
     """Return mean size of the horizontal gradient in the window around each pixel of the left view.
 
-    Args:
-        pair: The images.
-        window_px: Edge of the square window.
-        rows: N consecutive rows.
-
-    Returns:
-        float32 (N, W) of those rows, grey levels per pixel; NaN = no image.
+    float32 (N, W) of N consecutive rows, grey levels per pixel; NaN = no image.
     """
     reach = window_px // 2
     sizes = _sobel(pair.left, _around(rows, reach, len(pair.left)))

@@ -11,17 +11,16 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
-from recon.stereo.kernels.census import Descriptor
 from recon.stereo.kernels.minima import empty_minima
 from recon.stereo.kernels.path_costs import (
+    CENSUS_RADIUS,
     Views,
     Window,
-    column_offsets,
     empty_planes,
     scaled_window,
     write_views,
 )
-from recon.stereo.kernels.path_rows import Paths
+from recon.stereo.kernels.paths import Paths
 from recon.stereo.kernels.plane_minima import PARTS
 from recon.stereo.kernels.refine import REFINED_BYTES, refine_minima, refined_in
 from recon.stereo.kernels.semi_global import (
@@ -52,19 +51,11 @@ _SIDE_OVERLAP: Final = 16
 """Columns that neighbouring bands share: horizontal and diagonal paths start there."""
 
 
-_GRADIENT_CAP: Final = 127
-"""Horizontal gradients (Sobel units) are clipped to plus or minus this."""
-
 _COST_CAP: Final = 14
 """Largest difference of gradients that counts at one pixel."""
 
-_CENSUS_RADIUS: Final = 2
-"""Half the census, whose bits are added to the gradients."""
-
-_LARGEST_COST: Final = _COST_CAP + (2 * _CENSUS_RADIUS + 1) ** 2 - 1
+_LARGEST_COST: Final = _COST_CAP + (2 * CENSUS_RADIUS + 1) ** 2 - 1
 """Largest cost of one pixel: of its gradient and of all bits of the census."""
-
-_DESCRIPTOR: Final = Descriptor(_GRADIENT_CAP, _CENSUS_RADIUS, _CENSUS_RADIUS)
 
 _EDGE_GREY_LEVELS: Final = 12
 """Where the image changes by more along a path, large steps are cheaper: surfaces end there."""
@@ -122,11 +113,8 @@ class SgmMatcher:
     """Aggregates costs along paths through the image, and checks the result; a `Matcher`.
 
     Every pixel is searched, those at the left border as far as the right image reaches.
-
-    Args:
-        settings: What to search and what to believe.
-        threads: Strips of rows worked on at once, all cores by default. The result does not
-            depend on it.
+    ``threads`` strips of rows are worked on at once (None = all cores), without effect on the
+    result.
     """
 
     def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
@@ -149,8 +137,7 @@ class SgmMatcher:
         refined = refined_in(results, *size)
 
         def prepare(strip: range) -> None:
-            offsets = column_offsets(window, ndisp, s.min_disparity_px)
-            write_views(pair.right, _DESCRIPTOR, offsets, strip, views)
+            write_views(pair.right, window.radius, s.min_disparity_px, strip, views)
 
         def search(strip: range) -> None:
             with self._scratch.borrow(pair.camera.width_px, paths) as scratch:
@@ -160,7 +147,7 @@ class SgmMatcher:
 
         strips, at_once = self._strips(pair.camera, paths)
         with (
-            self._planes.borrow(*size, _DESCRIPTOR.planes, window.radius, ndisp) as planes,
+            self._planes.borrow(*size, window.radius, ndisp) as planes,
             self._minima.borrow(*size) as minima,
             ThreadPoolExecutor(at_once) as pool,
         ):

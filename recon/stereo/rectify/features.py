@@ -38,15 +38,10 @@ MOST_FEATURES: Final = 8000
 
 @dataclass(frozen=True, eq=False)
 class PairFeatures:
-    """Features matched between two images.
+    """Features matched between two images."""
 
-    Attributes:
-        left_uv: float32 (N, 2), columns and rows in the left (or first) image, pixels.
-        right_uv: float32 (N, 2), the same features in the right (or second) image.
-    """
-
-    left_uv: Float32
-    right_uv: Float32
+    left_uv: Float32  # (N, 2), columns and rows in the left (or first) image, pixels
+    right_uv: Float32  # (N, 2), the same features in the right (or second) image
 
     def __post_init__(self) -> None:
         freeze(self, "left_uv", np.float32, (None, 2))
@@ -75,19 +70,11 @@ def match_features(
 ) -> PairFeatures:
     """Match features between two images: mutual best matches that pass the ratio test.
 
-    Args:
-        first: uint8 (H, W).
-        second: uint8 (H, W).
-        count: Maximum number of features per image.
-        any_scale: Whether the scale may differ much between the images: uses SIFT, which takes
-            ten times as long as ORB.
+    Positions in the second image have subpixel accuracy. ``any_scale`` = the scale may differ much
+    between the images: uses SIFT, which takes ten times as long as ORB.
 
-    Returns:
-        The matches; those in the second image have subpixel accuracy.
-
-    Ref:
-        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011;
-        Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
+    Ref: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011;
+    Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
     """
     detector: cv2.Feature2D = (
         cv2.SIFT.create(nfeatures=count, contrastThreshold=_CONTRAST)
@@ -112,11 +99,6 @@ def match_exactly(left: UInt8, right: UInt8, count: int = MOST_FEATURES) -> Pair
 
     Slower than `match_features`, but subpixel accurate and robust to rotation, scale and slant
     between the images.
-
-    Args:
-        left: uint8 (H, W).
-        right: uint8 (H, W).
-        count: Maximum number of features per image.
     """
     sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=_CONTRAST)
     (left_uv, left_d), (right_uv, right_d) = (_describe(sift, side) for side in (left, right))
@@ -132,17 +114,10 @@ def match_exactly(left: UInt8, right: UInt8, count: int = MOST_FEATURES) -> Pair
 def match_again(
     left: UInt8, right: UInt8, H_left: Float64, H_right: Float64, count: int = MOST_FEATURES
 ) -> PairFeatures:
-    """Match images that homographies roughly align, for more and better matches.
+    """Match raw images that homographies roughly align, for more and better matches.
 
-    Args:
-        left: uint8 (H, W), raw.
-        right: uint8 (H, W), raw.
-        H_left: float64 (3, 3), from raw pixels to pixels with roughly aligned rows.
-        H_right: The same for the right image.
-        count: Maximum number of features per image.
-
-    Returns:
-        Matches with nearly equal rows after alignment, in raw pixels.
+    ``H_left`` and ``H_right`` are from raw pixels to pixels with roughly aligned rows, where
+    matches have nearly equal rows; the matches are in raw pixels.
     """
     size = (left.shape[1], left.shape[0])
     views = [
@@ -159,12 +134,7 @@ def match_again(
 
 
 def exposed_as(model: UInt8, image: UInt8) -> UInt8:
-    """Return an image with the brightness and contrast of another, since tracking needs them equal.
-
-    Args:
-        model: uint8 (H, W), reference for mean and standard deviation.
-        image: uint8 (H, W).
-    """
+    """Return an image with the brightness and contrast of ``model``: tracking needs them equal."""
     gain = float(model.std()) / max(float(image.std()), 1.0)
     shift = float(model.mean()) - gain * float(image.mean())
     return np.asarray(cv2.convertScaleAbs(image, alpha=gain, beta=shift), dtype=np.uint8)
@@ -250,21 +220,13 @@ _SWAPPED_SHARE: Final = 0.8
 
 @dataclass(frozen=True)
 class PairInspection:
-    """How well a pair is rectified, from features matched over the whole image. NaN = unknown.
+    """How well a pair is rectified, from features matched over the whole image. NaN = unknown."""
 
-    Attributes:
-        features: Number of matched features that agree on one row error.
-        row_error_px: Median of right minus left row; 0 if the rows are aligned.
-        row_spread_px: Robust standard deviation of that (from the median absolute deviation).
-        near: Number of features near enough to show whether the cameras are swapped.
-        negative_share: Share of those with a negative disparity: about 0, or about 1 if the
-            cameras are swapped.
-    """
-
-    features: int
-    row_error_px: float
-    row_spread_px: float
-    near: int
+    features: int  # number of matched features that agree on one row error
+    row_error_px: float  # median of right minus left row; 0 if the rows are aligned
+    row_spread_px: float  # robust standard deviation of that (from the median absolute deviation)
+    near: int  # number of features near enough to show whether the cameras are swapped
+    #: Share of those with a negative disparity: about 0, or about 1 if the cameras are swapped.
     negative_share: float
 
 
@@ -277,12 +239,9 @@ def inspect_pair(pair: RectifiedPair) -> PairInspection:
 def inspect_features(
     features: PairFeatures, doffs_px: float = 0.0, min_features: int = _MIN_FEATURES
 ) -> PairInspection:
-    """Measure how well matched features fit a rectified pair.
+    """Measure how well matches of pairs of one rig fit a rectified one; NaN with too few features.
 
-    Args:
-        features: Matches of one pair, or of several pairs of one rig.
-        doffs_px: ``cx_right - cx_left``, added to disparities so that 0 is at infinity.
-        min_features: With fewer features, the measures are NaN.
+    ``doffs_px`` (``cx_right - cx_left``) is added to disparities so that 0 is at infinity.
     """
     shift = features.right_uv - features.left_uv
     agree = _agreeing(shift[:, 1])

@@ -15,18 +15,11 @@ _PAPER_WEIGHTS: Final = np.array([0.299, 0.587, 0.144])
 
 
 def to_grey(image: UInt8, mode: GreyMode = "bt601") -> UInt8:
-    """Convert an image to grey; a grey image is returned unchanged.
+    """Convert an image, uint8 (H, W, 3) RGB, to grey; a grey image is returned unchanged.
 
     ``bt601`` weights red, green and blue by 0.299, 0.587 and 0.114, ``mean`` equally. ``paper`` is
     Eq. 6 of the seed paper as printed: its weight of blue, 0.144, is a misprint of 0.114, so the
     weights sum to 1.03 and bright pixels are clipped at 255.
-
-    Args:
-        image: uint8 (H, W), or (H, W, 3) RGB.
-        mode: Weights of the channels.
-
-    Returns:
-        uint8 (H, W), rounded to nearest.
 
     Ref: ITU-R BT.601, section 2.5.1.
     """

@@ -28,15 +28,10 @@ def project_raw(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
 def project_with_jacobian(
     camera: CameraIntrinsics, xyz: NDArray[Any]
 ) -> tuple[Float64, Float64, Float64]:
-    """Project points, with Jacobians.
+    """Project points (N, 3) in camera axes to pixels (N, 2), NaN at or behind the camera's plane.
 
-    Args:
-        camera: The raw camera.
-        xyz: (N, 3), in camera axes.
-
-    Returns:
-        Pixels float64 (N, 2), NaN for points at or behind the camera's plane; their Jacobians by
-        the point, (N, 2, 3), and by (fx, fy, cx, cy, distortion …), (N, 2, 4 + D).
+    With their Jacobians by the point, (N, 2, 3), and by (fx, fy, cx, cy, distortion …),
+    (N, 2, 4 + D).
     """
     points = np.ascontiguousarray(xyz, dtype=np.float64).reshape(-1, 1, 3)
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
@@ -57,8 +52,8 @@ def project_with_jacobian(
 def project_into_image(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
     """Return float64 (N, 2), pixels of points (N, 3) inside the image; NaN for all others.
 
-    Far outside the field of view, the distortion polynomial may fold points back into the image;
-    the ray of such a pixel does not lead to the point, and it is NaN too.
+    Far outside the field of view the distortion polynomial may fold points back into the image: the
+    ray of such a pixel does not lead to the point.
     """
     pixels = project_raw(camera, xyz)
     limit = np.array([camera.width_px - 1, camera.height_px - 1])
@@ -72,8 +67,7 @@ def project_into_image(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
 def rays_of(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     """Return float64 (N, 3), the rays of pixels (N, 2) in camera axes, with z = 1.
 
-    A ray is NaN where the lens model cannot be inverted (outside the image), or at 90 degrees or
-    more from the optical axis.
+    NaN where the lens model cannot be inverted, or at 90 degrees or more from the optical axis.
     """
     points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
@@ -110,11 +104,8 @@ def rectifying_maps(
 ) -> tuple[Float32, Float32]:
     """Return remap tables of a rotated pinhole view: columns and rows of the raw image, float32.
 
-    Args:
-        camera: The raw camera.
-        rotation: float64 (3, 3), from camera axes to those of the view.
-        matrix: float64 (3, 3) or (3, 4), the pinhole matrix of the view.
-        size: (width, height) of the view, pixels.
+    ``rotation`` is from camera axes to those of the view, ``matrix`` (3, 3) or (3, 4) its pinhole
+    matrix, ``size`` its (width, height).
     """
     if camera.model != "fisheye" and not sees_all(camera):
         return _without_folds(camera, rotation, matrix, size)
@@ -154,14 +145,8 @@ def epipolar_curves(
 ) -> tuple[list[Float64], list[Float64]]:
     """Return epipolar curves in the raw images (straight lines bent by the lenses).
 
-    Args:
-        calibration: The raw rig.
-        left_px: float64 (N, 2), pixels of the left image.
-        right_px: float64 (N, 2), pixels of the right image.
-
-    Returns:
-        For each right pixel its curve (M, 2) in the left image, and for each left pixel its curve
-        in the right image; NaN where a curve leaves the image.
+    For each right pixel (N, 2) its curve (M, 2) in the left image, and for each left pixel its
+    curve in the right image; NaN where a curve leaves the image.
     """
     T, near = calibration.T_right_left, calibration.baseline_m
     left, right = calibration.left, calibration.right
@@ -173,13 +158,9 @@ def epipolar_curves(
 def epipolar_lines(
     fundamental: Float64, left_px: Float64, right_px: Float64, size: tuple[int, int]
 ) -> tuple[list[Float64], list[Float64]]:
-    """Return epipolar lines of undistorted pinhole cameras; returned as by `epipolar_curves`.
+    """Return epipolar lines of undistorted pinhole cameras, as `epipolar_curves`.
 
-    Args:
-        fundamental: float64 (3, 3), the fundamental matrix, ``right.T @ F @ left = 0``.
-        left_px: float64 (N, 2), pixels of the left image.
-        right_px: float64 (N, 2), pixels of the right image.
-        size: (width, height) of the images.
+    ``fundamental`` is the matrix F of ``right.T @ F @ left = 0``, ``size`` (width, height).
     """
     in_left = [_line(fundamental.T @ [*pixel, 1.0], size) for pixel in right_px]
     in_right = [_line(fundamental @ [*pixel, 1.0], size) for pixel in left_px]

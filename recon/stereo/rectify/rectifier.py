@@ -56,15 +56,10 @@ class RectificationSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RemapTables:
-    """Remap tables of one rectified view.
+    """Remap tables of one rectified view."""
 
-    Attributes:
-        map_x: float32 (H, W), source columns in the raw image.
-        map_y: float32 (H, W), source rows in the raw image.
-    """
-
-    map_x: Float32
-    map_y: Float32
+    map_x: Float32  # (H, W), source columns in the raw image
+    map_y: Float32  # (H, W), source rows in the raw image
 
     @property
     def inside(self) -> Bool:
@@ -84,23 +79,14 @@ class RemapTables:
 
 
 class Rectifier:
-    """Rectifies the pairs of one rig.
-
-    Args:
-        calibration: The raw cameras, or the camera of already rectified images, which are only
-            checked for size and converted to grey.
-        settings: Zoom of the rectified views.
+    """Rectifies the pairs of one rig; images of a rectified camera are only checked and made grey.
 
     Attributes:
         camera: Geometry of the rectified views.
         valid: bool (H, W), where the rectified left view has a source; None = everywhere.
     """
 
-    def __init__(
-        self,
-        calibration: Rig,
-        settings: RectificationSettings | None = None,
-    ) -> None:
+    def __init__(self, calibration: Rig, settings: RectificationSettings | None = None) -> None:
         self.settings = settings or RectificationSettings()
         self.valid: Bool | None = None
         self._views: tuple[RemapTables, RemapTables] | None = None
@@ -142,17 +128,11 @@ class Rectifier:
 
 @dataclass(frozen=True, eq=False)
 class RectifyingTurns:
-    """Rectifying rotations of the two cameras, and the rectified camera.
+    """Rectifying rotations of the two cameras, and the rectified camera."""
 
-    Attributes:
-        R_left: float64 (3, 3), from the axes of the raw left camera to the rectified axes.
-        R_right: The same for the right camera.
-        camera: Geometry of the rectified views.
-    """
-
-    R_left: Float64
-    R_right: Float64
-    camera: RectifiedCamera
+    R_left: Float64  # (3, 3), from the axes of the raw left camera to the rectified axes
+    R_right: Float64  # the same for the right camera
+    camera: RectifiedCamera  # geometry of the rectified views
 
     @property
     def matrices(self) -> tuple[Float64, Float64]:
@@ -292,13 +272,10 @@ Box = tuple[Float64, Float64]
 def plan_wide_view(
     calibration: StereoCalibration, alpha: float | None
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    """Return rotations and projections of the rectified views, like ``stereoRectify`` for pinholes.
+    """Return R_left, R_right, P_left, P_right of wide views, as ``stereoRectify`` of pinholes.
 
     The centre of the views keeps the resolution of the lens, so they show less than a wide lens
     sees; along their shorter side they reach at most 60 degrees from the optical axis.
-
-    Returns:
-        ``R_left, R_right`` (3, 3) and ``P_left, P_right`` (3, 4).
 
     Ref: Bouguet's rotations; the scale between inner and outer rectangle as OpenCV's ``alpha``.
     """

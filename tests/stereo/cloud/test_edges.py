@@ -53,11 +53,7 @@ def test_a_mixed_column_beside_an_occlusion_goes_too() -> None:
     assert (result.reason[:, 20:30] == Reason.AMBIGUOUS).all()
 
 
-@given(
-    across=st.floats(-0.7, 0.7),
-    down=st.floats(-0.7, 0.7),
-    noise_seed=st.integers(0, 2**16),
-)
+@given(across=st.floats(-0.7, 0.7), down=st.floats(-0.7, 0.7), noise_seed=st.integers(0, 2**16))
 def test_every_slant_below_the_gradient_limit_survives(
     across: float, down: float, noise_seed: int
 ) -> None:

@@ -1,4 +1,4 @@
-"""`recon.stereo.kernels.opposite` in plain numpy: the definition of its results."""
+"""`recon.stereo.kernels.finish` in plain numpy: the definition of its results."""
 
 from __future__ import annotations
 

@@ -24,12 +24,7 @@ def make_points_reference(maps: Maps, rules: PointRules) -> Points:
     colours = maps.colours[rows, columns]
     return Points(
         xyz=np.stack(
-            [
-                (columns - rules.cx) * z / rules.focal,
-                (rows - rules.cy) * z / rules.focal,
-                z,
-            ],
-            axis=1,
+            [(columns - rules.cx) * z / rules.focal, (rows - rules.cy) * z / rules.focal, z], axis=1
         ).astype(np.float32),
         normals=_normals(maps.values, (rows, columns), rules)
         if rules.radius

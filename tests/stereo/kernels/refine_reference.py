@@ -11,10 +11,8 @@ from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.refine import (
     AMBIGUOUS,
     BORDER,
-    EQUIANGULAR,
     LEFT_RIGHT,
     LOW_TEXTURE,
-    NO_FIT,
     OCCLUDED,
     OUT_OF_RANGE,
     SIGMA_LARGEST_PX,
@@ -83,13 +81,10 @@ def _chosen_beside(right_winner: NDArray[np.uint16], rules: Rules) -> NDArray[np
 
 
 def _offsets(
-    best: NDArray[Any], before: NDArray[Any], after: NDArray[Any], fit: int
+    best: NDArray[Any], before: NDArray[Any], after: NDArray[Any], fit: bool
 ) -> NDArray[np.float64]:
-    if fit == NO_FIT:
-        return np.zeros(best.shape)
-    lines, parabola = np.maximum(before, after) - best, before + after - 2.0 * best
-    steepness = lines if fit == EQUIANGULAR else parabola
-    return np.where(steepness > 0, 0.5 * (before - after) / steepness, 0.0)
+    slope = np.maximum(before, after) - best
+    return np.where(fit & (slope > 0), 0.5 * (before - after) / slope, 0.0)
 
 
 def _sigmas(

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from recon.stereo.kernels.minima import Minima
 from recon.stereo.kernels.path_costs import Views, Window
-from recon.stereo.kernels.path_rows import Paths
+from recon.stereo.kernels.paths import Paths
 from recon.stereo.kernels.plane_minima import PARTS, Band
 from tests.stereo.kernels.sad_reference import minima_reference
 

@@ -1,4 +1,4 @@
-"""`recon.stereo.kernels.speckle` in plain Python: the definition of its results."""
+"""`recon.stereo.kernels.finish` in plain Python: the definition of its results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 def find_speckles_reference(
     values: NDArray[np.float32], largest_step: float, smallest_size: int
 ) -> NDArray[np.bool_]:
-    """As `recon.stereo.kernels.speckle.find_speckles`, by flooding one region after the other."""
+    """As `recon.stereo.kernels.finish.find_speckles`, by flooding one region after the other."""
     small = np.zeros(values.shape, np.bool_)
     todo = np.isfinite(values)
     while todo.any():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.stereo.kernels.opposite import average_opposite
+from recon.stereo.kernels.finish import average_opposite
 from tests.stereo.kernels.opposite_reference import average_opposite_reference
 
 maps = hnp.arrays(

@@ -20,7 +20,7 @@ from recon.stereo.kernels.half_windows import (
 )
 from recon.stereo.kernels.minima import NO_COST, Minima, empty_minima
 from recon.stereo.kernels.sad import sad_minima
-from recon.stereo.kernels.simd import LANES
+from recon.stereo.kernels.simd.vectors import LANES
 from recon.stereo.kernels.tiles import Tiles, make_tiles
 from tests.stereo.kernels.sad_reference import sad_minima_reference
 

@@ -12,17 +12,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.stereo.kernels.census import Descriptor
 from recon.stereo.kernels.minima import Minima, empty_minima
 from recon.stereo.kernels.path_costs import (
     Views,
     Window,
-    column_offsets,
     empty_planes,
     scaled_window,
     write_views,
 )
-from recon.stereo.kernels.path_rows import Paths
+from recon.stereo.kernels.paths import Paths
 from recon.stereo.kernels.semi_global import (
     ROWS,
     Scratch,
@@ -39,10 +37,8 @@ Image = NDArray[np.uint8]
 def make_views(left: Image, right: Image, window: Window, paths: Paths) -> Views:
     for image in (left, right):
         image.flags.writeable = False  # as those of a pair: kernels are compiled for them
-    descriptor = Descriptor(127, 1, 2)
-    views = Views(left, *empty_planes(*left.shape, descriptor.planes, window.radius, paths.ndisp))
-    offsets = column_offsets(window, paths.ndisp, paths.minimum)
-    write_views(right, descriptor, offsets, range(len(left)), views)
+    views = Views(left, *empty_planes(*left.shape, window.radius, paths.ndisp))
+    write_views(right, window.radius, paths.minimum, range(len(left)), views)
     return views
 
 
@@ -81,7 +77,7 @@ def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
     p1, more = draw(st.tuples(st.integers(1, 40), st.integers(0, 80)))
     # The largest that a path cost leaves: cost + P1 + P2 <= 254.
     top = 254 - 2 * p1 - more
-    window = scaled_window(radius, rows_radius, cap, cap + 14, top / (cap + 14))
+    window = scaled_window(radius, rows_radius, cap, cap + 24, top / (cap + 24))
     paths = Paths(
         ndisp=draw(st.sampled_from([1, 2, 3, 4, 5, 17, 70, 260])),
         minimum=draw(st.integers(-6, 6)),
@@ -119,10 +115,8 @@ def test_strips_that_overlap_wholly_do_not_change_the_result(
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
 def test_images_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
-    paths, window = (
-        Paths(4, 0, 10, 50, 20, 12, overlap=4, side_overlap=4),
-        scaled_window(2, 2, 16, 30, 3.0),
-    )
+    paths = Paths(4, 0, 10, 50, 20, 12, overlap=4, side_overlap=4)
+    window = scaled_window(2, 2, 16, 40, 3.0)
     minima = search(make_views(grey, grey, window, paths), window, paths)
     assert (minima.winner == 0).all()
     assert (minima.right_winner == 0).all()
@@ -132,10 +126,8 @@ def test_few_rows_of_overlap_change_little() -> None:
     rng = np.random.default_rng(0)
     left = rng.integers(0, 256, (80, 60), dtype=np.uint8)
     right = np.roll(left, -5, axis=1)
-    paths, window = (
-        Paths(16, 0, 10, 50, 20, 12, overlap=8, side_overlap=8),
-        scaled_window(1, 1, 16, 30, 3.0),
-    )
+    paths = Paths(16, 0, 10, 50, 20, 12, overlap=8, side_overlap=8)
+    window = scaled_window(1, 1, 16, 40, 3.0)
     views = make_views(left, right, window, paths)
     whole, strips = search(views, window, paths), search(views, window, paths, strips=4)
     assert (whole.winner == strips.winner).mean() > 0.99
@@ -150,7 +142,7 @@ def test_an_image_of_several_blocks_equals_the_reference(
     rng = np.random.default_rng(1)
     left, right = rng.integers(0, 256, (2, *shape), dtype=np.uint8)
     paths = Paths(9, -2, 10, 50, 20, 12, overlap=max(overlap, shape[0]), side_overlap=70)
-    window = scaled_window(1, 2, 16, 30, 3.0)
+    window = scaled_window(1, 2, 16, 40, 3.0)
     views = make_views(left, right, window, paths)
     expected = semi_global_minima_reference(views, window, paths)
     assert_equal(search(views, window, paths, strips=2), expected)
@@ -167,7 +159,7 @@ def test_bands_equal_the_reference_that_begins_paths_at_their_sides(
     left, right = rng.integers(0, 256, (2, rows, 300), dtype=np.uint8)
     right[:, :200] = left[:, 20:220]
     paths = Paths(70, minimum, 10, 50, 20, 12, overlap=rows, side_overlap=side_overlap)
-    window = scaled_window(2, 2, 16, 30, 3.0)
+    window = scaled_window(2, 2, 16, 40, 3.0)
     views = make_views(left, right, window, paths)
     for strips, columns in ((1, 64), (2, 128)):
         bands = bands_of(300, columns, window, paths)

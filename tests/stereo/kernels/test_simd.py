@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 from numba import njit
 from numba.core.errors import TypingError
 
-from recon.stereo.kernels import simd
-from recon.stereo.kernels.simd import LANES, transpose
+from recon.stereo.kernels.simd import vectors as simd
+from recon.stereo.kernels.simd.vectors import LANES, transpose
 
 KINDS = (np.uint8, np.uint16)
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from recon.stereo.kernels.speckle import find_speckles
+from recon.stereo.kernels.finish import find_speckles
 from tests.stereo.kernels.speckle_reference import find_speckles_reference
 
 maps = hnp.arrays(

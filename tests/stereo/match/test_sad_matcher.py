@@ -13,14 +13,7 @@ from recon.core.values.arrays import Float32, Float64
 from recon.stereo.match import sad
 from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import usual_ndisp
-from tests.stereo.match.images import (
-    HEIGHT,
-    WIDTH,
-    inner,
-    make_pair,
-    noise,
-    warped_pair,
-)
+from tests.stereo.match.images import HEIGHT, WIDTH, inner, make_pair, noise, warped_pair
 
 PLAIN = SadSettings(ndisp=32)
 

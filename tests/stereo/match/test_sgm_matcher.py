@@ -61,15 +61,7 @@ def test_brightness_and_contrast_of_one_camera_matter_little() -> None:
     assert (np.abs(inner(values) - 9) < 0.5).mean() > 0.97
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"window_px": 4},
-        {"p1": 70.0},
-        {"window_px": 33},
-        {"p2": 10.0},
-    ],
-)
+@pytest.mark.parametrize("wrong", [{"window_px": 4}, {"p1": 70.0}, {"window_px": 33}, {"p2": 10.0}])
 def test_settings_that_do_not_fit_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(SettingsError):
         SgmSettings.parse(wrong)

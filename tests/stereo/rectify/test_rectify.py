@@ -71,9 +71,7 @@ def raw_pixels(camera: CameraIntrinsics, xyz: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0, None])
-def test_a_point_lies_on_one_row_and_its_disparity_gives_its_depth(
-    alpha: float | None,
-) -> None:
+def test_a_point_lies_on_one_row_and_its_disparity_gives_its_depth(alpha: float | None) -> None:
     calibration = rig()
     settings = RectificationSettings(alpha=alpha)
     camera, (left, right) = plan_rectification(calibration, settings)

@@ -6,12 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.street.kernels.noise import (
-    MAX_TAPS,
-    fractal_noise,
-    lattice_values,
-    value_noise,
-)
+from recon.street.kernels.surface import MAX_TAPS, fractal_noise, lattice_values, value_noise
 
 coordinate = st.floats(-500.0, 500.0, allow_nan=False)
 

@@ -16,11 +16,7 @@ from recon.street.kernels.surface import (
 
 
 def describe_hits_reference(
-    table: SurfaceTable,
-    faces: np.ndarray,
-    origin: np.ndarray,
-    directions: np.ndarray,
-    pixel: float,
+    table: SurfaceTable, faces: np.ndarray, origin: np.ndarray, directions: np.ndarray, pixel: float
 ) -> SurfaceHits:
     """Return what `describe_hits` does, in plain numpy and all points at once."""
     plane = table.normal[faces]

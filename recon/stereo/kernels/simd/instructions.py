@@ -15,7 +15,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, typing
 from numba.extending import lower_builtin, models, register_model, type_callable
 
 from recon.stereo.kernels.simd.vectors import (
@@ -35,6 +35,7 @@ from recon.stereo.kernels.simd.vectors import (
     splat,
     store,
     store_row,
+    transpose,
     where_equal,
     where_less,
     widen,
@@ -54,20 +55,18 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
     """Represents a vector by LLVM's vector type."""
 
     def __init__(self, manager: Any, vector: _Vector) -> None:
-        super().__init__(manager, vector, llvm_type(vector.element.bitwidth))
+        super().__init__(manager, vector, _llvm_type(vector.element.bitwidth))
 
 
-def llvm_type(bits: int, lanes: int = LANES) -> ir.VectorType:
+def _llvm_type(bits: int, lanes: int = LANES) -> ir.VectorType:
     """Return LLVM's type of a vector of so many bits a lane."""
     return ir.VectorType(ir.IntType(bits), lanes)
 
 
-def compiled_as(function: Callable[..., Any], typer: Callable[..., Any]) -> Callable[..., Any]:
+def _compiled_as(function: Callable[..., Any], typer: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a function that emits LLVM instructions in place of a function of vectors.
 
-    Args:
-        function: The function in plain numpy.
-        typer: Gives the type of its result, from those of its arguments.
+    ``typer`` gives the type of its result, from those of its arguments.
     """
     type_callable(function)(lambda context: typer)
     return lower_builtin(function, types.VarArg(types.Any))  # type: ignore[no-any-return]
@@ -104,7 +103,7 @@ def _write_difference(builder: Any, a: Any, b: Any) -> Any:
 
 
 def _write_mean(builder: Any, a: Any, b: Any) -> Any:
-    wide = llvm_type(16)
+    wide = _llvm_type(16)
     one = ir.Constant(wide, [1] * LANES)
     total = builder.add(builder.add(builder.zext(a, wide), builder.zext(b, wide)), one)
     return builder.trunc(builder.lshr(total, one), a.type)
@@ -128,9 +127,9 @@ _binary(absolute_difference, _write_difference)
 
 
 def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
-    kind = llvm_type(value.type.width, lanes)
+    kind = _llvm_type(value.type.width, lanes)
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
-    return builder.shuffle_vector(one, one, ir.Constant(llvm_type(32, lanes), [0] * lanes))
+    return builder.shuffle_vector(one, one, ir.Constant(_llvm_type(32, lanes), [0] * lanes))
 
 
 def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
@@ -139,7 +138,7 @@ def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: A
     return builder.bitcast(builder.gep(array.data, [arguments[1]]), kind.as_pointer())
 
 
-def address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
+def _address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
     """Address, as of some type, of an element: arguments are the array, the row and the column."""
     rows = context.make_array(signature.args[0])(context, builder, arguments[0])
     n, at = (
@@ -150,7 +149,7 @@ def address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, k
     return builder.bitcast(builder.gep(rows.data, [start]), kind.as_pointer())
 
 
-def type_in_row(rows: Any, n: Any, at: Any) -> Any:
+def _type_in_row(rows: Any, n: Any, at: Any) -> Any:
     """Return the type of a vector in an array of rows; None = the array does not fit."""
     # The address is computed for a C-ordered array.
     fits = isinstance(rows, types.Array) and rows.ndim == 1 + 1 and rows.layout == "C"
@@ -158,35 +157,31 @@ def type_in_row(rows: Any, n: Any, at: Any) -> Any:
 
 
 def _store_type(rows: Any, n: Any, at: Any, lanes: Any) -> Any:
-    return types.none if lanes == type_in_row(rows, n, at) else None
+    return types.none if lanes == _type_in_row(rows, n, at) else None
 
 
-@compiled_as(load_row, type_in_row)
-def _load_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    kind = llvm_type(signature.return_type.element.bitwidth)
-    return builder.load(address_in_row(context, builder, signature, arguments, kind), align=1)
+def _load_from(address: Callable[..., Any]) -> Callable[..., Any]:
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = _llvm_type(signature.return_type.element.bitwidth)
+        return builder.load(address(context, builder, signature, arguments, kind), align=1)
+
+    return emit
 
 
-@compiled_as(store_row, _store_type)
-def _store_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    lanes = arguments[3]
-    address = address_in_row(context, builder, signature, arguments, lanes.type)
-    builder.store(lanes, address, align=1)
-    return context.get_dummy_value()
+def _store_at(address: Callable[..., Any]) -> Callable[..., Any]:
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        lanes = arguments[-1]
+        where = address(context, builder, signature, arguments, lanes.type)
+        builder.store(lanes, where, align=1)
+        return context.get_dummy_value()
+
+    return emit
 
 
-@compiled_as(load, lambda array, at: _Vector(array.dtype))
-def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    kind = llvm_type(signature.return_type.element.bitwidth)
-    return builder.load(_address(context, builder, signature, arguments, kind), align=1)
-
-
-@compiled_as(store, lambda array, at, lanes: types.none)
-def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    lanes = arguments[2]
-    address = _address(context, builder, signature, arguments, lanes.type)
-    builder.store(lanes, address, align=1)
-    return context.get_dummy_value()
+_compiled_as(load, lambda array, at: _Vector(array.dtype))(_load_from(_address))
+_compiled_as(store, lambda array, at, lanes: types.none)(_store_at(_address))
+_compiled_as(load_row, _type_in_row)(_load_from(_address_in_row))
+_compiled_as(store_row, _store_type)(_store_at(_address_in_row))
 
 
 def _vector_of(value: types.Integer) -> _Vector:
@@ -194,62 +189,111 @@ def _vector_of(value: types.Integer) -> _Vector:
     return _Vector(value)
 
 
-@compiled_as(splat, _vector_of)
+@_compiled_as(splat, _vector_of)
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return _write_splat(builder, arguments[0], LANES)
 
 
-@compiled_as(ramp, lambda first: _Vector(types.uint16))
+@_compiled_as(ramp, lambda first: _Vector(types.uint16))
 def _ramp(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     start = _write_splat(builder, arguments[0], LANES)
-    return builder.add(start, ir.Constant(llvm_type(16), list(range(LANES))))
+    return builder.add(start, ir.Constant(_llvm_type(16), list(range(LANES))))
 
 
-@compiled_as(where_equal, lambda a, b, then, otherwise: then)
-def _where_equal(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    a, b, then, otherwise = arguments
-    return builder.select(builder.icmp_unsigned("==", a, b), then, otherwise)
+def _select_where(sign: str) -> Callable[..., Any]:
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        a, b, then, otherwise = arguments
+        return builder.select(builder.icmp_unsigned(sign, a, b), then, otherwise)
+
+    return emit
 
 
-@compiled_as(where_less, lambda a, b, then, otherwise: then)
-def _where_less(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    a, b, then, otherwise = arguments
-    return builder.select(builder.icmp_unsigned("<", a, b), then, otherwise)
+_compiled_as(where_equal, lambda a, b, then, otherwise: then)(_select_where("=="))
+_compiled_as(where_less, lambda a, b, then, otherwise: then)(_select_where("<"))
 
 
-@compiled_as(widen, lambda lanes, array: _Vector(array.dtype))
+@_compiled_as(widen, lambda lanes, array: _Vector(array.dtype))
 def _widen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.zext(arguments[0], llvm_type(signature.return_type.element.bitwidth))
+    return builder.zext(arguments[0], _llvm_type(signature.return_type.element.bitwidth))
 
 
-@compiled_as(narrow, lambda lanes: _Vector(types.uint8))
+@_compiled_as(narrow, lambda lanes: _Vector(types.uint8))
 def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.trunc(arguments[0], llvm_type(8))
+    return builder.trunc(arguments[0], _llvm_type(8))
 
 
-@compiled_as(broadcast_smallest, lambda lanes: lanes)
+@_compiled_as(broadcast_smallest, lambda lanes: lanes)
 def _broadcast_smallest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     # A butterfly of exchanges between ever nearer lanes, which stays in registers.
     found, turn = arguments[0], LANES // 2
     while turn:
         order = [lane ^ turn for lane in range(LANES)]
-        found = _intrinsic("umin")(builder, found, shuffle(builder, found, found, order))
+        found = _intrinsic("umin")(builder, found, _shuffle(builder, found, found, order))
         turn //= 2
     return found
 
 
-def shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
+def _shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
     """Return lanes of two vectors in some order; ``LANES`` is the first lane of the second one."""
-    return builder.shuffle_vector(a, b, ir.Constant(llvm_type(32), order))
+    return builder.shuffle_vector(a, b, ir.Constant(_llvm_type(32), order))
 
 
 _binary(
     put_before,
-    lambda builder, lanes, before: shuffle(
+    lambda builder, lanes, before: _shuffle(
         builder, before, lanes, list(range(LANES - 1, 2 * LANES - 1))
     ),
 )
 _binary(
     put_after,
-    lambda builder, lanes, after: shuffle(builder, lanes, after, list(range(1, LANES + 1))),
+    lambda builder, lanes, after: _shuffle(builder, lanes, after, list(range(1, LANES + 1))),
 )
+
+
+def _transpose_type(rows: Any, n: Any, at: Any, out: Any, m: Any, to: Any) -> Any:
+    fits = all(_type_in_row(*part) for part in ((rows, n, at), (out, m, to)))
+    fits = fits and rows.dtype == out.dtype == types.uint8
+    return types.none if fits else None
+
+
+@_compiled_as(transpose, _transpose_type)
+def _transpose(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def address(row: int, part: slice) -> Any:
+        """Return where a row of a block begins, given by array, first row and first column."""
+        (array, n, at), (rows, kind, column) = arguments[part], signature.args[part]
+        first = context.cast(builder, n, kind, types.intp)
+        place = builder.add(first, first.type(row))
+        types_of = typing.signature(types.none, rows, types.intp, column)
+        return _address_in_row(context, builder, types_of, (array, place, at), _llvm_type(8))
+
+    block = [builder.load(address(row, slice(3)), align=1) for row in range(LANES)]
+    for row, lanes in enumerate(_write_transposed(builder, block)):
+        builder.store(lanes, address(row, slice(3, 6)), align=1)
+    return context.get_dummy_value()
+
+
+def _write_transposed(builder: Any, block: list[Any]) -> list[Any]:
+    """Transpose a square of bytes."""
+    # First the quarters of the square change places. Then the halves of all vectors are interleaved
+    # lane by lane, each half by itself: no instruction has to move lanes between halves.
+    half = LANES // 2
+    low = [*range(half), *range(LANES, LANES + half)]
+    pairs = list(zip(block[:half], block[half:], strict=True))
+    block = [_shuffle(builder, a, b, low) for a, b in pairs]
+    block += [_shuffle(builder, a, b, [lane + half for lane in low]) for a, b in pairs]
+    dealt = [[n for i in range(8) for n in (part + i, LANES + part + i)] for part in (0, half)]
+    first, second = dealt[0] + dealt[1], [n + 8 for n in dealt[0] + dealt[1]]
+    return [
+        lanes
+        for part in (block[:half], block[half:])
+        for lanes in _write_dealt(builder, part, first, second)
+    ]
+
+
+def _write_dealt(builder: Any, part: list[Any], first: list[int], second: list[int]) -> list[Any]:
+    """Interleave one half of the vectors with the other until each holds one lane of all."""
+    half = len(part) // 2
+    for _ in range(half.bit_length()):
+        pairs = zip(part[:half], part[half:], strict=True)
+        part = [_shuffle(builder, a, b, order) for a, b in pairs for order in (first, second)]
+    return part

@@ -112,14 +112,5 @@ def broadcast_smallest(vector: Vector) -> Vector:
 
 
 def transpose(rows: NDArray[Any], n: int, at: int, out: NDArray[Any], m: int, to: int) -> None:
-    """Write a block of `LANES` by `LANES` bytes, transposed, to another array.
-
-    Args:
-        rows: uint8 (N, C).
-        n: First row of the block.
-        at: Its first column.
-        out: uint8 (M, D), written.
-        m: First row of the transposed block.
-        to: Its first column.
-    """
+    """Write a block of `LANES` by `LANES` bytes at (n, at), transposed, to ``out`` at (m, to)."""
     out[m : m + LANES, to : to + LANES] = rows[n : n + LANES, at : at + LANES].T

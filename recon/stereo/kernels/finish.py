@@ -1,61 +1,39 @@
-"""Speckles: small connected regions of a disparity map."""
+"""What is done with disparities once they are found: speckles are marked, neighbours averaged."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Bool, Float32, Int32, UInt8, kernel
 
 
 class _Runs(NamedTuple):
     """Connected pixels of a row: run ``n`` is ``starts[n]`` to ``ends[n] - 1``.
 
     There is memory for as many runs as pixels; pages that are never touched cost nothing.
-
-    Attributes:
-        starts: int32 (N,), indices into the flattened map.
-        ends: int32 (N,).
-        parents: int32 (N,), an earlier run of the same region, or for the root itself.
-        sizes: int32 (N,), for a root, pixels of its region.
     """
 
-    starts: NDArray[np.int32]
-    ends: NDArray[np.int32]
-    parents: NDArray[np.int32]
-    sizes: NDArray[np.int32]
+    starts: Int32  # (N,), indices into the flattened map
+    ends: Int32  # (N,)
+    parents: Int32  # (N,), an earlier run of the same region, or for the root itself
+    sizes: Int32  # (N,), for a root, pixels of its region
 
 
 class _Row(NamedTuple):
-    """The runs of a row.
+    """The runs of a row."""
 
-    Attributes:
-        runs: int32 (W,), the run of each pixel that has a value.
-        breaks: uint8 (W,), 1 where a pixel does not belong to the run of the one before.
-    """
-
-    runs: NDArray[np.int32]
-    breaks: NDArray[np.uint8]
+    runs: Int32  # (W,), the run of each pixel that has a value
+    breaks: UInt8  # (W,), 1 where a pixel does not belong to the run of the one before
 
 
 @kernel
-def find_speckles(
-    values: NDArray[np.float32], largest_step: float, smallest_size: int
-) -> NDArray[np.bool_]:
-    """Mark the pixels of regions that are too small.
+def find_speckles(values: Float32, largest_step: float, smallest_size: int) -> Bool:
+    """Return bool (H, W), the pixels of connected regions of fewer than ``smallest_size``.
 
-    Two neighbours (left, right, above, below) belong to one region when both have a value and
-    the values differ by ``largest_step`` or less.
-
-    Args:
-        values: float32 (H, W); NaN = no value.
-        largest_step: In the unit of ``values``.
-        smallest_size: Regions of fewer pixels are marked.
-
-    Returns:
-        bool (H, W); False where there is no value.
+    Two neighbours (left, right, above, below) belong to one region when both have a value (not
+    NaN) and the values differ by ``largest_step`` or less.
 
     Ref: union-find with path halving, R. Sedgewick, K. Wayne, "Algorithms", 4th ed., 1.5; runs as
     nodes, L. He, Y. Chao, K. Suzuki, "A run-based two-scan labeling algorithm", IEEE Transactions
@@ -81,7 +59,7 @@ def find_speckles(
 
 @kernel
 def _cut_row(
-    row: NDArray[np.float32], place: int, step: np.float32, runs: _Runs, count: int, here: _Row
+    row: Float32, place: int, step: np.float32, runs: _Runs, count: int, here: _Row
 ) -> int:
     """Append the runs of a row to the ``count`` there are; return how many there are then."""
     breaks, width = here.breaks, row.size
@@ -103,22 +81,14 @@ def _cut_row(
 
 
 @kernel
-def _mark_touching(
-    one: NDArray[np.float32], other: NDArray[np.float32], step: np.float32, marks: NDArray[np.uint8]
-) -> None:
+def _mark_touching(one: Float32, other: Float32, step: np.float32, marks: UInt8) -> None:
     """Mark the pixels whose values differ by a step or less. No comparison with NaN is true."""
     for x in range(one.size):
         marks[x] = np.uint8(1) if abs(one[x] - other[x]) <= step else np.uint8(0)
 
 
 @kernel
-def _join_rows(
-    touches: NDArray[np.uint8],
-    parents: NDArray[np.int32],
-    above: _Row,
-    here: _Row,
-    joins: NDArray[np.uint8],
-) -> None:
+def _join_rows(touches: UInt8, parents: Int32, above: _Row, here: _Row, joins: UInt8) -> None:
     """Join the runs of a row with those of the row above, where their pixels touch."""
     # Along two runs that touch, one join does: where either begins, or where they begin to touch.
     before, begins, begins_above = touches[:-1], here.breaks[1:], above.breaks[1:]
@@ -132,7 +102,7 @@ def _join_rows(
 
 
 @kernel
-def _mark_small(runs: _Runs, count: int, smallest_size: int, small: NDArray[np.bool_]) -> None:
+def _mark_small(runs: _Runs, count: int, smallest_size: int, small: Bool) -> None:
     """Mark the runs of regions of fewer pixels."""
     parents = runs.parents
     for run in range(count):
@@ -145,7 +115,7 @@ def _mark_small(runs: _Runs, count: int, smallest_size: int, small: NDArray[np.b
 
 
 @kernel
-def _join(parents: NDArray[np.int32], one: int, other: int) -> None:
+def _join(parents: Int32, one: int, other: int) -> None:
     """Give two regions one root: the smaller index."""
     a, b = _root(parents, one), _root(parents, other)
     if a < b:
@@ -155,9 +125,55 @@ def _join(parents: NDArray[np.int32], one: int, other: int) -> None:
 
 
 @kernel
-def _root(parents: NDArray[np.int32], node: int) -> int:
+def _root(parents: Int32, node: int) -> int:
     """Return the root of a node's region; every step halves the path for the next call."""
     while parents[node] != node:
         parents[node] = parents[parents[node]]
         node = parents[node]
     return node
+
+
+@kernel
+def average_opposite(
+    values: Float32, radius: int, largest_step: float, first: int, end: int, averages: Float32
+) -> None:
+    """Average each pixel of some rows with the pairs of opposite neighbours that are near it.
+
+    A pair is a neighbour and its mirror image about the pixel; it counts where both are within
+    the square of half width ``radius`` and within the image, have a value, and differ from the
+    pixel's by ``largest_step`` or less. On a plane the mean of a pair is the pixel's own value, so
+    slopes are preserved even beside holes and steps, where a mean over all neighbours would be
+    biased. Only the fields of a chessboard that have the pixel's colour are used: the noise of
+    neighbours is correlated, so the others would add little for twice the time.
+    """
+    height, width = values.shape
+    step = np.float32(largest_step)
+    count = np.empty(width, np.float32)
+    for y in range(first, end):
+        row, total = values[y], averages[y]
+        total[:] = row
+        count[:] = np.float32(1)
+        for dy in range(min(radius, y, height - 1 - y) + 1):
+            before, after = values[y - dy], values[y + dy]
+            for dx in range((dy - radius) % 2 - radius if dy else 2, radius + 1, 2):
+                # The pixels whose two neighbours lie within the row.
+                start, stop = min(abs(dx), width), max(width - abs(dx), 0)
+                _add_pair(
+                    before[start - dx :], after[start + dx :], row[start:stop], step,
+                    total[start:stop], count[start:stop],
+                )  # fmt: skip
+        for x in range(width):
+            total[x] /= count[x]
+
+
+@kernel
+def _add_pair(
+    one: Float32, other: Float32, row: Float32, step: np.float32, total: Float32, count: Float32
+) -> None:
+    """Add one pair of neighbours of each pixel of a row. No comparison with NaN is true."""
+    zero, two = np.float32(0), np.float32(2)
+    for x in range(row.size):
+        a, b, centre = one[x], other[x], row[x]
+        near = (abs(a - centre) <= step) & (abs(b - centre) <= step)
+        total[x] += a + b if near else zero
+        count[x] += two if near else zero
