@@ -25,12 +25,16 @@ from recon.core.text import refuse_other_numbers
 class Settings(BaseModel):
     """Immutable settings of one stage.
 
-    Subclasses give each field a default, a unit in its name and a ``Field(description=…)``
-    with its bounds. Equal settings give equal results: environment variables have no effect.
+    Subclasses give each field a default, a unit in its name, a ``Field`` with its bounds, and a
+    docstring below it. Equal settings give equal results: environment variables have no effect.
     """
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+        frozen=True,
+        extra="forbid",
+        validate_default=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
     )
 
     @model_validator(mode="before")

@@ -67,15 +67,14 @@ class Cut:
     def submap_of_frame(self, drives: Sequence[int]) -> NDArray[np.int64]:
         """Return int64 (N,), number of the submap of each frame; -1 between two drives.
 
-        Args:
-            drives: Number of submaps of each drive; empty = all are of one.
+        ``drives`` is the number of submaps of each drive; empty = all are of one.
         """
         found = np.repeat(np.arange(len(self.frames)), self.frames)
         ends = np.searchsorted(found, np.cumsum(drives, dtype=np.int64)[:-1])
         return np.insert(found, ends, -1)
 
     def to_tree(self) -> dict[str, Any]:
-        """Return everything, as a tree of plain values."""
+        """Return all of it as plain values."""
         return {
             "frames": self.frames,
             "known": sorted(self.known),
@@ -85,7 +84,7 @@ class Cut:
 
     @classmethod
     def joined(cls, trees: Iterable[Mapping[str, Any]]) -> Cut:
-        """Return the cut of all submaps, from what `to_tree` gave of their parts in order."""
+        """Return the cut of all submaps, from the `to_tree` of their parts in order."""
         whole = cls()
         for tree in trees:
             (x0, y0), (x1, y1) = tree["extent"]
@@ -99,16 +98,11 @@ class Cut:
 class Cutter:
     """Cuts submaps into tiles, each with the margin that its points and grid cells depend on.
 
-    Args:
-        config: The configuration.
-        T_map_world: float64 (4, 4), from world to map axes.
-        halvings: How often the tiles of the configuration are halved.
-
     Attributes:
         edge_cells: Side of a tile in voxels; a power of two, at least 8.
         edge_m: Side of a tile.
         grid_margin_m: Margin of the occupancy.
-        limit_bytes: Largest size of a tile in memory, if it could be smaller.
+        limit_bytes: Largest size of a tile in memory; None = it cannot be smaller.
     """
 
     def __init__(self, config: DriveSettings, T_map_world: Float64, halvings: int = 0) -> None:
@@ -139,13 +133,10 @@ class Cutter:
         *,
         first: int = 0,
     ) -> Cut:
-        """Cut submaps; it ends early where a tile does not fit into memory.
+        """Cut consecutive submaps; it ends early where a tile does not fit into memory.
 
-        Args:
-            submaps: Consecutive submaps.
-            parts: Where the pieces go.
-            T_corrected_world: float64 (S, 4, 4), a rigid correction of each; None = none.
-            first: Number of the first one in its map.
+        ``T_corrected_world`` is float64 (S, 4, 4), a rigid correction of each; ``first`` the number
+        of the first one in its map.
         """
         cut = Cut()
         for place, submap in enumerate(submaps):
@@ -165,7 +156,6 @@ class Cutter:
         return np.asarray((part.blocks + 0.5) * (BLOCK_EDGE * self._config.occupancy.resolution_m))
 
     def _moved(self, submap: Submap, T_corrected_world: Float64 | None) -> Submap:
-        """Return a submap with its correction applied."""
         if T_corrected_world is None or np.array_equal(T_corrected_world, np.eye(4)):
             return submap
         config = self._config
@@ -185,7 +175,6 @@ class Cutter:
 
 
 def _extent(part: OccupancyPart) -> tuple[TileKey, TileKey]:
-    """Return the extent of the cells of a part; empty if it has none."""
     columns = part.cells[:, :2]
     if not len(columns):
         return (0, 0), (0, 0)
@@ -210,12 +199,7 @@ TileKey = tuple[int, int]
 class TileParts:
     """Numbered parts of several kinds in each tile, in a file; others' files can be looked into.
 
-    Args:
-        edge_m: Side of a tile.
-        path: The file, which `save` makes readable for others; None = a temporary one.
-
-    Attributes:
-        edge_m: Side of a tile.
+    ``path`` is the file, which `save` makes readable for others; None = a temporary one.
     """
 
     def __init__(self, edge_m: float, path: Path | None = None) -> None:
@@ -304,12 +288,7 @@ class TileParts:
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangle of the map.
-
-    Attributes:
-        low: Smallest x and y, metres.
-        high: Largest x and y, metres.
-    """
+    """A rectangle of the map seen from above: smallest and largest x and y, metres."""
 
     low: tuple[float, float]
     high: tuple[float, float]

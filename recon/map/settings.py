@@ -22,28 +22,22 @@ from recon.stereo.frame import StereoSettings
 class CheckpointSettings(Settings):
     """How often the map is committed while a drive is mapped; does not change results."""
 
-    every_frames: int = Field(
-        50, ge=1, le=1_000_000, description="Number of frames between two checkpoints."
-    )
+    every_frames: int = Field(50, ge=1, le=1_000_000)
+    """Number of frames between two checkpoints."""
 
 
 class LoopSettings(Settings):
     """Loop closure: recognising a place, verifying it and correcting the path."""
 
-    enabled: bool = Field(
-        True,
-        description="Look for loops and close them. Turn it off where the path has none, for "
-        "speed.",
-    )
+    enabled: bool = True
+    """Look for loops and close them. Turn it off where the path has none, for speed."""
 
 
 class DriveSettings(StereoSettings):
     """Everything that determines the map of a drive."""
 
-    map_filters: FilterSettings = Field(
-        default=FilterSettings(radius_m=0.3),
-        description="Filters of the fused cloud on export, in this order; none turns one off.",
-    )
+    map_filters: FilterSettings = FilterSettings(radius_m=0.3)
+    """Filters of the fused cloud on export, in this order; none turns one off."""
     odometry: OdometrySettings = OdometrySettings()
     loops: LoopSettings = LoopSettings()
     axes: AxesSettings = AxesSettings()

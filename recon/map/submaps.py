@@ -1,8 +1,7 @@
 """Submaps: consecutive frames with their part of the fused cloud and of the occupancy.
 
-A submap is built in the world of the odometry. Without corrections, all submaps together are the
-map that one long drive would have given; where loop closure moves a submap, its voxels are moved
-with it, and nothing has to be matched again.
+A submap is built in the world of the odometry. Where loop closure moves it, its voxels are moved
+with it, and nothing is matched again; without corrections the submaps together are one long drive.
 """
 
 from __future__ import annotations
@@ -28,37 +27,20 @@ _MAX_FRAMES: Final = 100
 class SubmapSettings(Settings):
     """Where a drive is divided into submaps, and into which tiles its map.
 
-    Both bound the memory; apart from rounding they change no result, except where a vehicle turned
+    Both bound the memory. Apart from rounding they change no result, except where a vehicle turned
     back and saw something on its own track: whether that came later is known by submaps.
     """
 
-    length_m: float = Field(
-        25.0,
-        ge=0.1,
-        le=10_000.0,
-        description="Path after which a new submap begins. Shorter ones bend better with closed "
-        "loops and take less memory.",
-    )
-    tile_m: float = Field(
-        50.0,
-        ge=5.0,
-        le=10_000.0,
-        description="Edge of the tiles, rounded to whole voxels. Smaller ones take less memory, "
-        "and more time.",
-    )
+    length_m: float = Field(25.0, ge=0.1, le=10_000.0)
+    """Path after which a new submap begins. Shorter ones bend better with closed loops and take
+    less memory."""
+    tile_m: float = Field(50.0, ge=5.0, le=10_000.0)
+    """Edge of the tiles, rounded to whole voxels. Smaller ones take less memory, and more time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """What consecutive frames saw.
-
-    Attributes:
-        index: Number of the submap in its drive, from 0.
-        first_frame: Number of its first frame.
-        frames: Number of its frames.
-        fused: Its part of the fused cloud, world axes.
-        occupancy: Its part of the occupancy, map axes.
-    """
+    """What consecutive frames saw: ``fused`` in world axes, ``occupancy`` in map axes."""
 
     index: int
     first_frame: int
@@ -73,14 +55,7 @@ class Submap:
         voxel_m: float,
         resolution_m: float,
     ) -> Submap:
-        """Return the submap after a correction of its pose.
-
-        Args:
-            T_corrected_world: float64 (4, 4), from the world of the odometry to the corrected one.
-            T_map_world: float64 (4, 4), from world to map axes.
-            voxel_m: Edge of a voxel of the fused cloud.
-            resolution_m: Edge of a cell of the occupancy.
-        """
+        """Return the submap after a correction of its pose."""
         T_corrected_map = T_map_world @ T_corrected_world @ invert(T_map_world)
         return replace(
             self,
@@ -89,7 +64,7 @@ class Submap:
         )
 
     def to_tree(self) -> dict[str, Any]:
-        """Return everything, as a tree of arrays and plain values."""
+        """Return all of it as a tree of arrays and plain values."""
         return {
             "index": self.index,
             "first_frame": self.first_frame,
@@ -113,12 +88,7 @@ class Submap:
 class SubmapBuilder:
     """Builds the submaps of a drive, one after the other.
 
-    Args:
-        settings: Where to cut.
-        fusion: How to fuse.
-        occupancy: How clouds become occupancy.
-        T_map_world: float64 (4, 4), from world to map axes.
-        max_bytes: Size of a submap at which a new one begins; None = no limit.
+    At ``max_bytes`` a new submap begins; None = no limit.
     """
 
     def __init__(
@@ -147,13 +117,7 @@ class SubmapBuilder:
     def integrate(
         self, cloud_world: PointCloud, cloud_camera: PointCloud, T_world_camera: Float64
     ) -> None:
-        """Add what one frame saw.
-
-        Args:
-            cloud_world: What is fused, world axes.
-            cloud_camera: What occupies and frees space, camera axes.
-            T_world_camera: float64 (4, 4).
-        """
+        """Add a frame: ``cloud_world`` is fused, ``cloud_camera`` occupies and frees space."""
         self._fused.integrate(cloud_world)
         self._occupancy.integrate(cloud_camera, T_world_camera)
         place = T_world_camera[:3, 3]

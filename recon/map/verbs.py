@@ -1,4 +1,4 @@
-"""A map with what is done with it: merge it, cut it into tiles, find a pair in it."""
+"""`recon.Map`: a map file with what is done with it: merge, cut into tiles, find a pair."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
@@ -43,21 +42,16 @@ _TRIALS: Final = 300
 class AxesSettings(Settings):
     """Where the map has its origin."""
 
-    origin: Literal["camera", "ground"] = Field(
-        "camera",
-        description="Origin of the map: the first left camera, or the ground below it, so that "
-        "z = 0 is on the ground at the start.",
-    )
+    origin: Literal["camera", "ground"] = "camera"
+    """Origin of the map: the first left camera, or the ground below it, so that z = 0 is on the
+    ground at the start."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundPlane:
     """The ground below a camera, in its axes: the points with ``normal · xyz = -height_m``.
 
-    Attributes:
-        normal: float64 (3,), unit length, upward.
-        height_m: Height of the camera above the plane.
-        inliers: Number of points that support it.
+    ``normal``, float64 (3,), has unit length and points up; ``inliers`` points support it.
     """
 
     normal: Float64
@@ -76,17 +70,12 @@ class GroundPlane:
 def map_axes(
     ground: GroundPlane | None, settings: AxesSettings, camera_height_m: float | None = None
 ) -> Float64:
-    """Return ``T_map_world``, from world to map axes.
+    """Return ``T_map_world``, float64 (4, 4), from world to map axes.
 
-    Args:
-        ground: The ground below the first camera, or None (not found).
-        settings: Where the origin is.
-        camera_height_m: Known height of the camera above the ground; None = that of ``ground``.
-
-    Returns:
-        float64 (4, 4). Without a ground, or with a tilt below the limit, exactly
-        x_map = z_world, y_map = -x_world, z_map = -y_world; else also turned the short way so
-        that the ground's normal is z_map. With its origin on the ground, also moved up along z.
+    Without a ground below the first camera (None), or with a tilt below the limit, exactly x_map =
+    z_world, y_map = -x_world, z_map = -y_world; else also turned the short way so that the ground's
+    normal is z_map. With its origin on the ground, also moved up along z, by ``camera_height_m`` or
+    else by the height above the plane.
     """
     turn = AXES_MAP_WORLD
     if ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
@@ -103,14 +92,13 @@ def map_axes(
 def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
     """Return ``T_base_camera``, from the left camera to the base of the vehicle (`base_link`).
 
-    The base has the axes of the map in the first frame (x forward, y left, z up), and its origin
-    on the ground below the camera; in the camera where its height is not known (None).
+    The base has the axes of the map in the first frame (x forward, y left, z up), and its origin on
+    the ground below the camera; in the camera where its height is not known (None).
     """
     return make_transform(T_map_world[:3, :3], np.array([0.0, 0.0, camera_height_m or 0.0]))
 
 
 def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
-    """Return how far the ground is below the camera, along z of the map."""
     if ground is None:
         raise MappingError(
             "the first frame shows no ground to put the map's origin on",
@@ -120,14 +108,10 @@ def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
 
 
 def estimate_ground(cloud: PointCloud) -> GroundPlane | None:
-    """Find the plane that the camera stands above: RANSAC, then least squares.
+    """Find the plane that the camera stands above in a cloud of one frame, camera axes.
 
-    Args:
-        cloud: Points of one frame in camera axes.
-
-    Returns:
-        The plane below the camera, within 30 degrees of level, with the most support; or
-        None. The same cloud gives the same plane.
+    RANSAC, then least squares: the plane within 30 degrees of level with the most support, or None.
+    The same cloud gives the same plane.
 
     Ref: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981.
     """

@@ -2,8 +2,8 @@
 
 A camera that looks ahead never sees the ground on which it starts, and what passed in front of it
 may have left hits. But where a vehicle drives there is nothing else, from the ground to the height
-of its camera and as wide as it is. That is an observation of free space at that time: it counts
-more than what was seen before, and less than what is seen on a later visit.
+of its camera and as wide as it is. That counts more than what was seen before, and less than what
+is seen on a later visit.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ _STEADY: Final = 0.8
 class DrivenPath:
     """The path of the camera in small steps, where its poses are trusted; map axes.
 
-    Attributes:
-        points_m: float64 (P, 3).
-        submap: int (P,), number of the submap of each point.
+    ``points_m`` is float64 (P, 3), ``submap`` int64 (P,) the number of the submap of each point.
     """
 
     points_m: Float64
@@ -43,14 +41,7 @@ class DrivenPath:
     def through(
         cls, path_m: Float64, trusted: Bool, submap: NDArray[np.int64], step_m: float
     ) -> DrivenPath:
-        """Fill in the path between neighbouring poses that are both trusted.
-
-        Args:
-            path_m: float64 (N, 3), positions of the camera, map axes; N >= 1.
-            trusted: bool (N,).
-            submap: int (N,), submap of each frame.
-            step_m: Largest distance between points.
-        """
+        """Fill in the path (N, 3) between neighbouring poses that are both trusted."""
         length_m = np.linalg.norm(np.diff(path_m, axis=0), axis=1)
         joined = trusted[:-1] & trusted[1:]
         steps = np.where(joined, np.ceil(length_m / step_m), 1).astype(np.int64).clip(min=1)
@@ -70,9 +61,8 @@ class DrivenPath:
 def is_driven(drops_m: Float64, camera_height_m: float) -> bool:
     """Return whether something carries the camera over the ground; a drone does not.
 
-    Args:
-        drops_m: float64 (C,), heights of the path above what was seen below it, place by place.
-        camera_height_m: Height of the camera above the ground; NaN = unknown.
+    ``drops_m`` (C,) are heights of the path above what was seen below it, place by place; a
+    ``camera_height_m`` of NaN is unknown.
     """
     if not np.isfinite(camera_height_m):
         return False
@@ -81,18 +71,11 @@ def is_driven(drops_m: Float64, camera_height_m: float) -> bool:
 
 
 def sweep(points_m: Float64, ground: GroundSurface, width_m: float, resolution_m: float) -> Int32:
-    """Return the voxels that a vehicle took up.
+    """Return the voxels that a vehicle took up, int32 (N, 3), each once.
 
-    Args:
-        points_m: float64 (P, 3), its path, in steps of at most half a voxel; map axes.
-        ground: The ground. Where something else than the ground was seen below the path, nothing
-            is taken up.
-        width_m: Its width.
-        resolution_m: Edge of a voxel.
-
-    Returns:
-        int32 (N, 3), each once: the columns that the path crosses and those with their centre
-        within half a width of it, from the ground up to the camera.
+    They are the columns that the path crosses and those with their centre within half a ``width_m``
+    of it, from the ground up to the camera; none where something else than the ground was seen
+    below it. ``points_m`` is its path, (P, 3), in steps of at most half a voxel; map axes.
     """
     columns, top_m = _columns(points_m[_on_ground(points_m, ground)], width_m, resolution_m)
     floor_m = ground.height_at((columns + 0.5) * resolution_m)

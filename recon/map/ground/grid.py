@@ -25,65 +25,30 @@ many cells, unless they touch a free one."""
 class GridSettings(Settings):
     """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
 
-    min_height_m: float = Field(
-        0.3,
-        ge=0.0,
-        le=10.0,
-        description="Lower end of the band in which obstacles are looked for: what the vehicle can "
-        "drive over.",
-    )
-    max_height_m: float = Field(
-        2.0,
-        ge=0.01,
-        le=100.0,
-        description="Upper end of the band: what is higher is passed under. The height of the "
-        "vehicle.",
-    )
-    free_height_m: float = Field(
-        0.8,
-        ge=0.01,
-        le=100.0,
-        description="Free voxels below this height make a cell free; higher ones may be seen "
-        "over an obstacle that hides what is behind it. About half the height of the camera.",
-    )
-    occupied_probability: float = Field(
-        0.55,
-        ge=0.5,
-        lt=1.0,
-        description="Voxels at least this probable are obstacles. Raise it for fewer false ones.",
-    )
-    free_probability: float = Field(
-        0.35,
-        gt=0.0,
-        le=0.5,
-        description="Voxels at most this probable are free. Lower it to drive only where it is "
-        "sure.",
-    )
-    min_blob_cells: int = Field(
-        3,
-        ge=1,
-        le=100_000_000,
-        description="Connected blocked cells fewer than this are taken for noise. 1 keeps thin "
-        "posts.",
-    )
-    vehicle_width_m: float = Field(
-        0.6,
-        ge=0.0,
-        le=10.0,
-        description="Width of what carried the camera: cells that it passed over are free; 0 = "
-        "only what was seen is free.",
-    )
+    min_height_m: float = Field(0.3, ge=0.0, le=10.0)
+    """Lower end of the band in which obstacles are looked for: what the vehicle can drive over."""
+    max_height_m: float = Field(2.0, ge=0.01, le=100.0)
+    """Upper end of the band: what is higher is passed under. The height of the vehicle."""
+    free_height_m: float = Field(0.8, ge=0.01, le=100.0)
+    """Free voxels below this height make a cell free; higher ones may be seen over an obstacle that
+    hides what is behind it. About half the height of the camera."""
+    occupied_probability: float = Field(0.55, ge=0.5, lt=1.0)
+    """Voxels at least this probable are obstacles. Raise it for fewer false ones."""
+    free_probability: float = Field(0.35, gt=0.0, le=0.5)
+    """Voxels at most this probable are free. Lower it to drive only where it is sure."""
+    min_blob_cells: int = Field(3, ge=1, le=100_000_000)
+    """Connected blocked cells fewer than this are taken for noise. 1 keeps thin posts."""
+    vehicle_width_m: float = Field(0.6, ge=0.0, le=10.0)
+    """Width of what carried the camera: cells that it passed over are free; 0 = only what was seen
+    is free."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
     """What the voxels of each column say; all bool (rows, columns).
 
-    Attributes:
-        blocked: Surely occupied in the height band.
-        seen_through: Free, low enough.
-        hit: Hit in the band, surely or not.
-        low_hit: The same, as low as what frees.
+    ``blocked``: surely occupied in the height band. ``seen_through``: free, low enough. ``hit``:
+    hit in the band, surely or not. ``low_hit``: the same, as low as what frees.
     """
 
     blocked: Bool
@@ -95,22 +60,14 @@ class _Found:
 def flatten(
     voxels: OccupancyVoxels, ground: GroundSurface, settings: GridSettings
 ) -> OccupancyGrid:
-    """Flatten an occupancy map.
+    """Flatten an occupancy map to a grid with the resolution of the voxels that spans all of them.
 
     A cell is occupied where an occupied voxel lies in the height band above the ground of that
     place. It is free where nothing is occupied and a free voxel lies low enough. That the ground
-    was seen is no proof: it is also seen below a parked car. Where voxels in the band were hit,
-    but none surely, it belongs to the obstacle beside it if nothing free is beside it: no ray
-    came out between the two; and it is not free if it lies beside an obstacle and was hit as low
-    as it is free. Everything else, and every cell without a known ground, is unknown.
-
-    Args:
-        voxels: The observed voxels, map axes.
-        ground: Height of the ground, map axes.
-        settings: Band and thresholds.
-
-    Returns:
-        A grid with the resolution of the voxels that spans all of them.
+    was seen is no proof: it is also seen below a parked car. Where voxels in the band were hit, but
+    none surely, it belongs to the obstacle beside it if nothing free is beside it: no ray came out
+    between the two; and it is not free if it lies beside an obstacle and was hit as low as it is
+    free. Everything else, and every cell without a known ground, is unknown.
     """
     if len(voxels) == 0:
         raise MappingError("nothing was observed: there is no map to flatten")
@@ -142,7 +99,6 @@ def flatten(
 
 
 def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
-    """Return int8 (rows, columns), what each cell is."""
     blocked = _without_small_blobs(found.blocked, s.min_blob_cells)
     free = found.seen_through & ~blocked & ~(found.low_hit & _beside(blocked))
     unsure = found.hit & ~free & ~_beside(free)
@@ -158,8 +114,8 @@ def ground_depths(
 ) -> Float64:
     """Return how far occupied voxels of the ground lie below it; float64 (N,), metres.
 
-    Nothing but ground is there, and as far as it is seen too low, it is seen too high elsewhere:
-    by its roughness, by noise, and because a voxel stands for all within it.
+    Nothing but ground is there, and as far as it is seen too low, it is seen too high elsewhere: by
+    its roughness, by noise, and because a voxel stands for all within it.
     """
     if len(voxels) == 0:
         return np.zeros(0)

@@ -1,9 +1,9 @@
 """The ground along a drive: a height map near the path that follows slopes and drift.
 
 A drive of some hundred metres is never level: one degree of pitch in the first frame is three
-metres after 170 m. So heights above ground are not heights above a plane. The surface starts
-below the path, one camera height down, and grows outward ring by ring; each cell of a ring
-searches for ground only near the height of its inner neighbours.
+metres after 170 m. So the surface starts below the path, one camera height down, and grows outward
+ring by ring; each cell of a ring searches for ground only near the height of its inner neighbours.
+Farther away, occupancy voxels show the ground, less precisely.
 """
 
 from __future__ import annotations
@@ -50,20 +50,12 @@ _MAX_GAP_M: Final = 4.0
 class GroundSettings(Settings):
     """How the ground is followed."""
 
-    reach_m: float = Field(
-        25.0,
-        ge=0.1,
-        le=500.0,
-        description="How far from the path the surface grows, and with it the grid. Raise it with "
-        "occupancy.max_range_m.",
-    )
-    camera_height_m: float | None = Field(
-        None,
-        ge=0.01,
-        le=100.0,
-        description="Height of the camera above ground; none = measured. Set it where the ground "
-        "near the path is not seen.",
-    )
+    reach_m: float = Field(25.0, ge=0.1, le=500.0)
+    """How far from the path the surface grows, and with it the grid. Raise it with
+    occupancy.max_range_m."""
+    camera_height_m: float | None = Field(None, ge=0.01, le=100.0)
+    """Height of the camera above ground; none = measured. Set it where the ground near the path is
+    not seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +83,9 @@ class GroundSurface:
         freeze(self, "drops_m", np.float64, self.heights_m.shape)
 
     def height_at(self, xy: NDArray[Any]) -> Float64:
-        """Return height of the ground at places (N, 2), metres; float64 (N,), NaN = unknown.
+        """Return the height of the ground at places (N, 2), bilinear between centres of cells.
 
-        Bilinear between the centres of cells; unknown where the cell of the place itself is.
+        NaN where the height of the cell of the place itself is unknown.
         """
         place = (np.asarray(xy, dtype=np.float64) - self.origin_m) / self.cell_m
         column, row = place[:, 0], place[:, 1]
@@ -128,16 +120,13 @@ class GroundSurface:
 def estimate_ground_surface(
     cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
 ) -> GroundSurface:
-    """Follow the ground along a path and to its sides.
+    """Follow the ground along a path and to its sides; unknown everywhere without ground below it.
 
     Args:
         cloud: The fused cloud in map axes (z up). With normals, only points that face up count.
         positions_m: float (N, 3), positions of the camera, map axes; N ≥ 1. A row of NaN separates
             pieces of a path.
         settings: How to follow it.
-
-    Returns:
-        The surface; unknown everywhere when no ground was found below the path.
     """
     field = _field(cloud, positions_m, settings)
     camera_height = settings.camera_height_m or field.camera_height()
@@ -155,13 +144,10 @@ def estimate_ground_surface(
 def measure_camera_height(
     cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
 ) -> tuple[float, Float64]:
-    """Measure the height of the camera above the ground along a path.
+    """Return the commonest height of the camera above the ground, and that in cells of the path.
 
-    Takes and raises what `estimate_ground_surface` does.
-
-    Returns:
-        The commonest height, NaN where no ground was found; and the commonest one in each cell of
-        the path that has points below it, float64 (C,).
+    NaN where no ground was found; cells, float64 (C,), are those with points below the path. Takes
+    what `estimate_ground_surface` does.
     """
     field = _field(cloud, positions_m, settings)
     drops = field.drops()
@@ -277,7 +263,6 @@ class _Field:
         return np.asarray(mean.reshape(self.heights.shape))
 
     def _points(self, cloud: PointCloud) -> tuple[NDArray[np.intp], Float64]:
-        """Return cell and height of each point that may be ground."""
         xyz = cloud.xyz.astype(np.float64)
         if cloud.normals is not None:
             upright = math.cos(math.radians(MAX_TILT_DEG))
@@ -344,14 +329,9 @@ def find_floors(voxels: OccupancyVoxels) -> Float32:
 
 
 def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
-    """Return a cloud to look for ground in: its points, and floors where it has too few.
+    """Return a cloud to look for ground in: its points, and floors (N, 3) where it has too few.
 
-    Args:
-        cloud: The fused cloud in map axes.
-        floors: float32 (N, 3), as `find_floors` gives them.
-
-    Returns:
-        Points, and normals if the cloud has them (straight up for voxels); frame of the cloud.
+    It has normals if the cloud has them, straight up for floors.
     """
     known = cloud.xyz
     if cloud.normals is not None:

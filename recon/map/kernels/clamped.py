@@ -92,16 +92,10 @@ def make_clamped(rows: int) -> ClampedBlocks:
 def add_evidence(
     blocks: ClampedBlocks, evidence: Blocks, lowest: float, highest: float
 ) -> ClampedBlocks:
-    """Add a frame's evidence to the map; clear the evidence for the next frame.
+    """Add a frame's evidence to the map, and clear it; return the stores that hold the map.
 
-    Args:
-        blocks: The map; written, or replaced by larger stores where they are full.
-        evidence: What the frame says; empty afterwards.
-        lowest: Log-odds never fall below.
-        highest: Log-odds never rise above.
-
-    Returns:
-        The stores that hold the map.
+    The map is written, or replaced by larger stores where it is full; its log-odds stay between
+    ``lowest`` and ``highest``.
     """
     blocks = reserve(blocks, int(blocks.used[0]) + int(evidence.used[0]), make_clamped)
     # Plain tuples: numba's cache on disk would remember the classes by name, and break when one
@@ -117,7 +111,6 @@ def _add_evidence(
     lowest: float,
     highest: float,
 ) -> None:
-    """The loop of `add_evidence`; the map has room for every block."""
     table, keys, cells, used = blocks
     frame_table, frame_keys, changes, frame_used = evidence
     lo, hi = np.float32(lowest), np.float32(highest)
@@ -168,12 +161,7 @@ def observed_rows(blocks: ClampedBlocks) -> CellRows:
 def chain_rows(blocks: ClampedBlocks, rows: CellRows) -> ClampedBlocks:
     """Chain a later part of a drive: what it did to each cell is done to the map.
 
-    Args:
-        blocks: The map; written, or replaced by larger stores where they are full.
-        rows: What the later part did.
-
-    Returns:
-        The stores that hold the map.
+    The map is written, or replaced by larger stores where it is full.
     """
     blocks = reserve(blocks, int(blocks.used[0]) + len(rows.blocks), make_clamped)
     _chain_rows(tuple(blocks), tuple(rows))
@@ -182,7 +170,6 @@ def chain_rows(blocks: ClampedBlocks, rows: CellRows) -> ClampedBlocks:
 
 @kernel
 def _chain_rows(blocks: tuple[NDArray[Any], ...], rows: tuple[NDArray[Any], ...]) -> None:
-    """The loop of `chain_rows`; the map has room for every block."""
     table, keys, cells, used = blocks
     new_blocks, starts, columns, values = rows
     for block in range(len(new_blocks)):
@@ -194,9 +181,7 @@ def _chain_rows(blocks: tuple[NDArray[Any], ...], rows: tuple[NDArray[Any], ...]
 def move_blocks(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> ClampedBlocks:
     """The map turned and shifted: each new cell takes what the old cell at its centre has.
 
-    Args:
-        blocks: The map.
-        T_new_old: float64 (4, 4), a rigid motion; its translation is in cells.
+    ``T_new_old`` is a rigid motion with its translation in cells.
     """
     targets = _blocks_reached(blocks, T_new_old)
     moved = make_clamped(max(1, len(targets)))
@@ -221,7 +206,6 @@ def _blocks_reached(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> ND
 def _fill_moved(
     old: tuple[NDArray[Any], ...], new: tuple[NDArray[Any], ...], T_old_new: NDArray[np.float64]
 ) -> None:
-    """Look every new cell up in the old map."""
     table, _, old_cells, _ = old
     _, keys, new_cells, used = new
     last_key, last_row = -1, -1

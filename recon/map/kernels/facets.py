@@ -33,17 +33,14 @@ def crossed_cells(
     """Fit a plane to the points in and around each cell, and test whether it crosses the cell.
 
     The normal is that of the weighted covariance of the points. The plane's distance from the
-    centre of the cell is their weighted mean; points beside the normal count less, by a Gaussian
-    of one cell.
+    centre of the cell is their weighted mean; points beside the normal count less, by a Gaussian of
+    one cell.
 
     Args:
         cells: int32 (N, 3), the cells asked about.
         keys: int64 (M,), packed cells that hold points, each once.
         sums: float32 (M, 4), sum of the weights of their points, above 0, and weighted sums of the
             offsets from the centre of the cell.
-
-    Returns:
-        bool (N,).
     """
     table = make_table(len(keys))
     enter_keys(table, keys)

@@ -79,17 +79,11 @@ def measure_points(
     max_range: float,
     margin: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Turn points of a camera into rays: their ends, and what is known of each.
+    """Turn points (N, 3) of a camera in metres into rays: their ends, and what is known of each.
 
-    A point farther than ``max_range`` is moved along its ray to that range and is no hit.
-
-    Args:
-        xyz: float32 (N, 3), camera axes, metres.
-        sigma: float32 (N,), standard deviation of the depth, metres.
-        confidence: float32 (N,), passed through.
-        T: float64 (4, 4), from camera axes in metres to cells of the map: a rotation times a scale.
-        max_range: Range of a hit, in cells.
-        margin: Standard deviations before a point where free space ends.
+    A point farther than ``max_range`` is moved along its ray to that range and is no hit. Free
+    space ends ``margin`` standard deviations before a point. ``T`` is from camera axes to cells of
+    the map, a rotation times a scale.
 
     Returns:
         float32 (N, 3), ends in cells of the map, and float32 (N, 4): standard deviation of the
@@ -112,7 +106,6 @@ def _measure_points(
     limits: tuple[float, float, float],
     out: tuple[NDArray[np.float32], NDArray[np.float32]],
 ) -> None:
-    """The loop of `measure_points`."""
     scale, max_range, margin = limits
     ends, values = out
     for n in range(len(xyz)):
@@ -140,20 +133,11 @@ def limit_points(
     beyond: float,
     margin: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Move points that are out of range along their rays to a common distance.
+    """Move points (N, 3) out of range along their rays to the distance ``beyond``.
 
     They are no hits anyway, and at one distance they can be averaged. A ray must stay free as far
-    as before, so the uncertainty of a point shrinks by as much as it moves, down to none.
-
-    Args:
-        xyz: float32 (N, 3), camera axes.
-        sigma: float32 (N,), standard deviation of the depth, same unit.
-        max_range: Points up to here stay as they are.
-        beyond: Where the others are moved to, not below ``max_range``.
-        margin: Standard deviations before a point where free space ends.
-
-    Returns:
-        Points float32 (N, 3) and standard deviations float32 (N,).
+    as before, up to ``margin`` standard deviations before its point, so the standard deviation of
+    the depth shrinks by as much as the point moves, down to none.
     """
     moved, left = xyz.copy(), sigma.copy()
     _limit_points(moved, left, (max_range, beyond, margin))
@@ -164,7 +148,6 @@ def limit_points(
 def _limit_points(
     xyz: NDArray[np.float32], sigma: NDArray[np.float32], limits: tuple[float, float, float]
 ) -> None:
-    """The loop of `limit_points`, in place."""
     max_range, beyond, margin = limits
     for n in range(len(xyz)):
         x, y, z = np.float64(xyz[n, 0]), np.float64(xyz[n, 1]), np.float64(xyz[n, 2])
@@ -201,20 +184,13 @@ def cell_in_block(i: int, j: int, k: int) -> int:
 
 
 def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
-    """Collect the evidence of the rays of one frame.
+    """Collect the evidence of the rays of one frame; return the stores that hold it.
 
-    The cells that a ray leaves before its length reaches ``free`` are missed. Where it hits,
-    the cells that touch ``length ± spread·sigma`` get ``hit`` times the share of the normal
-    distribution between the ray's entry and exit. Of several hits the largest counts, of
-    several misses the strongest, and a hit outweighs misses; so the order of rays is irrelevant.
-
-    Args:
-        evidence: Written, or replaced by larger stores where they are full.
-        rays: The rays, all finite; a ray of zero length says nothing.
-        spread: Half width of the zone of a hit, in standard deviations.
-
-    Returns:
-        The stores that hold the evidence.
+    The cells that a ray leaves before its length reaches ``free`` are missed. Where it hits, the
+    cells that touch ``length ± spread·sigma`` get ``hit`` times the share of the normal
+    distribution between the ray's entry and exit. Of several hits the largest counts, of several
+    misses the strongest, and a hit outweighs misses; so the order of rays is irrelevant. A ray of
+    zero length says nothing.
     """
     done = 0
     while True:

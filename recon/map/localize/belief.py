@@ -24,10 +24,10 @@ ones are beyond."""
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Where the camera is.
+    """Where the camera is, in the world of the map.
 
     Attributes:
-        T_world_camera: float64 (4, 4), in the world of the map.
+        T_world_camera: float64 (4, 4).
         corrected: float64 (6, 6), covariance of a step (translation in metres, rotation vector in
             radians) in camera axes, without the drift since the last correction.
         path_m: Path since the last correction.
@@ -61,12 +61,9 @@ class Belief:
         return self.sigma_m <= MAX_SIGMA_M and self.sigma_deg <= MAX_SIGMA_DEG
 
     def moved(self, T_before_now: Float64, covariance: Float64, path_m: float) -> Belief:
-        """Return the belief after a motion.
+        """Return the belief after a motion by odometry; the covariance is in the new camera axes.
 
-        Args:
-            T_before_now: float64 (4, 4), the motion by odometry.
-            covariance: float64 (6, 6) of it, in the axes of the camera now.
-            path_m: Its length, as drift counts it.
+        ``path_m`` is its length, as drift counts it.
         """
         turn = adjoint(invert(T_before_now))
         spread = turn @ self.corrected @ turn.T + covariance

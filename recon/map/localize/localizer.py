@@ -117,8 +117,8 @@ class Localizer:
 
     Visual odometry predicts each pose; features of the nearest views of the map, and its surfaces,
     correct it, by their covariances. A pose is given out only while it is certain; where nothing
-    corrects it, that is as far as odometry drifts by so much, some metres. Where frames are
-    matched roughly, since time is short, one view corrects them; surfaces do only if none is found.
+    corrects it, that is as far as odometry drifts by so much, some metres. Where frames are matched
+    roughly, since time is short, one view corrects them; surfaces do only if none is found.
 
     Args:
         known: The places of the map.
@@ -148,10 +148,8 @@ class Localizer:
     def add(self, frame: OdometryFrame, *, hurried: Callable[[], bool] = lambda: False) -> Located:
         """Locate the next frame.
 
-        Args:
-            frame: The frame.
-            hurried: Asked once odometry has moved it; if True and it is certain enough where that
-                is, the frame is not compared with the map.
+        If ``hurried`` says so once odometry has moved it, and it is certain enough where that is,
+        the frame is not compared with the map.
         """
         visual = self._visual.track(frame)
         self._advance(visual)
@@ -168,7 +166,6 @@ class Localizer:
         return self._result(replace(confirmed, loops=confirmed.loops or (fix,)))
 
     def _advance(self, visual: VisualEstimate) -> None:
-        """Move on by the motion since the last frame."""
         T_now = visual.result.T_world_camera
         seen = visual.information is not None
         steps = np.stack([self._T_odometry, T_now])
@@ -226,7 +223,6 @@ class Localizer:
         return self._surroundings.correct(belief, frame, learn=seen)
 
     def _result(self, confirmed: _Confirmed) -> Located:
-        """Return the result of a frame; a belief that is not certain is given up."""
         belief, seen = confirmed.belief, bool(confirmed.loops) or confirmed.surfaces
         why = "" if seen else confirmed.refused or "no view of the map is near"
         if not belief.certain:
@@ -263,13 +259,7 @@ _NEIGHBOURS: Final = 3
 
 @dataclass(frozen=True, eq=False)
 class _Sight:
-    """A frame, and the views of the map that show the same place.
-
-    Attributes:
-        T_odometry_camera: float64 (4, 4).
-        path_m: Path up to it.
-        loops: From the views to it.
-    """
+    """A frame, where it is by odometry, and the loops to it from views that show the same place."""
 
     T_odometry_camera: Float64
     path_m: float
@@ -280,10 +270,6 @@ class Search:
     """Looks for a drive in a map until enough views of it agree.
 
     Where two places look alike both are found, contradict each other, and neither is believed.
-
-    Args:
-        known: The places of the map.
-        frames: Least number of frames that must agree.
     """
 
     def __init__(self, known: KnownPlaces, frames: int) -> None:
@@ -301,12 +287,8 @@ class Search:
     ) -> list[Loop]:
         """Add the next frame; return its loops that are believed, perhaps none.
 
-        Args:
-            keyframe: The frame.
-            camera: That took it.
-            T_odometry_camera: float64 (4, 4), its pose by odometry.
-            path_m: Path up to it.
-            among: bool (N,), the views that may be compared; None = all.
+        ``path_m`` is the path up to it; ``among``, bool (N,), the views that may be compared, None
+        = all.
         """
         loops = self._loops(keyframe, camera, among)
         self._seen.append(_Sight(T_odometry_camera, path_m, loops))
@@ -317,7 +299,6 @@ class Search:
         self._seen.clear()
 
     def _loops(self, keyframe: Keyframe, camera: RectifiedCamera, among: Bool | None) -> list[Loop]:
-        """Return loops from recognised views and from those around them, each view once."""
         found = {loop.first: loop for loop in self._known.recognise(keyframe, camera, among).loops}
         for loop in list(found.values()):
             T = self._known.T_world_camera[loop.first] @ loop.T_first_last

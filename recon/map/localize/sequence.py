@@ -34,13 +34,7 @@ START_WITHIN_DEG: Final = 60.0
 
 @dataclass(frozen=True)
 class StartPose:
-    """Roughly where a drive begins, in map axes.
-
-    Attributes:
-        x_m: Position.
-        y_m: Position.
-        yaw_deg: Heading, from the x axis to the y axis.
-    """
+    """Roughly where a drive begins, in map axes; the heading is from the x axis to the y axis."""
 
     x_m: float
     y_m: float
@@ -57,14 +51,7 @@ class StartPose:
 
 @dataclass(frozen=True, eq=False)
 class LocalizedFrame:
-    """Where one frame is; a `Step` of the progress of a run.
-
-    Attributes:
-        index: Number of the frame in the drive.
-        time_s: Its time.
-        seconds: Time that locating it took, without matching.
-        located: Its state, pose and covariance.
-    """
+    """Where one frame is; a `Step` of progress. ``seconds`` is without matching."""
 
     index: int
     time_s: float
@@ -105,12 +92,9 @@ class LocalizedFrame:
 
 @dataclass(frozen=True, eq=False)
 class LocalizedDrive:
-    """A drive in a map.
+    """A drive in a map: all its frames in order, and the seconds from the first to the last.
 
-    Attributes:
-        frames: One for each frame of the drive, in order.
-        T_map_world: float64 (4, 4), from the world of the map to its axes.
-        seconds: Time from the first frame to the last.
+    ``T_map_world``, float64 (4, 4), is from the world of the map to its axes.
     """
 
     frames: tuple[LocalizedFrame, ...]
@@ -175,13 +159,7 @@ class LocalizedDrive:
 def open_localizer(
     map_: MapFile, config: DriveSettings, *, start: StartPose | None = None
 ) -> Localizer:
-    """Make ready to find a drive in a map.
-
-    Args:
-        map_: The map.
-        config: The settings of the drive.
-        start: Where it begins, roughly; None = anywhere.
-    """
+    """Make ready to find a drive in a map, which begins roughly at ``start``; None = anywhere."""
     known = known_places(map_)
     among = None
     if start is not None:
@@ -206,12 +184,7 @@ def localize_sequence(
 ) -> LocalizedDrive:
     """Find all frames of a source in a map, which is not changed.
 
-    Args:
-        source: The drive; its rig may be another than that of the map.
-        workspace: The map, threads and stopwatch.
-        config: The settings of the drive.
-        start: Where it begins, roughly; None = anywhere.
-        progress: Shown each frame.
+    The rig may be another than that of the map; ``start`` is as for `open_localizer`.
     """
     map_, watch = workspace.map, workspace.stopwatch
     localizer = open_localizer(map_, config, start=start)
@@ -255,22 +228,13 @@ def _located(
 
 
 def _turned_back(yaw_deg: float) -> Float64:
-    """Return float64 (2, 2), that turns rows (x, y) back by a heading."""
     c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     return np.array([[c, -s], [s, c]])
 
 
 @dataclass(frozen=True, eq=False)
 class LocalizeRun:
-    """Results of a run.
-
-    Attributes:
-        name: Display name of the source.
-        map_name: Display name of the map.
-        drive: Where its frames are in the map.
-        grid: The grid of the map; None = the run of the map has none.
-        summary: The figures of ``summary.json``.
-    """
+    """Results of a run; the grid is None where that of the map has none."""
 
     name: str
     map_name: str

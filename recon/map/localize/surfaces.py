@@ -61,14 +61,9 @@ class Fit:
 
 
 def describe_surfaces(xyz: Float64, edge_m: float) -> Surfaces:
-    """Fit a surface to the points in each cell of a cloud.
+    """Fit a surface to the points in each cell of a cloud (N, 3).
 
-    Args:
-        xyz: float64 (N, 3).
-        edge_m: Edge of a cell.
-
-    Ref:
-        Biber and Straßer, "The normal distributions transform", IROS 2003.
+    Ref: Biber and Straßer, "The normal distributions transform", IROS 2003.
     """
     keys, cell, count = np.unique(_keys(xyz, edge_m), return_inverse=True, return_counts=True)
     means = _sums(cell, xyz, len(keys)) / count[:, None]
@@ -131,7 +126,6 @@ def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]
 
 
 def _keys(xyz: Float64, edge_m: float) -> NDArray[np.int64]:
-    """Return int64 (N,), the packed cell of each point."""
     return pack_keys(np.floor(xyz / edge_m).astype(np.int64))
 
 

@@ -1,4 +1,8 @@
-"""The surfaces of a map around a pose, and how kiss-icp would correct the pose by them."""
+"""The surfaces of a map around a pose, and whether a correction by ICP to them is worth applying.
+
+It is if it fits better, is likely, and knows more; and if the surfaces could have refused it: in a
+street they fit as well half a metre on.
+"""
 
 from __future__ import annotations
 
@@ -55,11 +59,8 @@ _ASIDE: Final = SIGMAS * np.repeat([MAX_SIGMA_M, np.deg2rad(MAX_SIGMA_DEG)], 3)
 class _Part:
     """A submap, and from where it was seen.
 
-    Attributes:
-        session: Its drive.
-        index: Its number there.
-        T_map_submap: float64 (4, 4), from the world of the odometry to that of the map.
-        cameras_m: float64 (N, 3), where its frames were taken, in the world of the map.
+    ``T_map_submap`` is from the world of the odometry to that of the map; ``cameras_m`` (N, 3),
+    where its frames were taken, in the world of the map.
     """
 
     session: Session
@@ -78,12 +79,7 @@ class _Part:
 
 
 class Surroundings:
-    """The fused points of a map around a camera, as a map for kiss-icp.
-
-    Args:
-        map_: The map.
-        max_range_m: Farther points are not used.
-    """
+    """The fused points of a map around a camera, up to a range, as a map for kiss-icp."""
 
     def __init__(self, map_: MapFile, max_range_m: float) -> None:
         self._range_m = max_range_m
@@ -96,12 +92,9 @@ class Surroundings:
         self._measured = 0
 
     def correct(self, belief: Belief, frame: OdometryFrame, *, learn: bool) -> Belief | None:
-        """Return a belief corrected by the surfaces around it; None where they tell nothing.
+        """Return a belief corrected by the surfaces around it; None where they say nothing.
 
-        Args:
-            belief: Where the camera is.
-            frame: What it sees.
-            learn: Whether the belief is good enough to learn the bias of the correction from.
+        From a frame to ``learn`` from, the bias of the correction is learnt.
         """
         points = select_points(frame, self._range_m)
         if len(points) < _MIN_POINTS:
@@ -161,7 +154,6 @@ def contrast(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -
 
 
 def _parts(map_: MapFile, session: Session) -> Iterator[_Part]:
-    """Yield the submaps of a drive whose frames have a place in the map."""
     apart = session.trusted & ~map_.placed[session.number]
     corrections, T_map_session = session.corrections(), map_.T_world_session(session)
     cameras_m = apply(T_map_session, session.trajectory.positions_m)
@@ -226,12 +218,7 @@ class Correction:
 
 
 def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
-    """Return whether ICP improves on its prior.
-
-    Args:
-        correction: How ICP would move the prior.
-        prior_covariance: float64 (6, 6) of a step of the prior, metres and radians.
-    """
+    """Return whether ICP improves on its prior, of which (6, 6) is the covariance of a step."""
     before, after, step = correction.before, correction.after, correction.step
     # A residual that is not known compares as False.
     if not after.residual_m <= (1.0 - _MIN_RESIDUAL_GAIN) * before.residual_m:

@@ -7,10 +7,10 @@ agree. Of a fence one frame hits some cells and looks through others.
 
 So pairs of cells that touch are counted, frame by frame: those that a frame saw differently, and
 those that it would have if each cell had been hit at random, as often as it was. The ratio is 0
-where all is hit or looked through at once and 1 where cells have nothing in common (the join count
+where all is hit or looked through at once, and 1 where cells have nothing in common (the join count
 of spatial statistics). A piece moved if the ratio is small, over all pairs and over those that lie
-one above the other: things that move are upright, and what is entered by one edge first agrees
-from top to bottom.
+one above the other: things that move are upright, and what is entered by one edge first agrees from
+top to bottom.
 
 Ref: P. A. P. Moran, "The interpretation of statistical maps", J. R. Statist. Soc. B 10, 1948.
 """
@@ -50,14 +50,10 @@ _HALF: Final = np.array([s for s in product((-1, 0, 1), repeat=3) if s > (0, 0, 
 
 
 class _Seen(NamedTuple):
-    """What all frames saw.
+    """What all frames saw: of each cell (N,), and of each pair (P,); int64.
 
-    Attributes:
-        hit: int64 (N,), frames that hit each cell.
-        through: int64 (N,), frames that looked through it.
-        runs: int64 (N,), how often hits began.
-        both: int64 (P,), frames that saw both cells of a pair.
-        differed: int64 (P,), those that hit one and looked through the other.
+    ``hit`` and ``through`` count frames, ``runs`` how often hits began; ``both`` counts frames that
+    saw both cells of a pair, ``differed`` those that hit one and looked through the other.
     """
 
     hit: NDArray[np.int64]
@@ -101,7 +97,6 @@ def _pairs(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], Bool]:
 
 
 def _count(cells: int, pairs: NDArray[np.int64], looks: Iterable[Int8]) -> _Seen:
-    """Count what frames saw in cells and pairs."""
     hit, through, runs = (np.zeros(cells, np.int64) for _ in range(3))
     both, differed = np.zeros((2, len(pairs)), np.int64)
     before = np.zeros(cells, np.int8)
@@ -196,12 +191,9 @@ class Looks:
         object.__setattr__(self, "_read", lru_cache(_KEPT_FRAMES)(self.rays))
 
     def at(self, keys: NDArray[np.int64]) -> Iterator[Int8]:
-        """Yield what each frame near some cells saw in them, int8 (N,).
+        """Yield what each frame near some packed cells saw in them, int8 (N,).
 
         1 where it hit something, -1 where it looked through, 0 where it saw neither.
-
-        Args:
-            keys: int64 (N,), packed cells in map axes.
         """
         cells = unpack_keys(keys).astype(np.int64)
         centres = (cells + 0.5) * self.settings.resolution_m

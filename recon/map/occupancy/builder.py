@@ -1,4 +1,8 @@
-"""From clouds and poses to the occupancy of space: log-odds of voxels, by ray casting."""
+"""From clouds and poses to the occupancy of space: log-odds of voxels, by ray casting.
+
+Maps are built from the rays that are kept of each frame, points averaged in small cubes and
+rounded, so that the same map can be built again, and others with other voxels, heights or poses.
+"""
 
 from __future__ import annotations
 
@@ -47,48 +51,26 @@ _MIN_POINTS: Final = 2
 class OccupancySettings(Settings):
     """How clouds become occupancy."""
 
-    resolution_m: float = Field(
-        0.2,
-        ge=0.001,
-        le=10.0,
-        description="Edge of a voxel, and of a cell of the grid. Half of it takes about six times "
-        "the memory.",
-    )
-    max_range_m: float = Field(
-        25.0,
-        ge=0.1,
-        le=1000.0,
-        description="Points farther away hit nothing. Less for short baselines, more for long "
-        "ones.",
-    )
-    rays_per_voxel: int = Field(
-        2,
-        ge=1,
-        le=16,
-        description="Points of a frame are averaged in cubes so many times finer than a voxel. "
-        "Raise it if finer maps shall be made of the run.",
-    )
-    thin_surfaces: bool = Field(
-        default=True,
-        description="Voxels that the surface of the points around them does not cross are "
-        "undecided, however often they were hit. Off gives OctoMap's thicker walls.",
-    )
-    keep_rays: bool = Field(
-        default=True,
-        description="Keep the rays of every frame in the run's folder, for recon occupancy. Off "
-        "saves 0.2 to 0.3 MB per frame.",
-    )
+    resolution_m: float = Field(0.2, ge=0.001, le=10.0)
+    """Edge of a voxel, and of a cell of the grid. Half of it takes about six times the memory."""
+    max_range_m: float = Field(25.0, ge=0.1, le=1000.0)
+    """Points farther away hit nothing. Less for short baselines, more for long ones."""
+    rays_per_voxel: int = Field(2, ge=1, le=16)
+    """Points of a frame are averaged in cubes so many times finer than a voxel. Raise it if finer
+    maps shall be made of the run."""
+    thin_surfaces: bool = True
+    """Voxels that the surface of the points around them does not cross are undecided, however often
+    they were hit. Off gives OctoMap's thicker walls."""
+    keep_rays: bool = True
+    """Keep the rays of every frame in the run's folder, for recon occupancy. Off saves 0.2 to 0.3
+    MB per frame."""
 
 
 class OccupancyBuilder:
-    """Integrates clouds frame by frame into log-odds.
+    """Integrates clouds frame by frame into log-odds, in map axes (z up).
 
-    The points of a frame are first reduced to one ray per voxel that they end in; then each
-    voxel is updated at most once per frame, and a hit outweighs misses (OctoMap's rule).
-
-    Args:
-        settings: How to integrate.
-        T_map_world: float64 (4, 4), from world to map axes (z up).
+    The points of a frame are first reduced to one ray per voxel that they end in; then each voxel
+    is updated at most once per frame, and a hit outweighs misses (OctoMap's rule).
     """
 
     def __init__(self, settings: OccupancySettings, T_map_world: NDArray[Any]) -> None:
@@ -99,12 +81,10 @@ class OccupancyBuilder:
         self._points = voxels.make_sums(_FIRST_POINTS, 0)
 
     def integrate(self, cloud: PointCloud, T_world_camera: NDArray[Any]) -> None:
-        """Add what one frame saw.
+        """Add what one frame saw from the pose ``T_world_camera`` of the camera.
 
-        Args:
-            cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1;
-                ``count`` is the number of points that each stands for, None = 1.
-            T_world_camera: float64 (4, 4), pose of the camera.
+        ``cloud`` is in camera axes; ``sigma_m`` None = exact, ``confidence`` None = 1, and
+        ``count`` is the number of points that each stands for, None = 1.
         """
         check_camera_cloud(cloud)
         _check_pose(T_world_camera, self._settings.resolution_m)
@@ -210,7 +190,6 @@ def check_camera_cloud(cloud: PointCloud) -> None:
 
 
 def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
-    """Refuse a pose that would silently spoil the map."""
     if not np.isfinite(T_world_camera).all():
         raise MappingError("a pose to map is not finite")
     far_m = resolution_m * (voxels.KEY_LIMIT / 2)
@@ -239,11 +218,7 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
     """Average the points of a frame in cubes; points without confidence are dropped.
 
     A point out of the map's range is moved along its ray to just beyond it: it is still no hit, and
-    frees the same space.
-
-    Args:
-        cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1.
-        settings: Of the map.
+    frees the same space. ``cloud`` is as for `OccupancyBuilder.integrate`.
     """
     check_camera_cloud(cloud)
     grain = ray_grain(settings)

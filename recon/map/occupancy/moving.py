@@ -4,18 +4,17 @@ First what may have moved is found. All that a drive saw in a voxel adds up: hit
 passed before and after. Rays of a frame end two standard deviations before what they hit, so what
 is far or uncertain frees nothing near itself. A voxel that a frame hit is not freed by that frame.
 
-One voxel alone tells little. Someone who walks is hit in it nearly as often as it is seen through,
+One voxel alone says little. Someone who walks is hit in it nearly as often as it is seen through,
 and the surface of a wall lies partly in voxels that rays pass. So evidence is averaged over the
 voxels around a point in which there are points. What moved left a whole body where space was free;
-next to what stands, most voxels are surely occupied.
-
-What a later drive looked through is free, however often it was hit before.
+next to what stands, most voxels are surely occupied. What a later drive looked through is free,
+however often it was hit before.
 
 No ray passes some of the places where something moved, such as its last ones in a drive. They touch
-the others, and less is known of them than of what stands, which was seen again and again. So where
-a whole piece of surface was free, what moved grows into voxels that are not surely occupied, if
-half of those beside them at the same height have moved. That is one of two along an upright
-surface; at a straight edge on the ground it is three of eight, and nothing grows.
+the others, and less is known of them than of what stands. So where a whole piece of surface was
+free, what moved grows into voxels that are not surely occupied, if half of those beside them at the
+same height have moved. That is one of two along an upright surface; at a straight edge on the
+ground it is three of eight, and nothing grows.
 
 Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noise are looked
 through as well, but no frame sees a whole piece of them gone. They are contradicted, and stay.
@@ -83,7 +82,7 @@ def find_moved(
     Args:
         points: float64 (N, 3), what the drive fused, map axes.
         sigma_m: float32 (N,), standard deviation of each in a frame.
-        counted: bool (N,), which of them enough frames saw; the voxels of others tell nothing.
+        counted: bool (N,), which of them enough frames saw; the voxels of others do not count.
         voxels: What all drives observed, map axes.
         evidence: The `cell_evidence` of the same drive.
         looks: What single frames of all drives saw.
@@ -150,10 +149,7 @@ def _touching(
 
 
 def _mean_around(wanted: NDArray[np.int64], keys: NDArray[np.int64], values: Float32) -> Float32:
-    """Return float32 (N,), the mean value of the sorted keys that touch each wanted one or are it.
-
-    NaN where there are none.
-    """
+    """Return float32 (N,), mean value of the sorted keys that touch each wanted one, or NaN."""
     total, number = np.zeros((2, len(wanted)), np.float32)
     for stride in _strides(_AROUND):
         place, known = find_keys(wanted + stride, keys)
@@ -163,15 +159,11 @@ def _mean_around(wanted: NDArray[np.int64], keys: NDArray[np.int64], values: Flo
 
 
 def _strides(steps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return int64 (S,), what steps (S, 3) add to a packed cell."""
     return pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64))
 
 
 def _in_reach(places: Float64, reach: Float32, keys: NDArray[np.int64]) -> Bool:
-    """Return bool (N,): places with one of the sorted keys in reach; lengths in cells.
-
-    Only those that touch the cell of the place are looked at.
-    """
+    """Return bool (N,): places with one of the adjacent sorted keys in reach; in cells."""
     cells = np.floor(places).astype(np.int64)
     inside, near = places - cells, np.zeros(len(places), np.bool_)
     for step in _AROUND:
@@ -185,16 +177,10 @@ _EVEN: Final = np.float32(0)
 
 
 def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
-    """Return which points are in free space: their voxel is free, and no occupied one touches it.
+    """Return bool (N,), points (N, 3) whose voxel is free, with no occupied one that touches it.
 
-    Neighbours count because a surface along occupied voxels lies half in free ones.
-
-    Args:
-        points: float32 (N, 3), map axes.
-        voxels: The observed voxels; unobserved space is not free.
-
-    Returns:
-        bool (N,).
+    Neighbours count because a surface along occupied voxels lies half in free ones. Unobserved
+    space is not free.
     """
     cells = np.floor(points / np.float32(voxels.resolution_m)).astype(np.int64)
     keys = pack_keys(voxels.keys)

@@ -1,4 +1,7 @@
-"""The occupancy that one submap saw, to be chained with that of others."""
+"""The occupancy that one submap saw, to be chained with that of others.
+
+The mean position of the hits in each cell decides in which of two cells a surface is.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,9 @@ _UNSURE: Final = np.float32(0.01)
 
 @dataclass(frozen=True, eq=False)
 class OccupancyPart:
-    """The cells that a part of a drive observed, and what it did to the log-odds of each.
+    """The cells that a part of a drive observed, and what it did to the log-odds of each; map axes.
 
-    Attributes:
-        rows: `recon.map.kernels.clamped.CellRows`, cells in map axes.
-        points: Where its hits lie; None = not kept, surfaces are as thick as they were hit.
+    ``points`` is where its hits lie; None = not kept, surfaces are as thick as they were hit.
     """
 
     rows: clamped.CellRows
@@ -62,7 +63,7 @@ class OccupancyPart:
         )
 
     def to_tree(self) -> dict[str, Any]:
-        """Return everything, as a tree of arrays."""
+        """Return all of it as a tree of arrays."""
         points = self.points
         return {
             "rows": self.rows._asdict(),
@@ -98,8 +99,8 @@ class OccupancyPart:
     def voxels(self, resolution_m: float) -> OccupancyVoxels:
         """Return the log-odds of a drive that consists of this part alone.
 
-        A voxel that was hit is undecided unless the surface of the points around it crosses it:
-        the surface is then in the voxel before or behind.
+        A voxel that was hit is undecided unless the surface of the points around it crosses it: the
+        surface is then in the voxel before or behind.
         """
         change, low, high = self.rows.values.T
         cells, log_odds = self.cells, np.minimum(np.maximum(change, low), high)
@@ -142,12 +143,7 @@ def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
 
 
 def free_part(keys: Int32, log_odds: float) -> OccupancyPart:
-    """Return a part after which cells have given log-odds, whatever was known of them before.
-
-    Args:
-        keys: int32 (N, 3), the cells, each once.
-        log_odds: What they have afterwards.
-    """
+    """Return a part after which cells (N, 3), each once, have given log-odds in any case."""
     home = voxels.pack_keys(keys >> raycast.BLOCK_BITS)
     order = np.argsort(home, kind="stable")
     blocks, starts = np.unique(home[order], return_index=True)
@@ -199,11 +195,7 @@ class SurfacePoints:
         return self.select(are_among(home, blocks))
 
     def moved(self, T_new_map: Float64) -> SurfacePoints:
-        """Return the sums after a rigid motion: those of a cell go to that of its moved mean point.
-
-        Args:
-            T_new_map: float64 (4, 4), its translation in cells.
-        """
+        """Return the sums after a rigid motion in cells; a cell moves as its mean point does."""
         weight = self.sums[:, :1]
         centres = voxels.unpack_keys(self.keys) + 0.5
         places = apply(T_new_map, centres + self.sums[:, 1:] / weight)

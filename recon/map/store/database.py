@@ -60,15 +60,10 @@ def make_tables(database: sqlite3.Connection) -> None:
 def insert_record(
     database: sqlite3.Connection, head: tuple[str, str, str, int], content: Sequence[Bytes]
 ) -> None:
-    """Insert a record, in place of one of the same kind and key.
+    """Insert a record (kind, key, tree, checksum), in place of one of the same kind and key.
 
     Bound to a statement, bytes are copied twice, which for a submap is more memory than the submap
     itself; so room is made for them, and they are written into it piece by piece.
-
-    Args:
-        database: The file.
-        head: Kind, key, tree and checksum.
-        content: The bytes of its arrays.
     """
     insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
     if sys.version_info >= (3, 11):
@@ -83,19 +78,9 @@ def insert_record(
 
 
 class Content:
-    """The bytes of a record, read piece by piece, and their checksum so far.
+    """The bytes of a record, read piece by piece, with ``checksum`` so far and bytes ``left``.
 
     Read as one value, they would exist three times: in the database, as bytes, and as arrays.
-
-    Args:
-        database: The file.
-        row: Number of the row.
-        size: Number of bytes.
-        checksum: Checksum of what comes before the bytes.
-
-    Attributes:
-        checksum: Checksum of all so far.
-        left: Number of bytes that are not read.
     """
 
     def __init__(self, database: sqlite3.Connection, row: int, size: int, checksum: int) -> None:

@@ -1,4 +1,4 @@
-"""Occupancy of a drive, made again from the rays that its map kept."""
+"""What the map of finished drives keeps, and their occupancy made again from the kept rays."""
 
 from __future__ import annotations
 
@@ -48,7 +48,6 @@ class CastSubmaps:
         return len(self.session.submaps)
 
     def __getitem__(self, number: int) -> Submap:
-        """Return a submap."""
         session, kept = self.session, self.session.submaps[number]
         T_map_world = session.T_map_world if self.T_map_world is None else self.T_map_world
         poses = self.T_world_camera
@@ -63,14 +62,9 @@ class CastSubmaps:
 def looks_of(
     drives: Iterable[tuple[Session, Float64, Collection[int]]], settings: OccupancySettings
 ) -> Looks | None:
-    """Return what single frames of drives saw, from the rays that their sessions kept.
+    """Return what single frames of drives saw, from their kept rays; None where a drive kept none.
 
-    Args:
-        drives: Each session, its ``T_map_camera`` float64 (N, 4, 4), and the frames to leave out.
-        settings: How rays become occupancy.
-
-    Returns:
-        The looks; None where a drive kept no rays.
+    ``drives`` gives each session, its ``T_map_camera`` (N, 4, 4), and the frames to leave out.
     """
     found: list[tuple[Session, int]] = []
     poses = []
@@ -124,10 +118,6 @@ def keep_map(mapped: MapFile, path: Path) -> None:
     """Write the map of finished drives: path, rays, keyframes, loops, and fused submaps.
 
     Occupancy is left out, since `place_map` makes it from the rays again.
-
-    Args:
-        mapped: The map as it was made.
-        path: The new file.
     """
     with MapFile.create(path) as kept:
         for session in mapped.sessions:
@@ -143,6 +133,5 @@ def keep_map(mapped: MapFile, path: Path) -> None:
 
 
 def _nothing() -> OccupancyPart:
-    """Return occupancy without a cell."""
     blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
     return OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))

@@ -236,10 +236,6 @@ def placed_frames(sessions: Sequence[Session], links: Sequence[Link]) -> dict[in
     Those whose pose is to be trusted; in a map of several drives only those of stretches that
     loops, links or measured positions hold to the longest one of the first drive. Behind a lost
     pose odometry guesses, and a guess does not enter what other drives saw.
-
-    Args:
-        sessions: The drives that share axes.
-        links: The links between them.
     """
     of = {session.number: stretches(session.health) for session in sessions}
     if len(sessions) < 2:
@@ -255,12 +251,7 @@ def placed_frames(sessions: Sequence[Session], links: Sequence[Link]) -> dict[in
 
 
 def doubts_of_drives(sessions: Sequence[Session], placed: Mapping[int, Bool]) -> list[str]:
-    """Return lines of poses that are not to be trusted, and of what has no place after them.
-
-    Args:
-        sessions: The drives that share axes.
-        placed: Which of their frames have a place, see `placed_frames`.
-    """
+    """Return lines of poses that are not to be trusted, and of what has no place after them."""
     lines = []
     for session in sessions:
         of = f"session {session.number} ({session.info.source}): " if len(sessions) > 1 else ""
@@ -310,10 +301,8 @@ def known_places(map_: MapFile) -> KnownPlaces:
 class MapViews(Sequence[KnownView]):
     """What a map can recognise; each view is read when it is asked for.
 
-    Args:
-        map_: The map.
-        sessions: Numbers of the drives to take; None = those that share the axes of the map, as
-            far as they have a place in it.
+    ``sessions`` are the numbers of the drives to take; None = those that share the axes of the map,
+    as far as they have a place in it.
     """
 
     def __init__(self, map_: MapFile, sessions: Collection[int] | None = None) -> None:
@@ -341,7 +330,6 @@ class MapViews(Sequence[KnownView]):
     @overload
     def __getitem__(self, number: slice) -> list[KnownView]: ...
     def __getitem__(self, number: int | slice) -> KnownView | list[KnownView]:
-        """Return a view."""
         if isinstance(number, slice):
             return [self[n] for n in range(*number.indices(len(self)))]
         session, frame = self._keys[number]

@@ -88,7 +88,6 @@ def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
 
 
 def _checked(grain: RayGrain) -> RayGrain:
-    """Return the resolution of rays."""
     sizes_m = (grain.cell_m, grain.unit_m, grain.max_range_m)
     ordered = 0 < min(sizes_m) <= max(sizes_m) <= grain.max_range_m <= FARTHEST_M
     if not (ordered and np.isfinite(sizes_m).all()):
@@ -121,10 +120,8 @@ def loop_in(tree: Mapping[str, Any]) -> Loop:
 class Link:
     """A place that two drives saw.
 
-    Attributes:
-        sessions: Numbers of the two drives.
-        loop: ``first`` is a frame of the first drive, ``last`` one of the second.
-        kept: Whether the pose graph believes it.
+    ``loop.first`` is a frame of the first of ``sessions``, ``loop.last`` one of the second;
+    ``kept`` is whether the pose graph believes it.
     """
 
     sessions: tuple[int, int]
@@ -136,7 +133,7 @@ class Link:
         return replace(self, sessions=(one, other))
 
     def to_tree(self) -> dict[str, Any]:
-        """Return everything, as a tree of arrays and plain values."""
+        """Return all of it as a tree of arrays and plain values."""
         return {"sessions": self.sessions, "loop": asdict(self.loop), "kept": self.kept}
 
     @classmethod

@@ -45,10 +45,8 @@ class Store:
 
     What is put or deleted is on disk, and visible to other programs, when it is committed. A
     program that is killed, or meets a full disk, leaves the last commit. One program writes at a
-    time; others may read meanwhile, and see what was committed when they opened it. Threads of a
-    program share a store.
-
-    Open one with `create`, `open` or `temporary`.
+    time; others may read meanwhile, and see what was committed when they opened it. Threads share a
+    store.
 
     Attributes:
         path: The file; None = a temporary one.
@@ -109,12 +107,8 @@ class Store:
     def put(self, kind: str, key: Key, tree: Mapping[str, Any], *, compress: bool = False) -> None:
         """Store a record, in place of an earlier one of that kind and key.
 
-        Args:
-            kind: Its kind, such as ``rays``.
-            key: Its number, or several.
-            tree: Mappings and lists of arrays, numbers (also NaN), texts and None. Tuples are read
-                back as lists.
-            compress: Whether its arrays are worth compressing.
+        ``tree``: mappings and lists of arrays, numbers (also NaN), texts and None; tuples are read
+        back as lists.
         """
         text, content = to_bytes(tree, compress=compress)
         self._insert(kind, _name(key), text, content)
@@ -129,11 +123,8 @@ class Store:
     def read(self, kind: str, key: Key, *, most_bytes: int = 0) -> dict[str, Any]:
         """Return a record read from the file, past the cache; for those that are read once.
 
-        Args:
-            kind: Its kind.
-            key: Its number, or several.
-            most_bytes: What its compressed arrays can take together, as far as the rest of the
-                map says. A small file can claim very large ones.
+        ``most_bytes`` is what its compressed arrays can take together, as far as the rest of the
+        map says: a small file can claim very large ones.
         """
         name = _name(key)
         with self._lock, self._reading():
@@ -194,12 +185,9 @@ class Store:
         return ((key, self.read(kind, key)) for key in self.keys(kind))
 
     def copy(self, kind: str, other: Store, keys: Mapping[Key, Key] | None = None) -> None:
-        """Copy records of a kind to another store, as they are, without unpacking them.
+        """Copy records of a kind to another store without unpacking them.
 
-        Args:
-            kind: The kind.
-            other: The other store.
-            keys: Which ones, and their keys in the other store; None = all, under their own.
+        ``keys`` are those to copy, with their keys in the other store; None = all, under their own.
         """
         for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
             with self._lock, self._reading():
@@ -281,11 +269,7 @@ _PLAIN_BYTES: Final = 64
 
 
 class Cache:
-    """Keeps the values used last, up to a number of bytes. Threads may share it.
-
-    Args:
-        limit_bytes: Most that the kept values take together; 0 = nothing is kept.
-    """
+    """Keeps the values used last, up to a number of bytes (0 = nothing). Threads may share it."""
 
     def __init__(self, limit_bytes: int) -> None:
         self._limit = limit_bytes

@@ -247,7 +247,6 @@ class Session:
             raise FormatError("frames of the drive are not in order")
 
     def _check_loops(self) -> None:
-        """Refuse paths and loops that are none of these frames."""
         for name in (BENT, ALONE):
             if (poses := self.loops.get(name)) is not None:
                 path_of(poses, np.array(self._times_s))

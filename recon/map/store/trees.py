@@ -1,4 +1,4 @@
-"""Trees of arrays and plain values as JSON and bytes."""
+"""Trees of arrays and plain values as JSON and bytes, and values made of them."""
 
 from __future__ import annotations
 
@@ -61,14 +61,10 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Byte
 
 
 def from_bytes(text: str, read: Callable[[int], bytearray], most: int) -> dict[str, Any]:
-    """Return the tree of `to_bytes`. Tuples are lists now.
+    """Return the tree of `to_bytes`, its tuples as lists; ``read`` gives the next bytes.
 
-    Args:
-        text: The JSON.
-        read: Gives the next bytes, as many as it is asked for. Each array takes over its own, so
-            that a tree takes no more memory than its arrays.
-        most: Bytes that its compressed arrays may take together, beside what the length of the
-            JSON explains.
+    Each array takes over its own bytes, so that a tree takes no more memory than its arrays.
+    Compressed arrays may take ``most`` bytes together, beside what the length of the JSON explains.
     """
     position, left = 0, most + _INFLATED_PER_CHARACTER * len(text)
 
@@ -113,7 +109,6 @@ class _Claim(NamedTuple):
 
 
 def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | memoryview]:
-    """Return dtype, shape, layout and codec of an array, and its bytes."""
     # Products of matrices round differently in another order of axes.
     layout = "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
     little = array.astype(array.dtype.newbyteorder("<"), copy=False)
@@ -164,7 +159,7 @@ Value = TypeVar("Value")
 
 
 def value_in(kind: type[Value], tree: Mapping[str, Any]) -> Value:
-    """Return a dataclass of a tree of its fields; it checks shapes and ranges of arrays itself."""
+    """Return a dataclass of a tree of its fields; each part is checked against its type."""
     return kind(**{name: _part(kind, name, part) for name, part in tree.items()})
 
 
