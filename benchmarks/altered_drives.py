@@ -17,7 +17,8 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ Change = Callable[[int, UInt8, UInt8], tuple[UInt8, UInt8]]
 
 
 @dataclass(frozen=True, eq=False)
-class Altered:
+class Altered(StereoSource):
     """A drive derived from another by changing its frames, images or poses.
 
     Attributes:
@@ -60,16 +61,15 @@ class Altered:
     """
 
     drive: StereoSource
-    calibration: RectifiedCamera
+    calibration: RectifiedCamera = field()
     order: list[int]
     T_world_camera: Float64
     change: Change
 
     name = "altered"
     description = "altered drive"
-    files: Sequence[Path] = ()
 
-    @property
+    @cached_property
     def truth(self) -> SequenceTruth:
         """The true path alone."""
         return SequenceTruth(self.trajectory)
@@ -80,16 +80,13 @@ class Altered:
         poses = se3.invert(self.T_world_camera[0]) @ self.T_world_camera
         return Trajectory(poses, self.stamps_s)
 
-    @property
+    @cached_property
     def stamps_s(self) -> Float64:
         """float64 (N,): timestamps of the original drive, ascending regardless of ``order``."""
         return true_path(self.drive).timestamps_s[sorted(self.order)]
 
     def __len__(self) -> int:
         return len(self.order)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """The altered pairs, from frame ``start`` on."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -23,12 +23,13 @@ from altered_drives import Altered, Change, alterations, errors_of, thinned
 
 from recon.commands.config import load_config
 from recon.core.geometry import se3
-from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
+from recon.core.values import SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
 from recon.run.threads import serial_algebra
 from recon.sources.registry import open_source
+from recon.sources.source import DerivedSource
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import StreetScene, StreetSettings
@@ -119,27 +120,20 @@ class TurningSource(SyntheticSource):
 
 def kept(source: SyntheticSource) -> Altered:
     """A rendered drive whose images are kept, because each degradation wants them again."""
-    truth = SequenceTruth(source.trajectory)
-    return alterations(Kept(source.calibration, list(source), truth))["as it is"]
+    return alterations(Kept(source))["as it is"]
 
 
-@dataclass(frozen=True, eq=False)
-class Kept:
-    """A drive in memory."""
+class Kept(DerivedSource):
+    """A rendered drive in memory."""
 
-    calibration: RectifiedCamera
-    pairs: list[StereoPair]
     truth: SequenceTruth
 
-    name = "kept"
-    description = "a rendered street"
-    files: Sequence[Path] = ()
+    def __init__(self, source: SyntheticSource) -> None:
+        super().__init__(source)
+        self.pairs, self.truth = list(source), SequenceTruth(source.trajectory)
 
     def __len__(self) -> int:
         return len(self.pairs)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """The pairs from number ``start`` on."""

@@ -24,7 +24,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32
 from recon.evaluation.disparity import evaluate_disparity
-from recon.evaluation.drive_errors import LEAST_FRAMES, known_occupancy
+from recon.evaluation.drive_errors import LEAST_FRAMES, occupancy_view
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.map_comparison import (
     MapComparison,
@@ -55,7 +55,7 @@ from recon.report.trajectory_page import write_trajectory_page
 from recon.run.directory import recorded_files
 from recon.run.finished import CLOUD, GRID, OCTOMAP, command_of_map
 from recon.run.run import Run, plain
-from recon.sources.source import KnowsOccupancy
+from recon.sources.synthetic import SyntheticSource
 from recon.sources.times import read_times
 
 
@@ -292,16 +292,16 @@ def run_evaluate_occupancy(
     if image is not None:
         check_targets([image], (folder / name for name in recorded_files(folder)))
     config = run_settings(folder)
-    source, map_ = _source_that_knows(folder, config), map_of_run(folder)
+    source, map_ = _rendered_again(folder, config), map_of_run(folder)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
-    truth = known_occupancy(source, config, map_.T_map_world, least_frames)
+    truth = source.occupancy_truth(**occupancy_view(config, map_.T_map_world, least_frames))
     if image is not None:
         write_image(image, colour_grid_errors(grid, truth))
     metrics = evaluate_occupancy(voxels, grid, truth)
     return OccupancyComparison(metrics, grid, truth, list(map_.doubts))
 
 
-def _source_that_knows(folder: Path, config: ReconConfig) -> KnowsOccupancy:
+def _rendered_again(folder: Path, config: ReconConfig) -> SyntheticSource:
     command = command_of_map(folder)
     if command != "demo":
         raise EvaluationError(

@@ -22,7 +22,6 @@ from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequenc
 from recon.map.store.map_file import MAP_FILE
 from recon.map.verbs import Map
 from recon.report.localize_page import write_localize_page
-from recon.rig.cameras import CameraSource
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
 from recon.sources.source import DerivedSource, StereoSource
@@ -65,10 +64,8 @@ def run_localize(
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, map_run=str(map_path), **drive.figures())
         made.summary["T_map_world"] = drive.T_map_world.tolist()
-        made.summary["warnings"] = [*map_.doubts, *drive.warnings()]
-        if isinstance(source, LiveSource):
-            made.summary["live"] = source.figures()
-            made.summary["warnings"] += source.warnings()
+        made.summary["warnings"] = [*map_.doubts, *drive.warnings(), *source.warnings()]
+        made.summary.update(source.figures())
         with run.stage("write"):
             height_m = None if folder is None else figure_of(folder, "camera_height_m")
             export_localized(drive, height_m, run)
@@ -129,9 +126,8 @@ def run_live(
     config, options = config or load_config(), options or MapOptions(command="live")
     _check_pose_first(config)
     _warm_up(LiveSource(_Beginning(source), stopped=stopped), config, map_path)
-    live = isinstance(source, CameraSource) and source.live
-    played = LiveSource(source, None if live else rate, stopped)
-    options = replace(options, audit=False, progress=played.timed(options.progress))
+    played = LiveSource(source, None if source.live else rate, stopped)
+    options = replace(options, audit=False)
     if map_path is not None:
         return run_localize(played, map_path, config, options, start=start).summary
     try:

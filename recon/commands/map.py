@@ -24,8 +24,7 @@ from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
 from recon.run.run import Run, plain
-from recon.sources.live import LiveSource
-from recon.sources.source import IncompleteSource, StereoSource
+from recon.sources.source import StereoSource, check_source
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +95,7 @@ def run_map(
             cannot be written or the memory limit is exceeded; the run can then be resumed.
     """
     config, options = config or load_config(), options or MapOptions()
+    check_source(source)
     findings = quick_warnings(source, config) if options.audit else ()
     if options.audit and options.known_poses is not None:
         findings += doubt_poses(options.known_poses, source, config)
@@ -148,14 +148,12 @@ def map_whole(
 
 def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
     """Return what the user should know about the drive."""
-    left_out = source.left_out if isinstance(source, IncompleteSource) else 0
     return [
-        *([f"{counted(left_out, 'image')} without a partner: left out"] if left_out else ()),
+        *source.warnings(),
         *health_warnings(mapped.health),
         *(() if mapped.expected_drift is None else mapped.expected_drift.warnings()),
         *(() if mapped.prior is None else mapped.prior.warnings()),
         *(() if mapped.loops is None else mapped.loops.warnings()),
-        *(source.warnings() if isinstance(source, LiveSource) else ()),
     ]
 
 
@@ -183,7 +181,6 @@ def _summary(
         "warnings": warnings,
         **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
         **{name: plain(found) for name, found in known.items() if found is not None},
-        **({"frames_left_out": source.left_out} if isinstance(source, IncompleteSource) else {}),
-        **({"live": source.figures()} if isinstance(source, LiveSource) else {}),
+        **source.figures(),
         **({} if prior is None else {"prior": {"from": options.prior_origin, **plain(prior)}}),
     }

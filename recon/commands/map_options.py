@@ -35,8 +35,6 @@ from recon.run.machine import versions
 from recon.run.memory import memory_overrides
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run, fingerprint
-from recon.sources.live import LiveSource
-from recon.sources.prior import read_prior
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 
@@ -152,7 +150,7 @@ class MapRequest:
             raise SettingsError("there is no source to map", hint="name SOURCE")
         settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})
         source = open_source(self.source, self.kind, settings)
-        prior = None if self.prior is None else read_prior(source, self.prior)
+        prior = None if self.prior is None else source.read_prior(self.prior)
         return source, MapOptions(
             known_poses=None if self.poses is None else read_trajectory(self.poses),
             prior=None if prior is None else prior.path,
@@ -312,8 +310,8 @@ def begin_or_resume(
         with resuming(path):
             return Map.open(path, read_only=False, cache_bytes=memory)
     map_ = Map.create(path, cache_bytes=memory)
-    live = isinstance(source, LiveSource)  # what arrived then will not arrive again
-    start = {} if live else {"identity": dict(identity), "arguments": dict(arguments)}
+    # What arrives in its own time will not arrive again.
+    start = {} if source.live else {"identity": dict(identity), "arguments": dict(arguments)}
     map_.begin(session_info(source, config, start))
     map_.commit()
     run.begun = run.command != "demo"  # whose street no command line names
@@ -339,7 +337,7 @@ def with_resume_hint(run: RunDirectory, source: StereoSource) -> Iterator[None]:
 
 def _way_on(folder: Path, source: StereoSource) -> str:
     """Return how to go on after a run was interrupted."""
-    if isinstance(source, LiveSource):
+    if source.live:
         return f"the map so far is in {state_folder(folder) / STARTED}"
     return f"recon map --resume {shlex.quote(str(folder))} goes on from there"
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from recon.core.errors import EvaluationError
 from recon.core.values import (
     MapMetrics,
     OccupancyGrid,
     OccupancyMetrics,
-    OccupancyTruth,
     SequenceTruth,
     Trajectory,
     TrajectoryMetrics,
@@ -22,7 +21,7 @@ from recon.evaluation.trajectory import evaluate_trajectory
 from recon.map.drive.sequence import MappedSequence
 from recon.map.ground.grid import drop_undecided
 from recon.map.settings import DriveSettings
-from recon.sources.source import KnowsOccupancy, StereoSource
+from recon.sources.source import StereoSource
 
 SURFACE_THRESHOLD_M: Final = 0.2
 """Distance to the true surface below which a map point counts as correct."""
@@ -99,9 +98,9 @@ def _compare_surfaces(
 def _compare_occupancy(
     source: StereoSource, mapped: MappedSequence, grid: OccupancyGrid, warnings: list[str]
 ) -> OccupancyMetrics | None:
-    if not isinstance(source, KnowsOccupancy):
+    truth = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
+    if truth is None:
         return None
-    truth = known_occupancy(source, mapped.config, mapped.T_map_world)
     try:
         return evaluate_occupancy(drop_undecided(mapped.voxels, mapped.config.grid), grid, truth)
     except EvaluationError as error:
@@ -109,17 +108,14 @@ def _compare_occupancy(
         return None
 
 
-def known_occupancy(
-    source: KnowsOccupancy,
-    config: DriveSettings,
-    T_map_world: Float64,
-    least_frames: int = LEAST_FRAMES,
-) -> OccupancyTruth:
-    """Return the true occupancy of a source, in the cells, axes and height band of a map."""
-    return source.occupancy_truth(
-        resolution_m=config.occupancy.resolution_m,
-        band_m=(config.grid.min_height_m, config.grid.max_height_m),
-        range_m=config.occupancy.max_range_m,
-        least_frames=least_frames,
-        T_map_world=T_map_world,
-    )
+def occupancy_view(
+    config: DriveSettings, T_map_world: Float64, least_frames: int = LEAST_FRAMES
+) -> dict[str, Any]:
+    """Return the cells, axes and height band of a map, for `StereoSource.occupancy_truth`."""
+    return {
+        "resolution_m": config.occupancy.resolution_m,
+        "band_m": (config.grid.min_height_m, config.grid.max_height_m),
+        "range_m": config.occupancy.max_range_m,
+        "least_frames": least_frames,
+        "T_map_world": T_map_world,
+    }

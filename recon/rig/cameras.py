@@ -20,11 +20,13 @@ from recon.rig.capture import (
 from recon.sources.calibration import CALIBRATE, read_rig
 from recon.sources.opencv_camera import Camera
 from recon.sources.settings import SourceSettings
-from recon.sources.source import source_text
+from recon.sources.source import StereoSource
 
 
-class CameraSource:
-    """The pairs that cameras take from now on; a `StereoSource` whose length nobody knows.
+class CameraSource(StereoSource):
+    """The pairs that cameras take from now on; their number need not be known.
+
+    It is live if all are cameras; video files take as long as one likes.
 
     Args:
         cameras: Left and right one, or one with both views.
@@ -34,7 +36,10 @@ class CameraSource:
         stopped: Called before each pair; True ends the drive.
     """
 
-    truth = None
+    name: str
+    calibration: Rig
+    files: Sequence[Path]
+    description = "pairs from cameras"
 
     def __init__(
         self,
@@ -47,23 +52,11 @@ class CameraSource:
         self._cameras, self._settings, self._stopped = cameras, settings, stopped
         self.calibration, self.files = calibration, files
         self.name = " and ".join(camera.name for camera in cameras)
-        self.description = "pairs from cameras"
-
-    def __repr__(self) -> str:
-        return source_text(self)
-
-    @property
-    def live(self) -> bool:
-        """Whether all are cameras; video files take as long as one likes."""
-        return all(camera.live for camera in self._cameras)
+        self.live = all(camera.live for camera in cameras)
 
     def __len__(self) -> int:
         """Return the largest number of pairs; 0 = not known."""
         return self._settings.frames or 0
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        """Yield the pairs, like ``frames()``."""
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Yield the pairs from now on, numbered from 0; the first ``start`` are left out."""

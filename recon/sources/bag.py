@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -17,6 +18,7 @@ from recon.core.values.arrays import Float64, UInt8
 from recon.io.cameras.ros import ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
 from recon.io.files import reading, resolved
 from recon.io.images.image import decode_image, pixels_of_ros_image
+from recon.sources.bag_prior import read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.frame_list import check_most, pair_frames
 from recon.sources.image_names import find_partners, partner_names
@@ -31,7 +33,7 @@ from recon.sources.rosbags import (
     BagImage,
 )
 from recon.sources.settings import SourceSettings
-from recon.sources.source import Recording
+from recon.sources.source import ReadPrior, Recording
 from recon.sources.times import check_increasing, pair_stamps, pairs_in_time
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
@@ -58,7 +60,7 @@ class BagSource(Recording):
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     stamped: bool = True
 
-    @property
+    @cached_property
     def files(self) -> Sequence[Path]:
         """The calibration file, then those of the recording."""
         inside = (
@@ -67,10 +69,16 @@ class BagSource(Recording):
         )
         return [*self.texts, *(file for files in inside for file in files)]
 
-    @property
+    @cached_property
     def stamps_s(self) -> Float64:
         """float64 (N,), times of the left images of the pairs."""
         return self.left_s[[left for left, _ in self.pairs]]
+
+    def read_prior(self, name: str) -> ReadPrior:
+        """Read the motion by other sensors from a TUM file or, if there is none, a topic."""
+        if Path(name).is_file():
+            return super().read_prior(name)
+        return read_topic(self.bag, name, self.topics[0], stamped=self.stamped)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Read the pairs from number ``start`` on, without reading the messages before."""
@@ -202,7 +210,7 @@ def _read_rig(
         raise SourceError(
             "recording has no calibration of both cameras",
             where=path,
-            got=list_topics(bag, (CAMERA_INFO,)) or "no CameraInfo",
+            got=bag.list_topics((CAMERA_INFO,)) or "no CameraInfo",
             hint=CALIBRATE,
         )
     left, right = (bag.camera_info(topic) for topic in infos if topic is not None)
@@ -238,21 +246,12 @@ def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], 
         raise SourceError(
             "recording has no image topics of a left and a right camera",
             where=bag.paths[0],
-            got=list_topics(bag, _IMAGES) or "no image topic",
+            got=bag.list_topics(_IMAGES) or "no image topic",
             hint="name them with --left and --right",
         )
     best, *others = sorted(pairs, key=lambda pair: _rank(bag, pair[0]))
     also = ", ".join(left for left, _ in others)
     return best, f" (also there: {also}; choose with --left)" if also else ""
-
-
-def list_topics(bag: Bag, kinds: Sequence[str]) -> str:
-    """List the topics of some types with their message counts, for error messages."""
-    return ", ".join(
-        f"{topic.name} ({topic.messages})"
-        for topic in sorted(bag.topics.values(), key=lambda topic: topic.name)
-        if topic.kind in kinds
-    )
 
 
 def list_others(bag: Bag, used: Sequence[str]) -> str:
@@ -299,7 +298,7 @@ def _named(bag: Bag, settings: SourceSettings) -> tuple[str, str]:
                 "recording has no such image topic",
                 where=bag.paths[0],
                 got=name or "one name alone",
-                expected=list_topics(bag, _IMAGES) or "an image topic",
+                expected=bag.list_topics(_IMAGES) or "an image topic",
             )
     return str(left), str(right)
 

@@ -46,21 +46,17 @@ class ImageFrame:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class ImageSource(Recording):
-    """A drive in image files, read one pair at a time.
-
-    Attributes:
-        images: The files of each frame, in order.
-    """
+    """A drive in image files; ``images`` are those of each frame, in order."""
 
     images: Sequence[ImageFrame]
 
-    @property
+    @cached_property
     def files(self) -> Sequence[Path]:
         """Calibration and other text files, then the images."""
         images = (path for frame in self.images for path in (frame.left, frame.right))
         return [*self.texts, *images]
 
-    @property
+    @cached_property
     def stamps_s(self) -> Float64:
         """float64 (N,), times of the left images."""
         return np.array([frame.timestamp_s for frame in self.images])

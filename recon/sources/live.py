@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from threading import Condition, Thread
 from typing import Any, Final
 
@@ -14,7 +13,6 @@ import numpy as np
 from recon.core.errors import SourceError
 from recon.core.text import counted
 from recon.core.values import StereoPair
-from recon.run.progress import Progress, Step
 from recon.sources.source import DerivedSource, StereoSource
 
 _WAITING: Final = 1
@@ -25,16 +23,8 @@ _PATIENCE_S: Final = 0.2
 """How long to wait for a pair before asking whether to stop."""
 
 
-@dataclass(frozen=True)
-class _Arrived:
-    """A pair, and when it arrived (`time.monotonic`)."""
-
-    pair: StereoPair
-    due_s: float
-
-
 class LiveSource(DerivedSource):
-    """Hands over the pairs of a source when they are due; what comes too fast is left out.
+    """The pairs of a source when they are due; what comes too fast is left out.
 
     A thread reads each pair and hands it over when it is due. Where the consumer is not ready, one
     pair waits, and the next takes its place: the older one is dropped.
@@ -46,6 +36,8 @@ class LiveSource(DerivedSource):
         stopped: Asked now and then; True ends the drive.
     """
 
+    live = True
+
     def __init__(
         self,
         source: StereoSource,
@@ -53,9 +45,11 @@ class LiveSource(DerivedSource):
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         super().__init__(source)
+        if rate is not None:
+            self.description += f", played at {rate:g} times its speed"
         self.rate = rate
         self._stopped = stopped
-        self._waiting: deque[_Arrived] = deque()
+        self._waiting: deque[tuple[StereoPair, float]] = deque()
         self._news = Condition()
         self._ended = False
         self._error: BaseException | None = None
@@ -63,13 +57,6 @@ class LiveSource(DerivedSource):
         self._latency_s: list[float] = []
         self._unmatched = 0
         self.dropped = 0
-
-    @property
-    def description(self) -> str:
-        """That of the source, and how it is played."""
-        if self.rate is None:
-            return self.source.description
-        return f"{self.source.description}, played at {self.rate:g} times its speed"
 
     def __len__(self) -> int:
         """Return the number of pairs, if none is dropped."""
@@ -79,26 +66,21 @@ class LiveSource(DerivedSource):
         """Yield the pairs as they arrive, those that are not dropped; once."""
         Thread(target=self._play, args=(start,), name="live", daemon=True).start()
         try:
-            while (arrived := self._take()) is not None:
-                yield arrived.pair
+            while (pair := self._take()) is not None:
+                yield pair
         finally:
             self._ended = True
 
-    @property
-    def waits(self) -> bool:
-        """Whether the next pair is there already: the consumer is late."""
+    def hurried(self) -> bool:
+        """Return whether the next pair waits already."""
         return bool(self._waiting)
 
-    def leave_unmatched(self) -> None:
-        """Note that there is no time to match a pair that was yielded."""
+    def note_unmatched(self) -> None:
+        """Count a pair that there is no time to match."""
         self._unmatched += 1
 
-    def timed(self, progress: Progress) -> Progress:
-        """Return a progress that notes when the result of each frame is there."""
-        return _Timed(self, progress)
-
-    def done(self, index: int) -> None:
-        """Note that the result of a frame that was yielded is there."""
+    def note_located(self, index: int) -> None:
+        """Measure the time from the arrival of a pair to its pose."""
         self._latency_s.append(time.monotonic() - self._due_s[index])
 
     def figures(self) -> dict[str, Any]:
@@ -106,7 +88,7 @@ class LiveSource(DerivedSource):
         latency_ms = 1e3 * np.array(self._latency_s or [np.nan])
         p50, p95 = np.percentile(latency_ms, (50, 95)).tolist()
         known = bool(self._latency_s)
-        return {
+        live = {
             "rate": self.rate,
             "frames_arrived": len(self._due_s) + self.dropped,
             "frames_dropped": self.dropped,
@@ -116,6 +98,7 @@ class LiveSource(DerivedSource):
                 for name, value in (("p50", p50), ("p95", p95), ("max", float(latency_ms.max())))
             },
         }
+        return {"live": live}
 
     def warnings(self) -> list[str]:
         """Return what was left out, in words."""
@@ -139,7 +122,7 @@ class LiveSource(DerivedSource):
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 if self._ended:
                     return
-                self._put(_Arrived(pair, due_s))
+                self._put(pair, due_s)
         except BaseException as error:  # noqa: BLE001 - raised where the pairs are taken
             self._error = error
         finally:
@@ -147,15 +130,15 @@ class LiveSource(DerivedSource):
                 self._ended = True
                 self._news.notify()
 
-    def _put(self, arrived: _Arrived) -> None:
+    def _put(self, pair: StereoPair, due_s: float) -> None:
         with self._news:
             if len(self._waiting) == _WAITING:
                 self._waiting.popleft()
                 self.dropped += 1
-            self._waiting.append(arrived)
+            self._waiting.append((pair, due_s))
             self._news.notify()
 
-    def _take(self) -> _Arrived | None:
+    def _take(self) -> StereoPair | None:
         """Wait for the next pair; None = there is none any more."""
         with self._news:
             while not (self._waiting or self._ended or self._stopped()):
@@ -168,29 +151,6 @@ class LiveSource(DerivedSource):
                 if self._error is not None:
                     raise self._error
                 return None
-            arrived = self._waiting.popleft()
-        self._due_s.append(arrived.due_s)
-        return arrived
-
-
-class _Timed:
-    """A progress that tells a live source when the result of a frame is there."""
-
-    def __init__(self, source: LiveSource, shown: Progress) -> None:
-        self._source = source
-        self._shown = shown
-        self._done = 0
-
-    def on_start(self, name: str, total: int, unit: str = "frames") -> None:
-        self._shown.on_start(name, total, unit)
-
-    def on_step(self, step: Step) -> None:
-        self._source.done(self._done)
-        self._done += 1
-        self._shown.on_step(step)
-
-    def on_stage(self, name: str) -> None:
-        self._shown.on_stage(name)
-
-    def on_finish(self) -> None:
-        self._shown.on_finish()
+            pair, due_s = self._waiting.popleft()
+        self._due_s.append(due_s)
+        return pair

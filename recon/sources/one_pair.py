@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError, SourceError
-from recon.core.values import DisparityTruth, Rig, SequenceTruth, StereoPair
+from recon.core.values import DisparityTruth, Rig, StereoPair
 from recon.core.values.arrays import UInt8
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
@@ -22,43 +23,28 @@ from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.sources.calibration import CALIBRATE, camera_of_numbers, check_given_once, read_rig
 from recon.sources.frame_list import pair_frames
 from recon.sources.settings import SourceSettings
-from recon.sources.source import source_text
+from recon.sources.source import StereoSource
 
 LEAST_SIDE_PX: Final = 16
 """Smaller than this, an image does not hold the windows that are compared."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OnePair:
-    """One pair as a source.
-
-    Attributes:
-        pair: The images.
-        calibration: A `RectifiedCamera` if they are already rectified.
-        files: The files that both were read from.
-        description: What it is, in one line.
-        truth: None: what is known of the truth of a pair is a disparity.
-    """
+class OnePair(StereoSource):
+    """One pair as a source; what is known of its truth is a disparity, which is no `truth`."""
 
     pair: StereoPair
     calibration: Rig
     files: tuple[Path, ...] = ()
     description: str = "two images"
-    truth: SequenceTruth | None = None
 
-    @property
+    @cached_property
     def name(self) -> str:
         """Name of the pair."""
         return self.pair.name
 
-    def __repr__(self) -> str:
-        return source_text(self)
-
     def __len__(self) -> int:
         return 1
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Yield the pair, or nothing from any later start."""

@@ -138,7 +138,15 @@ class Bag:
             if kind not in self._store.types:
                 fields = "geometry_msgs/TransformStamped[] transforms\n"
                 self._store.register(typesys.get_types_from_msg(fields, kind))
-        self.topics = self._list_topics()
+        self.topics = self._find_topics()
+
+    def list_topics(self, kinds: Sequence[str]) -> str:
+        """List the topics of some types with their message counts, for error messages."""
+        return ", ".join(
+            f"{topic.name} ({topic.messages})"
+            for topic in sorted(self.topics.values(), key=lambda topic: topic.name)
+            if topic.kind in kinds
+        )
 
     def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
         """Read only the times of all messages of some topics.
@@ -209,7 +217,7 @@ class Bag:
             for part in getattr(message, "transforms", [message]):
                 yield _pose_of(part, recorded_ns)
 
-    def _list_topics(self) -> dict[str, BagTopic]:
+    def _find_topics(self) -> dict[str, BagTopic]:
         found: dict[str, BagTopic] = {}
         with self._our_errors(), self._opened() as readers:
             for connection in (c for reader in readers for c in reader.connections):

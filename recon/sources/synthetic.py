@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
-from pathlib import Path
 
 from recon.core.values import (
     DisparityTruth,
@@ -15,14 +14,14 @@ from recon.core.values import (
     Trajectory,
 )
 from recon.core.values.arrays import Float64
-from recon.sources.source import source_text
+from recon.sources.source import StereoSource
 from recon.street.render import StreetCamera, SyntheticFrame
 from recon.street.settings import StreetSettings
 from recon.street.street import StreetWorld, build_street
 from recon.street.truth import true_occupancy, true_surface
 
 
-class SyntheticSource:
+class SyntheticSource(StereoSource):
     """A rendered drive through a synthetic street, with complete ground truth.
 
     The street is built on first use; images are rendered while iterating.
@@ -32,24 +31,15 @@ class SyntheticSource:
         surface_range_m: Depth up to which a visible surface is part of the true surface.
     """
 
+    name: str
+    description = "a rendered street"
+
     def __init__(
         self, settings: StreetSettings | None = None, *, surface_range_m: float = 30.0
     ) -> None:
         self.settings = StreetSettings() if settings is None else settings
         self._surface_range_m = surface_range_m
-
-    def __repr__(self) -> str:
-        return source_text(self)
-
-    @property
-    def name(self) -> str:
-        """Seed and number of frames."""
-        return f"synthetic street {self.settings.seed}"
-
-    @property
-    def description(self) -> str:
-        """One line."""
-        return "a rendered street"
+        self.name = f"synthetic street {self.settings.seed}"
 
     @cached_property
     def world(self) -> StreetWorld:
@@ -61,7 +51,7 @@ class SyntheticSource:
         """The rig in the street, which renders any frame with its ground truth."""
         return StreetCamera(self.world)
 
-    @property
+    @cached_property
     def calibration(self) -> RectifiedCamera:
         """The rectified camera."""
         return self.world.camera
@@ -77,16 +67,8 @@ class SyntheticSource:
         surface = true_surface(self.camera, range_m=self._surface_range_m)
         return SequenceTruth(self.trajectory, surface)
 
-    @property
-    def files(self) -> Sequence[Path]:
-        """Empty: the images depend only on the settings."""
-        return ()
-
     def __len__(self) -> int:
         return self.settings.frames
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Render the pairs from number ``start`` on."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
 from typing import Final
@@ -40,7 +41,7 @@ class VideoSource(Recording):
     settings: SourceSettings
     numbers: Sequence[tuple[int, int]]
 
-    @property
+    @cached_property
     def files(self) -> Sequence[Path]:
         """The calibration, then the videos."""
         return [*self.texts, *(video.path for video in self.videos)]

@@ -19,6 +19,7 @@ from recon.map.drive.map_behind import MapBehind
 from recon.run.progress import Silent
 from recon.sources import live
 from recon.sources.live import LiveSource
+from recon.sources.source import DerivedSource
 from tests.scenery.film import Film
 from tests.scenery.patience import be_patient
 
@@ -53,7 +54,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         MapBehind,
         "_map",
-        lambda self, late, last: self._map_frame(late, late.pair.index == 0),
+        lambda self, late, last: self._map_frame(*late, late[0].index == 0),
     )
 
 
@@ -118,21 +119,14 @@ def test_a_drive_ends_when_it_is_told_to_and_its_map_is_completed(
     assert (tmp_path / "live" / "map" / "cloud.ply").is_file()
 
 
-class _WithGap:
+class _WithGap(DerivedSource):
     """A street whose second image comes an hour after the first."""
 
-    truth = None
-
-    def __init__(self, street: Film) -> None:
-        self._street = street
-        self.name, self.description = street.name, street.description
-        self.calibration, self.files = street.calibration, street.files
-
     def __len__(self) -> int:
-        return len(self._street)
+        return len(self.source)
 
     def frames(self, start: int = 0):
-        for pair in self._street.frames(start):
+        for pair in self.source.frames(start):
             late_s = 3600.0 if pair.index else 0.0
             yield replace(pair, timestamp_s=pair.timestamp_s + late_s)
 

@@ -18,6 +18,7 @@ from recon.core.values import SequenceTruth, StereoPair
 from recon.io.trajectory import read_tum
 from recon.map.drive.mapper import FrameResult
 from recon.run.progress import Silent
+from recon.sources.source import DerivedSource
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import CORNER_M, StreetScene
@@ -44,23 +45,17 @@ FILES = [
 ]
 
 
-class _Filmed:
+class _Filmed(DerivedSource):
     """A drive whose images are rendered once, and whose path alone is known."""
-
-    description = "a rendered street"
-    files: tuple[Path, ...] = ()
 
     def __init__(self, settings: StreetScene) -> None:
         street = SyntheticSource(settings)
-        self.name, self.calibration = street.name, street.calibration
+        super().__init__(street)
         self.truth = SequenceTruth(street.trajectory)
         self._pairs = list(street)
 
     def __len__(self) -> int:
         return len(self._pairs)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         return iter(self._pairs[start:])

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from recon.core.values import (
-    Trajectory,
     Disparity,
     DisparityTruth,
     PointCloud,
+    Trajectory,
 )
 from recon.evaluation.drive_errors import DriveErrors
 from recon.odometry.protocol import OdometryHealth

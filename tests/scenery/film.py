@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
+from recon.sources.source import StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 
@@ -16,10 +17,10 @@ RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": Fal
 """Large enough that places are recognised."""
 
 
-class Film:
+class Film(StereoSource):
     """Some frames of a rendered drive, in any order, perhaps changed; each is rendered once."""
 
-    description, truth, files = "a rendered street", None, ()
+    description = "a rendered street"
 
     def __init__(
         self, pairs: list[StereoPair], camera: RectifiedCamera, T_world_camera: Float64
@@ -29,9 +30,6 @@ class Film:
 
     def __len__(self) -> int:
         return len(self.pairs)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         times = enumerate(self.pairs[start:], start)

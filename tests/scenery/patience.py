@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from recon.map.drive.map_behind import MapBehind, Registered
+from recon.core.values import RectifiedPair
+from recon.map.drive.map_behind import MapBehind
+from recon.odometry.protocol import OdometryResult
 from recon.sources import live
 
 LONG_S = 300.0
@@ -15,7 +17,7 @@ def be_patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let pairs wait for poses, and poses for the map."""
     add = MapBehind.add
 
-    def add_and_wait(self: MapBehind, registered: Registered) -> None:
+    def add_and_wait(self: MapBehind, registered: tuple[RectifiedPair, OdometryResult]) -> None:
         add(self, registered)
         self.wait()
 

@@ -17,7 +17,6 @@ from recon.rig.cameras import open_camera_source
 from recon.rig.capture import CaptureSettings
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
-from recon.sources.source import IncompleteSource
 from tests.sources import drives
 from tests.sources.test_chosen_frames import ALL, CAMERA, FRAMES
 from tests.sources.test_stray_frames import LAYOUTS, images
@@ -70,7 +69,6 @@ def test_every_layout_pairs_each_left_image_with_the_right_one_of_later(
     assert [pair.timestamp_s for pair in found] == [times[k] for k in kept]
     assert [shown(pair) for pair in source.frames(3)] == [(k, k + shift) for k in kept[3:]]
     assert f"right images {shift:+d} frame" in source.description
-    assert isinstance(source, IncompleteSource)
     assert source.lines(FRAMES) == kept
     assert source.left_out == 0
     part = SourceSettings(shift_frames=shift, start=1, stride=3)
@@ -87,7 +85,6 @@ def test_a_lost_image_costs_its_pair_and_moves_no_other(
     source = open_source(folder, settings=SourceSettings(shift_frames=1))
     # The partner of left image 3 is lost.
     assert [shown(pair) for pair in source] == [(k, k + 1) for k in (0, 1, 2, 4, 5, 6, 8, 9)]
-    assert isinstance(source, IncompleteSource)
     assert source.left_out == 2
 
 
@@ -150,5 +147,4 @@ def test_the_advice_counts_what_is_shifted_already_and_frames_that_are_left_out(
 ) -> None:
     folder = drives.write_kitti(pairs, CAMERA, tmp_path)
     source = open_source(folder, settings=SourceSettings(shift_frames=1, stride=2))
-    assert isinstance(source, IncompleteSource)
     assert source.shift_of(-2) == -3

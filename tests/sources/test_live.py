@@ -11,17 +11,17 @@ import pytest
 
 from recon.core.errors import FormatError
 from recon.core.values import RectifiedCamera, StereoPair
-from recon.run.progress import SILENT
 from recon.sources.live import LiveSource
+from recon.sources.source import StereoSource
 from tests.scenery.patience import LONG_S
 
 GREY = np.zeros((16, 16), np.uint8)
 
 
-class Recording:
+class Recording(StereoSource):
     """Pairs 0.1 s apart; the first one is read, then all others once `go` is set."""
 
-    name, description, files, truth = "recording", "a recording", (), None
+    name, description = "recording", "a recording"
     calibration = RectifiedCamera(10.0, 8.0, 8.0, 8.0, 0.5, 16, 16)
 
     def __init__(self, pairs: int, error: Exception | None = None) -> None:
@@ -30,9 +30,6 @@ class Recording:
 
     def __len__(self) -> int:
         return self.pairs
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         for index in range(start, self.pairs):
@@ -53,7 +50,7 @@ def test_who_keeps_up_gets_every_pair() -> None:
     pairs = list(live)
 
     assert time.perf_counter() - begun >= 0.25  # five gaps of 50 ms
-    figures = live.figures()
+    figures = live.figures()["live"]
     assert [pair.index for pair in pairs] == [0, 1, 2, 3, 4, 5][-len(pairs) :]
     assert figures["frames_arrived"] == 6
     assert len(pairs) + figures["frames_dropped"] == 6
@@ -69,13 +66,13 @@ def test_who_is_slow_gets_the_newest_and_is_told_what_was_dropped() -> None:
     recording.read.wait(LONG_S)
     while live.dropped < 8:  # the last pair is handed over after it was read
         time.sleep(0.001)
-    assert live.waits
+    assert live.hurried()
     rest = list(pairs)
 
     assert [pair.index for pair in (first, *rest)] == [0, 9]
-    assert not live.waits
-    live.leave_unmatched()
-    figures = live.figures()
+    assert not live.hurried()
+    live.note_unmatched()
+    figures = live.figures()["live"]
     assert figures["frames_arrived"] == 10
     assert figures["frames_dropped"] == 8
     assert figures["frames_not_matched"] == 1
@@ -88,13 +85,12 @@ def test_pairs_of_cameras_are_due_when_they_were_taken() -> None:
             yield StereoPair(GREY, GREY, time.monotonic() - 0.05, 0)
 
     live = LiveSource(Camera(1), rate=None)
-    progress = live.timed(SILENT)
 
     for _ in live:
-        progress.on_step(None)
+        live.note_located(0)
 
-    assert 50 <= live.figures()["latency_ms"]["p50"] < 1000 * LONG_S
-    assert live.figures()["rate"] is None
+    assert 50 <= live.figures()["live"]["latency_ms"]["p50"] < 1000 * LONG_S
+    assert live.figures()["live"]["rate"] is None
     assert live.description == "a recording"
 
 
@@ -112,20 +108,19 @@ def test_a_drive_ends_when_it_is_told_to() -> None:
 
 def test_the_time_from_arrival_to_result_is_measured() -> None:
     live = LiveSource(Recording(1))
-    progress = live.timed(SILENT)
 
     for _ in live:
         time.sleep(0.02)
-        progress.on_step(None)
+        live.note_located(0)
 
-    latency_ms = live.figures()["latency_ms"]
+    latency_ms = live.figures()["live"]["latency_ms"]
     assert 20 <= latency_ms["p50"] <= latency_ms["p95"] <= latency_ms["max"]
 
 
 def test_nothing_is_said_of_a_drive_that_was_never_played() -> None:
     live = LiveSource(Recording(3))
 
-    assert live.figures()["latency_ms"] == {"p50": None, "p95": None, "max": None}
+    assert live.figures()["live"]["latency_ms"] == {"p50": None, "p95": None, "max": None}
     assert live.warnings() == []
 
 

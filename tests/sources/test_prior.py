@@ -10,7 +10,6 @@ import pytest
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
-from recon.sources.prior import read_prior
 from recon.sources.registry import open_source
 from tests.sources import drives
 
@@ -62,7 +61,7 @@ def write(folder: Path, kind: str, *, static: bool = True) -> Path:
 def test_odometry_of_a_bag_becomes_the_path_of_its_camera(
     tmp_path: Path, kind: str, topic: str
 ) -> None:
-    found = read_prior(open_source(write(tmp_path, kind)), topic)
+    found = open_source(write(tmp_path, kind)).read_prior(topic)
     T_base_camera = T_BASE_BRACKET @ T_BRACKET_CAM
     expected = np.stack([base(index) @ T_base_camera for index in range(3)])
     # Quaternions of unit length to 16 digits.
@@ -76,7 +75,7 @@ def test_odometry_of_a_bag_becomes_the_path_of_its_camera(
 
 
 def test_without_static_transforms_the_poses_stay_those_of_the_body(tmp_path: Path) -> None:
-    found = read_prior(open_source(write(tmp_path, "ros1", static=False)), "/odom")
+    found = open_source(write(tmp_path, "ros1", static=False)).read_prior("/odom")
     np.testing.assert_allclose(found.path.T_world_camera[2], base(2), atol=1e-12)
     assert "no static transform to cam" in found.origin
 
@@ -91,12 +90,12 @@ def test_a_topic_that_is_no_prior_is_refused_with_those_that_are(tmp_path: Path)
     source = open_source(write(tmp_path, "ros1"))
     for name in (TOPICS[0], "/wheels"):
         with pytest.raises(ReconError, match=r"no such topic of poses.*expected /odom \(3\), /tf"):
-            read_prior(source, name)
+            source.read_prior(name)
 
 
 def test_a_file_is_read_for_any_source(tmp_path: Path) -> None:
     path = tmp_path / "wheels.txt"
     path.write_text("0 0 0 0 0 0 0 1\n1 0 0 2 0 0 0 1\n")
-    found = read_prior(open_source(write(tmp_path / "bag", "ros1")), str(path))
+    found = open_source(write(tmp_path / "bag", "ros1")).read_prior(str(path))
     assert found.path.path_length_m == 2
     assert found.origin == str(path)

@@ -10,15 +10,14 @@ from typing import Any, Final
 from recon.core.errors import RegistrationError
 from recon.core.values import RectifiedPair, Trajectory
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
-from recon.map.drive.map_behind import Registered, poses_first
+from recon.map.drive.map_behind import poses_first
 from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.drive.workspace import Workspace, resuming
 from recon.map.occupancy.builder import thin_rays
 from recon.map.settings import DriveSettings
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.threads import look_ahead
-from recon.sources.live import LiveSource
-from recon.sources.source import SourcePart, StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
 _COMMIT_S: Final = 3.0
@@ -31,55 +30,59 @@ class Drive:
     Goes on from the last commit if there is one; the time spent before it is included.
 
     Attributes:
-        config: The settings.
         session: Where it is kept.
         sample: The frame in the middle; None = it was mapped before this process started.
     """
 
     def __init__(
-        self, mapper: Mapper, loops: LoopWatch, config: DriveSettings, workspace: Workspace
+        self,
+        source: StereoSource,
+        reconstructor: FrameReconstructor,
+        mapper: Mapper,
+        loops: LoopWatch,
+        config: DriveSettings,
+        workspace: Workspace,
     ) -> None:
+        self.source, self.reconstructor, self.config = source, reconstructor, config
         self.mapper = mapper
         self._loops = loops
-        self.config = config
         self._map = workspace.map
         self.session = mapper.session
         self._stage = workspace.stopwatch.stage
         self.sample: ReconstructedFrame | None = None
         self._saved = 0
-        self._live = False
         self._start = self._last = self._saved_s = time.perf_counter()
         with resuming(self._map.store.name):
             state = self.session.state()
             if state is not None:
                 self._restore(state)
 
-    def frames(
-        self, source: StereoSource, reconstructor: FrameReconstructor
-    ) -> Generator[FrameResult]:
+    def frames(self) -> Generator[FrameResult]:
         """Yield the pose of each frame that is left, which becomes part of the map."""
+        if self.source.live:
+            return poses_first(
+                self.source, self.reconstructor, self.mapper.register, self._map_behind
+            )
+        return self._in_order()
 
-        def reconstruct(pair: RectifiedPair) -> ReconstructedFrame:
-            frame = reconstructor.reconstruct_rectified(pair)
-            with self._stage("thin"):
-                return replace(frame, rays=thin_rays(frame.cloud, self.config.occupancy))
-
-        def map_behind(late: Registered, matched: bool) -> None:
-            frame = reconstruct(late.pair) if matched else reconstructor.unmatched(late.pair)
-            self._add(frame, late.result, total=len(source))
-
-        if isinstance(source, LiveSource):
-            self._live = True
-            yield from poses_first(source, reconstructor, self.mapper.register, map_behind)
-            return
-        pairs = map(reconstructor.rectify, source.frames(len(self.mapper)))
-        lead = source.lead if isinstance(source, SourcePart) else 0
-        for seen in look_ahead(reconstruct, pairs):
-            frame = seen.unmapped() if len(self.mapper) < lead else seen
+    def _in_order(self) -> Generator[FrameResult]:
+        """Match ahead, find the pose, integrate."""
+        pairs = map(self.reconstructor.rectify, self.source.frames(len(self.mapper)))
+        for frame in look_ahead(self._reconstruct, pairs):
             found = self.mapper.register(OdometryFrame(frame.pair, frame.disparity))
-            yield self._add(frame, found, total=len(source))
+            led = len(self.mapper) < self.source.lead
+            yield self._add(frame.unmapped() if led else frame, found)
 
-    def _add(self, frame: ReconstructedFrame, found: OdometryResult, *, total: int) -> FrameResult:
+    def _map_behind(self, pair: RectifiedPair, found: OdometryResult, matched: bool) -> None:
+        self._add(self._reconstruct(pair) if matched else self.reconstructor.unmatched(pair), found)
+
+    def _reconstruct(self, pair: RectifiedPair) -> ReconstructedFrame:
+        frame = self.reconstructor.reconstruct_rectified(pair)
+        with self._stage("thin"):
+            return replace(frame, rays=thin_rays(frame.cloud, self.config.occupancy))
+
+    def _add(self, frame: ReconstructedFrame, found: OdometryResult) -> FrameResult:
+        total = len(self.source)
         result = self.mapper.add(frame, found, total=total)
         self._loops.add(frame, result.T_world_camera, trusted=result.health.ok)
         if result.index <= total // 2 and (self.sample is None or len(frame.cloud)):
@@ -119,6 +122,11 @@ class Drive:
             self.session.set_loops(loops.record())
             return loops
 
+    def sample_again(self) -> ReconstructedFrame:
+        """Reconstruct the frame in the middle, which was mapped before this process started."""
+        index = min(len(self.source) // 2, len(self.session) - 1)
+        return self.reconstructor.reconstruct(next(self.source.frames(index)))
+
     @property
     def seconds(self) -> float:
         """Time from the first frame to the last."""
@@ -126,7 +134,7 @@ class Drive:
 
     def _due(self) -> bool:
         """Return whether the map is to be committed."""
-        if self._live:
+        if self.source.live:
             return time.perf_counter() - self._saved_s >= _COMMIT_S
         return len(self.mapper) - self._saved >= self.config.checkpoints.every_frames
 
@@ -143,7 +151,7 @@ class Drive:
             return
         self.wait()  # else keyframes that a resumed run needs might be missing
         with self._stage("checkpoint"):
-            if self._live:
+            if self.source.live:
                 self.mapper.close()  # not to be resumed: frames that were dropped do not come again
             else:
                 seconds = time.perf_counter() - self._start

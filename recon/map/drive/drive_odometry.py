@@ -17,7 +17,7 @@ from recon.odometry.prior_axes import find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame
 from recon.odometry.registry import KnownPoses, make_odometry
 from recon.odometry.settings import PriorSettings
-from recon.sources.source import IncompleteSource, StampedSource, StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 _KNOWN: Final = PriorSettings(sigma_share=0.01)
@@ -54,7 +54,7 @@ def axes_of(
 ) -> UsedPrior:
     """Return the axes of a prior: those set, else those that explain the first motions."""
     start = 0
-    if isinstance(source, StampedSource):
+    if source.stamps_s is not None:
         MotionPrior(prior, settings).check_covers(source.stamps_s)
         start = first_moving(prior, source.stamps_s, settings)
     frames = (OdometryFrame(*reconstructor.match(pair)) for pair in source.frames(start))
@@ -120,14 +120,11 @@ def doubt_poses(
 
 def _of_frames(known_poses: Trajectory, source: StereoSource) -> Trajectory:
     """Return the known pose of each frame."""
-    count = len(known_poses)
-    lines = list(range(len(source))) if count >= len(source) else None
-    if isinstance(source, IncompleteSource):
-        lines = source.lines(count)
+    lines = source.lines(len(known_poses))
     if lines is None:
         raise RegistrationError(
             "fewer known poses than frames",
-            got=counted(count, "pose"),
+            got=counted(len(known_poses), "pose"),
             expected=f"{len(source)}",
             hint="the pose file must list every frame of the source",
         )

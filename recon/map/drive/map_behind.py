@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
 from threading import Condition, Thread
 from typing import Final
 
@@ -14,7 +13,7 @@ from recon.core.values import RectifiedPair
 from recon.map.drive.mapper import FrameResult
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.threads import work_in_background
-from recon.sources.live import LiveSource
+from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 _MOST_WAITING: Final = 20
@@ -22,24 +21,16 @@ _MOST_WAITING: Final = 20
 disk hangs."""
 
 
-@dataclass(frozen=True, eq=False)
-class Registered:
-    """A frame that has its pose.
-
-    Attributes:
-        pair: The rectified images.
-        result: Where it was taken.
-    """
-
-    pair: RectifiedPair
-    result: OdometryResult
+_Registered = tuple[RectifiedPair, OdometryResult]
+MapFrame = Callable[[RectifiedPair, OdometryResult, bool], None]
+"""Puts a frame that has its pose into the map, matched or not."""
 
 
 def poses_first(
-    source: LiveSource,
+    source: StereoSource,
     reconstructor: FrameReconstructor,
     register: Callable[[OdometryFrame], OdometryResult],
-    map_frame: Callable[[Registered, bool], None],
+    map_frame: MapFrame,
 ) -> Generator[FrameResult]:
     """Yield the pose of each frame as soon as it is known, by odometry on rough disparities.
 
@@ -54,10 +45,11 @@ def poses_first(
         for index, pair in enumerate(source.frames()):
             rectified, disparity = reconstructor.match_roughly(pair)
             found = register(OdometryFrame(rectified, disparity, rough=True))
+            source.note_located(index)
             valid_share = float(np.mean(disparity.valid))
             T = found.T_world_camera
             yield FrameResult(index, len(source), 0.0, valid_share, 0, T, found.health)
-            behind.add(Registered(rectified, found))
+            behind.add((rectified, found))
         behind.wait()
     finally:
         behind.stop()
@@ -74,10 +66,10 @@ class MapBehind:
         map_frame: Puts a frame into the map, matched or not.
     """
 
-    def __init__(self, source: LiveSource, map_frame: Callable[[Registered, bool], None]) -> None:
+    def __init__(self, source: StereoSource, map_frame: MapFrame) -> None:
         self._source = source
         self._map_frame = map_frame
-        self._waiting: deque[Registered] = deque()
+        self._waiting: deque[_Registered] = deque()
         self._news = Condition()
         self._busy = self._ended = False
         self._error: BaseException | None = None
@@ -85,7 +77,7 @@ class MapBehind:
         self._thread = Thread(target=self._work, name="map-behind", daemon=True)
         self._thread.start()
 
-    def add(self, registered: Registered) -> None:
+    def add(self, registered: _Registered) -> None:
         """Add the next frame."""
         with self._news:
             self._news.wait_for(lambda: len(self._waiting) < _MOST_WAITING or self._error)
@@ -124,7 +116,7 @@ class MapBehind:
                 self._busy = False
                 self._news.notify_all()
 
-    def _take(self) -> list[Registered]:
+    def _take(self) -> list[_Registered]:
         """Wait for frames; empty = there are none any more."""
         with self._news:
             self._busy = False
@@ -135,10 +127,10 @@ class MapBehind:
             self._news.notify_all()
         return batch
 
-    def _map(self, registered: Registered, *, last: bool) -> None:
+    def _map(self, registered: _Registered, *, last: bool) -> None:
         # The first frame says where the ground is, and with it the axes of the map.
         matched = last or not self._mapped
         if not matched:
-            self._source.leave_unmatched()
-        self._map_frame(registered, matched)
+            self._source.note_unmatched()
+        self._map_frame(*registered, matched)
         self._mapped += 1

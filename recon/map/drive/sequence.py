@@ -40,7 +40,7 @@ from recon.odometry.health import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
 from recon.run.progress import SILENT, Progress
 from recon.run.threads import serial_algebra
-from recon.sources.source import StereoSource
+from recon.sources.source import StereoSource, check_source
 from recon.stereo.cloud.back_project import CloudSettings
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
@@ -163,6 +163,7 @@ def map_sequence(
     Raises:
         ReconError: A frame cannot be read, matched or registered.
     """
+    check_source(source)
     work = workspace or Workspace()
     reconstructor = FrameReconstructor(
         source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
@@ -175,8 +176,8 @@ def map_sequence(
     session = work.session(source, config)
     watch = LoopWatch(session.keyframes, work.stopwatch, search=looking)
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
-    drive = Drive(mapper, watch, config, work)
-    steps = drive.frames(source, reconstructor)
+    drive = Drive(source, reconstructor, mapper, watch, config, work)
+    steps = drive.frames()
     progress.on_start(source.name, len(source))
     try:
         with serial_algebra(), closing(steps):
@@ -186,36 +187,16 @@ def map_sequence(
     finally:
         drive.stop()
         progress.on_finish()
-    return _mapped(drive, source, reconstructor, work, used)
-
-
-def _mapped(
-    drive: Drive,
-    source: StereoSource,
-    reconstructor: FrameReconstructor,
-    work: Workspace,
-    prior: UsedPrior | None,
-) -> MappedSequence:
-    """Complete a drive."""
     drive.finish()
-    session = drive.session
     return MappedSequence(
         map=work.map,
-        config=drive.config,
-        sample=drive.sample or _sample_again(len(session), source, reconstructor),
+        config=config,
+        sample=drive.sample or drive.sample_again(),
         seconds=drive.seconds,
         loops=drive.close_loops(session.odometry),
-        prior=prior,
+        prior=used,
         threads=work.threads or 1,
     )
-
-
-def _sample_again(
-    mapped: int, source: StereoSource, reconstructor: FrameReconstructor
-) -> ReconstructedFrame:
-    """Reconstruct the frame in the middle, which was mapped before this process started."""
-    index = min(len(source) // 2, mapped - 1)
-    return reconstructor.reconstruct(next(source.frames(index)))
 
 
 def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) -> None:

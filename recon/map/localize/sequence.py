@@ -21,8 +21,7 @@ from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
 from recon.run.progress import SILENT, Progress
 from recon.run.threads import look_ahead, serial_algebra
-from recon.sources.live import LiveSource
-from recon.sources.source import StereoSource
+from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
 
 START_WITHIN_M: Final = 10.0
@@ -186,18 +185,17 @@ def localize_sequence(
 
     The rig may be another than that of the map; ``start`` is as for `open_localizer`.
     """
+    check_source(source)
     map_, watch = workspace.map, workspace.stopwatch
     localizer = open_localizer(map_, config, start=start)
     reconstructor = FrameReconstructor(
         source.calibration, config, threads=workspace.threads, stopwatch=watch
     )
 
-    live = source if isinstance(source, LiveSource) else None
-
     def match(pair: StereoPair) -> OdometryFrame:
-        if live is None:
-            return OdometryFrame(*reconstructor.match(pair))
-        return OdometryFrame(*reconstructor.match_roughly(pair), rough=True)
+        if source.live:
+            return OdometryFrame(*reconstructor.match_roughly(pair), rough=True)
+        return OdometryFrame(*reconstructor.match(pair))
 
     frames: list[LocalizedFrame] = []
     progress.on_start(source.name, len(source))
@@ -206,9 +204,10 @@ def localize_sequence(
         with serial_algebra():
             # What is matched ahead of its turn would be old when it is located.
             pairs = source.frames()
-            for frame in look_ahead(match, pairs) if live is None else map(match, pairs):
+            for frame in map(match, pairs) if source.live else look_ahead(match, pairs):
                 with watch.stage("localize"):
-                    frames.append(_located(localizer, frame, len(frames), live))
+                    frames.append(_located(localizer, frame, len(frames), source))
+                source.note_located(len(frames) - 1)
                 progress.on_step(frames[-1])
                 config.memory.check(f"frame {len(frames) - 1}")
     finally:
@@ -220,10 +219,10 @@ def localize_sequence(
 
 
 def _located(
-    localizer: Localizer, frame: OdometryFrame, index: int, live: LiveSource | None
+    localizer: Localizer, frame: OdometryFrame, index: int, source: StereoSource
 ) -> LocalizedFrame:
     begun = time.perf_counter()
-    located = localizer.add(frame, hurried=lambda: live is not None and live.waits)
+    located = localizer.add(frame, hurried=source.hurried)
     return LocalizedFrame(index, frame.pair.timestamp_s, time.perf_counter() - begun, located)
 
 

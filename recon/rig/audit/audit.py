@@ -33,7 +33,7 @@ from recon.rig.audit.seen_motion import SeenMotion, measure_turn, turn_figures
 from recon.rig.settings import AuditedSettings
 from recon.run.run import plain
 from recon.sources.one_pair import OnePair, PairInput
-from recon.sources.source import IncompleteSource, StereoSource
+from recon.sources.source import StereoSource, check_source
 from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.rectify.rectifier import Rectifier, plan_turns
@@ -94,6 +94,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
         config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
         quick: A short check of a second or two, as in `recon map`.
     """
+    check_source(source)
     settings = config.audit
     rectifier = Rectifier(source.calibration, config.rectification)
     camera = rectifier.camera
@@ -253,7 +254,7 @@ def _figures(
         "source": source.name,
         "description": source.description,
         "frames": len(source),
-        "frames_left_out": source.left_out if isinstance(source, IncompleteSource) else 0,
+        "frames_left_out": source.left_out,
         "frames_read": sample.frames,
         "repeated_frames": sample.repeats.both,
         "frozen_left_frames": sample.repeats.frozen[0],

@@ -14,7 +14,7 @@ from recon.rig.audit.corrections import RightTurn
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample
 from recon.rig.audit.seen_motion import turn_figures
-from recon.sources.source import IncompleteSource, StereoSource
+from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]
@@ -199,9 +199,10 @@ def find_geometry_faults(geometry: Geometry, source: StereoSource) -> Iterator[F
 
 def _in_step(source: StereoSource, lag: int) -> str:
     """Return how the images of two cameras come to belong together."""
-    if not isinstance(source, IncompleteSource):
+    shift = source.shift_of(lag)
+    if shift is None:
         return "pair the images by timestamp"
-    return f"--set source.shift_frames={source.shift_of(lag)} pairs the images that belong together"
+    return f"--set source.shift_frames={shift} pairs the images that belong together"
 
 
 def _find_row_faults(geometry: Geometry) -> Iterator[Finding]:

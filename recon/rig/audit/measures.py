@@ -12,7 +12,7 @@ import numpy as np
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.odometry.locate_camera import find_consensus, fit_pose
-from recon.sources.source import StampedSource, StereoSource
+from recon.sources.source import StereoSource
 
 # Half of the pixels around a corner may be saturated before their median is.
 _AROUND_PX: Final = 9
@@ -223,7 +223,7 @@ class Gaps:
 
 def find_gaps(source: StereoSource) -> Gaps:
     """Find time steps that are too long, in sources with known timestamps."""
-    steps = np.diff(source.stamps_s) if isinstance(source, StampedSource) else np.zeros(0)
+    steps = np.zeros(0) if source.stamps_s is None else np.diff(source.stamps_s)
     usual_s = float(np.median(steps)) if len(steps) else 0.0
     if usual_s <= 0:
         return Gaps()

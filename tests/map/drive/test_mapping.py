@@ -14,7 +14,7 @@ from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import FREE, OCCUPIED, PointCloud, RectifiedCamera, RectifiedPair, Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.map_behind import MapBehind, Registered
+from recon.map.drive.map_behind import MapBehind
 from recon.map.fusion import CloudBuilder, FusionSettings
 from recon.map.ground.axes import AxesSettings, estimate_ground, map_axes
 from recon.map.ground.grid import GridSettings, flatten
@@ -145,7 +145,7 @@ class Counted:
 
     unmatched = 0
 
-    def leave_unmatched(self) -> None:
+    def note_unmatched(self) -> None:
         self.unmatched += 1
 
 
@@ -156,15 +156,15 @@ class Mapper:
         self.done: list[tuple[int, bool]] = []
         self.begun, self.go = Event(), Event()
 
-    def __call__(self, registered: Registered, matched: bool) -> None:
+    def __call__(self, pair: RectifiedPair, result: OdometryResult, matched: bool) -> None:
         self.begun.set()
         self.go.wait(LONG_S)
-        self.done.append((registered.pair.index, matched))
+        self.done.append((pair.index, matched))
 
 
-def _frame(index: int) -> Registered:
+def _frame(index: int) -> tuple[RectifiedPair, OdometryResult]:
     pair = RectifiedPair(GREY, GREY, CAMERA, index=index)
-    return Registered(pair, OdometryResult(np.eye(4), OdometryHealth()))
+    return pair, OdometryResult(np.eye(4), OdometryHealth())
 
 
 def test_of_frames_that_wait_the_newest_is_matched() -> None:
@@ -198,7 +198,7 @@ def test_the_first_frame_is_matched_however_late_it_is() -> None:
 
 
 def test_what_goes_wrong_is_raised_where_frames_are_added() -> None:
-    def fail(registered: Registered, matched: bool) -> None:
+    def fail(*_: object) -> None:
         begun.set()
         raise MappingError("no")
 

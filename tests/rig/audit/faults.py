@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,7 +14,6 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import (
     CameraIntrinsics,
     RectifiedCamera,
-    SequenceTruth,
     StereoCalibration,
     StereoPair,
 )
@@ -23,7 +22,7 @@ from recon.sources.source import StereoSource
 
 
 @dataclass(frozen=True, eq=False)
-class Spoiled:
+class Spoiled(StereoSource):
     """A source with modified pairs of another one; ``take(i)`` gives pair i."""
 
     camera: RectifiedCamera | StereoCalibration
@@ -31,18 +30,13 @@ class Spoiled:
     take: Callable[[int], StereoPair]
     name: str = "spoiled"
     description: str = "a drive with a planted fault"
-    truth: SequenceTruth | None = None
-    files: Sequence[Path] = ()
 
-    @property
+    @cached_property
     def calibration(self) -> RectifiedCamera | StereoCalibration:
         return self.camera
 
     def __len__(self) -> int:
         return self.count
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         return (replace(self.take(index), index=index) for index in range(start, self.count))

@@ -1,10 +1,8 @@
-"""Reads the motion of the rig by other sensors: from a file, or from a topic of the recording."""
+"""The motion of the rig by other sensors, from a topic of the recording of its images."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -14,10 +12,8 @@ from recon.core.geometry.se3 import invert, make_transform, rotation_from_quater
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.io.trajectory import read_tum
-from recon.sources.bag import BagSource, list_topics
 from recon.sources.rosbags import POSES, TRANSFORMS, Bag, BagPose
-from recon.sources.source import StereoSource
+from recon.sources.source import ReadPrior
 
 _STATIC: Final = "tf_static"
 _ODOMETRY: Final = "odom"
@@ -25,45 +21,23 @@ _ODOMETRY: Final = "odom"
 _S: Final = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class ReadPrior:
-    """A path by other sensors.
+def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadPrior:
+    """Read the poses of a topic with odometry, poses or transforms.
 
-    Attributes:
-        path: The poses on the clock of the images.
-        origin: Where they are from and whose they are, in one line.
+    The static transforms of the recording, if they connect the two, turn the poses into those of
+    the camera of ``image_topic``. ``stamped``: by the stamps of headers, not of the recording.
     """
-
-    path: Trajectory
-    origin: str
-
-
-def read_prior(source: StereoSource, name: str) -> ReadPrior:
-    """Read a prior of the motion.
-
-    Args:
-        source: The drive.
-        name: A TUM file, or, if the source is a recording, one of its topics with odometry, poses
-            or transforms. Its static transforms, if they connect the two, turn the poses into
-            those of the left camera.
-    """
-    if isinstance(source, BagSource) and not Path(name).is_file():
-        return _read_topic(source, name)
-    return ReadPrior(read_tum(name), name)
-
-
-def _read_topic(source: BagSource, name: str) -> ReadPrior:
-    bag, where = source.bag, f"{source.bag.paths[0]}: {name}"
+    where = f"{bag.paths[0]}: {name}"
     if name not in bag.topics or bag.topics[name].kind not in POSES:
         raise SourceError(
             "recording has no such topic of poses, and there is no such file",
             where=bag.paths[0],
             got=name,
-            expected=list_topics(bag, POSES) or "a file; the recording has no poses",
+            expected=bag.list_topics(POSES) or "a file; the recording has no poses",
         )
     (parent, child), poses = _choose_frames(list(bag.poses(name)), where)
-    path = _path_of(poses, where, stamped=source.stamped)
-    camera = bag.frame_id(source.topics[0])
+    path = _path_of(poses, where, stamped=stamped)
+    camera = bag.frame_id(image_topic)
     T_child_camera = _static_transform(bag, child, camera)
     origin = f"{name}, {counted(len(path), 'pose')} of {child or 'an unnamed frame'} in {parent}"
     if T_child_camera is None:
