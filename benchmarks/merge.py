@@ -28,7 +28,7 @@ import numpy as np
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.localize import run_localize
 from recon.commands.map import run_map
-from recon.commands.map_options import MapOptions, MapRequest
+from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_merge
 from recon.core.geometry import se3
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud, Trajectory
@@ -100,18 +100,18 @@ def real_drive() -> Path | None:
 
 def halves(drive: Path, overlap: int, folder: Path) -> dict[str, Any]:
     """A drive in one run, and in two that are merged."""
-    frames = len(MapRequest(drive).open(load_config())[0])
+    frames = len(MapOptions(source=drive).open(load_config())[0])
     middle = (frames + overlap) // 2
     spans = {"whole": (0, frames), "first": (0, middle), "second": (middle - overlap, frames)}
     for name, (start, end) in spans.items():
         config = load_config(None, [f"source.start={start}", f"source.end={end}"])
-        source, options = MapRequest(drive, mesh=False).open(config)
+        source, options = MapOptions(source=drive, mesh=False).open(config)
         run_map(source, config, replace(options, out=folder / name, audit=False))
     began = time.perf_counter()
     options = MapOptions("merge", folder / "merged", mesh=False)
     summary = run_merge([folder / "first", folder / "second"], None, options)
     seconds = time.perf_counter() - began
-    truth = MapRequest(drive).open(load_config())[0].truth
+    truth = MapOptions(source=drive).open(load_config())[0].truth
     found = compare_halves(folder, middle, None if truth is None else truth.trajectory)
     return {**found, "links": summary["links"], "seconds": round(seconds, 1)}
 

@@ -43,14 +43,16 @@ def calibrate(
     ] = "recon",
     model: Annotated[
         Literal["radtan", "rational", "fisheye"] | None,
-        typer.Option(
+        opt.setting(
+            "calibration.model",
             help="Lens model: radtan, rational (wide angle) or fisheye (150 degrees or more).",
             show_default="radtan",
         ),
     ] = None,
     distance: Annotated[
         float | None,
-        typer.Option(
+        opt.setting(
+            "calibration.working_m",
             help="Distance in metres for which the verdict is made.",
             show_default="where matching errs by 2 %",
         ),
@@ -85,12 +87,9 @@ def calibrate(
 
         # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form == "kalibr" else []
-        chosen = [] if model is None else [f"calibration.model={model}"]
-        if distance is not None:
-            chosen.append(f"calibration.working_m={distance}")
         if out is not None and shared.config is not None:
             check_targets([out], [shared.config])
-        settings = load_config(shared.config, [*fitting, *shared.changes, *chosen])
+        settings = load_config(shared.config, [*fitting, *shared.changes])
         run = run_calibrate(
             left,
             right,
@@ -189,13 +188,12 @@ def rectify(
       recon rectify left.png right.png
     """
     with shared.one_line_errors():
-        from recon.commands.config import load_config
         from recon.commands.rectify import run_rectify
 
         run = run_rectify(
             left,
             right,
-            load_config(shared.config, shared.changes),
+            shared.settings(),
             calibration=calib,
             metres_per_unit=unit_m,
             out=out,

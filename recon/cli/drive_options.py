@@ -2,28 +2,43 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from recon.cli import options as opt
+from recon.cli.options import setting
 from recon.core.errors import SettingsError
 
 if TYPE_CHECKING:
     from recon.commands.config import ReconConfig
-    from recon.commands.map_options import MapOptions, MapRequest
+    from recon.commands.map_options import MapOptions
     from recon.map.localize.sequence import StartPose
     from recon.run.batch.cluster import BatchOptions
     from recon.sources.source import StereoSource
 
-Start = Annotated[int | None, typer.Option("--start", help="First frame to use.", show_default="0")]
+
+def _first_frame(text: str) -> dict[str, Any]:
+    _, frame = read_start(text)
+    return {} if frame is None else {"source.start": frame}
+
+
+def _memory_limit(text: str) -> dict[str, Any]:
+    from recon.run.memory import parse_size_mb
+
+    return {"memory.limit_mb": parse_size_mb(text)}
+
+
+Start = Annotated[
+    int | None, setting("source.start", "--start", help="First frame to use.", show_default="0")
+]
 StartInMap = Annotated[
     str | None,
-    typer.Option(
+    setting(
+        _first_frame,
         "--start",
         metavar="X,Y,YAW|FRAME",
         help="Where the drive begins in map axes, if known: metres, and degrees from x to y. "
@@ -39,7 +54,8 @@ class RectifiedOptions:
 
     focal: Annotated[
         float | None,
-        typer.Option(
+        setting(
+            "source.focal_px",
             metavar="PX",
             help="Focal length of images that are rectified already, without --calib.",
             show_default="that of the calibration",
@@ -47,7 +63,8 @@ class RectifiedOptions:
     ] = None
     baseline: Annotated[
         float | None,
-        typer.Option(
+        setting(
+            "source.baseline_m",
             metavar="M",
             help="Distance between their cameras in metres.",
             show_default="that of the calibration",
@@ -55,22 +72,17 @@ class RectifiedOptions:
     ] = None
     cx: Annotated[
         float | None,
-        typer.Option(metavar="PX", help="Column of their principal points.", show_default="middle"),
+        setting(
+            "source.cx_px",
+            metavar="PX",
+            help="Column of their principal points.",
+            show_default="middle",
+        ),
     ] = None
     cy: Annotated[
-        float | None, typer.Option(metavar="PX", help="Row of it.", show_default="middle")
+        float | None,
+        setting("source.cy_px", metavar="PX", help="Row of it.", show_default="middle"),
     ] = None
-
-    @property
-    def numbers(self) -> list[str]:
-        """The settings that they stand for."""
-        given = {
-            "focal_px": self.focal,
-            "baseline_m": self.baseline,
-            "cx_px": self.cx,
-            "cy_px": self.cy,
-        }
-        return [f"source.{key}={value}" for key, value in given.items() if value is not None]
 
 
 @dataclass(frozen=True)
@@ -87,50 +99,39 @@ class SourceOptions(RectifiedOptions):
     ] = None
     calib: Annotated[
         Path | None,
-        typer.Option(help="Calibration file.", show_default="the one that comes with the source"),
+        setting(
+            "source.calibration",
+            help="Calibration file.",
+            show_default="the one that comes with the source",
+        ),
     ] = None
     left: Annotated[
-        str | None, typer.Option(help="Left image folder or topic.", show_default="found by name")
+        str | None,
+        setting("source.left", help="Left image folder or topic.", show_default="found by name"),
     ] = None
     right: Annotated[
         str | None,
-        typer.Option(
+        setting(
+            "source.right",
             help="Right image folder or topic, or the right video where SOURCE is the left one.",
             show_default="found by name",
         ),
     ] = None
     tolerance: Annotated[
         float | None,
-        typer.Option(
+        setting(
+            "source.tolerance_s",
             help="Largest difference between the time stamps of a pair, in seconds.",
             show_default="0.01",
         ),
     ] = None
     end: Annotated[
-        int | None, typer.Option(help="Frame at which to stop.", show_default="after the last")
+        int | None,
+        setting("source.end", help="Frame at which to stop.", show_default="after the last"),
     ] = None
     stride: Annotated[
-        int | None, typer.Option(help="Use every so many frames.", show_default="1")
+        int | None, setting("source.stride", help="Use every so many frames.", show_default="1")
     ] = None
-
-    def overrides(self, start: int | None) -> list[str]:
-        """Return the settings that they stand for.
-
-        Args:
-            start: First frame to use; None = unchanged, like the options.
-        """
-        given = {
-            "calibration": None if self.calib is None else str(self.calib),
-            "left": self.left,
-            "right": self.right,
-            "tolerance_s": self.tolerance,
-            "start": start,
-            "end": self.end,
-            "stride": self.stride,
-        }
-        # Quoted, since a topic or folder may be named 0 or null.
-        quoted = {key: json.dumps(value) for key, value in given.items() if value is not None}
-        return [*self.numbers, *(f"source.{key}={text}" for key, text in quoted.items())]
 
 
 @dataclass(frozen=True)
@@ -140,42 +141,24 @@ class DriveOptions(SourceOptions):
     matcher: opt.Matcher = None
     memory_limit: Annotated[
         str | None,
-        typer.Option(
+        setting(
+            _memory_limit,
             help="Memory limit of the process, e.g. 2G or 1500M. A run that exceeds it stops and "
             "can be resumed.",
             show_default="none",
         ),
     ] = None
 
-    def overrides(self, start: int | None) -> list[str]:
-        """Return the settings that all but the memory limit stand for; see `SourceOptions`."""
-        from recon.cli.overrides import matching_overrides
-
-        return [*matching_overrides(self.matcher), *super().overrides(start)]
-
-    def settings(self, shared: opt.Shared, start: int | None) -> ReconConfig:
-        """Return the configuration of a command."""
-        from recon.commands.config import load_config
-        from recon.run.memory import memory_overrides
-
-        limit = memory_overrides(self.memory_limit)
-        return load_config(shared.config, [*shared.changes, *self.overrides(start), *limit])
-
 
 def open_drive(
-    request: MapRequest, settings: ReconConfig, shared: opt.Shared
+    options: MapOptions, settings: ReconConfig, shared: opt.Shared
 ) -> tuple[StereoSource, MapOptions]:
     """Open a drive, say how it is read, and return it with the options of its run."""
-    drive, options = request.open(settings)
-    return drive, announced(drive, options, shared)
-
-
-def announced(drive: StereoSource, options: MapOptions, shared: opt.Shared) -> MapOptions:
-    """Say how a drive is read, and return the options of its run with a progress that is shown."""
     from recon.cli.progress import announce
 
+    drive, options = options.open(settings)
     announce(drive, quiet=shared.quiet, verbose=shared.verbose)
-    return replace(options, progress=shared.viewer())
+    return drive, options
 
 
 def open_workers(

@@ -28,6 +28,7 @@ Matchers = Annotated[
 
 
 @app.command()
+@opt.takes_groups
 def middlebury(
     folder: Annotated[
         Path,
@@ -61,15 +62,11 @@ def middlebury(
         ),
     ] = "scene",
     out: opt.Out = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
     latex: Annotated[
         bool, typer.Option("--latex", help="Print the tables in LaTeX, the best value in bold.")
     ] = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Score matchers on Middlebury scenes with the measures of the benchmark.
 
@@ -81,32 +78,30 @@ def middlebury(
       recon evaluate middlebury MiddEval3/trainingH --truth MiddEval3/trainingQ
       recon evaluate middlebury MiddEval3/trainingQ --results results/mine --latex
     """
-    if json and latex:
+    if shared.json and latex:
         raise typer.BadParameter("--json and --latex exclude each other")
-    with one_line_errors(quiet=quiet):
-        from recon.cli.progress import choose_viewer
-        from recon.commands.config import load_config
+    with shared.one_line_errors():
         from recon.commands.evaluate_middlebury import run_middlebury
         from recon.report.middlebury_page import middlebury_tables
         from recon.report.table import Table, join
 
         summary = run_middlebury(
             folder,
-            load_config(config, set_ or ()),
+            shared.settings(),
             matchers=_names(matcher),
             results=results or (),
             truth=truth,
             out=out,
-            threads=threads,
+            threads=shared.threads,
             parallel=parallel,
             auto_range=range_ == "auto",
-            progress=choose_viewer(quiet=quiet, verbose=verbose),
+            progress=shared.viewer(),
         )
         form = Table.latex if latex else Table.text
         tables = join(map(form, middlebury_tables(summary)))
     for warning in summary["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
-    if json:
+    if shared.json:
         print_json(summary)
         return
     typer.echo(tables)

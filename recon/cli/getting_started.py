@@ -16,10 +16,10 @@ from recon.core.text import counted
 def demo(
     out: opt.Out = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="Number of frames.", show_default="40")
+        int | None, opt.setting("street.frames", min=1, help="Number of frames.", show_default="40")
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the street.", show_default="0")
+        int | None, opt.setting("street.seed", min=0, help="Seed of the street.", show_default="0")
     ] = None,
     mesh: opt.Mesh = True,
     *,
@@ -34,13 +34,9 @@ def demo(
       recon demo --frames 60 --seed 3 --out outputs/street
     """
     with shared.one_line_errors():
-        from recon.commands.config import load_config
         from recon.commands.demo import run_demo
 
-        given = {"frames": frames, "seed": seed}
-        overrides = [f"street.{key}={value}" for key, value in given.items() if value is not None]
-        settings = load_config(shared.config, [*shared.changes, *overrides])
-        viewer = shared.viewer()
+        settings, viewer = shared.settings(), shared.viewer()
         run = run_demo(settings, out=out, mesh=mesh, threads=shared.threads, progress=viewer)
     shared.show(run.summary)
 

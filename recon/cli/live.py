@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive_options import DriveOptions, StartInMap, announced, open_drive, read_start
+from recon.cli.drive_options import DriveOptions, StartInMap, open_drive, read_start
 from recon.cli.errors import until_interrupted
 
 if TYPE_CHECKING:
@@ -60,23 +59,22 @@ def live(
       recon live rides/today --map outputs/map/latest
     """
     with shared.one_line_errors(), ExitStack() as stack:
+        from recon.cli.progress import announce
         from recon.commands.localize import run_live
-        from recon.commands.map_options import MapOptions, MapRequest
         from recon.rig.cameras import is_camera, open_camera_source
 
         stopped = stack.enter_context(until_interrupted())
-        pose, first = read_start(start)
-        settings = reading.settings(shared, first)
+        pose, _ = read_start(start)
+        settings = shared.settings()
+        options = shared.options("live", out, mesh=mesh, source=source, kind=reading.kind)
         drive: StereoSource
         if right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]
             cameras = open_camera_source(devices, settings.capture, settings.source, stopped)
-            drive, options = stack.enter_context(cameras), MapOptions(mesh=mesh)
-            options = announced(drive, options, shared)
+            drive = stack.enter_context(cameras)
+            announce(drive, quiet=shared.quiet, verbose=shared.verbose)
         else:
-            request = MapRequest(Path(source), reading.kind, mesh=mesh)
-            drive, options = open_drive(request, settings, shared)
-        options = replace(options, command="live", out=out, threads=shared.threads)
+            drive, options = open_drive(options, settings, shared)
         summary = run_live(
             drive, settings, options, rate=rate, map_path=map_, start=pose, stopped=stopped
         )
@@ -111,12 +109,10 @@ def localize(
     """
     with shared.one_line_errors():
         from recon.commands.localize import run_localize
-        from recon.commands.map_options import MapRequest
 
-        pose, first = read_start(start)
-        settings = reading.settings(shared, first)
-        request = MapRequest(source, reading.kind)
-        drive, options = open_drive(request, settings, shared)
-        options = replace(options, command="localize", out=out, threads=shared.threads)
+        pose, _ = read_start(start)
+        settings = shared.settings()
+        options = shared.options("localize", out, source=source, kind=reading.kind)
+        drive, options = open_drive(options, settings, shared)
         run = run_localize(drive, map_, settings, options, start=pose)
     shared.show(run.summary)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -23,7 +22,8 @@ def map_(
     start: Start = None,
     odometry: Annotated[
         Literal["visual", "kiss", "fused"] | None,
-        typer.Option(
+        opt.setting(
+            "odometry.method",
             help="visual: features followed from frame to frame; kiss: kiss-icp on the points that "
             "stereo measures well, to compare with; fused: earlier name of visual.",
             show_default="visual",
@@ -87,39 +87,31 @@ def map_(
         raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
     with shared.one_line_errors():
         from recon.cli.progress import warn
-        from recon.commands.config import load_config, run_settings
+        from recon.commands.config import run_settings
         from recon.commands.map import run_map
-        from recon.commands.map_options import MapOptions, MapRequest, resumed
         from recon.commands.merge import run_map_into, run_remove
-        from recon.run.memory import memory_overrides
 
-        request = MapRequest(source, reading.kind, poses, prior, mesh)
-        method = [] if odometry is None else [f"odometry.method={odometry}"]
-        changes = [*shared.changes, *method, *reading.overrides(start)]
-        limit = memory_overrides(reading.memory_limit)
+        options = shared.options(
+            out=out,
+            mesh=mesh,
+            warn=partial(warn, quiet=shared.quiet, verbose=shared.verbose),
+            workers=open_workers(workers, scheduler, shared),
+            source=source,
+            kind=reading.kind,
+            poses_file=poses,
+            prior_from=prior,
+        )
         if resume is not None:
-            request, settings = resumed(
-                resume, request, shared.config, changes, reading.memory_limit
-            )
+            options, settings = options.resumed(resume, shared.config, shared.changes)
         elif into is not None:
             of_the_source = () if remove is not None else ("source",)
-            settings = run_settings(into, shared.config, [*changes, *limit], of_the_source)
+            settings = run_settings(into, shared.config, shared.changes, of_the_source)
         else:
-            settings = load_config(shared.config, [*changes, *limit])
+            settings = shared.settings()
         if into is not None and remove is not None:
-            options = MapOptions(threads=shared.threads, mesh=mesh, progress=shared.viewer())
             summary = run_remove(into, remove, settings, options)
         else:
-            apart = open_workers(workers, scheduler, shared)
-            drive, options = open_drive(request, settings, shared)
-            options = replace(
-                options,
-                out=resume or out,
-                threads=shared.threads,
-                resume=resume is not None,
-                tell=partial(warn, quiet=shared.quiet, verbose=shared.verbose),
-                workers=apart,
-            )
+            drive, options = open_drive(options, settings, shared)
             if into is not None:
                 summary = run_map_into(into, drive, settings, options)
             else:

@@ -48,11 +48,9 @@ def merge(
     """
     with shared.one_line_errors():
         from recon.commands.config import run_settings
-        from recon.commands.map_options import MapOptions
         from recon.commands.merge import run_merge
 
         settings = run_settings(runs[0], shared.config, shared.changes)
-        viewer = shared.viewer()
-        options = MapOptions("merge", out, shared.threads, mesh=mesh, progress=viewer)
+        options = shared.options("merge", out, mesh=mesh)
         summary = run_merge(runs, settings, options, opt.survey_of(georeference, antenna))
     shared.show(summary)

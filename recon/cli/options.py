@@ -1,4 +1,8 @@
-"""Options shared by commands, each defined once; those of nearly every command as one value."""
+"""Options shared by commands, each defined once; those of nearly every command as one value.
+
+An option that stands for a setting names it with `setting`, and nothing else has to be written:
+`takes_groups` gathers what was given, and ``changes`` of the command's `Asked` has it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin, get_type_hints
 
 import typer
 
@@ -19,8 +23,28 @@ from recon.core.errors import SettingsError
 from recon.core.text import parse_number
 
 if TYPE_CHECKING:
+    from recon.commands.config import Changes, ReconConfig
+    from recon.commands.map_options import MapOptions
     from recon.map.sessions.measured import Survey
     from recon.run.progress import Progress
+
+_KEYWORD: Final = inspect.Parameter.KEYWORD_ONLY
+Read = str | Callable[[Any], Mapping[str, Any]]
+"""The setting that an option stands for; or what makes of its value settings with theirs."""
+
+
+def setting(read: Read, *names: str, **how: Any) -> Any:
+    """Declare an option that stands for a setting.
+
+    Args:
+        read: The dotted name of the setting, or a function for what is not as simple.
+        names: Names of the option, as for `typer.Option`.
+        how: What else `typer.Option` takes.
+    """
+    option = typer.Option(*names, **how)
+    option.setting = read
+    return option
+
 
 Out = Annotated[
     Path | None,
@@ -45,7 +69,8 @@ Set = Annotated[
 ]
 Matcher = Annotated[
     str | None,
-    typer.Option(
+    setting(
+        "matching.matcher",
         "--matcher",
         help="Matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one of an installed plug-in.",
         show_default="matching.matcher, sad unless changed",
@@ -143,30 +168,56 @@ def survey_of(positions: Path | None, antenna: str | None, crs: str | None = Non
 
 
 @dataclass(frozen=True)
-class Shared:
-    """What nearly every command takes, last in its help: settings, threads, and what is shown."""
+class Asked:
+    """What commands with settings take, last in their help."""
 
     config: Config = None
     set_: Set = None
     json: Json = False
     quiet: Quiet = False
-    verbose: Verbose = False
-    threads: Threads = None
+    given: Sequence[tuple[Read, Any]] = ()
+    """What was given of the options that stand for settings; no option itself."""
 
     @property
-    def changes(self) -> Sequence[str]:
-        """The settings of ``--set``."""
-        return self.set_ or ()
+    def changes(self) -> Changes:
+        """The settings of ``--set``, and then those of options."""
+        read = (
+            {one: str(value) if isinstance(value, Path) else value}
+            if isinstance(one, str)
+            else one(value)
+            for one, value in self.given
+        )
+        return [*(self.set_ or ()), *read]
+
+    def settings(self, defaults: Mapping[str, Any] | None = None) -> ReconConfig:
+        """Return the configuration of the command."""
+        from recon.commands.config import load_config
+
+        return load_config(self.config, self.changes, defaults)
 
     def one_line_errors(self) -> AbstractContextManager[None]:
         """Return what the body of the command runs in; see `recon.cli.errors`."""
         return one_line_errors(quiet=self.quiet)
+
+
+@dataclass(frozen=True)
+class Shared(Asked):
+    """What nearly every command takes: also threads, and what is shown."""
+
+    verbose: Verbose = False
+    threads: Threads = None
 
     def viewer(self) -> Progress:
         """Choose what shows the progress."""
         from recon.cli.progress import choose_viewer
 
         return choose_viewer(quiet=self.quiet, verbose=self.verbose)
+
+    def options(self, command: str = "map", out: Path | None = None, **more: Any) -> MapOptions:
+        """Return the options of a run that maps, which shows its progress."""
+        from recon.commands.map_options import MapOptions
+
+        return MapOptions(command, out, self.threads, progress=self.viewer(), **more)
 
     def show(self, summary: Mapping[str, Any]) -> None:
         """Print the figures of a run."""
@@ -176,25 +227,45 @@ class Shared:
 def takes_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Let typer see the options of groups, such as `Shared`, one by one.
 
-    The command gets each group, a dataclass, as one value.
+    The command gets each group, a dataclass, as one value; that of `Asked` has what was given of
+    all options that stand for a setting.
     """
     own = inspect.signature(command, eval_str=True)
-    kinds: dict[str, Any] = {name: one.annotation for name, one in own.parameters.items()}
-    groups: dict[str, Any] = {name: kind for name, kind in kinds.items() if is_dataclass(kind)}
-    named = {name: [field.name for field in fields(group)] for name, group in groups.items()}
+    groups: dict[str, Any] = {n: p.annotation for n, p in own.parameters.items() if _is_group(p)}
     options = [one for name, one in own.parameters.items() if name not in groups]
-    for group in groups.values():
-        hints = get_type_hints(group, None, None, True)
-        for field in fields(group):
-            one = inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY)
-            options.append(one.replace(default=field.default, annotation=hints[field.name]))
+    members = {name: _options_of(group) for name, group in groups.items()}
+    options += [option for inside in members.values() for option in inside]
+    settings = {one.name: read for one in options if (read := _setting_of(one))}
 
     @wraps(command)
-    def with_options(**given: Any) -> None:
+    def with_options(**values: Any) -> None:
+        named = ((read, values[name]) for name, read in settings.items())
+        # A flag that is not set says nothing.
+        given = [(read, v) for read, v in named if v is not None and v is not False]
         for name, group in groups.items():
-            given[name] = group(**{each: given.pop(each) for each in named[name]})
-        command(**given)
+            inside = {option.name: values.pop(option.name) for option in members[name]}
+            values[name] = group(**inside, **({"given": given} if issubclass(group, Asked) else {}))
+        command(**values)
 
     seen: Any = with_options
     seen.__signature__ = own.replace(parameters=options)
     return with_options
+
+
+def _is_group(parameter: inspect.Parameter) -> bool:
+    return is_dataclass(parameter.annotation)
+
+
+def _options_of(group: Any) -> list[inspect.Parameter]:
+    """Return the fields of a group that are options, as parameters of a command."""
+    hints = get_type_hints(group, None, None, True)
+    return [
+        inspect.Parameter(one.name, _KEYWORD, default=one.default, annotation=hints[one.name])
+        for one in fields(group)
+        if get_origin(hints[one.name]) is Annotated
+    ]
+
+
+def _setting_of(option: inspect.Parameter) -> Read | None:
+    marks = getattr(option.annotation, "__metadata__", ())
+    return next((mark.setting for mark in marks if hasattr(mark, "setting")), None)

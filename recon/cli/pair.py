@@ -3,18 +3,48 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from recon.cli import options as opt
 from recon.cli.drive_options import RectifiedOptions
+from recon.core.errors import SettingsError
+
+if TYPE_CHECKING:
+    from recon.commands.config import ReconConfig
+
+
+def _disparities(ndisp: int) -> dict[str, int]:
+    """Return the settings of all matchers that have a number of disparities."""
+    from recon.stereo.match.registry import MatchingSettings
+
+    groups = {name: field.annotation for name, field in MatchingSettings.model_fields.items()}
+    ranged = (name for name, one in groups.items() if "ndisp" in getattr(one, "model_fields", ()))
+    return {f"matching.{name}.ndisp": ndisp for name in ranged}
+
+
+def _settings(shared: opt.Shared, ndisp: int | None) -> ReconConfig:
+    """Return the configuration of one pair, whose matcher has a number of disparities if given."""
+    from recon.commands.config import PAIR_DEFAULTS
+    from recon.stereo.match.protocol import name_of
+    from recon.stereo.match.registry import settings_of
+
+    settings = shared.settings(PAIR_DEFAULTS)
+    used = settings.matching.matcher
+    if ndisp is not None and not hasattr(settings_of(used, settings.matching), "ndisp"):
+        raise SettingsError(
+            "the matcher has no such setting", where="--ndisp", got=f"matcher {name_of(used)!r}"
+        )
+    return settings
+
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
 Right = Annotated[Path, typer.Argument(help="Right image.")]
 Ndisp = Annotated[
     int | None,
-    typer.Option(
+    opt.setting(
+        _disparities,
         min=1,
         help="Number of disparities to search.",
         show_default="from the calibration, else estimated from the pair",
@@ -60,12 +90,10 @@ def pair(
       recon pair left.png right.png --focal 721.5 --baseline 0.54
     """
     with shared.one_line_errors():
-        from recon.cli.overrides import pair_config
         from recon.commands.pair import run_pair
         from recon.sources.one_pair import read_pair_input, with_truth
 
-        changes = [*shared.changes, *known.numbers]
-        settings = pair_config(shared.config, changes, matcher, ndisp)
+        settings = _settings(shared, ndisp)
         given = read_pair_input(
             left,
             right,
@@ -108,11 +136,10 @@ def disparity(
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
     with shared.one_line_errors():
-        from recon.cli.overrides import pair_config
         from recon.commands.pair import run_disparity
         from recon.sources.one_pair import read_pair_input
 
-        settings = pair_config(shared.config, shared.changes, matcher, ndisp)
+        settings = _settings(shared, ndisp)
         given = read_pair_input(
             left,
             right,

@@ -21,7 +21,11 @@ def paper(
     ] = None,
     as_printed: Annotated[
         bool,
-        typer.Option("--as-printed", help="Also run the method as printed, and compare the two."),
+        opt.setting(
+            "paper.as_printed",
+            "--as-printed",
+            help="Also run the method as printed, and compare the two.",
+        ),
     ] = False,
     out: opt.Out = None,
     *,
@@ -37,10 +41,9 @@ def paper(
       recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
     """
     with shared.one_line_errors():
-        from recon.commands.config import PAIR_DEFAULTS, load_config
+        from recon.commands.config import PAIR_DEFAULTS
         from recon.commands.paper import headline, run_paper
 
-        overrides = [*shared.changes, *(["paper.as_printed=true"] if as_printed else ())]
-        settings = load_config(shared.config, overrides, PAIR_DEFAULTS)
+        settings = shared.settings(PAIR_DEFAULTS)
         summary = run_paper(scenes, settings, out=out, threads=shared.threads)
     shared.show(summary if shared.json else {**headline(summary), **summary})

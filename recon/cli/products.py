@@ -26,7 +26,11 @@ def export(
     formats: opt.Formats = None,
     resolution: Annotated[
         float | None,
-        typer.Option(help="Cell size of grid and OctoMap in metres.", show_default="as in the run"),
+        opt.setting(
+            "occupancy.resolution_m",
+            help="Cell size of grid and OctoMap in metres.",
+            show_default="as in the run",
+        ),
     ] = None,
     georeference: Annotated[
         Path | None,
@@ -66,10 +70,9 @@ def export(
         from recon.commands.config import run_settings
         from recon.commands.export import run_export
 
-        cells = [] if resolution is None else [f"occupancy.resolution_m={resolution}"]
         summary = run_export(
             run,
-            run_settings(run, shared.config, [*shared.changes, *cells]),
+            run_settings(run, shared.config, shared.changes),
             products=[name.strip() for text in to or () for name in text.split(",")],
             formats=tuple(formats or ("ply",)),
             out=out,
@@ -105,12 +108,12 @@ def mesh(
       recon mesh outputs/map/latest --set mesh.target_faces=500000
     """
     with shared.one_line_errors():
-        from recon.commands.config import PAIR_DEFAULTS, load_config
+        from recon.commands.config import PAIR_DEFAULTS
         from recon.commands.mesh import run_mesh
         from recon.run.finished import is_pair_run
 
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
-        settings = load_config(shared.config, shared.changes, defaults)
+        settings = shared.settings(defaults)
         summary = run_mesh(
             source, settings, formats=tuple(formats or ("ply",)), out=out, threads=shared.threads
         )
@@ -122,18 +125,27 @@ def occupancy(
     run: Annotated[Path, typer.Argument(help="Folder of a recon map or recon demo run.")],
     out: opt.Out = None,
     resolution: Annotated[
-        float | None, typer.Option(help="Cell size in metres.", show_default="as in the run")
+        float | None,
+        opt.setting(
+            "occupancy.resolution_m", help="Cell size in metres.", show_default="as in the run"
+        ),
     ] = None,
     min_height: Annotated[
         float | None,
-        typer.Option(help="Lower end of the obstacle height band, in metres above ground."),
+        opt.setting(
+            "grid.min_height_m",
+            help="Lower end of the obstacle height band, in metres above ground.",
+        ),
     ] = None,
     max_height: Annotated[
-        float | None, typer.Option(help="Upper end of the band, in metres.")
+        float | None, opt.setting("grid.max_height_m", help="Upper end of the band, in metres.")
     ] = None,
     max_range: Annotated[
         float | None,
-        typer.Option(help="Ignore obstacles farther than this from the camera, in metres."),
+        opt.setting(
+            "occupancy.max_range_m",
+            help="Ignore obstacles farther than this from the camera, in metres.",
+        ),
     ] = None,
     *,
     shared: opt.Shared,
@@ -151,13 +163,6 @@ def occupancy(
         from recon.commands.config import run_settings
         from recon.commands.occupancy import run_occupancy
 
-        given = {
-            "occupancy.resolution_m": resolution,
-            "grid.min_height_m": min_height,
-            "grid.max_height_m": max_height,
-            "occupancy.max_range_m": max_range,
-        }
-        named = [f"{key}={value}" for key, value in given.items() if value is not None]
-        settings = run_settings(run, shared.config, [*shared.changes, *named])
+        settings = run_settings(run, shared.config, shared.changes)
         summary = run_occupancy(run, settings, out=out, threads=shared.threads)
     shared.show(summary)

@@ -1,4 +1,4 @@
-"""`recon audit`: check a recording before a long run."""
+"""`recon audit` and `recon capture`: check a recording; make one."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive_options import SourceOptions, Start
-from recon.cli.errors import one_line_errors, until_interrupted
+from recon.cli.errors import until_interrupted
 from recon.cli.tables import print_figures, print_json
+from recon.core.errors import SettingsError
+from recon.core.text import is_count
 
 
 @opt.takes_groups
@@ -25,13 +27,10 @@ def audit(
         typer.Option("--out", "-o", help="Folder for a report with images.", show_default="none"),
     ] = None,
     start: Start = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
     *,
     reading: SourceOptions,
+    shared: opt.Asked,
 ) -> None:
     """Check a recording before a long run: good, usable or not usable, and why.
 
@@ -45,21 +44,20 @@ def audit(
       recon audit rides/today --mend mended.yaml
       recon audit rides/today --out audited
     """
-    with one_line_errors(quiet=quiet):
+    with shared.one_line_errors():
         from recon.cli.progress import announce
-        from recon.commands.config import load_config
         from recon.commands.recording import run_audit
         from recon.io.atomic import check_targets
         from recon.report.audit_page import audit_lines
         from recon.sources.registry import open_source
 
-        if mend is not None and config is not None:
-            check_targets([mend], [config])
-        settings = load_config(config, [*(set_ or ()), *reading.overrides(start)])
+        if mend is not None and shared.config is not None:
+            check_targets([mend], [shared.config])
+        settings = shared.settings()
         drive = open_source(source, reading.kind, settings.source)
-        announce(drive, quiet=quiet, verbose=verbose)
+        announce(drive, quiet=shared.quiet, verbose=verbose)
         found = run_audit(drive, settings, mend=mend, out=out)
-    if json:
+    if shared.json:
         print_json(found.summary)
         return
     print_figures("", audit_lines(found.summary))
@@ -70,6 +68,14 @@ def audit(
         typer.echo(f"results: {out}")
 
 
+def _size(text: str) -> dict[str, str]:
+    width, _, height = text.partition("x")
+    if not (is_count(width) and is_count(height)):
+        raise SettingsError("cannot read this size", got=text, expected="WIDTHxHEIGHT: 1280x720")
+    return {"capture.width_px": width, "capture.height_px": height}
+
+
+@opt.takes_groups
 def capture(
     left: Annotated[
         str,
@@ -82,17 +88,18 @@ def capture(
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many pairs.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Stop after this many seconds.")] = None,
-    size: Annotated[str | None, typer.Option(help="Requested image size, e.g. 1280x720.")] = None,
+    size: Annotated[
+        str | None, opt.setting(_size, help="Requested image size, e.g. 1280x720.")
+    ] = None,
     rate: Annotated[
-        float | None, typer.Option(help="Requested frame rate, in frames per second.")
+        float | None,
+        opt.setting("capture.rate_hz", help="Requested frame rate, in frames per second."),
     ] = None,
     preview: Annotated[
         int | None, typer.Option(min=1, help="Update preview.jpg every N pairs.")
     ] = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
+    *,
+    shared: opt.Asked,
 ) -> None:
     """Record a drive from two cameras, or from one that has both views side by side.
 
@@ -103,16 +110,14 @@ def capture(
       recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
       recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
-    with one_line_errors(quiet=quiet):
-        from recon.cli.overrides import capture_overrides
-        from recon.commands.config import load_config
+    with shared.one_line_errors():
         from recon.commands.recording import run_capture
         from recon.rig.capture import RecordingSettings
 
-        known = load_config(config, [*(set_ or ()), *capture_overrides(size, rate)]).capture
+        known = shared.settings().capture
         limits = {"frames": frames, "seconds": seconds, "preview_every": preview}
         settings = RecordingSettings.parse({**dict(known), **limits})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)
-    print_json(summary) if json else print_figures("", summary)
+    print_json(summary) if shared.json else print_figures("", summary)

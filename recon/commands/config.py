@@ -27,6 +27,8 @@ from recon.stereo.match.protocol import name_of
 from recon.stereo.match.registry import MATCHERS, field_of
 from recon.street.settings import StreetSettings
 
+Changes = Sequence[str | Mapping[str, Any]]
+"""Changed settings: ``key=value`` texts with dotted keys, or values by such keys."""
 _MOST_DOTS: Final = 10
 _BYTES_PER_PIXEL: Final = 18
 """Two colour images, and the disparity with its confidence and deviation: the least of a pair."""
@@ -106,14 +108,15 @@ PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
 
 def load_config(
     path: StrPath | None = None,
-    overrides: Sequence[str] = (),
+    overrides: Changes = (),
     defaults: Mapping[str, Any] | None = None,
 ) -> ReconConfig:
     """Build the configuration; what comes later wins: defaults, file, overrides.
 
     Args:
         path: A YAML file with any part of the configuration, such as a run's ``config.yaml``.
-        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``.
+        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``; or
+            values by such keys.
         defaults: Defaults of a command that differ from those of the stages.
 
     Raises:
@@ -121,8 +124,9 @@ def load_config(
     """
     given = merge(defaults or {}, {} if path is None else _read_yaml(Path(path)))
     values = given
-    for text in overrides:
-        values = merge(values, _parse_override(text))
+    for one in overrides:
+        for key, value in [_parse_override(one)] if isinstance(one, str) else one.items():
+            values = merge(values, _nested(key, value))
     try:
         return ReconConfig.parse(values)
     except SettingsError:
@@ -134,7 +138,7 @@ def load_config(
 def run_settings(
     folder: Path,
     file: Path | None = None,
-    overrides: Sequence[str] = (),
+    overrides: Changes = (),
     without: Collection[str] = (),
 ) -> ReconConfig:
     """Return the settings of a finished run of map, demo or pair, with changes.
@@ -205,19 +209,23 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     return content
 
 
-def _parse_override(text: str) -> dict[str, Any]:
+def _parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or key.count(".") > _MOST_DOTS:
         raise SettingsError(
             "cannot read this setting", where="--set", got=repr(text), expected="key=value"
         )
     try:
-        nested: Any = parse_yaml(value, "--set")
+        return key.strip(), parse_yaml(value, "--set")
     except FormatError as error:
         raise SettingsError(f"value of {key!r} is not YAML", where="--set", got=value) from error
-    for part in reversed(key.strip().split(".")):
-        nested = {part: nested}
-    return dict(nested)
+
+
+def _nested(key: str, value: Any) -> dict[str, Any]:
+    """Return a value as it stands in a file: below the parts of its dotted key."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return dict(value)
 
 
 #: Units by the end of a setting's name, longer endings first.

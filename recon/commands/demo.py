@@ -50,14 +50,7 @@ def run_demo(
         threads: As for `run_map`.
         progress: As for `run_map`.
     """
-    options = MapOptions(
-        command="demo",
-        out=out,
-        threads=threads,
-        mesh=mesh,
-        progress=progress,
-        audit=False,
-    )
+    options = MapOptions("demo", out, threads, mesh=mesh, progress=progress, audit=False)
     return run_map(demo_source(config), config, options)
 
 

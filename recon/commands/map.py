@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map_options import MapOptions, begin_or_resume, identity_of, with_resume_hint
+from recon.commands.map_options import MapOptions, with_resume_hint
 from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
@@ -99,12 +99,11 @@ def run_map(
     findings = quick_warnings(source, config) if options.audit else ()
     if options.audit and options.known_poses is not None:
         findings += doubt_poses(options.known_poses, source, config)
-    options.tell(findings)
-    identity = identity_of(source, config, options.known_poses, options.prior)
+    options.warn(findings)
     with (
         options.run(config) as run,
         with_resume_hint(run, source),
-        begin_or_resume(run, source, config, identity, options.arguments) as map_,
+        options.begin(run, source, config) as map_,
     ):
         apart = options.workers is not None or begun_in_pieces(run)
         mapped = (map_in_pieces if apart else map_whole)(source, config, options, run, map_)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig
-from recon.commands.map_options import MapOptions, MapRequest, begin_or_resume, identity_of
+from recon.commands.map_options import MapOptions
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
 from recon.io.atomic import write_text
 from recon.io.files import read_text, reading, resolved
@@ -130,7 +130,7 @@ class PiecePlan:
 
     Attributes:
         pieces: The pieces in order.
-        arguments: The `MapRequest.arguments` of the run.
+        arguments: The `MapOptions.arguments` of the run.
         config: Its configuration, as plain values.
     """
 
@@ -192,12 +192,12 @@ def run_piece(
     # Loops are looked for in the whole drive.
     loops = config.loops.model_copy(update={"enabled": False})
     config = config.model_copy(update={"loops": loops})
-    source, _ = MapRequest.of(planned.arguments).open(config)
+    source, _ = MapOptions.of(planned.arguments).open(config)
     part = planned.pieces[number].of(source)
-    identity = identity_of(part, config, None)
+    options = MapOptions("piece", out, threads, progress=progress, resume=resume)
     with (
-        Run("piece", out, config, threads=threads, progress=progress, resume=resume) as run,
-        begin_or_resume(run, part, config, identity, {}) as map_,
+        options.run(config) as run,
+        options.begin(run, part, config) as map_,
     ):
         work = Workspace(map_, run.watch, run.threads)
         map_sequence(part, config, progress=progress, workspace=work)

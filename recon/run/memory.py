@@ -65,11 +65,6 @@ class MemorySettings(Settings):
         return_free_memory()
 
 
-def memory_overrides(limit: str | None) -> list[str]:
-    """Return the override for a size such as ``2G`` or ``1500M``; None = no override."""
-    return [] if limit is None else [f"memory.limit_mb={parse_size_mb(limit):g}"]
-
-
 def parse_size_mb(text: str) -> float:
     """Parse a size into 10⁶ bytes, which is also the unit if none is given."""
     found = _SIZE.fullmatch(text)

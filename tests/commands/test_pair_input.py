@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.cli.drive_options import SourceOptions
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.pair import run_pair
 from recon.core.errors import CalibrationError, ReconError
@@ -79,8 +78,7 @@ def test_a_drive_takes_the_same_numbers_and_a_file_is_not_needed(
     folder = images[0].parent
     with pytest.raises(ReconError, match=r"calibration is missing.*--focal PX and --baseline M"):
         open_source(folder)
-    options = SourceOptions(focal=300, baseline=0.2, cx=100)
-    settings = load_config(None, options.overrides(None)).source
+    settings = SourceSettings(focal_px=300, baseline_m=0.2, cx_px=100)
     camera = open_source(folder, settings=settings).calibration
     assert isinstance(camera, RectifiedCamera)
     assert (camera.focal_px, camera.baseline_m, camera.cx_px) == (300, 0.2, 100)

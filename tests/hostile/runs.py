@@ -9,7 +9,7 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.commands.map import run_map
-from recon.commands.map_options import MapRequest
+from recon.commands.map_options import MapOptions
 from recon.map.drive.mapper import FrameResult
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
@@ -32,7 +32,7 @@ def interrupt_run(folder: Path) -> None:
     """Write a drive to ``folder/drive`` and an interrupted run of it to ``folder/run``."""
     write_kitti(SyntheticSource(StreetScene(smooth_edges=False, **DRIVE)), folder / "drive")
     config = load_config(None, ["checkpoints.every_frames=1", "submaps.length_m=1"])
-    source, options = MapRequest(folder / "drive", mesh=False).open(config)
+    source, options = MapOptions(source=folder / "drive", mesh=False).open(config)
     options = replace(options, audit=False, out=folder / "run", progress=_Stops())
     with pytest.raises(KeyboardInterrupt):
         run_map(source, config, options)

@@ -10,7 +10,7 @@ import pytest
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
-from recon.commands.map_options import MapRequest, resumed
+from recon.commands.map_options import MapOptions
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud, join_clouds, join_voxels
@@ -20,7 +20,7 @@ from recon.map.store.session import Submaps
 from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles
 from recon.run import memory
-from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
+from recon.run.memory import MemorySettings, parse_size_mb
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
@@ -37,13 +37,12 @@ STREET = StreetScene(frames=12, speed_m_per_frame=0.5, smooth_edges=False, **SIZ
 )
 def test_a_size_is_read_in_its_unit(text: str, size_mb: float) -> None:
     assert parse_size_mb(text) == size_mb
-    assert load_config(None, memory_overrides(text)).memory.limit_mb == size_mb
 
 
 @pytest.mark.parametrize("text", ["", "2T", "-1G", "G", "0", "1e3M", "two"])
 def test_what_is_no_size_is_refused(text: str) -> None:
     with pytest.raises(SettingsError, match="cannot read this size"):
-        memory_overrides(text)
+        parse_size_mb(text)
 
 
 def test_without_a_limit_nothing_is_cut_and_nothing_stops(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,14 +131,14 @@ def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
     out = tmp_path / "run"
     overrides = ["checkpoints.every_frames=4", "submaps.length_m=4", "memory.limit_mb=500"]
     config = load_config(None, overrides)
-    source, options = MapRequest(drive, mesh=False).open(config)
+    source, options = MapOptions(source=drive, mesh=False).open(config)
     options = replace(options, audit=False, out=out)
     with pytest.raises(MemoryLimitError, match=r"got 600 MB.*--resume .* larger --memory-limit"):
         run_map(source, config, options)
-    request, config = resumed(out, MapRequest(mesh=False), None, [], "700M")
+    options, config = MapOptions(mesh=False).resumed(out, None, [{"memory.limit_mb": 700}])
     assert config.memory.limit_mb == 700
     assert config.submaps.length_m == 4
-    assert request.source == drive
-    run = run_map(source, config, replace(options, resume=True))
+    assert options.source == str(drive)
+    run = run_map(source, config, replace(options, audit=False))
     assert run.summary["frames"] == STREET.frames
     assert "limit_mb: 700" in (out / "config.yaml").read_text()

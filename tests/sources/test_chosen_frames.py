@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from recon.cli.drive_options import SourceOptions
 from recon.commands.config import load_config
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import make_transform
@@ -143,9 +141,3 @@ def test_one_pair_has_no_second_frame(tmp_path: Path) -> None:
     assert len(open_source(tmp_path, settings=SourceSettings(end=1))) == 1
     with pytest.raises(ReconError, match="no frame is chosen"):
         open_source(tmp_path, settings=SourceSettings(start=1))
-
-
-def test_the_options_are_settings_so_that_a_run_can_be_resumed_and_repeated() -> None:
-    overrides = SourceOptions(end=9, stride=3).overrides(2)
-    config: Any = load_config(None, overrides).source
-    assert (config.start, config.end, config.stride) == (2, 9, 3)
