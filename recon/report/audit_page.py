@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from string import Formatter
 from typing import Any, Final
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from recon.core.text import counted
 from recon.core.values import RectifiedPair
-from recon.core.values.arrays import Float64
+from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import disparity_figure, is_wide, pair_figure
-from recon.report.style import ESTIMATE, INK, WIDE_IN, bare_figure, show_image, styled, to_png
 from recon.rig.audit.audit import Audit
 from recon.rig.audit.sample import Look
 from recon.run.directory import RunDirectory
@@ -58,14 +56,14 @@ def _pair(look: Look, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
     }
 
 
-@styled
+@style.styled
 def rows_figure(look: Look, pair: RectifiedPair) -> bytes:
     """Draw the left image with the row error of each feature."""
     height, width = pair.left.shape
-    size_in = WIDE_IN if is_wide(pair.left.shape) else WIDE_IN / 2
-    figure = bare_figure(size_in, size_in * height / width)
+    size_in = style.WIDE_IN if is_wide(pair.left.shape) else style.WIDE_IN / 2
+    figure = style.bare_figure(size_in, size_in * height / width)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    show_image(axes, pair.left)
+    style.show_image(axes, pair.left)
     at, apart = look.features.left_uv, look.rows_px
     near = np.abs(apart) <= _SHOWN_ROWS_PX
     axes.quiver(
@@ -74,81 +72,81 @@ def rows_figure(look: Look, pair: RectifiedPair) -> bytes:
         headwidth=2, headlength=2, headaxislength=2,
     )  # fmt: skip
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    return to_png(figure)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def frames_figure(looks: Sequence[Look]) -> bytes:
     """Draw brightness, sharpness and row error of the measured pairs."""
-    figure = Figure((WIDE_IN, 6.4))
-    brightness, sharpness, rows = figure.subplots(3, 1, sharex=True)
-    frames = np.array([look.index for look in looks])
-    _draw_sides(brightness, frames, np.array([look.brightness_dn for look in looks]))
-    brightness.set(ylabel="mean grey level", ylim=(0, 255))
-    _draw_sides(sharpness, frames, np.array([look.sharpness for look in looks]))
-    sharpness.set(ylabel="sharpness (0 to 1)", ylim=(0, None))
+    labels = ("mean grey level", "sharpness (0 to 1)", "row error (px)\nmedian, middle half")
+    figure, (brightness, sharpness, rows) = style.stacked(6.4, "frame", labels)
+    frames = [look.index for look in looks]
+    for side, name in enumerate(("left", "right")):
+        look_of: dict[str, Any] = {"label": name, "linewidth": 1.3}
+        brightness.plot(frames, [look.brightness_dn[side] for look in looks], "o-", **look_of)
+        sharpness.plot(frames, [look.sharpness[side] for look in looks], "o-", **look_of)
+    brightness.set_ylim(0, 255)
+    sharpness.set_ylim(bottom=0)
+    for axes in (brightness, sharpness):
+        axes.legend(ncols=2)
     known = [look for look in looks if len(look.features)]
     if known:
         spread = np.array([np.quantile(look.rows_px, (0.25, 0.5, 0.75)) for look in known])
         places = [look.index for look in known]
         reach = np.abs(spread[:, [0, 2]].T - spread[:, 1])
-        rows.errorbar(places, spread[:, 1], reach, fmt="o", color=ESTIMATE, capsize=3)
-    rows.axhline(0, color=INK, linewidth=1)
-    rows.set(xlabel="frame", ylabel="row error (px)\nmedian, middle half")
-    return to_png(figure)
-
-
-def _draw_sides(axes: Axes, frames: Float64, values: Float64) -> None:
-    for side, name in enumerate(("left", "right")):
-        axes.plot(frames, values[:, side], "o-", label=name, linewidth=1.3)
-    axes.legend(ncols=2)
-
-
-_UNKNOWN = "not known"
+        rows.errorbar(places, spread[:, 1], reach, fmt="o", color=style.ESTIMATE, capsize=3)
+    rows.axhline(0, color=style.INK, linewidth=1)
+    return style.to_png(figure)
 
 
 def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
-    """Describe the measurements of an audit.
-
-    Returns:
-        Subject and text of each line, in display order.
-    """
+    """Return the measurements of an audit as subject and text of lines, in display order."""
     lines = {
         "frames": _frames(summary),
-        "rows": _rows(summary),
-        "left, right": _eyes(summary),
+        "rows": _known(
+            "{row_error_rms_px:.2f} px rms (mean {row_error_mean_px:+.2f}, "
+            "spread {row_error_spread_px:.2f}, feature noise {row_noise_px:.2f}); "
+            "corrected by pitch {mend_pitch_deg:+.3f}, roll {mend_roll_deg:+.3f} deg",
+            summary,
+        ),
+        "left, right": "not known"
+        if summary["swapped_share"] is None
+        else f"{100 * summary['swapped_share']:.0f} % of near features suggest swapped cameras",
         "time": _time(summary),
-        "brightness": _known("right / left {:.2f}", summary["gain"]),
+        "brightness": _known("right / left {gain:.2f}", summary),
         "sharpness": _known(
-            "left {:.2f}, right {:.2f} (0 to 1)",
-            summary["sharpness_left"],
-            summary["sharpness_right"],
+            "left {sharpness_left:.2f}, right {sharpness_right:.2f} (0 to 1)", summary
         ),
         "disparities": _known(
-            "{0:.1f} to {2:.1f} px (5 to 95 %), median {1:.1f} px",
-            *summary.get("disparity_5_50_95_px", [None]),
+            "{disparity_5_50_95_px[0]:.1f} to {disparity_5_50_95_px[2]:.1f} px (5 to 95 %), "
+            "median {disparity_5_50_95_px[1]:.1f} px",
+            summary,
         ),
         "rig": _rig(summary),
         "depth error": ", ".join(
             f"{_length(error)} at {at} m" for at, error in summary.get("depth_error_m", {}).items()
         )
-        or _UNKNOWN,
+        or "not known",
     }
-    by_motion = summary.get("rig_by_motion")
-    if by_motion is not None:
+    if (by_motion := summary.get("rig_by_motion")) is not None:
         lines["by its motion"] = _by_motion(by_motion)
-    mended = summary.get("mended")
-    if mended is not None:
-        turn = ", ".join(f"{mended[f'{x}_deg']:+.3f} deg {x}" for x in ("pitch", "yaw", "roll"))
-        lines["mended"] = (
-            f"{mended['calibration']}: right camera rotated by {turn}, its focal length changed by "
-            f"{mended['focal_percent']:+.2f} %" + _straightened(mended["lenses_px"])
-        )
+    if (mended := summary.get("mended")) is not None:
+        lines["mended"] = _mended(mended)
     return lines
 
 
+def _known(text: str, figures: Mapping[str, Any]) -> str:
+    """Put figures into a text that names them; "not known" if one is not."""
+    named = {name.partition("[")[0] for _, name, _, _ in Formatter().parse(text) if name}
+    known = all(figures.get(name) is not None for name in named)
+    return text.format_map(figures) if known else "not known"
+
+
 def _by_motion(found: Mapping[str, Any]) -> str:
-    off = {name: _interval(found[name]) for name in ("disparity_px", "focal_percent", "lens_px")}
+    off = {
+        name: f"{found[name]['value']:+.2f} ± {1.96 * found[name]['sigma']:.2f}"
+        for name in ("disparity_px", "focal_percent", "lens_px")
+    }
     depths = ", ".join(
         f"{percent:+.1f} % at {z} m" for z, percent in found["depth_percent"].items()
     )
@@ -159,16 +157,16 @@ def _by_motion(found: Mapping[str, Any]) -> str:
     )
 
 
-def _straightened(moved_px: Sequence[float] | None) -> str:
-    if moved_px is None:
-        return ""
-    left, right = moved_px
-    return f", and both lenses straightened, by {left:.2f} and {right:.2f} px (rms)"
-
-
-def _interval(figure: Mapping[str, float]) -> str:
-    """Return a value with the half width of its 95 % interval."""
-    return f"{figure['value']:+.2f} ± {1.96 * figure['sigma']:.2f}"
+def _mended(mended: Mapping[str, Any]) -> str:
+    turn = ", ".join(f"{mended[f'{x}_deg']:+.3f} deg {x}" for x in ("pitch", "yaw", "roll"))
+    text = (
+        f"{mended['calibration']}: right camera rotated by {turn}, its focal length changed by "
+        f"{mended['focal_percent']:+.2f} %"
+    )
+    if mended["lenses_px"] is None:
+        return text
+    left, right = mended["lenses_px"]
+    return f"{text}, and both lenses straightened, by {left:.2f} and {right:.2f} px (rms)"
 
 
 def _frames(summary: Mapping[str, Any]) -> str:
@@ -182,32 +180,12 @@ def _frames(summary: Mapping[str, Any]) -> str:
     )
 
 
-def _rows(summary: Mapping[str, Any]) -> str:
-    if "row_error_rms_px" not in summary:
-        return _UNKNOWN
-    return (
-        f"{summary['row_error_rms_px']:.2f} px rms (mean {summary['row_error_mean_px']:+.2f}, "
-        f"spread {summary['row_error_spread_px']:.2f}, feature noise "
-        f"{summary['row_noise_px']:.2f}); corrected by pitch {summary['mend_pitch_deg']:+.3f}, "
-        f"roll {summary['mend_roll_deg']:+.3f} deg"
-    )
-
-
-def _eyes(summary: Mapping[str, Any]) -> str:
-    return _known("{:.0f} % of near features suggest swapped cameras", _percent(summary))
-
-
-def _percent(summary: Mapping[str, Any]) -> float | None:
-    share = summary["swapped_share"]
-    return None if share is None else 100 * float(share)
-
-
 def _time(summary: Mapping[str, Any]) -> str:
     if summary["lag_frames"]:
         return f"right camera {counted(summary['lag_frames'], 'frame', form='+d')} late"
-    skew = summary["time_skew_frames"]
-    # Avoids a negative zero.
-    return _known("right camera {:+.2f} frames late", skew and round(skew, 2) + 0.0)
+    if (skew := summary["time_skew_frames"]) is None:
+        return "not known"
+    return f"right camera {round(skew, 2) + 0.0:+.2f} frames late"  # not a negative zero
 
 
 def _rig(summary: Mapping[str, Any]) -> str:
@@ -215,10 +193,6 @@ def _rig(summary: Mapping[str, Any]) -> str:
     moving = "" if speed is None else f", moving at {speed:.1f} m/s"
     view = f"f {summary['focal_px']:.0f} px ({summary['field_of_view_deg']:.0f} deg wide)"
     return f"baseline {_length(summary['baseline_m'])}, {view}{moving}"
-
-
-def _known(text: str, *values: float | None) -> str:
-    return _UNKNOWN if None in values else text.format(*values)
 
 
 def _length(metres: float) -> str:

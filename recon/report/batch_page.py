@@ -8,11 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from recon.io.atomic import write_bytes, write_text
+from recon.report import style
 from recon.report.page import write_page
-from recon.report.style import WIDE_IN, styled, to_png
 from recon.report.table import NOT_KNOWN, Table, csv_text, join
 from recon.run.batch.job import LOGS
 from recon.run.batch.results import JobResult, accuracies, outliers_first
@@ -30,13 +29,7 @@ _PANEL_IN: Final = 3.2
 def write_batch_page(
     results: Sequence[JobResult], summary: Mapping[str, Any], run: RunDirectory
 ) -> None:
-    """Write the table as CSV and Markdown, and ``report.html`` with the outliers first.
-
-    Args:
-        results: The jobs, in the order of the batch.
-        summary: The content of ``summary.json``.
-        run: The run of the batch.
-    """
+    """Write the table as CSV and Markdown, and ``report.html`` with the outliers first."""
     write_text(run.path("table.csv"), batch_csv(results))
     write_text(run.path("table.md"), join(table.markdown() for table in batch_tables(results)))
     sweep = sweep_figure(results)
@@ -96,7 +89,7 @@ def batch_csv(results: Sequence[JobResult]) -> str:
     return csv_text([["job", *facts[1:], *swept, *names], *rows])
 
 
-@styled
+@style.styled
 def sweep_figure(results: Sequence[JobResult]) -> bytes:
     """Draw accuracy and time over each swept setting: a point per job, a line through the medians.
 
@@ -106,14 +99,15 @@ def sweep_figure(results: Sequence[JobResult]) -> bytes:
     rows = list(dict.fromkeys((one.job.command, key) for one in done for key in one.job.swept))
     if not rows:
         return b""
-    figure = Figure((WIDE_IN, _PANEL_IN * len(rows)))
-    panels = figure.subplots(len(rows), 2, squeeze=False)
+    figure, panels = style.subplots(
+        style.WIDE_IN, _PANEL_IN * len(rows), len(rows), 2, squeeze=False
+    )
     for (command, setting), (left, right) in zip(rows, panels, strict=True):
         jobs = [one for one in done if one.job.command == command]
         for name in accuracies(one.figures for one in jobs)[:1]:
             _draw(left, jobs, setting, name)
         _draw(right, jobs, setting, "seconds")
-    return to_png(figure)
+    return style.to_png(figure)
 
 
 def _draw(axes: Axes, jobs: Sequence[JobResult], setting: str, name: str) -> None:

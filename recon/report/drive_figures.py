@@ -1,4 +1,4 @@
-"""Figures of a drive: paths, drift, grid, odometry health and timing. All return PNG bytes."""
+"""Figures of a drive: paths, drift, grid and odometry health. All return PNG bytes."""
 
 from __future__ import annotations
 
@@ -17,24 +17,7 @@ from recon.core.text import counted
 from recon.core.values import UNKNOWN, OccupancyGrid, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.protocol import OdometryHealth
-from recon.report.style import (
-    BAD,
-    ESTIMATE,
-    FAINT,
-    GRID_FREE,
-    GRID_OCCUPIED,
-    GRID_UNKNOWN,
-    INK,
-    TRUTH,
-    WIDE_IN,
-    colour_grid,
-    colour_key,
-    nice_length,
-    styled,
-    to_png,
-    unit_colour,
-    write_note,
-)
+from recon.report import style
 
 Line = tuple[Float64, Mapping[str, Any]]
 """Points (N, 2) and how matplotlib draws them."""
@@ -44,8 +27,8 @@ _MOST_CELLS: Final = 2400  # of a grid's figure, a side: some for each of its pi
 _MARGIN_CELLS: Final = 10
 _PATH_MARGIN_M: Final = 3.0
 _CIRCLES: Final = 5  # along a path, of its expected drift
-ESTIMATE_LINE: Final = {"color": ESTIMATE, "linewidth": 1.8, "label": "estimate"}
-TRUTH_LINE: Final = {"color": TRUTH, "linewidth": 3.5, "alpha": 0.75, "label": "truth"}
+ESTIMATE_LINE: Final = {"color": style.ESTIMATE, "linewidth": 1.8, "label": "estimate"}
+TRUTH_LINE: Final = {"color": style.TRUTH, "linewidth": 3.5, "alpha": 0.75, "label": "truth"}
 
 
 def path_figure(
@@ -57,25 +40,22 @@ def path_figure(
 ) -> bytes:
     """Draw the path in map axes from above; poses that are not trusted are marked.
 
-    Args:
-        estimate: The estimated path.
-        truth: The true path, in the same world, or None.
-        T_map_world: (4, 4), from world to map axes.
-        health: One record per pose of ``estimate``, or none.
-        radius_share: Where the camera was with 95 % probability: circles of this share of the path
-            up to there; 0 = not known.
+    ``radius_share``: with 95 % probability the camera was in a circle of this share of the path up
+    to there; 0 = not known.
     """
     path = seen_from_above(estimate, T_map_world)
     lines: list[Line] = [(path, ESTIMATE_LINE)]
     if radius_share > 0.0:
-        look = {"color": ESTIMATE, "linewidth": 0.8, "label": "95 % (expected drift)"}
+        look = {"color": style.ESTIMATE, "linewidth": 0.8, "label": "95 % (expected drift)"}
         lines.append((_circles(path, radius_share * estimate.distances_m), look))
     if truth is not None:
         lines.insert(0, (seen_from_above(truth, T_map_world), TRUTH_LINE))
     bad = _bad_frames(health, len(estimate))
     if len(bad):
         look = {"marker": "x", "linestyle": "", "markersize": 8, "markeredgewidth": 2}
-        lines.append((path[bad], {**look, "color": BAD, "label": f"not trusted ({len(bad)})"}))
+        lines.append(
+            (path[bad], {**look, "color": style.BAD, "label": f"not trusted ({len(bad)})"})
+        )
     return top_view(lines, path, _MAP_LABELS)
 
 
@@ -99,17 +79,20 @@ def loops_figure(
     joined = np.concatenate([np.zeros((0, 2)), *gaps])
     look = {"marker": "o", "linewidth": 0.8, "markersize": 2.5}
     lines: list[Line] = [
-        (odometry, {"color": FAINT, "linewidth": 1.4, "linestyle": "--", "label": "odometry"}),
+        (
+            odometry,
+            {"color": style.FAINT, "linewidth": 1.4, "linestyle": "--", "label": "odometry"},
+        ),
         (closed, {**ESTIMATE_LINE, "label": "loops closed"}),
-        (joined, {**look, "color": BAD, "label": f"loops ({len(loops)})"}),
+        (joined, {**look, "color": style.BAD, "label": f"loops ({len(loops)})"}),
     ]
     return top_view(lines, closed, _MAP_LABELS)
 
 
-@styled
+@style.styled
 def top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> bytes:
     """Draw lines in a plane with equal axes, with the start and end of one path."""
-    figure = Figure((WIDE_IN, _height_in(np.concatenate([points for points, _ in lines]))))
+    figure = Figure((style.WIDE_IN, _height_in(np.concatenate([points for points, _ in lines]))))
     axes = figure.subplots()
     for points, look in lines:
         axes.plot(*points.T, **look)
@@ -117,64 +100,54 @@ def top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> b
     axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(loc="best")
-    return to_png(figure)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def drift_figure(
     estimate: Trajectory, truth: Trajectory, health: Sequence[OdometryHealth] = ()
 ) -> bytes:
     """Draw the drift of position and rotation, with both paths starting at the identity."""
     if len(estimate) != len(truth):
-        figure = Figure((WIDE_IN, 4.6))
-        note = (
-            f"{counted(len(estimate), 'pose')}, but {counted(len(truth), 'true one')}: not compared"
-        )
-        write_note(figure.subplots(), note)
-        return to_png(figure)
+        figure = Figure((style.WIDE_IN, 4.6))
+        poses = f"{counted(len(estimate), 'pose')}, but {counted(len(truth), 'true one')}"
+        style.write_note(figure.subplots(), f"{poses}: not compared")
+        return style.to_png(figure)
     drift = invert(truth.T_world_camera) @ estimate.T_world_camera
-    figure, all_axes = errors_along(
-        truth, np.linalg.norm(drift[:, :3, 3], axis=1), np.degrees(angle_rad(drift))
-    )
+    position_m, rotation_deg = np.linalg.norm(drift[:, :3, 3], axis=1), np.degrees(angle_rad(drift))
+    figure, rows = errors_along(truth, position_m, rotation_deg)
     bad = truth.distances_m[_bad_frames(health, len(estimate))]
     width = float(np.median(np.diff(truth.distances_m))) if len(truth) > 1 else 1.0
-    for axes in all_axes:
-        _shade(axes, bad, width)
-    return to_png(figure)
+    for axes in rows:
+        style.shade(axes, bad, width)
+    return style.to_png(figure)
 
 
 def errors_along(
     truth: Trajectory, position_m: ArrayLike, rotation_deg: ArrayLike
-) -> tuple[Figure, tuple[Axes, Axes]]:
+) -> tuple[Figure, list[Axes]]:
     """Draw errors of position and rotation along the true path; also return their axes."""
-    figure = Figure((WIDE_IN, 4.6))
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(truth.distances_m, position_m)
-    lower.plot(truth.distances_m, rotation_deg)
-    upper.set(ylabel="position error (m)", ylim=(0, None))
-    lower.set(xlabel="distance along the true path (m)", ylabel="rotation error (°)")
-    lower.set_ylim(bottom=0)
-    return figure, (upper, lower)
+    labels = ("position error (m)", "rotation error (°)")
+    figure, rows = style.stacked(4.6, "distance along the true path (m)", labels)
+    for axes, errors in zip(rows, (position_m, rotation_deg), strict=True):
+        axes.plot(truth.distances_m, errors)
+        axes.set_ylim(bottom=0)
+    return figure, rows
 
 
-@styled
+@style.styled
 def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
-    """Draw the occupancy grid with paths; axes in metres, cropped to the known cells.
-
-    Args:
-        grid: The map.
-        paths: Paths of the camera seen from above, (N, 2), by their names.
-    """
+    """Draw the known cells of a grid, in metres, with paths (N, 2) by their names."""
     grid = thin_grid(_crop_to_known(grid), _MOST_CELLS)
     near = np.asarray(grid.origin_m)
     far = near + np.asarray(grid.cells.shape[::-1]) * grid.resolution_m
     path = np.concatenate([np.zeros((0, 2)), *paths.values()])
     corners = np.concatenate([[near, far], path - _PATH_MARGIN_M, path + _PATH_MARGIN_M])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    figure = Figure((WIDE_IN, _height_in(corners)))
+    figure = Figure((style.WIDE_IN, _height_in(corners)))
     axes = figure.subplots()
-    axes.set_facecolor(unit_colour(GRID_UNKNOWN))
-    axes.imshow(colour_grid(grid), extent=(near[0], far[0], near[1], far[1]))
+    axes.set_facecolor(style.unit_colour(style.GRID_UNKNOWN))
+    axes.imshow(style.colour_grid(grid), extent=(near[0], far[0], near[1], far[1]))
     lines = [axes.plot(*way.T, linewidth=1.6, label=name)[0] for name, way in paths.items()]
     for way in paths.values():
         _mark_ends(axes, way)
@@ -182,36 +155,33 @@ def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1])
     _draw_scale_bar(axes, low, high - low)
-    keys = (("free", GRID_FREE), ("occupied", GRID_OCCUPIED), ("unknown", GRID_UNKNOWN))
-    handles = [colour_key(*key) for key in keys]
+    colours = (style.GRID_FREE, style.GRID_OCCUPIED, style.GRID_UNKNOWN)
+    keys = [*map(style.colour_key, ("free", "occupied", "unknown"), colours)]
     named = lines if len(lines) > 1 else []
-    figure.legend(handles=[*handles, *named], loc="outside lower center", ncols=3)
-    return to_png(figure)
+    figure.legend(handles=[*keys, *named], loc="outside lower center", ncols=3)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def health_figure(health: Sequence[OdometryHealth]) -> bytes:
     """Draw the odometry health of each frame; frames with an untrusted pose are shaded red."""
-    rows = (
-        ("inlier tracks", [float(record.inliers) for record in health]),
-        ("reprojection\nerror (px)", [record.reprojection_px for record in health]),
-        ("standard deviation\nof the motion (m)", [record.sigma_m for record in health]),
-    )
-    figure = Figure((WIDE_IN, 5.6))
-    all_axes = figure.subplots(len(rows), 1, sharex=True)
-    for axes, (label, values) in zip(all_axes, rows, strict=True):
+    drawn = {
+        "inlier tracks": [float(record.inliers) for record in health],
+        "reprojection\nerror (px)": [record.reprojection_px for record in health],
+        "standard deviation\nof the motion (m)": [record.sigma_m for record in health],
+    }
+    figure, rows = style.stacked(5.6, "frame", [*drawn])
+    for axes, values in zip(rows, drawn.values(), strict=True):
         known = np.isfinite(values)
         if known.any():
             # A value between frames without one has no neighbour to connect by a line.
             axes.plot(values, linewidth=1.3, marker="" if known.all() else ".")
             axes.set_ylim(bottom=0)
         else:
-            write_note(axes, "not measured")
-        _shade(axes, _bad_frames(health, len(health)), 1.0)
-        axes.set_ylabel(label)
-    all_axes[-1].set_xlabel("frame")
+            style.write_note(axes, "not measured")
+        style.shade(axes, _bad_frames(health, len(health)), 1.0)
     figure.align_ylabels()
-    return to_png(figure)
+    return style.to_png(figure)
 
 
 def seen_from_above(trajectory: Trajectory, T_map_world: NDArray[Any]) -> Float64:
@@ -223,7 +193,7 @@ def _height_in(points: NDArray[Any]) -> float:
     """Return the height in inches of a wide figure that shows points (N, 2) with equal axes."""
     extent = np.nanmax(points, axis=0) - np.nanmin(points, axis=0) if len(points) else np.ones(2)
     ratio = float(extent[1]) / max(float(extent[0]), 1e-9)
-    return float(np.clip((WIDE_IN - 0.8) * ratio + 1.1, 3.0, 9.0))
+    return float(np.clip((style.WIDE_IN - 0.8) * ratio + 1.1, 3.0, 9.0))
 
 
 def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
@@ -232,14 +202,8 @@ def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
     ends = ((0, "start", 9, "o", 9), (-1, "end", -18, "s", 7))
     for number, text, up, marker, size in ends if len(path) else ():
         place = path[number]
-        axes.plot(
-            *place,
-            marker=marker,
-            color=ESTIMATE,
-            markersize=size,
-            markeredgecolor="white",
-            zorder=5,
-        )
+        look: dict[str, Any] = {"color": style.ESTIMATE, "markeredgecolor": "white", "zorder": 5}
+        axes.plot(*place, marker=marker, markersize=size, **look)
         label = axes.annotate(text, place, (0, up), textcoords="offset points", ha="center")
         label.set_path_effects([withStroke(linewidth=3, foreground="white")])
 
@@ -247,11 +211,6 @@ def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
 def _bad_frames(health: Sequence[OdometryHealth], poses: int) -> NDArray[np.intp]:
     """Return indices of the poses that are not trusted."""
     return np.flatnonzero([not record.ok for record in health[:poses]])
-
-
-def _shade(axes: Axes, places: NDArray[Any], width: float) -> None:
-    for place in places:
-        axes.axvspan(place - 0.5 * width, place + 0.5 * width, color=BAD, alpha=0.2, linewidth=0)
 
 
 def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
@@ -266,21 +225,23 @@ def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
     return OccupancyGrid(grid.cells[top:bottom, left:right], grid.resolution_m, origin_m)
 
 
+def nice_length(target: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is at most ``target`` (> 0)."""
+    power = 10.0 ** math.floor(math.log10(target))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= target * (1 + 1e-9))
+
+
 def _draw_scale_bar(axes: Axes, low: NDArray[Any], size_m: NDArray[Any]) -> None:
     length = nice_length(float(size_m[0]) / 6)
     left, bottom = low + size_m * (0.03, 0.06)
     ends = [left, left + length]
-    axes.plot(ends, [bottom, bottom], color=INK, linewidth=4, solid_capstyle="butt")
+    axes.plot(ends, [bottom, bottom], color=style.INK, linewidth=4, solid_capstyle="butt")
     middle = (left + length / 2, bottom)
     axes.annotate(f"{length:g} m", middle, (0, 5), textcoords="offset points", ha="center")
 
 
 def thin_grid(grid: OccupancyGrid, limit: int) -> OccupancyGrid:
-    """Return a grid of larger cells, at most ``limit`` per side, for figures of large maps.
-
-    A larger cell is occupied if any of its cells is, else free if any is, so that no obstacle is
-    lost.
-    """
+    """Return a grid of at most ``limit`` larger cells a side; no obstacle in it is lost."""
     factor = math.ceil(max(grid.cells.shape) / limit)
     if factor <= 1:
         return grid

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
+from recon.report import style
 from recon.report.drive_figures import grid_figure, path_figure, seen_from_above
 from recon.report.page import write_page
-from recon.report.style import BAD, FAINT, TRUTH, WIDE_IN, styled, to_png
 from recon.run.directory import RunDirectory
 
-_SHADES: Final = {State.SEARCHING: FAINT, State.COASTING: TRUTH, State.LOST: BAD}
+_SHADES: Final = {State.SEARCHING: style.FAINT, State.COASTING: style.TRUTH, State.LOST: style.BAD}
 
 
 def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
@@ -33,29 +30,18 @@ def _path(result: LocalizeRun) -> bytes | None:
     return path_figure(path, None, T_map_world) if len(path) else None
 
 
-@styled
+@style.styled
 def certainty_figure(drive: LocalizedDrive) -> bytes:
-    """Return standard deviations of each pose, and what confirms it; the others are shaded."""
+    """Draw standard deviations of each pose, and what confirms it; the others are shaded."""
     known = [frame.located for frame in drive.frames]
-    sigmas_m = [located.sigma_m for located in known]
     inliers = [float(x.inliers) if x.covariance is not None else np.nan for x in known]
-    figure = Figure((WIDE_IN, 4.4))
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(sigmas_m, marker=".")
-    lower.plot(inliers, marker=".")
-    upper.set(ylabel="standard deviation\nof the position (m)")
-    lower.set(ylabel="features that\nagree", xlabel="frame")
-    for axes in (upper, lower):
+    labels = ("standard deviation\nof the position (m)", "features that\nagree")
+    figure, rows = style.stacked(4.4, "frame", labels)
+    for axes, values in zip(rows, ([x.sigma_m for x in known], inliers), strict=True):
+        axes.plot(values, marker=".")
         axes.set_ylim(bottom=0)
         axes.set_xlim(-0.5, len(known) - 0.5)
-        _shade(axes, [located.state for located in known])
+        for state, colour in _SHADES.items():
+            style.shade(axes, [n for n, x in enumerate(known) if x.state == state], 1.0, colour)
     figure.align_ylabels()
-    return to_png(figure)
-
-
-def _shade(axes: Axes, states: Sequence[State]) -> None:
-    """Mark the frames whose pose nothing confirms."""
-    for number, state in enumerate(states):
-        if state in _SHADES:
-            ends = (number - 0.5, number + 0.5)
-            axes.axvspan(*ends, color=_SHADES[state], alpha=0.2, linewidth=0)
+    return style.to_png(figure)

@@ -18,6 +18,7 @@ from recon.io.models.ply import write_ply
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
+from recon.report import style
 from recon.report.drive_figures import (
     drift_figure,
     grid_figure,
@@ -29,7 +30,6 @@ from recon.report.drive_figures import (
 from recon.report.page import write_page
 from recon.report.pair_page import stereo_figures
 from recon.report.scene import Json, Scene, plot_scene
-from recon.report.style import ERROR_SCALE, colour_values
 from recon.run.directory import RunDirectory
 from recon.stereo.frame import ReconstructedFrame
 
@@ -119,6 +119,6 @@ def write_map_errors(comparison: MapComparison, run: RunDirectory) -> None:
     cloud, reference = comparison.cloud, comparison.reference
     for name, points, others in (("error", cloud, reference), ("missed", reference, cloud)):
         distance_m = nearest_distances(points.xyz, others.xyz)
-        rgb = colour_values(distance_m, ERROR_SCALE, (0.0, limit_m))
+        rgb = style.colour_values(distance_m, style.ERROR_SCALE, (0.0, limit_m))
         coloured = replace(PointCloud(points.xyz, frame=points.frame), rgb=rgb)
         write_ply(run.path(f"{name}.ply"), coloured, quality=distance_m)

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from matplotlib.figure import Figure
 from PIL import Image
 
 from recon.core.text import counted
@@ -16,17 +15,9 @@ from recon.evaluation.middlebury.bench import SceneResult
 from recon.evaluation.middlebury.score import error_map
 from recon.io.atomic import write_text
 from recon.io.images.image import write_image
+from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import ERROR_LIMIT_PX
-from recon.report.style import (
-    FAINT,
-    HALF_IN,
-    colour_disparity,
-    colour_error,
-    styled,
-    to_png,
-    value_range,
-)
 from recon.report.table import NOT_KNOWN, Row, Table, csv_text, join, number
 from recon.run.directory import RunDirectory
 
@@ -46,11 +37,11 @@ def draw_result(result: SceneResult, run: RunDirectory) -> None:
     """
     scene, values = result.scene, result.values
     scale = round(4 * values.shape[1] / scene.truth.values.shape[1]) / 4
-    low, high = value_range(scene.truth.values)
+    low, high = style.value_range(scene.truth.values)
     stem = f"pictures/{result.matcher}/{scene.name}"
-    disparity = colour_disparity(values, low * scale, high * scale)
+    disparity = style.colour_disparity(values, (low * scale, high * scale))
     write_image(run.path(f"{stem}_disparity.png"), disparity)
-    error = colour_error(error_map(scene, values), ERROR_LIMIT_PX)
+    error = style.colour_error(error_map(scene, values), ERROR_LIMIT_PX)
     write_image(run.path(f"{stem}_error.png"), error)
 
 
@@ -74,16 +65,17 @@ def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None
     )
 
 
-@styled
+@style.styled
 def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
     """Draw the fraction of correct pixels by confidence (reliability diagram).
 
     Bins with less than a thousandth of the pixels are left out; the bars show the distribution of
     the pixels over the bins.
     """
-    figure = Figure((HALF_IN, 5.0))
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
-    upper.plot((0, 1), (0, 1), color=FAINT, linestyle="--", linewidth=1, label="calibrated")
+    figure, (upper, lower) = style.subplots(
+        style.HALF_IN, 5.0, 2, sharex=True, height_ratios=(4, 1)
+    )
+    upper.plot((0, 1), (0, 1), color=style.FAINT, linestyle="--", linewidth=1, label="calibrated")
     for n, (name, curves) in enumerate(matchers.items()):
         bins, colour = curves["reliability"], f"C{n}"
         confidence, right, share = _floats(bins, "confidence", "right", "share")
@@ -96,26 +88,23 @@ def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
     upper.set(ylim=(0, 1), ylabel="share of right pixels")
     upper.legend(loc="upper left")
     lower.set(xlim=(0, 1), xlabel="confidence", ylabel="share of pixels")
-    return to_png(figure)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
     """Draw the fraction of wrong pixels left as the least confident ones are removed."""
-    figure = Figure((HALF_IN, 5.0))
-    axes = figure.subplots()
+    figure, axes = style.subplots(style.HALF_IN, 5.0)
     for n, (name, curves) in enumerate(matchers.items()):
         steps, colour = curves["sparsification"], f"C{n}"
         removed, wrong, best = 100 * _floats(steps, "removed", "wrong", "best")
         axes.plot(removed, wrong, color=colour, label=f"{name}: AUSE {curves['ause']:.3f}")
         axes.plot(removed, best, color=colour, linewidth=1.0, linestyle=":")
-    axes.plot([], [], color=FAINT, linestyle=":", label="if the wrong ones went first")
-    axes.set(xlim=(0, 100), ylim=(0, None))
-    axes.set(
-        xlabel="pixels removed, the least certain first (%)", ylabel="wrong among the rest (%)"
-    )
+    axes.plot([], [], color=style.FAINT, linestyle=":", label="if the wrong ones went first")
+    axes.set(xlabel="pixels removed, the least certain first (%)", xlim=(0, 100), ylim=(0, None))
+    axes.set_ylabel("wrong among the rest (%)")
     axes.legend(loc="upper right")
-    return to_png(figure)
+    return style.to_png(figure)
 
 
 def _floats(curves: Curves, *names: str) -> Any:

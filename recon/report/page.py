@@ -22,11 +22,7 @@ from plotly.offline import get_plotlyjs
 
 from recon.core.text import counted, with_unit
 from recon.io.atomic import write_text
-from recon.report.style import (
-    HALF_IN,
-    styled,
-    to_png,
-)
+from recon.report import style
 from recon.report.table import NOT_KNOWN
 from recon.run.directory import RunDirectory
 from recon.run.machine import versions
@@ -162,10 +158,10 @@ def _words(name: str) -> list[str]:
     return re.split(r"(?<=[._])(?=[a-z])", name)
 
 
-@styled
+@style.styled
 def timing_figure(stages: Mapping[str, float]) -> bytes:
     """Draw time and share of each stage, in the order of the mapping."""
-    figure = Figure((HALF_IN, max(1.6, 0.42 * len(stages) + 0.9)))
+    figure = Figure((style.HALF_IN, max(1.6, 0.42 * len(stages) + 0.9)))
     axes = figure.subplots()
     seconds = np.asarray(list(stages.values()), dtype=np.float64)
     total = max(float(seconds.sum()), 1e-12)
@@ -174,4 +170,4 @@ def timing_figure(stages: Mapping[str, float]) -> bytes:
     axes.invert_yaxis()
     axes.set(xlabel="time (s)", xlim=(0, max(float(seconds.max(initial=0.0)), 1e-12) * 1.28))
     axes.grid(visible=False, axis="y")
-    return to_png(figure)
+    return style.to_png(figure)

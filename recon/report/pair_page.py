@@ -17,28 +17,9 @@ from recon.core.geometry.projection import depth_from_disparity, disparity_from_
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.io.images.image import write_image
+from recon.report import style
 from recon.report.page import write_page
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
-from recon.report.style import (
-    CONFIDENCE_SCALE,
-    DISPARITY_SCALE,
-    ERROR_SCALE,
-    HALF_IN,
-    REASON_COLOURS,
-    REASON_LABELS,
-    WIDE_IN,
-    bare_figure,
-    colour_confidence,
-    colour_disparity,
-    colour_error,
-    colour_key,
-    colour_reasons,
-    colour_values,
-    show_image,
-    styled,
-    to_png,
-    value_range,
-)
 from recon.run.directory import RunDirectory
 from recon.stereo.frame import PairRun
 
@@ -52,9 +33,9 @@ def write_pair_page(result: PairRun, run: RunDirectory) -> None:
 def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
     """Write disparity, confidence and reasons of a pair as colour images."""
     images = {
-        "disparity_colour.png": colour_disparity(result.disparity.values),
-        "confidence_colour.png": colour_confidence(result.disparity.confidence),
-        "reason_colour.png": colour_reasons(result.disparity.reason),
+        "disparity_colour.png": style.colour_disparity(result.disparity.values),
+        "confidence_colour.png": style.colour_confidence(result.disparity.confidence),
+        "reason_colour.png": style.colour_reasons(result.disparity.reason),
     }
     for name, image in images.items():
         write_image(run.path(f"disparity/{name}"), image)
@@ -116,89 +97,84 @@ def stereo_figures(pair: RectifiedPair, disparity: Disparity) -> dict[str, Any]:
     }
 
 
-@styled
+@style.styled
 def pair_figure(pair: RectifiedPair) -> bytes:
     """Draw both rectified images: stacked if they are wide, else side by side."""
     height, width = pair.left.shape
     rows, columns = (2, 1) if is_wide(pair.left.shape) else (1, 2)
-    figure = Figure((WIDE_IN, (WIDE_IN / columns * height / width + 0.3) * rows))
-    left_axes, right_axes = figure.subplots(rows, columns)
-    show_image(left_axes, pair.colours, "Left, rectified")
+    height_in = (style.WIDE_IN / columns * height / width + 0.3) * rows
+    figure, (left_axes, right_axes) = style.subplots(style.WIDE_IN, height_in, rows, columns)
+    style.show_image(left_axes, pair.colours, "Left, rectified")
     right = pair.right if pair.right_rgb is None else pair.right_rgb
-    show_image(right_axes, right, "Right, rectified")
-    return to_png(figure)
+    style.show_image(right_axes, right, "Right, rectified")
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
     """Draw the disparity map, with scales in pixels below it and in metres of depth above that."""
-    limits = value_range(disparity.values)
-    figure = _image(colour_disparity(disparity.values, *limits))
-    bar = _colour_bar(figure, DISPARITY_SCALE, limits, "disparity in pixels")
+    limits = style.value_range(disparity.values)
+    figure = _image(style.colour_disparity(disparity.values, limits))
+    bar = _colour_bar(figure, style.DISPARITY_SCALE, limits, "disparity in pixels")
     _mark_depths(bar, limits, camera)
-    return to_png(figure)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def depth_figure(depth_m: NDArray[Any]) -> bytes:
     """Draw a depth map (H, W) in metres, NaN = unknown; the scale is logarithmic, near is red."""
     known_m = np.where(depth_m > 0, depth_m, np.nan)
-    low, high = value_range(known_m)
+    low, high = style.value_range(known_m)
     low = max(low, 1e-3)
     limits = (math.log(low), math.log(max(high, low * 1.01)))
     # Reversed, so that near has the same colour as in the disparity map.
-    scale = f"{DISPARITY_SCALE}_r"
-    figure = _image(colour_values(np.log(known_m), scale, limits))
+    scale = f"{style.DISPARITY_SCALE}_r"
+    figure = _image(style.colour_values(np.log(known_m), scale, limits))
     bar = _colour_bar(figure, scale, limits, "depth in metres (logarithmic)")
     depths = depth_marks(low, high, math.log, limits)
     bar.set_xticks(np.log(depths).tolist(), [f"{depth:g}" for depth in depths])
-    return to_png(figure)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def confidence_figure(disparity: Disparity) -> bytes:
     """Draw the confidence of each match, from 0 to 1."""
-    figure = _image(colour_confidence(disparity.confidence))
-    _colour_bar(figure, CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: no match)")
-    return to_png(figure)
+    figure = _image(style.colour_confidence(disparity.confidence))
+    _colour_bar(figure, style.CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: no match)")
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def error_figure(error_px: NDArray[Any]) -> bytes:
     """Draw the absolute disparity error of each pixel, up to the limit; NaN = not compared."""
-    figure = _image(colour_error(error_px, ERROR_LIMIT_PX))
+    figure = _image(style.colour_error(error_px, ERROR_LIMIT_PX))
     label = "absolute disparity error in pixels (dark: not compared)"
-    _colour_bar(figure, ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
-    return to_png(figure)
+    _colour_bar(figure, style.ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def reasons_figure(disparity: Disparity) -> bytes:
     """Draw why each pixel has a disparity or not, and the share of each reason."""
-    figure = _image(colour_reasons(disparity.reason))
+    figure = _image(style.colour_reasons(disparity.reason))
     handles = [
-        colour_key(f"{REASON_LABELS[reason]} {100 * share:.1f} %", REASON_COLOURS[reason])
+        style.colour_key(
+            f"{style.REASON_LABELS[reason]} {100 * share:.1f} %", style.REASON_COLOURS[reason]
+        )
         for reason, share in disparity.reason_shares.items()
     ]
     columns = 4 if is_wide(disparity.reason.shape) else 3
     middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
     figure.legend(handles=handles, loc="center", ncols=columns, bbox_to_anchor=(0.5, middle))
-    return to_png(figure)
+    return style.to_png(figure)
 
 
 def depth_marks(
     low_m: float, high_m: float, place: Callable[[float], float], limits: tuple[float, float]
 ) -> list[float]:
-    """Return round depths to mark on a scale, as many as there is room for labels.
+    """Return depths > 0 to mark on a scale, as many as there is room for labels, round ones first.
 
-    Args:
-        low_m: Smallest depth on the scale, > 0.
-        high_m: Largest depth.
-        place: Maps a depth to its position on the scale.
-        limits: Start and end of the scale.
-
-    Returns:
-        The depths, increasing; the roundest are preferred.
+    ``place`` maps a depth to its position on the scale, whose ends are ``limits``.
     """
     powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
     choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
@@ -215,10 +191,10 @@ def depth_marks(
 def _image(image: UInt8) -> Figure:
     """Return an image that fills the width of its figure, with room for a scale or legend below."""
     height, width = image.shape[:2]
-    width_in = WIDE_IN if is_wide(image.shape) else HALF_IN
+    width_in = style.WIDE_IN if is_wide(image.shape) else style.HALF_IN
     height_in = width_in * height / width + _BELOW_IN
     # Placed by hand, as layout engines ignore the ticks on the upper side of a scale.
-    figure = bare_figure(width_in, height_in)
+    figure = style.bare_figure(width_in, height_in)
     axes = figure.add_axes((0.0, _BELOW_IN / height_in, 1.0, 1.0 - _BELOW_IN / height_in))
     axes.imshow(image, aspect="auto")
     axes.set_axis_off()

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
@@ -23,6 +22,7 @@ from recon.evaluation.paper import (
     MethodResult,
     camera_of_table_1,
 )
+from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import (
     ERROR_LIMIT_PX,
@@ -33,27 +33,16 @@ from recon.report.pair_page import (
     pair_figure,
 )
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
-from recon.report.style import (
-    BAD,
-    DISPARITY_SCALE,
-    ESTIMATE,
-    FAINT,
-    HALF_IN,
-    TRUTH,
-    WIDE_IN,
-    bare_figure,
-    colour_values,
-    styled,
-    to_png,
-    value_range,
-    write_note,
-)
 from recon.run.directory import RunDirectory
 
 _MAX_POINTS: Final = 20_000
 _NEAR_SHARE: Final = 0.9  # the caption of the clouds says so
 # Dashed, as both printed methods give a value to the same pixels.
-_LINES: Final = {CORRECTED: (ESTIMATE, "-"), ABSOLUTE: (TRUTH, "-"), AS_PRINTED: (BAD, "--")}
+_LINES: Final = {
+    CORRECTED: (style.ESTIMATE, "-"),
+    ABSOLUTE: (style.TRUTH, "-"),
+    AS_PRINTED: (style.BAD, "--"),
+}
 _SURFACE_COLUMNS: Final = 220
 _CURVE_SAMPLES: Final = 400
 _ELEVATION_DEG: Final = 55.0
@@ -66,14 +55,7 @@ def write_paper_page(
     summary: Mapping[str, Any],
     run: RunDirectory,
 ) -> None:
-    """Write ``report.html`` of the seed paper's experiments.
-
-    Args:
-        folder: The folder of the scenes.
-        results: The experiments, and what each method gave.
-        summary: The figures of the run.
-        run: The run.
-    """
+    """Write ``report.html`` of the seed paper's experiments on the scenes of a folder."""
     write_page(
         "paper",
         run,
@@ -120,7 +102,7 @@ def _view(result: MethodResult) -> Json | None:
     return plot_scene(Scene(T_UPRIGHT_CAMERA, cloud), _MAX_POINTS)
 
 
-@styled
+@style.styled
 def surface_figure(disparity: Disparity) -> bytes:
     """Draw the disparity map as a surface over the image, height = disparity; gaps stay open.
 
@@ -130,77 +112,69 @@ def surface_figure(disparity: Disparity) -> bytes:
     step = max(1, math.ceil(width / _SURFACE_COLUMNS))
     values = disparity.values[::step, ::step].astype(np.float64)
     rows, columns = np.mgrid[0:height:step, 0:width:step]
-    limits = value_range(values)
-    colours = colour_values(values, DISPARITY_SCALE, limits)
-    figure = bare_figure(HALF_IN, 5.2)
+    limits = style.value_range(values)
+    colours = style.colour_values(values, style.DISPARITY_SCALE, limits)
+    figure = style.bare_figure(style.HALF_IN, 5.2)
     axes: Any = figure.add_axes((0.02, 0.02, 0.9, 0.98), projection="3d")
-    axes.plot_surface(
-        columns,
-        rows,
-        np.clip(values, *limits),
-        facecolors=np.dstack([colours / 255.0, np.isfinite(values)]),  # gaps are transparent
-        rstride=1,
-        cstride=1,
-        linewidth=0,
-        antialiased=False,
-        shade=False,
-    )
+    faces = np.dstack([colours / 255.0, np.isfinite(values)])  # gaps are transparent
+    look = {"rstride": 1, "cstride": 1, "linewidth": 0, "antialiased": False, "shade": False}
+    axes.plot_surface(columns, rows, np.clip(values, *limits), facecolors=faces, **look)
     # Seen like the image: row 0 is far and on top.
     axes.set(xlabel="column (px)", ylabel="row (px)", zlabel="disparity (px)", ylim=(height, 0))
     axes.set_box_aspect((1.0, height / width, 0.45), zoom=1.0)
     axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)
-    return to_png(figure)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def depth_curve_figure(camera: RectifiedCamera, disparities_px: Float32) -> bytes:
     """Draw depth against disparity, with the true camera and the focal length of Table 1.
 
-    Args:
-        camera: The true camera.
-        disparities_px: Disparities that occur, of any shape; their range is shaded.
+    The range of the disparities that occur is shaded.
 
     Ref: Fig. 24-26 of the seed paper.
     """
     last = float(camera.ndisp or np.nanmax(disparities_px, initial=1.0))
     d = np.linspace(last / _CURVE_SAMPLES, last, _CURVE_SAMPLES)
-    figure = Figure((HALF_IN, 4.2))
-    axes = figure.subplots()
+    figure, axes = style.subplots(style.HALF_IN, 4.2)
     doffs = f"doffs = {camera.doffs_px:.7g} px"
     label = f"Z = f·b / (d + doffs), f = {camera.focal_px:.7g} px, {doffs}"
-    axes.plot(d, depth_from_disparity(d, camera), color=ESTIMATE, linewidth=2.2, label=label)
+    lines = [(camera, style.ESTIMATE, label)]
     if camera.doffs_px > 0:
         believed = camera_of_table_1(camera)
         label = f"as printed: Z = f·b / d, f = {believed.focal_px:.7g} px"
-        axes.plot(d, depth_from_disparity(d, believed), color=BAD, linewidth=2.2, label=label)
+        lines.append((believed, style.BAD, label))
+    for each, colour, label in lines:
+        axes.plot(d, depth_from_disparity(d, each), color=colour, linewidth=2.2, label=label)
     known = disparities_px[np.isfinite(disparities_px)]
     if known.size:
         low, high = np.percentile(known, (1.0, 99.0))
-        axes.axvspan(low, high, color=FAINT, alpha=0.13, linewidth=0, label="disparities found")
+        axes.axvspan(
+            low, high, color=style.FAINT, alpha=0.13, linewidth=0, label="disparities found"
+        )
     axes.set(yscale="log", xlabel="disparity d (px)", ylabel="depth Z (m, logarithmic)")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     figure.legend(loc="outside lower center", fontsize=9)
-    return to_png(figure)
+    return style.to_png(figure)
 
 
-@styled
+@style.styled
 def patches_figure(patches: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
     """Draw the effect of the patch size: wrong pixels, mean error, pixels with a value."""
-    figure = Figure((WIDE_IN, 3.8))
-    panels = (
-        (f"off by more than {BAD_PX:g} px (%)", "bad_percent"),
-        ("mean error (px)", "avgerr_px"),
-        ("pixels with a value (%)", "valid_percent"),
-    )
-    for axes, (label, name) in zip(figure.subplots(1, 3), panels, strict=True):
+    panels = {
+        f"off by more than {BAD_PX:g} px (%)": "bad_percent",
+        "mean error (px)": "avgerr_px",
+        "pixels with a value (%)": "valid_percent",
+    }
+    figure, row = style.subplots(style.WIDE_IN, 3.8, columns=3)
+    for axes, (label, name) in zip(row, panels.items(), strict=True):
         for method, tried in patches.items():
             known = [(one["patch_px"], one[name]) for one in tried if one[name] is not None]
-            colour, style = _LINES[method]
-            axes.plot(*np.reshape(known, (-1, 2)).T, style, color=colour, marker="o", markersize=4)
+            colour, dashes = _LINES[method]
+            axes.plot(*np.reshape(known, (-1, 2)).T, dashes, color=colour, marker="o", markersize=4)
         if all(one[name] is None for tried in patches.values() for one in tried):
-            write_note(axes, "no truth to compare with")
+            style.write_note(axes, "no truth to compare with")
         axes.set(xlabel="patch (px)", ylabel=label, ylim=(0, None))
-    figure.legend(
-        axes.lines, [TITLES[name] for name in patches], loc="outside lower center", ncols=3
-    )
-    return to_png(figure)
+    titles = [TITLES[name] for name in patches]
+    figure.legend(row[-1].lines, titles, loc="outside lower center", ncols=3)
+    return style.to_png(figure)

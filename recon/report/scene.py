@@ -22,7 +22,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.text import counted
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.report.style import value_range
+from recon.report import style
 
 MAX_POINTS: Final = 120_000
 MAX_FACES: Final = 80_000
@@ -175,7 +175,7 @@ def _xyz(points: NDArray[Any]) -> Json:
 
 def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
     """Return colours by the image if the points have them, and by height."""
-    low, high = value_range(xyz[:, 2])
+    low, high = style.value_range(xyz[:, 2])
     height = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
     scale = {"color": height, "colorscale": _TURBO, "cmin": 0, "cmax": 255}
     by_height = [{"label": "height", "marker": scale}]

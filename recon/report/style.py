@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final
 
 import matplotlib.style
@@ -67,15 +65,32 @@ def show_image(axes: Axes, image: object, title: str = "") -> None:
     axes.set_axis_off()
 
 
+def subplots(
+    width_in: float, height_in: float, rows: int = 1, columns: int = 1, **layout: Any
+) -> tuple[Figure, Any]:
+    """Return a figure and its axes: one, or an array of several."""
+    figure = Figure((width_in, height_in))
+    return figure, figure.subplots(rows, columns, **layout)
+
+
+def stacked(height_in: float, xlabel: str, ylabels: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    """Return a wide figure of axes above each other that share x, and these axes."""
+    figure, rows = subplots(WIDE_IN, height_in, len(ylabels), sharex=True)
+    for axes, label in zip(rows, ylabels, strict=True):
+        axes.set_ylabel(label)
+    rows[-1].set_xlabel(xlabel)
+    return figure, [*rows]
+
+
+def shade(axes: Axes, places: Iterable[float], width: float, colour: str = BAD) -> None:
+    """Mark places along x."""
+    for place in places:
+        axes.axvspan(place - 0.5 * width, place + 0.5 * width, color=colour, alpha=0.2, linewidth=0)
+
+
 def write_note(axes: Axes, text: str) -> None:
     """Write a note in the centre of empty axes."""
     axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)
-
-
-def nice_length(target: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is at most ``target`` (> 0)."""
-    power = 10.0 ** math.floor(math.log10(target))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= target * (1 + 1e-9))
 
 
 Rgb = tuple[int, int, int]
@@ -86,55 +101,46 @@ ERROR_SCALE: Final = "RdYlBu_r"
 MISSING: Final[Rgb] = (20, 22, 26)
 
 # Valid pixels recede and each failure stands out, also in lightness.
-REASON_COLOURS: Final[Mapping[Reason, Rgb]] = MappingProxyType(
-    {
-        Reason.VALID: (226, 232, 236),
-        Reason.LOW_TEXTURE: (86, 180, 233),
-        Reason.AMBIGUOUS: (230, 159, 0),
-        Reason.LEFT_RIGHT: (213, 94, 0),
-        Reason.OCCLUDED: (140, 30, 80),
-        Reason.OUT_OF_RANGE: (0, 114, 178),
-        Reason.BORDER: (70, 76, 84),
-        Reason.SPECKLE: (240, 100, 180),
-        Reason.EDGE: (0, 158, 115),
-    }
-)
-REASON_LABELS: Final[Mapping[Reason, str]] = MappingProxyType(
-    {reason: reason.name.lower().replace("_", " ") for reason in Reason}
-    | {Reason.LEFT_RIGHT: "left-right check", Reason.EDGE: "flying edge"}
-)
+REASON_COLOURS: Final[Mapping[Reason, Rgb]] = {
+    Reason.VALID: (226, 232, 236),
+    Reason.LOW_TEXTURE: (86, 180, 233),
+    Reason.AMBIGUOUS: (230, 159, 0),
+    Reason.LEFT_RIGHT: (213, 94, 0),
+    Reason.OCCLUDED: (140, 30, 80),
+    Reason.OUT_OF_RANGE: (0, 114, 178),
+    Reason.BORDER: (70, 76, 84),
+    Reason.SPECKLE: (240, 100, 180),
+    Reason.EDGE: (0, 158, 115),
+}
+REASON_LABELS: Final[Mapping[Reason, str]] = {
+    **{reason: reason.name.lower().replace("_", " ") for reason in Reason},
+    Reason.LEFT_RIGHT: "left-right check",
+    Reason.EDGE: "flying edge",
+}
 _GRID_IMAGE_PX: Final = 1500
 GRID_FREE: Final[Rgb] = (247, 249, 250)
 GRID_OCCUPIED: Final[Rgb] = (24, 28, 34)
 GRID_UNKNOWN: Final[Rgb] = (190, 197, 204)
 # Correct cells keep the colours of a grid; cells that do not count are darker.
-GRID_ERRORS: Final[Mapping[tuple[int, int], Rgb]] = MappingProxyType(
-    {
-        (FREE, FREE): GRID_FREE,
-        (FREE, OCCUPIED): (230, 159, 0),
-        (FREE, UNKNOWN): (160, 220, 190),
-        (OCCUPIED, FREE): (213, 40, 40),
-        (OCCUPIED, OCCUPIED): GRID_OCCUPIED,
-        (OCCUPIED, UNKNOWN): (0, 114, 178),
-    }
-)
+GRID_ERRORS: Final[Mapping[tuple[int, int], Rgb]] = {
+    (FREE, FREE): GRID_FREE,
+    (FREE, OCCUPIED): (230, 159, 0),
+    (FREE, UNKNOWN): (160, 220, 190),
+    (OCCUPIED, FREE): (213, 40, 40),
+    (OCCUPIED, OCCUPIED): GRID_OCCUPIED,
+    (OCCUPIED, UNKNOWN): (0, 114, 178),
+}
 GRID_NOT_COUNTED: Final[Rgb] = (120, 128, 136)
 
 
-def colour_disparity(
-    values: NDArray[Any], low: float | None = None, high: float | None = None
-) -> UInt8:
-    """Colour a disparity map: far is blue, near is red, invalid is almost black.
+def colour_disparity(values: NDArray[Any], limits: tuple[float, float] | None = None) -> UInt8:
+    """Colour a disparity map (H, W): far is blue, near is red, NaN is almost black.
 
     Args:
-        values: (H, W), pixels; NaN = no match.
-        low: Value of the first colour; None = 1st percentile of the finite values.
-        high: Value of the last colour; None = 99th percentile.
-
-    Returns:
-        uint8 (H, W, 3) RGB.
+        values: Pixels; NaN = no match.
+        limits: Values of the first and the last colour; None = `value_range`.
     """
-    return colour_values(values, DISPARITY_SCALE, value_range(values, low, high))
+    return colour_values(values, DISPARITY_SCALE, limits or value_range(values))
 
 
 def colour_confidence(confidence: NDArray[Any]) -> UInt8:
@@ -144,12 +150,7 @@ def colour_confidence(confidence: NDArray[Any]) -> UInt8:
 
 
 def colour_error(error: NDArray[Any], limit: float) -> UInt8:
-    """Colour absolute errors: 0 is blue, ``limit`` and above is red, NaN is almost black.
-
-    Args:
-        error: (H, W), of either sign.
-        limit: Error of the last colour, in the same unit.
-    """
+    """Colour absolute errors: 0 is blue, ``limit`` and above is red, NaN is almost black."""
     return colour_values(np.abs(error), ERROR_SCALE, (0.0, limit))
 
 
@@ -165,11 +166,7 @@ def colour_reasons(reason: UInt8) -> UInt8:
 
 
 def colour_grid(grid: OccupancyGrid) -> UInt8:
-    """Colour a grid as a map with y up: row 0 of the image is the largest y.
-
-    Returns:
-        uint8 (rows, columns, 3) RGB: free is almost white, occupied almost black.
-    """
+    """Colour a grid, free almost white and occupied almost black; row 0 is the largest y."""
     image = np.full((*grid.cells.shape, 3), GRID_UNKNOWN, dtype=np.uint8)
     image[grid.cells == FREE] = GRID_FREE
     image[grid.cells == OCCUPIED] = GRID_OCCUPIED
@@ -177,13 +174,10 @@ def colour_grid(grid: OccupancyGrid) -> UInt8:
 
 
 def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
-    """Colour a grid by comparison with ground truth.
+    """Colour a grid by comparison with ground truth (`GRID_ERRORS`); row 0 is the largest y.
 
-    Returns:
-        uint8 (rows, columns, 3) RGB, row 0 = the largest y. Correct cells are almost white (free)
-        or almost black (occupied); an obstacle marked free is red, one marked unknown blue, a
-        false obstacle orange, free ground marked unknown green; unseen cells are grey. Each cell
-        is a square of whole pixels, so that small grids are enlarged.
+    An obstacle marked free is red, one marked unknown blue, a false obstacle orange, free ground
+    marked unknown green; unseen cells are grey. Each cell is a square of whole pixels.
     """
     cells = grid_on_truth(grid, truth)
     image = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)
@@ -200,18 +194,11 @@ def colour_values(values: NDArray[Any], scale: str, limits: tuple[float, float])
     return np.asarray(colormap(shown, bytes=True)[..., :3])
 
 
-def value_range(
-    values: NDArray[Any], low: float | None = None, high: float | None = None
-) -> tuple[float, float]:
-    """Return limits of a colour scale: as given, else the 1st and 99th percentile; never empty."""
+def value_range(values: NDArray[Any]) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of the finite values; a range that is never empty."""
     finite = np.asarray(values)[np.isfinite(values)]
-    if finite.size:
-        found_low, found_high = np.percentile(finite, (1.0, 99.0))
-    else:
-        found_low, found_high = 0.0, 1.0
-    first = float(found_low if low is None else low)
-    last = float(found_high if high is None else high)
-    return (first, last) if last > first else (first, first + 1.0)
+    low, high = np.percentile(finite, (1.0, 99.0)).tolist() if finite.size else (0.0, 1.0)
+    return (low, high) if high > low else (low, low + 1.0)
 
 
 def unit_colour(colour: Rgb) -> tuple[float, float, float]:

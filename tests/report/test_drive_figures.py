@@ -11,11 +11,11 @@ from recon.report.drive_figures import (
     drift_figure,
     grid_figure,
     health_figure,
+    nice_length,
     path_figure,
     seen_from_above,
 )
 from recon.report.page import timing_figure
-from recon.report.style import nice_length
 
 
 def is_png(content: bytes) -> bool:

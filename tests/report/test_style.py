@@ -37,7 +37,7 @@ def scale(name: str) -> np.ndarray:
 
 def test_lowest_and_highest_disparity_get_the_ends_of_the_scale() -> None:
     values = np.array([[0.0, 10.0, np.nan, -5.0, 99.0]], dtype=np.float32)
-    colours = colour_disparity(values, 0.0, 10.0)
+    colours = colour_disparity(values, (0.0, 10.0))
     first, last = scale("turbo")[[0, 255]]
     np.testing.assert_array_equal(colours[0, [0, 3]], [first, first])
     np.testing.assert_array_equal(colours[0, [1, 4]], [last, last])
@@ -45,9 +45,8 @@ def test_lowest_and_highest_disparity_get_the_ends_of_the_scale() -> None:
 
 
 def test_near_is_red_and_far_is_blue() -> None:
-    far, near = colour_disparity(np.array([[20.0, 85.0]], dtype=np.float32), 0.0, 100.0)[0].astype(
-        int
-    )
+    values = np.array([[20.0, 85.0]], dtype=np.float32)
+    far, near = colour_disparity(values, (0.0, 100.0))[0].astype(int)
     assert far[2] > far[0]
     assert near[0] > near[2]
 
@@ -64,11 +63,6 @@ def test_range_ignores_what_is_not_finite_and_is_never_empty() -> None:
     assert value_range(np.array([4.0, 4.0, np.nan])) == (4.0, 5.0)
     low, high = value_range(np.arange(101.0))
     assert (low, high) == pytest.approx((1.0, 99.0))
-
-
-def test_range_keeps_the_limits_that_are_given() -> None:
-    assert value_range(np.arange(101.0), low=-3.0) == pytest.approx((-3.0, 99.0))
-    assert value_range(np.arange(101.0), high=50.0) == pytest.approx((1.0, 50.0))
 
 
 def test_error_colours_depend_on_its_size_alone() -> None:
