@@ -18,7 +18,6 @@ from recon.report.audit_page import write_audit_page
 from recon.rig.audit.audit import Audit, audit_source, correct_calibration
 from recon.rig.capture import (
     CaptureFolder,
-    CaptureLog,
     RecordingSettings,
     capture_pairs,
     open_cameras,
@@ -66,19 +65,18 @@ def record(
 ) -> dict[str, Any]:
     """Record from opened cameras; see `run_capture`."""
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    log = CaptureLog()
     with CaptureFolder(folder, settings.suffix) as target:
         if calibration is not None:
             shutil.copyfile(calibration, folder / f"calibration{calibration.suffix}")
         locked = warm_up(cameras, settings)
         try:
-            write_pairs(capture_pairs(cameras, settings, stopped), target, settings, log)
+            write_pairs(capture_pairs(cameras, settings, stopped), target, settings.preview_every)
         finally:
             summary = {
                 "started_utc": started,
                 "devices": [camera.name for camera in cameras],
                 "exposure_locked": locked,
-                **log.figures,
+                **target.figures,
                 "calibration": calibration is not None,
                 "out": str(folder),
             }

@@ -12,27 +12,18 @@ from recon.core.values import Disparity, DisparityTruth
 from recon.core.values.arrays import Bool, Float32, Float64, freeze
 from recon.evaluation.disparity import compared_pixels
 
-_BINS: Final = 10
-"""Equal bins of confidence between 0 and 1."""
-_STEPS: Final = 100
-"""Points of a sparsification curve."""
+_BINS: Final = 10  # equal bins of confidence between 0 and 1
+_STEPS: Final = 100  # points of a sparsification curve
 
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Reliability diagram: share of correct pixels for each level of confidence.
+    """Reliability diagram: share of correct pixels for each level of confidence."""
 
-    Attributes:
-        edges: float64 (B + 1,), limits of the bins, from 0 to 1.
-        confidence: float64 (B,), mean confidence in the bin; NaN = empty bin.
-        right: float64 (B,), share of correct pixels in the bin; NaN = empty bin.
-        pixels: float64 (B,), number of pixels in the bin.
-    """
-
-    edges: Float64
-    confidence: Float64
-    right: Float64
-    pixels: Float64
+    edges: Float64  # (B + 1,), limits of the bins, from 0 to 1
+    confidence: Float64  # (B,), mean confidence in the bin; NaN = empty bin
+    right: Float64  # (B,), share of correct pixels in the bin; NaN = empty bin
+    pixels: Float64  # (B,), number of pixels in the bin
 
     def __post_init__(self) -> None:
         freeze(self, "edges", np.float64, (None,))
@@ -48,17 +39,11 @@ class Reliability:
 
 @dataclass(frozen=True, eq=False)
 class Sparsification:
-    """Sparsification curve: share of wrong pixels left as the least confident ones are removed.
+    """Sparsification curve: share of wrong pixels left as the least confident ones are removed."""
 
-    Attributes:
-        removed: float64 (N,), share of removed pixels, from 0 to below 1.
-        wrong: float64 (N,), share of wrong pixels among the rest, if removed by confidence.
-        best: float64 (N,), the same if the wrong pixels are removed first: the optimum.
-    """
-
-    removed: Float64
-    wrong: Float64
-    best: Float64
+    removed: Float64  # (N,), share of removed pixels, from 0 to below 1
+    wrong: Float64  # (N,), share of wrong pixels among the rest, if removed by confidence
+    best: Float64  # (N,), the same if the wrong pixels are removed first: the optimum
 
     def __post_init__(self) -> None:
         freeze(self, "removed", np.float64, (None,))
@@ -76,14 +61,12 @@ def measure_reliability(
 ) -> Reliability:
     """Compare the confidence of pixels with the share of them that is correct.
 
-    Args:
-        estimate: The disparity, with its confidence.
-        truth: Ground truth at the same size; occluded pixels count too.
-        limit_px: Largest error of a correct pixel.
+    ``limit_px`` is the largest error of a correct pixel; occluded ones count too.
 
     Ref: C. Guo et al., "On calibration of modern neural networks", ICML 2017, section 2.
     """
-    confidence, error_px = _pixels(estimate, truth)
+    both, error_px = _pixels(estimate, truth)
+    confidence = estimate.confidence[both]
     right = error_px <= limit_px
     place = np.minimum((confidence.astype(np.float64) * _BINS).astype(np.int64), _BINS - 1)
     pixels = np.bincount(place, minlength=_BINS).astype(np.float64)
@@ -106,13 +89,13 @@ def measure_sparsification(
     Ref: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow",
     ECCV 2018, section 4 (sparsification, AUSE).
     """
-    confidence, error_px = _pixels(estimate, truth)
+    both, error_px = _pixels(estimate, truth)
     wrong = (error_px > limit_px).astype(np.float64)
     removed = np.arange(_STEPS) / _STEPS
     kept = np.maximum(np.ceil((1 - removed) * wrong.size).astype(np.int64), 1)
     return Sparsification(
         removed=removed,
-        wrong=np.cumsum(_shared_by_equals(confidence, wrong))[kept - 1] / kept,
+        wrong=np.cumsum(_shared_by_equals(estimate.confidence[both], wrong))[kept - 1] / kept,
         best=np.cumsum(np.sort(wrong))[kept - 1] / kept,
     )
 
@@ -122,8 +105,7 @@ def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float
 
     For a normal distribution, it is 0.683 within one and 0.954 within two.
     """
-    both = _compared(estimate, truth)
-    error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])
+    both, error_px = _pixels(estimate, truth)
     return float(np.mean(error_px < sigmas * estimate.sigma_px[both]))
 
 
@@ -134,16 +116,9 @@ def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
     return np.asarray(np.repeat(share, size), dtype=np.float64)
 
 
-def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Float32, Float64]:
-    """Return confidence and absolute error of the pixels that have a value and a known truth."""
-    both = _compared(estimate, truth)
-    error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])
-    return estimate.confidence[both], error_px
-
-
-def _compared(estimate: Disparity, truth: DisparityTruth) -> Bool:
-    """Return bool (H, W), the pixels that have a value and a known truth."""
+def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Bool, Float64]:
+    """Return bool (H, W), the pixels with a value and a known truth, and their errors (N,)."""
     both = estimate.valid & compared_pixels(estimate.values, truth, occluded=True)
     if not both.any():
         raise EvaluationError("no pixel has both a disparity and a known truth")
-    return both
+    return both, np.abs(estimate.values[both].astype(np.float64) - truth.values[both])

@@ -23,30 +23,20 @@ from recon.map.ground.grid import drop_undecided
 from recon.map.settings import DriveSettings
 from recon.sources.source import StereoSource
 
+# Distance to the true surface below which a map point counts as correct.
 SURFACE_THRESHOLD_M: Final = 0.2
-"""Distance to the true surface below which a map point counts as correct."""
-
-LEAST_FRAMES: Final = 3
-"""Number of frames that must have seen a cell for it to be compared."""
+LEAST_FRAMES: Final = 3  # number of frames that must have seen a cell for it to be compared
 
 
 @dataclass(frozen=True)
 class DriveErrors:
-    """Errors of a drive; None = the truth is not known, or cannot be compared with.
+    """Errors of a drive; None = the truth is not known, or cannot be compared with."""
 
-    Attributes:
-        path: Errors against the true path.
-        surface: Errors against the true surface.
-        occupancy: Errors against the true occupancy.
-        warnings: What could not be compared.
-        true_path: The true path, to be drawn.
-    """
-
-    path: TrajectoryMetrics | None
-    surface: MapMetrics | None
-    occupancy: OccupancyMetrics | None
-    warnings: tuple[str, ...] = ()
-    true_path: Trajectory | None = None
+    path: TrajectoryMetrics | None  # errors against the true path
+    surface: MapMetrics | None  # errors against the true surface
+    occupancy: OccupancyMetrics | None  # errors against the true occupancy
+    warnings: tuple[str, ...] = ()  # what could not be compared
+    true_path: Trajectory | None = None  # to be drawn
 
 
 def compare_with_truth(

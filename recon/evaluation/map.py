@@ -31,10 +31,6 @@ def evaluate_map(
         threshold_m: Distance below which a point counts as correct.
         voxel_m: Voxel size; None = half of the threshold.
 
-    Returns:
-        Precision, recall, their harmonic mean, and the distances from the estimate to the
-        reference.
-
     Raises:
         EvaluationError: A cloud is empty, the frames differ, or the threshold is not positive.
 
@@ -64,15 +60,7 @@ def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> 
 
     A LiDAR sees little above its own height, a camera sees tree tops: points there can be neither
     confirmed nor refuted. The range is that of the whole reference, so that points floating above
-    a road still count.
-
-    Args:
-        cloud: The estimate.
-        reference: The cloud taken as true.
-        path: Camera poses, in the frame of both clouds (y of a camera points down).
-
-    Returns:
-        bool (N,), one for each point of the cloud.
+    a road still count. The path is in the frame of both clouds (y of a camera points down).
     """
     low_m, high_m = np.percentile(_heights_m(reference.xyz, path), _BAND_PERCENT)
     heights_m = _heights_m(cloud.xyz, path)
@@ -89,17 +77,10 @@ def _heights_m(xyz: Float32, path: Trajectory) -> Float64:
 def register_cloud(
     cloud: PointCloud, reference: PointCloud, reach_m: float
 ) -> tuple[Float64, float]:
-    """Align a cloud to a reference by ICP, starting from its present pose.
+    """Align a cloud to a reference by ICP: ``T_reference_cloud``, and the share of matched points.
 
-    This removes errors in the pose of the whole map and leaves the errors of its shape.
-
-    Args:
-        cloud: The estimate, misaligned by less than ten times ``reach_m``.
-        reference: The cloud taken as true, in the same frame.
-        reach_m: Largest distance of correspondences in the last stage.
-
-    Returns:
-        float64 (4, 4), ``T_reference_cloud``, and the share of the points with a correspondence.
+    This removes errors in the pose of the whole map and leaves the errors of its shape. The cloud
+    may be off by less than ten times ``reach_m``, the largest distance of partners at the end.
     """
     _check(cloud, reference, reach_m)
     thinned = [_thinned(one, reach_m / 2) for one in (cloud, reference)]
@@ -107,22 +88,13 @@ def register_cloud(
 
 
 def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
-    """Return the distance of each point to the nearest reference point.
-
-    Args:
-        xyz: float32 (N, 3), metres.
-        reference_xyz: float32 (M, 3), metres, M > 0.
-
-    Returns:
-        float32 (N,), metres.
-    """
+    """Return float32 (N,), the distance of each point to the nearest of the reference, metres."""
     if len(reference_xyz) == 0:
         raise EvaluationError("the reference cloud is empty")
     return open3d_clouds.nearest(xyz, reference_xyz)[1][:, 0]
 
 
 def _check(cloud: PointCloud, reference: PointCloud, threshold_m: float) -> None:
-    """Raise if the clouds cannot be compared."""
     if not (isinstance(cloud, PointCloud) and isinstance(reference, PointCloud)):
         raise EvaluationError(
             "only point clouds can be compared",
@@ -155,16 +127,10 @@ _CONVERGED = 1e-7
 def icp(
     xyz: NDArray[Any], reference_xyz: NDArray[Any], reaches_m: tuple[float, ...]
 ) -> tuple[Float64, float]:
-    """Align points to a reference cloud by robust point-to-plane ICP.
+    """Align points (N, 3) to a reference cloud by robust point-to-plane ICP, from where they are.
 
-    Args:
-        xyz: (N, 3), metres, finite, roughly aligned.
-        reference_xyz: (M, 3), metres, finite.
-        reaches_m: Maximum correspondence distance of each pass, decreasing.
-
-    Returns:
-        float64 (4, 4), ``T_reference_points``, and the share of the points that have a
-        correspondence in the last pass.
+    ``reaches_m``: largest distance of partners in each pass, decreasing. Returns
+    ``T_reference_points``, and the share of the points that have a partner in the last pass.
 
     Ref: Chen & Medioni, "Object modelling by registration of multiple range images", 1992;
     robust weights: Babin et al., "Analysis of robust functions for registration algorithms", 2019.

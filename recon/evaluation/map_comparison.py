@@ -31,43 +31,28 @@ _FITS, _HARDLY_MEETS = 0.5, 0.1
 
 @dataclass(frozen=True, eq=False)
 class MapComparison:
-    """The result of a comparison, from which its clouds are coloured.
+    """The result of a comparison, from which its clouds are coloured."""
 
-    Attributes:
-        cloud: The estimate, in the axes of the reference, aligned.
-        reference: The reference.
-        thresholds_m: Distances below which a point counts as correct.
-        summary: The figures of ``summary.json``.
-    """
-
-    cloud: PointCloud
-    reference: PointCloud
-    thresholds_m: tuple[float, ...]
-    summary: dict[str, Any]
+    cloud: PointCloud  # the estimate, in the axes of the reference, aligned
+    reference: PointCloud  # the reference
+    thresholds_m: tuple[float, ...]  # distances below which a point counts as correct
+    summary: dict[str, Any]  # the figures of ``summary.json``
 
 
 @dataclass(frozen=True, eq=False)
 class MappedCloud:
-    """A cloud, and the run that it belongs to.
+    """A cloud, and the run that it belongs to."""
 
-    Attributes:
-        cloud: The cloud; as read, in map axes if it is of a run.
-        path: The path of the cameras; as read, in world axes; None = unknown.
-        T_map_world: float64 (4, 4), from world to map axes; None = no run.
-        doubts: What is not to be trusted in the map of the run.
-    """
-
-    cloud: PointCloud
-    path: Trajectory | None = None
-    T_map_world: Float64 | None = None
-    doubts: Sequence[str] = ()
+    cloud: PointCloud  # as read, in map axes if it is of a run
+    path: Trajectory | None = None  # of the cameras; as read, in world axes; None = unknown
+    T_map_world: Float64 | None = None  # (4, 4), from world to map axes; None = no run
+    doubts: Sequence[str] = ()  # what is not to be trusted in the map of the run
 
 
 def read_mapped_cloud(run: Path) -> MappedCloud:
-    """Read the map of a run, or a cloud.
+    """Read the map of a run, by its folder, or a PLY file.
 
-    Args:
-        run: A run's folder, or a PLY file. A PLY inside a run's folder is in that run's map axes.
+    A PLY inside a run's folder is in that run's map axes.
     """
     folder = run if run.is_dir() else run.parent.parent
     if not run.is_dir() and (run.parent.name != "map" or not (folder / RECORD).is_file()):
@@ -79,16 +64,10 @@ def read_mapped_cloud(run: Path) -> MappedCloud:
 def place_cloud(
     mapped: MappedCloud, frame: ReferenceFrame, align_to: Path | None
 ) -> tuple[MappedCloud, dict[str, Any]]:
-    """Bring a map into the axes of its reference.
+    """Bring a map into the axes of its reference: those of the first left camera, or the map's.
 
-    Args:
-        mapped: The map; a cloud of no run is taken to be in the axes of the reference already.
-        frame: Axes of the reference: those of the first left camera, or the map's.
-        align_to: Ground-truth poses of the run's cameras, in the axes of the reference; the run's
-            path is aligned rigidly to them, and its map moves with it.
-
-    Returns:
-        The map, and how it was aligned.
+    A cloud of no run is taken to be in them already. ``align_to`` are true poses of the run's
+    cameras in these axes, to which its path is aligned rigidly. Also returns how it was aligned.
     """
     if frame == "map" and align_to is not None:
         raise SettingsError(
@@ -133,15 +112,8 @@ def place_by_icp(
 ) -> tuple[MappedCloud, dict[str, Any], ReferenceFrame]:
     """Bring a map into the axes of its reference (`place_cloud`), and align it there by ICP.
 
-    Args:
-        mapped: The map.
-        reference: The reference, in some axes.
-        frames: Those that are tried; the cloud is placed where most of its points have a partner.
-        align_to: Ground-truth poses of the run's cameras, see `place_cloud`.
-        reach_m: Largest distance of partners.
-
-    Returns:
-        The map, how it was aligned, and the axes.
+    Of several ``frames``, the cloud is placed where most of its points have a partner within
+    ``reach_m``. Returns the map, how it was aligned, and the axes.
     """
     found: list[tuple[MappedCloud, dict[str, Any], ReferenceFrame]] = []
     for frame in frames:
@@ -159,7 +131,6 @@ def place_by_icp(
 def _fit_cloud(
     mapped: MappedCloud, reference: PointCloud, reach_m: float
 ) -> tuple[MappedCloud, dict[str, Any]]:
-    """Align a map to the reference by ICP; also returns how far that moved it."""
     reference = replace(reference, frame=mapped.cloud.frame)
     T, share = register_cloud(mapped.cloud, reference, reach_m)
     # Measured at the centre of the map: a rotation about a far origin would look like a shift.

@@ -38,17 +38,11 @@ _TOLERANCE: Final = 1
 def evaluate_occupancy(
     voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth
 ) -> OccupancyMetrics:
-    """Compare the voxels and the 2-D grid of a map with the truth.
+    """Compare the voxels and the 2-D grid of a map with the truth in its axes and cells.
 
-    Args:
-        voxels: The map; log-odds above 0 are occupied.
-        grid: The 2-D grid of the same map.
-        truth: Ground truth, in the axes and cells of the map.
-
-    Returns:
-        Results with a tolerance of one cell (26 neighbours in 3-D, 8 in the grid), and without.
-        With the tolerance, a true cell is found if an estimated cell of its state is that near,
-        and an estimated cell is wrong if no true one is: IoU = found / (true + wrong).
+    Results are with a tolerance of one cell (26 neighbours in 3-D, 8 in the grid), and without.
+    With it, a true cell is found if an estimated cell of its state is that near, and an estimated
+    cell is wrong if no true one is: IoU = found / (true + wrong). Log-odds above 0 are occupied.
     """
     _check(voxels, grid, truth)
     occupied = voxels.keys[voxels.log_odds > 0]
@@ -65,7 +59,6 @@ def evaluate_occupancy(
 
 
 def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) -> None:
-    """Raise if map and truth cannot be compared."""
     sizes = {voxels.resolution_m, grid.resolution_m, truth.grid.resolution_m}
     if max(sizes) - min(sizes) > 1e-9:
         raise EvaluationError(
@@ -151,7 +144,6 @@ def _iou(estimate: Bool, true: Bool, seen: Bool, tolerance: int) -> float:
 
 
 def _grown(cells: Bool, tolerance: int) -> Bool:
-    """Return the cells dilated by ``tolerance`` cells."""
     kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
     return np.asarray(cv2.dilate(cells.astype(np.uint8), kernel) > 0)
 

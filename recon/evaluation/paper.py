@@ -38,8 +38,8 @@ from recon.stereo.match.search import usual_ndisp
 from recon.stereo.rectify.grey import to_grey
 from recon.stereo.rectify.rectifier import Rectifier
 
+# Scene of each experiment, identified by Table 1: docs/paper.md.
 EXPERIMENTS: Final[Mapping[int, str]] = MappingProxyType({2: "ArtL", 3: "Jadeplant", 4: "Pipes"})
-"""Scene of each experiment, identified by Table 1: docs/paper.md."""
 CORRECTED: Final = "corrected"
 ABSOLUTE: Final = "absolute"
 AS_PRINTED: Final = "as_printed"
@@ -50,8 +50,7 @@ TITLES: Final[Mapping[str, str]] = MappingProxyType(
         AS_PRINTED: "as printed",
     }
 )
-BAD_PX: Final = 1.0
-"""Disparity error above which a pixel counts as wrong."""
+BAD_PX: Final = 1.0  # disparity error above which a pixel counts as wrong
 _SCENES: Final = Path("middlebury", "MiddEval3", "trainingQ")
 _WHERE: Final = "name the folder MiddEval3/trainingQ of the Middlebury benchmark"
 # A value rounded to whole pixels is off by up to half a pixel, each amount as likely.
@@ -108,23 +107,14 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """Result of one method on one experiment.
+    """Result of one method on one experiment."""
 
-    Attributes:
-        method: A key of `TITLES`.
-        pair: The grey images, with the camera that the method assumes.
-        disparity: The disparity map.
-        depth_m: float32 (H, W), metres; NaN = unknown.
-        cloud: The points in camera axes.
-        figures: Shares, and errors of disparity and depth; None without ground truth.
-    """
-
-    method: str
-    pair: RectifiedPair
-    disparity: Disparity
-    depth_m: Float32
-    cloud: PointCloud
-    figures: dict[str, Any]
+    method: str  # a key of `TITLES`
+    pair: RectifiedPair  # the grey images, with the camera that the method assumes
+    disparity: Disparity  # the disparity map
+    depth_m: Float32  # (H, W), metres; NaN = unknown
+    cloud: PointCloud  # the points in camera axes
+    figures: dict[str, Any]  # shares, and errors of disparity and depth; None without ground truth
 
 
 @dataclass(frozen=True)
@@ -133,16 +123,11 @@ class PrintedMatcher:
 
     A pixel has no value only where no patch lies within both images. Every other pixel keeps
     its minimum, however doubtful: confidence 1 says that nothing was asked, not that it is right.
-
-    Attributes:
-        patch_px: Edge of the patch; odd.
-        signed: Whether to sum the differences with their signs, as Eq. 9-10 are printed; else
-            their absolute values, which is what SAD means.
-
-    Ref: Eq. 9-10 of the seed paper, see docs/paper.md.
     """
 
-    patch_px: int
+    patch_px: int  # edge of the patch; odd
+    # whether to sum the differences with their signs, as Eq. 9-10 are printed; else their absolute
+    # values, which is what SAD means. Ref: Eq. 9-10 of the seed paper, see docs/paper.md
     signed: bool
 
     def match(self, pair: RectifiedPair) -> Disparity:

@@ -1,4 +1,4 @@
-"""Segments of a path, over which its drift is measured, as in the KITTI development kit."""
+"""Which poses of two paths are compared: near in time, at the ends of segments, measured."""
 
 from __future__ import annotations
 
@@ -14,35 +14,24 @@ from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64, Int32
 
+# Segment lengths of the KITTI benchmark.
 KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-"""Segment lengths of the KITTI benchmark."""
-
+# Segment lengths for a drive that is too short for two lengths of the benchmark.
 SHORT_LENGTHS_M: Final = (50.0, 100.0)
-"""Segment lengths for a drive that is too short for two lengths of the benchmark."""
-
-KITTI_STEP_FRAMES: Final = 10
-"""The benchmark starts a segment at every tenth frame (one second)."""
+KITTI_STEP_FRAMES: Final = 10  # the benchmark starts a segment at every tenth frame (one second)
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Segments of the true path.
+    """Segments of the true path."""
 
-    Attributes:
-        first: int32 (N,), first frame of each segment.
-        last: int32 (N,), last frame of each segment.
-        length_m: float64 (N,), nominal length of each segment.
-    """
-
-    first: Int32
-    last: Int32
-    length_m: Float64
+    first: Int32  # (N,), first frame of each segment
+    last: Int32  # (N,), last frame of each segment
+    length_m: Float64  # (N,), nominal length of each segment
 
 
 def choose_segments(
-    distances_m: Float64,
-    lengths_m: tuple[float, ...] | None = None,
-    step_frames: int | None = None,
+    distances_m: Float64, lengths_m: tuple[float, ...] | None = None, step_frames: int | None = None
 ) -> Segments:
     """Choose the segments over which a drive is evaluated.
 
@@ -83,8 +72,8 @@ def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -
     return Segments(first[fits].astype(np.int32), last[fits].astype(np.int32), length_m[fits])
 
 
+# Largest time difference of two associated poses, unless another is given.
 TOLERANCE_S: Final = 0.01
-"""Largest time difference of two associated poses, unless another is given."""
 
 
 def associate(
@@ -92,50 +81,37 @@ def associate(
 ) -> tuple[Trajectory, Trajectory]:
     """Match poses that are mutually nearest in time; poses without a match are left out.
 
-    Args:
-        estimate: Estimated trajectory.
-        truth: True trajectory, on the same clock; its rate may differ.
-        tolerance_s: Largest time difference of a match.
-
-    Returns:
-        Two trajectories of equal length, pose by pose, each with its own timestamps.
+    Both paths are on the same clock, their rates may differ. Those returned are of equal length.
     """
     there = nearest_sorted(estimate.timestamps_s, truth.timestamps_s)
     back = nearest_sorted(truth.timestamps_s, estimate.timestamps_s)
     apart_s = np.abs(truth.timestamps_s[there] - estimate.timestamps_s)
     mutual = (back[there] == np.arange(len(estimate))) & (apart_s <= tolerance_s)
     if not mutual.any():
+        spans = [
+            f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (estimate.timestamps_s, truth.timestamps_s)
+        ]
         raise EvaluationError(
             "no poses of the two trajectories match in time",
-            got=f"times {_span(estimate)} and {_span(truth)}",
+            got=f"times {' and '.join(spans)}",
             expected=f"times within {tolerance_s:g} s of each other",
             hint="raise --tolerance, or make sure that both use the same clock",
         )
     return estimate.select(mutual), truth.select(there[mutual])
 
 
-def _span(path: Trajectory) -> str:
-    return f"{path.timestamps_s[0]:.3f} to {path.timestamps_s[-1]:.3f} s"
-
-
+# A turn changes evenly from frame to frame if it does so less than this share of the median.
 _EVEN: Final = 0.02
-"""A turn changes evenly from frame to frame if it does so less than this share of the median."""
-
-_LEAST_CHANGES: Final = 5
-"""Fewer even changes in a row may be chance."""
-
+_LEAST_CHANGES: Final = 5  # fewer even changes in a row may be chance
+# Where turns change less than this everywhere, the digits of the file decide: KITTI has six.
 _LEAST_MEDIAN_RAD: Final = 5e-5
-"""Where turns change less than this everywhere, the digits of the file decide: KITTI has six."""
 
 
 def interpolated_poses(path: Trajectory) -> Bool:
     """Return bool (N,): poses along which the path turns at one rate, as it does nowhere else.
 
     A vehicle never does for more than a moment: its rates of turn change from frame to frame. A
-    path that turns evenly for the most part has none, as rendered ones do.
-
-    Args:
-        path: The true path, at about equal times.
+    path that turns evenly for the most part has none, as rendered ones do. Times are about equal.
     """
     found = np.zeros(len(path), np.bool_)
     if len(path) < _LEAST_CHANGES + 2:
@@ -144,7 +120,8 @@ def interpolated_poses(path: Trajectory) -> Bool:
     change = angle_rad(invert(step[:-1]) @ step[1:])
     typical = float(np.median(change))
     even = (change < _EVEN * typical) & (typical > _LEAST_MEDIAN_RAD)
-    for first in np.flatnonzero(_runs(even)):
+    runs = np.lib.stride_tricks.sliding_window_view(even, _LEAST_CHANGES).all(axis=1)
+    for first in np.flatnonzero(runs):
         found[first : first + _LEAST_CHANGES + 2] = True
     return found
 
@@ -159,8 +136,3 @@ def interpolation_warnings(truth: Trajectory, segments: Segments) -> list[str]:
     which = f"{counted(int(found.sum()), 'true pose')} (between {first} and {last})"
     where = f"{resting} of {counted(len(segments.first), 'segment')} begin or end there"
     return [f"{which} turn evenly, as interpolated ones do: {where}"]
-
-
-def _runs(even: Bool) -> Bool:
-    """Return where so many even changes begin."""
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(even, _LEAST_CHANGES).all(axis=1))

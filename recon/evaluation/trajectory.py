@@ -22,8 +22,8 @@ from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
 from recon.places.places import drift_at_end, fit_to_path
 
+# On a shorter path, relative errors would be dominated by the noise of the ground truth.
 MIN_PATH_M: Final = 1.0
-"""On a shorter path, relative errors would be dominated by the noise of the ground truth."""
 
 
 class TrajectoryRules(Settings):
@@ -53,25 +53,15 @@ class TrajectoryRules(Settings):
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryComparison:
-    """Two trajectories and their differences, as needed for plots.
+    """Two trajectories and their differences, as needed for plots."""
 
-    Attributes:
-        estimate: The aligned estimate.
-        truth: The true trajectory, pose by pose.
-        segments: The segments of the relative errors.
-        segment_percent: float64 (N,), translation error of each segment, per cent of its length.
-        segment_deg_per_100m: float64 (N,), rotation error of each segment.
-        metrics: The summary.
-        motion: What aligned the estimate.
-    """
-
-    estimate: Trajectory
-    truth: Trajectory
-    segments: Segments
-    segment_percent: Float64
-    segment_deg_per_100m: Float64
-    metrics: TrajectoryMetrics
-    motion: Similarity
+    estimate: Trajectory  # the aligned estimate
+    truth: Trajectory  # the true trajectory, pose by pose
+    segments: Segments  # the segments of the relative errors
+    segment_percent: Float64  # (N,), translation error of each segment, per cent of its length
+    segment_deg_per_100m: Float64  # (N,), rotation error of each segment
+    metrics: TrajectoryMetrics  # the summary
+    motion: Similarity  # what aligned the estimate
 
     @property
     def position_errors_m(self) -> Float64:
@@ -104,19 +94,12 @@ class TrajectoryComparison:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryRun:
-    """The result of a comparison.
+    """The result of a comparison."""
 
-    Attributes:
-        estimate: File of the estimate.
-        truth: File of the ground truth.
-        comparison: The two paths, aligned, and their differences.
-        summary: The figures of ``summary.json``.
-    """
-
-    estimate: Path
-    truth: Path
-    comparison: TrajectoryComparison
-    summary: dict[str, Any]
+    estimate: Path  # file of the estimate
+    truth: Path  # file of the ground truth
+    comparison: TrajectoryComparison  # the two paths, aligned, and their differences
+    summary: dict[str, Any]  # the figures of ``summary.json``
 
 
 def evaluate_trajectory(
@@ -161,18 +144,11 @@ def compare_paths(
     path has room for them, starting at every tenth frame; the error of a segment is the error of
     the motion over it, divided by its length; the mean is over all segments. A drive with room for
     fewer than two of these lengths uses segments of 50 and 100 m instead, starting at every frame,
-    and a drive of 50 m or less uses segments of half its length. The lengths used are in
-    `TrajectoryMetrics.segment_lengths_m`.
+    and a drive of 50 m or less uses segments of half its length. The scale of the alignment affects
+    all errors, its rigid part only the ATE.
 
-    Args:
-        estimate: One pose for each true pose.
-        truth: The true poses.
-        rules: Alignment and segments; None = the defaults. The scale of the alignment affects all
-            errors, its rigid part only the ATE.
-
-    Ref:
-        Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012;
-        Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
+    Ref: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012; Sturm et al., "A
+    benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
     """
     rules = rules or TrajectoryRules()
     _check(estimate, truth, rules)
@@ -220,20 +196,11 @@ def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity
 def motion_errors(
     estimate: Trajectory, truth: Trajectory, first: Int32, last: Int32
 ) -> tuple[Float64, Float64]:
-    """Return errors of the motion between two frames.
-
-    Returns:
-        Translation in metres (N,) and rotation in radians (N,).
-    """
-    wrong = invert(_motion(estimate, first, last)) @ _motion(truth, first, last)
-    return np.linalg.norm(wrong[:, :3, 3], axis=1), angle_rad(wrong)
-
-
-def _motion(trajectory: Trajectory, first: Int32, last: Int32) -> Float64:
-    """Return float64 (N, 4, 4), poses of the last frames relative to the first ones."""
-    poses = trajectory.T_world_camera
+    """Return errors of the motion between two frames: metres (N,) and radians (N,)."""
+    poses, true = estimate.T_world_camera, truth.T_world_camera
     motion: Float64 = invert(poses[first]) @ poses[last]
-    return motion
+    wrong = invert(motion) @ (invert(true[first]) @ true[last])
+    return np.linalg.norm(wrong[:, :3, 3], axis=1), angle_rad(wrong)
 
 
 def _by_length(
@@ -296,12 +263,8 @@ _FIXED_RAD: Final = float(np.radians(0.5))
 def open_roll_axis(estimate: Trajectory, truth: Trajectory) -> Float64 | None:
     """Return the direction of a straight path about which aligned positions do not fix the roll.
 
-    Args:
-        estimate: The estimate, aligned to the true path by positions.
-        truth: The true path.
-
-    Returns:
-        float64 (3,), world axes of ``truth``; None if the positions fix every rotation.
+    float64 (3,), world axes of ``truth``; None if the positions fix every rotation. The estimate is
+    aligned to the true path by positions.
     """
     centred = truth.positions_m - truth.positions_m.mean(axis=0)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)

@@ -42,13 +42,7 @@ _FAINT: Final = "#6e7781"
 
 @dataclass(frozen=True)
 class Sheet:
-    """Paper, oriented so that a board fits.
-
-    Attributes:
-        name: Name of the paper size.
-        width_mm: Width.
-        height_mm: Height.
-    """
+    """Paper with its name, oriented so that a board fits."""
 
     name: str
     width_mm: float
@@ -66,8 +60,7 @@ def write_board(
         paper: Name of a paper size, or ``600x400mm``; None = the smallest A size that fits.
         dpi: Approximate resolution of a PNG; a square has a whole number of pixels.
 
-    Returns:
-        A description of the sheet as plain values.
+    Returns a description of the sheet as plain values.
     """
     kind = path.suffix.lower()
     if kind not in _KINDS:
@@ -85,8 +78,14 @@ def write_board(
         )
     sheet = choose_sheet(board, paper)
     exact_dpi = _whole_pixels(board, dpi)
-    if kind == ".png":
-        _check_pixels(sheet, exact_dpi)
+    longest = round(max(sheet.width_mm, sheet.height_mm) / _MM_PER_IN * exact_dpi)
+    if kind == ".png" and longest > _LARGEST_PNG_PX:
+        raise SettingsError(
+            "image of the board would be too large",
+            got=f"{longest} px",
+            expected=f"at most {_LARGEST_PNG_PX} px",
+            hint="a smaller --dpi, or PDF, which has none",
+        )
     write_bytes(path, _draw(board, sheet, kind[1:], exact_dpi))
     width_mm, height_mm = (1e3 * length for length in board.size_m)
     figures = {
@@ -135,13 +134,11 @@ def _turned(name: str, board: CalibrationBoard) -> Sheet:
 
 def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
     """Return the factor by which the squares could grow (above 1) or must shrink on a sheet."""
-    scales = []
-    sides = zip((sheet.width_mm, sheet.height_mm), board.squares, strict=True)
-    for paper_mm, squares in sides:
-        by_square = paper_mm / (squares + 2 * _MARGIN_SQUARES)
-        by_printer = (paper_mm - 2 * _SMALLEST_MARGIN_MM) / squares
-        scales.append(min(by_square, by_printer) / (1e3 * board.square_m))
-    return min(scales)
+    largest_mm = []
+    for paper_mm, squares in zip((sheet.width_mm, sheet.height_mm), board.squares, strict=True):
+        largest_mm.append(paper_mm / (squares + 2 * _MARGIN_SQUARES))
+        largest_mm.append((paper_mm - 2 * _SMALLEST_MARGIN_MM) / squares)
+    return min(largest_mm) / (1e3 * board.square_m)
 
 
 def _whole_pixels(board: CalibrationBoard, dpi: float) -> float:
@@ -150,20 +147,12 @@ def _whole_pixels(board: CalibrationBoard, dpi: float) -> float:
     return max(round(square_in * dpi), 1) / square_in
 
 
-def _check_pixels(sheet: Sheet, dpi: float) -> None:
-    longest = round(max(sheet.width_mm, sheet.height_mm) / _MM_PER_IN * dpi)
-    if longest > _LARGEST_PNG_PX:
-        raise SettingsError(
-            "image of the board would be too large",
-            got=f"{longest} px",
-            expected=f"at most {_LARGEST_PNG_PX} px",
-            hint="a smaller --dpi, or PDF, which has none",
-        )
-
-
 def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes:
     figure = Figure((sheet.width_mm / _MM_PER_IN, sheet.height_mm / _MM_PER_IN), facecolor="white")
-    axes = _page(figure, sheet)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))  # in millimetres, from the upper left corner
+    axes.set_axis_off()
+    axes.set_xlim(0, sheet.width_mm)
+    axes.set_ylim(sheet.height_mm, 0)
     width_mm, height_mm = (1e3 * length for length in board.size_m)
     left_mm, top_mm = (sheet.width_mm - width_mm) / 2, (sheet.height_mm - height_mm) / 2
     if kind == "png":  # align squares with pixels
@@ -179,15 +168,6 @@ def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes
     undated = {"CreationDate": None} if kind == "pdf" else {}
     figure.savefig(buffer, format=kind, dpi=dpi, metadata=undated)
     return buffer.getvalue()
-
-
-def _page(figure: Figure, sheet: Sheet) -> Axes:
-    """Return axes over the whole sheet, in millimetres from its upper left corner."""
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set_axis_off()
-    axes.set_xlim(0, sheet.width_mm)
-    axes.set_ylim(sheet.height_mm, 0)
-    return axes
 
 
 def _outline(boxes_mm: Float64) -> Outline:

@@ -28,12 +28,8 @@ class CameraSource(StereoSource):
 
     It is live if all are cameras; video files take as long as one likes.
 
-    Args:
-        cameras: Left and right one, or one with both views.
-        settings: How to take pairs, and how many.
-        calibration: Of the two views.
-        files: What the calibration was read from.
-        stopped: Called before each pair; True ends the drive.
+    ``files`` are what the calibration was read from; ``stopped`` is called before each pair, and
+    True ends the drive.
     """
 
     name: str
@@ -80,11 +76,7 @@ def open_camera_source(
 ) -> Iterator[CameraSource]:
     """Open cameras as a source, for the body of a ``with`` statement.
 
-    Args:
-        devices: See `open_cameras`.
-        settings: Image size, frame rate, arrangement of the views.
-        source: Names the calibration; its ``end`` is the number of pairs.
-        stopped: Called before each pair; True ends the drive.
+    ``source`` names the calibration; its ``end`` is the number of pairs. See `CameraSource`.
     """
     if source.shift_frames:
         raise SettingsError(

@@ -1,4 +1,4 @@
-"""Records from two cameras, or from one that gives both views side by side.
+"""Records pairs from two cameras, or from one that gives both views side by side.
 
 Both cameras are grabbed before either frame is decoded, to keep the exposures close. Recordings
 have the layout of plain folders (see `folders`); the line of a pair in ``frames.csv`` is written
@@ -12,7 +12,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -22,7 +22,7 @@ from typing_extensions import Self
 
 from recon.core.errors import OutputError, ReconError, SourceError
 from recon.core.settings import Settings
-from recon.core.values.arrays import UInt8
+from recon.core.values.arrays import UInt8, size_text
 from recon.io.images.image import write_image
 from recon.io.trajectory import FRAMES, HEADER, CapturedFrame
 from recon.sources.opencv_camera import Camera, OpenCvCamera
@@ -31,10 +31,11 @@ from recon.sources.video import split_views
 
 # Assumed if a driver does not report its rate; the most common one.
 _USUAL_RATE_HZ: Final = 30.0
-
-
-_WARM_UP_FRAMES: Final = 15
-"""Frames dropped at the start, while the exposure adapts."""
+_WARM_UP_FRAMES: Final = 15  # frames dropped at the start, while the exposure adapts
+# Length of the write queue: a longer one would only hide that the disk is too slow.
+_WAITING: Final = 32
+# A time step longer than this many periods means that a frame was lost.
+_GAP_PERIODS: Final = 1.5
 
 
 class CaptureSettings(Settings):
@@ -87,14 +88,7 @@ class RecordingSettings(CaptureSettings):
 
 @dataclass(frozen=True, eq=False)
 class CapturedPair:
-    """One pair of frames from the cameras.
-
-    Attributes:
-        left: Left image, uint8 (H, W, 3) RGB.
-        right: Right image, likewise.
-        left_s: Time of the left image.
-        right_s: Time of the right image.
-    """
+    """One pair of frames from the cameras: uint8 (H, W, 3) RGB, and their times."""
 
     left: UInt8
     right: UInt8
@@ -106,9 +100,7 @@ class CapturedPair:
 def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[tuple[Camera, ...]]:
     """Open the left and the right camera, or one with both views, for the body of a ``with``.
 
-    Args:
-        devices: Numbers, paths, addresses of streams, or video files.
-        settings: Image size and frame rate to ask for.
+    ``devices`` are numbers, paths, addresses of streams, or video files.
     """
     width, height = settings.width_px, settings.height_px
     size = None if width is None or height is None else (width, height)
@@ -127,7 +119,8 @@ def capture_pairs(
 
     If one camera loses a frame, the other drops its frame too, so that pairs are nearest in time.
     """
-    period_s = 1 / _rate_hz(cameras, settings)
+    known_hz = [camera.rate_hz for camera in cameras if np.isfinite(camera.rate_hz)]
+    period_s = 1 / (settings.rate_hz or min(known_hz, default=_USUAL_RATE_HZ))
     first_s: float | None = None
     count = 0
     while not stopped() and count != settings.frames:
@@ -137,18 +130,14 @@ def capture_pairs(
         first_s = stamps[0] if first_s is None else first_s
         if settings.seconds is not None and stamps[0] - first_s > settings.seconds:
             return
-        left, right = _retrieve(cameras, settings)
-        yield CapturedPair(left, right, stamps[0], stamps[-1])
+        yield CapturedPair(*_retrieve(cameras, settings), stamps[0], stamps[-1])
         count += 1
 
 
 def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
     """Drop the first frames, then lock the exposure of the left camera on both.
 
-    Video files need no warm-up and keep all their frames.
-
-    Returns:
-        Whether the exposure is locked on every camera.
+    Returns whether it is locked on every camera. Video files need no warm-up and keep all frames.
     """
     if not all(camera.live for camera in cameras):
         return False
@@ -159,11 +148,6 @@ def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
         return False
     exposure = cameras[0].lock(None)
     return exposure is not None and all(camera.lock(exposure) is not None for camera in cameras[1:])
-
-
-def _rate_hz(cameras: tuple[Camera, ...], settings: CaptureSettings) -> float:
-    known_hz = [camera.rate_hz for camera in cameras if np.isfinite(camera.rate_hz)]
-    return settings.rate_hz or min(known_hz, default=_USUAL_RATE_HZ)
 
 
 def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:
@@ -186,39 +170,31 @@ def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:
 def _retrieve(cameras: tuple[Camera, ...], settings: CaptureSettings) -> tuple[UInt8, UInt8]:
     images = [camera.retrieve() for camera in cameras]
     if len(images) == 1:
-        _check_halves(images[0], cameras[0].name, settings)
+        stacked = settings.side_by_side in {"top-bottom", "bottom-top"}
+        if images[0].shape[0 if stacked else 1] % 2:
+            got = size_text(images[0])
+            raise SourceError("frames cannot be halved", where=cameras[0].name, got=got)
         return split_views(images[0], SourceSettings(side_by_side=settings.side_by_side))
     if images[0].shape != images[1].shape:
-        sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
         raise SourceError(
             "cameras differ in frame size",
             where=cameras[1].name,
-            got=f"left {sizes[0]}, right {sizes[1]}",
+            got=f"left {size_text(images[0])}, right {size_text(images[1])}",
             hint="request the same size from both with --size",
         )
     return images[0], images[1]
 
 
-def _check_halves(image: UInt8, name: str, settings: CaptureSettings) -> None:
-    stacked = settings.side_by_side in {"top-bottom", "bottom-top"}
-    if image.shape[0 if stacked else 1] % 2:
-        raise SourceError(
-            "frames cannot be halved", where=name, got=f"{image.shape[1]}x{image.shape[0]}"
-        )
-
-
-# Length of the write queue: a longer one would only hide that the disk is too slow.
-_WAITING: Final = 32
-# A time step longer than this many periods means that a frame was lost.
-_GAP_PERIODS: Final = 1.5
-
-
 class CaptureFolder:
-    """Appends pairs; a pair that cannot be written completely is removed again."""
+    """The folder a capture is written to, pair by pair; valid at any moment.
+
+    A pair that cannot be written completely is removed again.
+    """
 
     def __init__(self, folder: Path, suffix: str) -> None:
         self.folder, self._suffix = folder, suffix
-        self.frames = 0
+        self._left_s: list[float] = []
+        self._right_s: list[float] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
@@ -243,6 +219,11 @@ class CaptureFolder:
             with suppress(OSError):  # it holds a preview
                 self.folder.rmdir()
 
+    @property
+    def frames(self) -> int:
+        """Number of pairs that were written."""
+        return len(self._left_s)
+
     def add(self, pair: CapturedPair) -> None:
         """Write both images, then their line in the list."""
         name = f"{self.frames:06d}.{self._suffix}"
@@ -255,11 +236,27 @@ class CaptureFolder:
             for written in (frame.left, frame.right):
                 (self.folder / written).unlink(missing_ok=True)
             raise
-        self.frames += 1
+        self._left_s.append(pair.left_s)
+        self._right_s.append(pair.right_s)
 
     def preview(self, pair: CapturedPair) -> None:
         """Replace ``preview.jpg`` by both images side by side."""
         write_image(self.folder / "preview.jpg", np.hstack([pair.left, pair.right]))
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Number of pairs, rate, gaps and difference in time between the cameras."""
+        left_s, frames = np.array(self._left_s), self.frames
+        steps_s, skew_s = np.diff(left_s), np.abs(np.array(self._right_s) - left_s)
+        period_s = float(np.median(steps_s)) if frames > 1 else None
+        return {
+            "frames": frames,
+            "seconds": float(left_s[-1] - left_s[0]) if frames else 0.0,
+            "rate_hz": 1 / period_s if period_s else None,
+            "gaps": int((steps_s > _GAP_PERIODS * period_s).sum()) if period_s else 0,
+            "skew_mean_ms": 1000 * float(skew_s.mean()) if frames else None,
+            "skew_max_ms": 1000 * float(skew_s.max()) if frames else None,
+        }
 
     def _append(self, line: bytes) -> None:
         try:
@@ -278,40 +275,8 @@ class CaptureFolder:
         self._length += written
 
 
-@dataclass(eq=False)
-class CaptureLog:
-    """Timestamps of the pairs that were written."""
-
-    left_s: list[float] = field(default_factory=list)
-    right_s: list[float] = field(default_factory=list)
-
-    def add(self, pair: CapturedPair) -> None:
-        """Note a pair that was written."""
-        self.left_s.append(pair.left_s)
-        self.right_s.append(pair.right_s)
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """Number of pairs, rate, gaps and difference in time between the cameras."""
-        left_s, right_s = np.array(self.left_s), np.array(self.right_s)
-        frames = len(left_s)
-        steps_s, skew_s = np.diff(left_s), np.abs(right_s - left_s)
-        period_s = float(np.median(steps_s)) if frames > 1 else None
-        return {
-            "frames": frames,
-            "seconds": float(left_s[-1] - left_s[0]) if frames else 0.0,
-            "rate_hz": 1 / period_s if period_s else None,
-            "gaps": int((steps_s > _GAP_PERIODS * period_s).sum()) if period_s else 0,
-            "skew_mean_ms": 1000 * float(skew_s.mean()) if frames else None,
-            "skew_max_ms": 1000 * float(skew_s.max()) if frames else None,
-        }
-
-
 def write_pairs(
-    pairs: Iterable[CapturedPair],
-    target: CaptureFolder,
-    settings: RecordingSettings,
-    log: CaptureLog,
+    pairs: Iterable[CapturedPair], target: CaptureFolder, preview_every: int | None
 ) -> None:
     """Write in a second thread, so that the disk does not block the cameras."""
     waiting: queue.Queue[CapturedPair | None] = queue.Queue(_WAITING)
@@ -323,8 +288,7 @@ def write_pairs(
                 continue  # keep draining the queue, so that the other thread does not block
             try:
                 target.add(pair)
-                log.add(pair)
-                if settings.preview_every and (target.frames - 1) % settings.preview_every == 0:
+                if preview_every and (target.frames - 1) % preview_every == 0:
                     target.preview(pair)
             except (ReconError, OSError, MemoryError) as error:
                 failed.append(error)

@@ -13,12 +13,12 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
 from recon.core.values import StereoCalibration, StereoPair
-from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.arrays import Float64, UInt8, size_text
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.fields import write_yaml
-from recon.rig.uncalibrated import UncalibratedRectification, rectify_images
+from recon.rig.uncalibrated import rectify_images
 from recon.run.directory import RunDirectory
 from recon.run.run import plain
 from recon.sources.image_names import ImagePairs
@@ -28,55 +28,39 @@ from recon.stereo.rectify.grey import to_grey
 from recon.stereo.rectify.lens import epipolar_curves, epipolar_lines
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, plan_turns
 
+# Pairs of a folder whose features are matched where there is no calibration: in other pairs of a
+# flown room rows are 0.44 to 0.52 px apart by 8 of them, 0.41 to 0.43 by 16, and 0.41 by 74.
 _UNCALIBRATED_PAIRS: Final = 16
-"""Pairs of a folder whose features are matched where there is no calibration: in other pairs of a
-flown room rows are 0.44 to 0.52 px apart by 8 of them, 0.41 to 0.43 by 16, and 0.41 by 74."""
 # A row error above this multiple of the median is a false match, not a calibration error.
 _WRONG: Final = 5.0
 _NEVER_WRONG_PX: Final = 0.5
-
 Lines = tuple[list[Float64], list[Float64]]
 
 
 @dataclass(frozen=True, eq=False)
 class RectifyPlan:
-    """One way to rectify.
+    """One way to rectify."""
 
-    Attributes:
-        warp: Rectifies the images of a pair.
-        place: Maps float64 (N, 2) pixels of the left and right image to the rectified ones.
-        lines: Epipolar lines of such pixels in the left and right image as recorded.
-        write: Writes the calibration of the rectified images, or the homographies.
-        figures: Figures of the plan for ``summary.json``.
-    """
-
-    warp: Callable[[StereoPair], tuple[UInt8, UInt8]]
+    warp: Callable[[StereoPair], tuple[UInt8, UInt8]]  # rectifies the images of a pair
+    # maps float64 (N, 2) pixels of the left and right image to the rectified ones
     place: Callable[[Float64, Float64], tuple[Float64, Float64]]
+    # epipolar lines of such pixels in the left and right image as recorded
     lines: Callable[[Float64, Float64], Lines]
+    # writes the calibration of the rectified images, or the homographies
     write: Callable[[RunDirectory], None]
-    figures: dict[str, Any]
+    figures: dict[str, Any]  # figures of the plan for ``summary.json``
 
 
 @dataclass(frozen=True, eq=False)
 class RectifyRun:
-    """Results of a run.
+    """Results of a run; pixels are float64 (N, 2) of the left and the right image."""
 
-    Attributes:
-        pair: The first pair, as recorded.
-        rectified: Its rectified images.
-        raw_px: float64 (N, 2) twice: feature matches of the first pair without false ones, in the
-            left and right image as recorded.
-        raw_lines: Their epipolar lines in the left and right image.
-        rectified_px: The same matches, rectified.
-        summary: The figures of ``summary.json``.
-    """
-
-    pair: StereoPair
-    rectified: tuple[UInt8, UInt8]
-    raw_px: tuple[Float64, Float64]
-    raw_lines: Lines
-    rectified_px: tuple[Float64, Float64]
-    summary: dict[str, Any]
+    pair: StereoPair  # the first pair, as recorded
+    rectified: tuple[UInt8, UInt8]  # its rectified images
+    raw_px: tuple[Float64, Float64]  # its feature matches without false ones
+    raw_lines: Lines  # their epipolar lines
+    rectified_px: tuple[Float64, Float64]  # the same matches, rectified
+    summary: dict[str, Any]  # the figures of ``summary.json``
 
 
 def plan_by_calibration(
@@ -85,13 +69,8 @@ def plan_by_calibration(
     """Return the rectification by a calibration file; depth is metric."""
     files = images.pairs[0]
     height, width = read_pair(*files).left.shape[:2]
-    rig = read_calibration(
-        path,
-        width,
-        height,
-        metres_per_unit=metres_per_unit,
-        cameras=kitti_cameras_of(files[0]),
-    )
+    cameras = kitti_cameras_of(files[0])
+    rig = read_calibration(path, width, height, metres_per_unit=metres_per_unit, cameras=cameras)
     if not isinstance(rig, StereoCalibration):
         raise CalibrationError(
             "the calibration is of images that are already rectified",
@@ -127,10 +106,8 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
     except CalibrationError as error:
         if len(images.pairs) > 1:
             raise
-        more = (
-            "several pairs are needed: give two folders of one rig, or a calibration with --calib"
-        )
-        hint = f"{error.hint}; or it has too few good matches, and {more}"
+        hint = f"{error.hint}; or it has too few good matches, and several pairs are needed: "
+        hint += "give two folders of one rig, or a calibration with --calib"
         raise error.but(where=images.pairs[0][0], hint=hint) from error
 
     def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
@@ -142,7 +119,15 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
         )
         return left, right
 
-    figures = _uncalibrated_figures(result)
+    figures: dict[str, Any] = {
+        "method": "features",
+        "model": result.model,
+        "up_to_scale": True,
+        **plain(result),
+        "H_left": result.H_left.tolist(),
+        "H_right": result.H_right.tolist(),
+        "fundamental": result.fundamental.tolist(),
+    }
     return RectifyPlan(
         warp=warp,
         place=lambda a, b: (map_pixels(result.H_left, a), map_pixels(result.H_right, b)),
@@ -160,36 +145,16 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
     )
 
 
-def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
-    return {
-        "method": "features",
-        "model": result.model,
-        "up_to_scale": True,
-        "matches": result.matches,
-        "inliers": result.inliers,
-        "row_error_before_px": result.before_px,
-        "row_error_after_px": result.after_px,
-        "row_error_held_out_px": plain(result.held_out_px),
-        "disparity_range_px": list(result.disparity_px),
-        "H_left": result.H_left.tolist(),
-        "H_right": result.H_right.tolist(),
-        "fundamental": result.fundamental.tolist(),
-    }
-
-
 def read_pairs(images: ImagePairs) -> Iterator[tuple[StereoPair, tuple[Path, Path]]]:
     """Yield the pairs with their files, one in memory at a time."""
-    shape: tuple[int, ...] | None = None
+    first: str | None = None
     for files in images.pairs:
         pair = read_pair(*files)
-        shape = shape or pair.left.shape[:2]
-        if pair.left.shape[:2] != shape:
-            raise CalibrationError(
-                "images differ in size",
-                where=files[0],
-                got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
-                expected=f"{shape[1]}x{shape[0]}",
-            )
+        size = size_text(pair.left)
+        first = first or size
+        if size != first:
+            what = "images differ in size"
+            raise CalibrationError(what, where=files[0], got=size, expected=first)
         yield pair, files
 
 

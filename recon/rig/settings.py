@@ -1,4 +1,4 @@
-"""Settings of the audit."""
+"""What calibration and audit can be set to."""
 
 from __future__ import annotations
 

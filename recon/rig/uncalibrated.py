@@ -1,4 +1,8 @@
-"""Uncalibrated rectification: rows are aligned, metric scale is unknown."""
+"""Rectification without a calibration: the simplest change that aligns rows; its scale is unknown.
+
+The images as they are, a small rotation of the right camera, or homographies from the fundamental
+matrix of the two views.
+"""
 
 from __future__ import annotations
 
@@ -25,42 +29,43 @@ from recon.stereo.rectify.features import (
     pool_features,
 )
 
+Size = tuple[int, int]
+Homographies = tuple[Float64, Float64]
+_MOST_STRETCHED: Final = 20.0  # largest ratio of the scales at two corners of an image
+_SMALLEST_DISPARITY_PX: Final = 4.0  # of the farthest matches; a matcher searches from 0
+_FEWEST: Final = 8
+# With little parallax, a wide threshold accepts a wrong geometry: several are tried.
+_DRAWS: Final = (
+    (cv2.USAC_MAGSAC, 1.0), (cv2.USAC_MAGSAC, 0.5), (cv2.USAC_MAGSAC, 0.25), (cv2.RANSAC, 1.0),
+)  # fmt: skip
+_ROUNDS: Final = 50
+_STILL: Final = 1e-7  # relative decrease of the cost at which the fit ends
+_STEP: Final = 1e-6
+_SMALLEST_PX: Final = 0.1  # errors below about this size are weighted alike
 _INLIER_PX: Final = 1.0  # largest distance of an inlier from its epipolar line
 _FEWEST_AT_FIRST: Final = 12
 _MIN_FEATURES: Final = 40  # matches that must agree on one geometry
 _HELD_OUT: Final = 4  # every fourth feature of a single pair is held out of the fit
 _FLAT_SHARE: Final = 0.9  # share of matches on one plane from which the scene counts as flat
 _FOCAL_WIDTHS: Final = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0)  # tried: they decide how pitch bends rows
+# Row error that a simpler model may have more: matching compares whole rows, and half of one is
+# less than a warped image costs.
 _RESOLVED_PX: Final = 0.5
-"""Row error that a simpler model may have more: matching compares whole rows, and half of one is
-less than a warped image costs."""
 
 
 @dataclass(frozen=True, eq=False)
 class UncalibratedRectification:
-    """Rectifying homographies, and how good they are.
+    """Rectifying homographies, and how good they are, as ``summary.json`` has it."""
 
-    Attributes:
-        model: What aligns the rows: "raw" (nothing to do), "rotation" or "homographies".
-        H_left: float64 (3, 3), from raw to rectified pixels.
-        H_right: The same for the right image.
-        matches: Number of all matches.
-        inliers: Number of those that the homographies bring onto one row.
-        before_px: Median absolute row error of all matches of all pairs, raw.
-        after_px: The same, rectified.
-        held_out_px: Mean absolute row error of matches held out of the fit; NaN = too few.
-        disparity_px: 1st and 99th percentile of the rectified disparity.
-    """
-
-    model: str
-    H_left: Float64
-    H_right: Float64
-    matches: int
-    inliers: int
-    before_px: float
-    after_px: float
-    held_out_px: float
-    disparity_px: tuple[float, float]
+    model: str  # what aligns the rows: "raw" (nothing to do), "rotation" or "homographies"
+    matches: int  # number of all matches
+    inliers: int  # number of those that the homographies bring onto one row
+    row_error_before_px: float  # median absolute row error of all matches of all pairs, raw
+    row_error_after_px: float  # the same, rectified
+    row_error_held_out_px: float  # mean of matches held out of the fit; NaN = too few
+    disparity_range_px: tuple[float, float]  # 1st and 99th percentile of the rectified disparity
+    H_left: Float64  # (3, 3), from raw to rectified pixels
+    H_right: Float64  # the same for the right image
 
     @property
     def fundamental(self) -> Float64:
@@ -71,13 +76,10 @@ class UncalibratedRectification:
 def rectify_images(
     pairs: Sequence[tuple[UInt8, UInt8]], count: int = MOST_FEATURES
 ) -> UncalibratedRectification:
-    """Find the simplest change that aligns the rows of images of uncalibrated cameras.
+    """Find the simplest change that aligns the rows of grey pairs of one uncalibrated rig.
 
-    If homographies are needed, features are matched again in the images that these align.
-
-    Args:
-        pairs: uint8 (H, W) left and right, of one pair or of several pairs of one rig.
-        count: Maximum number of features per image.
+    If homographies are needed, features are matched again in the images that these align. ``count``
+    limits the features of an image.
     """
     height, width = pairs[0][0].shape
     matched = [match_exactly(left, right, count) for left, right in pairs]
@@ -95,13 +97,8 @@ def rectify_features(
 ) -> UncalibratedRectification:
     """Find the simplest change whose held-out row errors are not clearly above the smallest.
 
-    The images as they are, a small rotation of the right camera and homographies are compared by
-    their row errors over held-out pairs (of fewer than four pairs: features).
-
-    Args:
-        matched: The matches of each pair.
-        size: (width, height) of the images.
-        min_features: How many must agree on homographies.
+    Held out are every second pair or, of fewer than four pairs, every fourth feature. So many as
+    ``min_features`` must agree on homographies.
     """
     features = pool_features(matched)
     several = sum(len(each) > 0 for each in matched) >= _HELD_OUT
@@ -209,34 +206,23 @@ def _result(
     low, high = np.percentile((left - right)[agreeing, 0], (1, 99))
     return UncalibratedRectification(
         model=model,
-        H_left=H[0],
-        H_right=H[1],
         matches=len(features),
         inliers=int(agreeing.sum()),
-        before_px=float(np.median(np.abs(features.left_uv - features.right_uv)[:, 1])),
-        after_px=float(np.median(errors)),
-        held_out_px=float(held_out[good].mean()) if good.any() else float("nan"),
-        disparity_px=(float(low), float(high)),
+        row_error_before_px=float(np.median(np.abs(features.left_uv - features.right_uv)[:, 1])),
+        row_error_after_px=float(np.median(errors)),
+        row_error_held_out_px=float(held_out[good].mean()) if good.any() else float("nan"),
+        disparity_range_px=(float(low), float(high)),
+        H_left=H[0],
+        H_right=H[1],
     )
-
-
-Size = tuple[int, int]
-Homographies = tuple[Float64, Float64]
-
-_MOST_STRETCHED: Final = 20.0  # largest ratio of the scales at two corners of an image
-_SMALLEST_DISPARITY_PX: Final = 4.0  # of the farthest matches; a matcher searches from 0
 
 
 def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> Homographies:
     """Return float64 (3, 3) for the left and for the right image, which align matching rows.
 
     The borders of both images stay as near to their places as aligned rows allow, and then the
-    right image is shifted so that disparities are positive.
-
-    Args:
-        F: float64 (3, 3), ``right.T @ F @ left = 0``.
-        features: Correct matches, raw pixels.
-        size: (width, height) of the images.
+    right image is shifted so that disparities are positive. The matches are correct ones, raw
+    pixels, for which ``right.T @ F @ left = 0``.
 
     Ref: Hartley 1999, "Theory and practice of projective rectification", as OpenCV has it.
     """
@@ -289,23 +275,11 @@ def _affine(places: Float64, wanted: Float64) -> Float64:
     return np.asarray(found[0], dtype=np.float64)
 
 
-_FEWEST: Final = 8
-# With little parallax, a wide threshold accepts a wrong geometry: several are tried.
-_DRAWS: Final = (
-    (cv2.USAC_MAGSAC, 1.0), (cv2.USAC_MAGSAC, 0.5), (cv2.USAC_MAGSAC, 0.25), (cv2.RANSAC, 1.0),
-)  # fmt: skip
-_ROUNDS: Final = 50
-_STILL: Final = 1e-7  # relative decrease of the cost at which the fit ends
-_STEP: Final = 1e-6
-_SMALLEST_PX: Final = 0.1  # errors below about this size are weighted alike
-
-
 def find_fundamental(features: PairFeatures, inlier_px: float) -> tuple[Float64 | None, Bool]:
     """Estimate the fundamental matrix robustly (RANSAC, MAGSAC++) and refine it on its inliers.
 
-    Returns:
-        float64 (3, 3) with ``right.T @ F @ left = 0``, or None; and bool (N,), the matches that
-        are at most ``inlier_px`` away from their epipolar lines.
+    Returns float64 (3, 3) with ``right.T @ F @ left = 0``, or None; and bool (N,), the matches that
+    are at most ``inlier_px`` away from their epipolar lines.
     """
     left, right = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)
     best, distances = None, np.full(len(left), np.inf)
@@ -327,15 +301,10 @@ def find_fundamental(features: PairFeatures, inlier_px: float) -> tuple[Float64 
 
 
 def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
-    """Refine the seven parameters of a fundamental matrix, minimising absolute distances.
-
-    Args:
-        F: float64 (3, 3), initial guess.
-        left_px: float64 (N, 2), inliers.
-        right_px: float64 (N, 2), the matching pixels.
+    """Refine a fundamental matrix, minimising the absolute distances of inliers (N, 2).
 
     Ref: Bartoli and Sturm 2004, "Non-linear estimation of the fundamental matrix with minimal
-        parameters".
+    parameters".
     """
     middle = np.concatenate([left_px, right_px]).mean(axis=0)
     scale = 1.0 / max(float(np.abs([left_px - middle, right_px - middle]).mean()), 1e-12)

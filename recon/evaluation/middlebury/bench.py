@@ -1,4 +1,4 @@
-"""One scene matched by several matchers, or matched by other programs, and scored."""
+"""Scenes matched by several matchers, or by other programs, scored, and the figures of all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from recon.core.errors import SettingsError, SourceError
 from recon.core.text import counted
-from recon.core.values import Disparity, RectifiedPair
+from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float32, Float64
 from recon.evaluation.middlebury.scenes import ResultFolder, read_seconds
 from recon.evaluation.middlebury.score import (
@@ -25,7 +25,6 @@ from recon.evaluation.middlebury.score import (
     rounded,
     scene_weight,
     score_result,
-    weighted_mean,
 )
 from recon.io.files import naming
 from recon.io.images.disparity import read_pfm
@@ -41,32 +40,19 @@ _FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """Result of one matcher, or of another program, on one scene.
+    """Result of one matcher, or of another program, on one scene."""
 
-    Attributes:
-        scene: The scene.
-        matcher: Name of the matcher or of the folder of results.
-        values: float32 (h, w), its disparity in pixels of its own size; NaN = none.
-        figures: An entry of ``scenes`` in ``summary.json``.
-    """
-
-    scene: ScoredScene
-    matcher: str
-    values: Float32
-    figures: Figures
+    scene: ScoredScene  # the scene
+    matcher: str  # name of the matcher or of the folder of results
+    values: Float32  # (h, w), its disparity in pixels of its own size; NaN = none
+    figures: Figures  # an entry of ``scenes`` in ``summary.json``
 
 
 class Bench:
     """Matches and scores scenes; each thread has its own matchers, warmed up once.
 
     The warm-up keeps kernel compilation and network loading out of the timings. A matcher given as
-    an object is shared by the threads.
-
-    Args:
-        matchers: The matchers, by name or as objects.
-        config: Their settings, and the conversion of images to grey.
-        threads: Threads of each matcher.
-        auto_range: Whether the disparity range is estimated from each pair, as if unknown.
+    an object is shared by the threads. ``auto_range``: estimate the disparity range from each pair.
     """
 
     def __init__(
@@ -92,7 +78,10 @@ class Bench:
                 start = time.perf_counter()
                 disparity = matcher.match(pair)
                 seconds = time.perf_counter() - start
-                rated = confidence_figures(disparity, scene.truth) if _rates(disparity) else None
+                sure = disparity.confidence[disparity.valid]
+                # Not where the matcher gives all matches the same confidence.
+                rates = sure.size and sure.min() < sure.max()
+                rated = confidence_figures(disparity, scene.truth) if rates else None
                 ndisp = searched_ndisp(given, self._config.matching, pair)
                 figures = _figures(scene, disparity.values, ndisp, rated, round(seconds, 4))
                 yield SceneResult(scene, name_of(given), disparity.values, figures)
@@ -101,8 +90,10 @@ class Bench:
         made: list[Matcher] | None = getattr(self._own, "matchers", None)
         if made is None:
             made = [make_matcher(n, self._config.matching, self._threads) for n in self._given]
+            rows = min(_WARM_UP_ROWS, pair.camera.height_px)
+            camera = replace(pair.camera, height_px=rows)
             for matcher in made:
-                matcher.match(_upper_rows(pair))
+                matcher.match(RectifiedPair(pair.left[:rows], pair.right[:rows], camera))
             self._own.matchers = made
         return made
 
@@ -152,21 +143,7 @@ def _figures(
     }
 
 
-def _rates(disparity: Disparity) -> bool:
-    """Return whether the matcher gives each match a confidence of its own."""
-    sure = disparity.confidence[disparity.valid]
-    return bool(sure.size) and bool(sure.min() < sure.max())
-
-
-def _upper_rows(pair: RectifiedPair) -> RectifiedPair:
-    """Return the top rows of a pair, for a quick warm-up on images of the same kind."""
-    rows = min(_WARM_UP_ROWS, pair.camera.height_px)
-    camera = replace(pair.camera, height_px=rows)
-    return RectifiedPair(left=pair.left[:rows], right=pair.right[:rows], camera=camera)
-
-
-SceneFigures = dict[str, Figures]
-"""Figures of one scene, by matcher."""
+SceneFigures = dict[str, Figures]  # Figures of one scene, by matcher
 
 
 @dataclass(frozen=True)
@@ -201,13 +178,8 @@ def summarise_scenes(
 ) -> Figures:
     """Return the content of ``summary.json``: the figures of each matcher, and its means.
 
-    Means are over the scenes for which all have a result, so that they can be compared.
-
-    Args:
-        found: Figures of each scene; None without ground truth.
-        names: Names of the matchers and of the folders of results.
-        results: Folders of results of other programs.
-        folder: The folder of the scenes.
+    Means are over the scenes for which all ``names`` (matchers and folders of results) have a
+    result, so that they can be compared. A scene without ground truth has no figures.
     """
     skipped = [name for name, figures in found.items() if figures is None]
     scenes = {name: figures for name, figures in found.items() if figures is not None}
@@ -266,7 +238,7 @@ def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequen
 def weighted_figures(scenes: Mapping[str, Any]) -> Any:
     """Return the mean of nested figures and curves over scenes, with the benchmark's weights.
 
-    A figure that any scene lacks is left out.
+    A figure that any scene lacks is left out; one that is NaN in any is NaN.
     """
     first = next(iter(scenes.values()))
     if isinstance(first, Mapping):
@@ -275,7 +247,8 @@ def weighted_figures(scenes: Mapping[str, Any]) -> Any:
         return {key: weighted_figures(each) for key, each in by_key.items()}
     if isinstance(first, list):
         return rounded(np.average(list(scenes.values()), axis=0, weights=_weights(scenes)))
-    return weighted_mean(scenes)
+    values = np.array(list(scenes.values()), dtype=np.float64)
+    return float(np.average(values, weights=_weights(scenes)))
 
 
 def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:

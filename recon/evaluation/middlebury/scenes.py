@@ -86,11 +86,8 @@ def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene 
     width_px, truth_width_px = scene.pair.left.shape[1], judge.truth.values.shape[1]
     # Sizes may be off by a row or column; real mismatches are rejected by the comparison.
     factor = max(round(4 * truth_width_px / width_px), 1) / 4
-    rules = MiddleburyRules(
-        full_size_factor=judge.full_size_factor,
-        largest_px=None if scene.ndisp is None else scene.ndisp * factor,
-        isint=judge.isint,
-    )
+    largest_px = None if scene.ndisp is None else scene.ndisp * factor
+    rules = MiddleburyRules(judge.full_size_factor, largest_px, judge.isint)
     camera = _matching_camera(scene, judge.truth, factor)
     return ScoredScene(name, scene.pair, camera, judge.truth, judge.camera, rules)
 

@@ -1,4 +1,10 @@
-"""The figures of one result, as ``summary.json`` holds them."""
+"""The rules of the Middlebury stereo benchmark, version 3, and the figures of one result.
+
+Errors are in full-size pixels.
+
+Ref: D. Scharstein, H. Hirschmüller et al., Middlebury Stereo Evaluation SDK 1.6, and the table of
+https://vision.middlebury.edu/stereo/eval3/.
+"""
 
 from __future__ import annotations
 
@@ -26,33 +32,38 @@ from recon.evaluation.confidence import (
 )
 from recon.evaluation.disparity import evaluate_depth, evaluate_disparity, truth_of, values_of
 
+# Pixels that are scored: those seen by both cameras, or occluded ones as well.
 MASKS: Final = {"nonocc": False, "all": True}
-"""Pixels that are scored: those seen by both cameras, or occluded ones as well."""
-
+_HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
 Figures = dict[str, Any]
-
 _RIGHT_PX: Final = 1.0  # largest error of a correct pixel, in pixels of the result
 _KEPT: Final = 5  # every fifth point of a sparsification curve: 20 of 100
 
 
-@dataclass(frozen=True, eq=False)
-class ScoredScene:
-    """One scene, ready to be matched and scored.
+@dataclass(frozen=True)
+class MiddleburyRules:
+    """Rules of a scene for the evaluation of results.
 
     Attributes:
-        name: Name of its folder, with parent folders if several scenes share a name.
-        pair: The images.
-        camera: The camera for matching; its ``ndisp`` is set.
-        truth: True disparity, at the size of the images or another size.
-        truth_camera: The camera at the size of the truth, or None if none is published.
-        rules: How results are compared with the truth.
+        full_size_factor: Full-size pixels per pixel of the truth.
+        largest_px: Results are clipped to [0, this], pixels of the truth; None = unknown.
+        isint: Whether results are rounded to whole pixels of the truth.
     """
 
-    name: str
+    full_size_factor: float = 1.0
+    largest_px: float | None = None
+    isint: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredScene:
+    """One scene, ready to be matched and scored."""
+
+    name: str  # name of its folder, with parent folders if several scenes share a name
     pair: StereoPair
-    camera: RectifiedCamera
-    truth: DisparityTruth
-    truth_camera: RectifiedCamera | None
+    camera: RectifiedCamera  # for matching; its ``ndisp`` is set
+    truth: DisparityTruth  # at the size of the images or another size
+    truth_camera: RectifiedCamera | None  # at the size of the truth; None = not published
     rules: MiddleburyRules
 
 
@@ -89,16 +100,17 @@ def named_figures(metrics: DisparityMetrics) -> Figures:
 def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | None:
     """Return how well the confidence and the standard deviation of a result predict its errors.
 
-    Counts all pixels with a value and known ground truth, occluded ones included.
-
-    Args:
-        estimate: The result.
-        truth: Ground truth at the same size, or at 2, 4, 1/2 or 1/4 times it.
-
-    Returns:
-        The figures, or None if no pixel can be compared.
+    Counts all pixels with a value and known ground truth, occluded ones included; None if there are
+    none. The truth may be 2 or 4 times larger or smaller.
     """
-    sized, step = estimate_at_truth_size(estimate, truth.values.shape)
+    shape = truth.values.shape
+    step = _step(estimate.values.shape, shape)  # pixels of the result per pixel of the truth
+    sized = Disparity(
+        values=at_truth_size(estimate.values, shape),
+        confidence=_taken(estimate.confidence, shape, step),
+        sigma_px=at_truth_size(estimate.sigma_px, shape),
+        reason=_taken(estimate.reason, shape, step),
+    )
     if not (sized.valid & np.isfinite(truth.values)).any():
         return None
     shares = {f"within_{n}_sigma": share_within_sigma(sized, truth, n) for n in (1, 2)}
@@ -146,13 +158,11 @@ def dense_map(values: Float32) -> Float32:
 
 
 def fill_holes(values: Float32) -> Float32:
-    """Give each pixel without a disparity that of the background beside it.
+    """Give each pixel without a disparity that of the background beside it: float32 (H, W).
 
     What only one camera sees is hidden behind something nearer, so a hole gets the smaller one of
     the nearest values to the left and to the right on its row, or the only one. A row without any
     value is copied from the nearest row with some, the upper one of two. Known values stay.
-
-    Takes and returns float32 (H, W), in pixels; NaN = none.
 
     Ref: the background interpolation of A. Geiger et al., KITTI stereo development kit.
     """
@@ -176,24 +186,6 @@ def _gather(values: Float32, columns: Int32) -> Float32:
     return np.where(columns >= 0, there, np.float32(np.nan))
 
 
-_HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
-
-
-@dataclass(frozen=True)
-class MiddleburyRules:
-    """Rules of a scene for the evaluation of results.
-
-    Attributes:
-        full_size_factor: Full-size pixels per pixel of the truth.
-        largest_px: Results are clipped to [0, this], pixels of the truth; None = unknown.
-        isint: Whether results are rounded to whole pixels of the truth.
-    """
-
-    full_size_factor: float = 1.0
-    largest_px: float | None = None
-    isint: bool = False
-
-
 def evaluate_middlebury(
     estimate: Disparity | ArrayLike,
     truth: DisparityTruth | ArrayLike,
@@ -208,8 +200,7 @@ def evaluate_middlebury(
             Sparse as matched, or dense (holes filled).
         truth: Ground truth, at the size of the result or 2 or 4 times larger or smaller; or its
             values as `DisparityTruth.from_values` takes them.
-        rules: Rules of the scene; None = errors in pixels of the truth, nothing clipped or
-            rounded.
+        rules: Rules of the scene; None = errors in pixels of the truth, nothing clipped, rounded.
         occluded: Whether to include pixels that only the left camera sees ("all").
 
     Raises:
@@ -236,18 +227,6 @@ def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
     return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)
 
 
-def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple[Disparity, float]:
-    """Return a result as `at_truth_size` does, and its original pixels per pixel of the truth."""
-    step = _step(estimate.values.shape, shape)
-    sized = Disparity(
-        values=at_truth_size(estimate.values, shape),
-        confidence=_taken(estimate.confidence, shape, step),
-        sigma_px=at_truth_size(estimate.sigma_px, shape),
-        reason=_taken(estimate.reason, shape, step),
-    )
-    return sized, step
-
-
 def scene_weight(name: str) -> float:
     """Return what a scene counts for in the table's mean: 4 if it is a variant or hard, else 8.
 
@@ -257,28 +236,22 @@ def scene_weight(name: str) -> float:
     return 4.0 if scene in _HALF_WEIGHT else 8.0
 
 
-def weighted_mean(figures: Mapping[str, float]) -> float:
-    """Return the mean over scenes, weighted as in the table; NaN if any value is NaN."""
-    weights = [scene_weight(name) for name in figures]
-    return float(np.average(np.array(list(figures.values()), dtype=np.float64), weights=weights))
-
-
 def _step(shape: tuple[int, ...], truth_shape: tuple[int, ...]) -> float:
     """Return pixels of a result for each pixel of the truth, along a row: 4, 2, 1, 0.5 or 0.25."""
+
+    def fits(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
+        return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))
+
     for factor in (1, 2, 4):
-        if _fits(truth_shape, shape, factor):
+        if fits(truth_shape, shape, factor):
             return 1 / factor
-        if _fits(shape, truth_shape, factor):
+        if fits(shape, truth_shape, factor):
             return factor
     raise EvaluationError(
         "result and truth differ in size",
         got=f"{shape[1]}x{shape[0]} against {truth_shape[1]}x{truth_shape[0]}",
         expected="one 1, 2 or 4 times the other",
     )
-
-
-def _fits(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
-    return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))
 
 
 def _taken(values: NDArray[Any], shape: tuple[int, ...], step: float) -> NDArray[Any]:

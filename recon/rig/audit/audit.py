@@ -1,4 +1,4 @@
-"""The audit of a recording: what is measured, what is found, and the verdict."""
+"""The audit of a recording, or of a pair: what is measured and found, the verdict, a correction."""
 
 from __future__ import annotations
 
@@ -38,12 +38,16 @@ from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.rectify.rectifier import Rectifier, plan_turns
 
-RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)
-"""Distances for which the depth error is predicted."""
-
-_MATCHED_ROWS_PX: Final = 0.3
-"""Rms row error that does not spoil matching."""
-
+_RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
+# Findings of a pair that images alone support, and those that need a calibration. The inspection of
+# the frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
+# is dense.
+_BY_IMAGES: Final = frozenset({"black", "gain", "blur"})
+_BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
+# Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs, even
+# of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %.
+_FEW_VALID_SHARE: Final = 0.25
+_MATCHED_ROWS_PX: Final = 0.3  # rms row error that does not spoil matching
 # No matcher is more accurate than a twentieth of a pixel on real images.
 _LEAST_SIGMA_PX: Final = 0.05
 
@@ -57,8 +61,7 @@ class Audit:
         findings: Problems found, fatal ones first.
         figures: All measures, ready for JSON.
         alignment: Row errors of all pairs together; None if there are too few features.
-        motion: What the motion of the drive shows of the rig, rows aligned; None if it was not
-            measured.
+        motion: What the motion of the drive shows of the rig; None if it was not measured.
         looks: What was measured in each pair, and a few of the images.
         corrected: What `correct_calibration` did, if it was asked to.
     """
@@ -87,12 +90,9 @@ class Audit:
 
 
 def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool = False) -> Audit:
-    """Check a drive before a long run.
+    """Check a drive before a long run; ``quick``: in a second or two, as `recon map` does.
 
-    Args:
-        source: The drive.
-        config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
-        quick: A short check of a second or two, as in `recon map`.
+    Of the configuration, ``audit``, ``rectification`` and ``matching`` are used.
     """
     check_source(source)
     settings = config.audit
@@ -116,42 +116,18 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     figures = _figures(source, sample, geometry, gaps, camera)
     if turn is not None:
         figures["rig_by_motion"] = turn_figures(turn, camera)
-    return Audit(
-        verdict_of(findings),
-        tuple(findings),
-        figures,
-        geometry.alignment,
-        motion,
-        tuple(sample.looks),
-    )
-
-
-def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, ...]:
-    """Return findings of a quick audit, one line each; none if it is switched off.
-
-    A calibration that cannot rectify is reported by the run itself, not here.
-    """
-    if not config.audit.quick:
-        return ()
-    try:
-        audit = audit_source(source, config, quick=True)
-    except CalibrationError:
-        return ()
-    return tuple(f"{finding.text} [quick audit]" for finding in audit.findings)
+    verdict, looks = verdict_of(findings), tuple(sample.looks)
+    return Audit(verdict, tuple(findings), figures, geometry.alignment, motion, looks)
 
 
 def correct_calibration(
     source: StereoSource, config: AuditedSettings, audit: Audit, path: Path
 ) -> dict[str, Any]:
-    """Write the calibration with which rows and motion agree.
+    """Write the calibration with which rows and motion agree, and return how it differs.
 
     The lenses of rectified images are straightened, if they bend; and the right camera is turned.
     What the drive does not show beyond two standard deviations stays as it is; the baseline always
     does.
-
-    Returns:
-        The turn of the right camera in degrees, the change of its focal length in per cent, what
-        the lenses moved (None: they are as they were), and the row error before.
     """
     if audit.alignment is None:
         raise CalibrationError(
@@ -178,9 +154,9 @@ def correct_calibration(
 
 
 def _bent_lenses(rig: Rig, motion: SeenMotion | None) -> BentLenses | None:
-    """Return what the lenses bend; None if they do not, or are in the calibration already.
+    """Return what the lenses bend; None if they do not, or are for a board to calibrate.
 
-    The lenses of images that are rectified here are for a board to calibrate.
+    The latter are those of images that are rectified here.
     """
     if motion is None or not isinstance(rig, RectifiedCamera):
         return None
@@ -247,7 +223,7 @@ def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None
 def _figures(
     source: StereoSource, sample: Sample, geometry: Geometry, gaps: Gaps, camera: RectifiedCamera
 ) -> dict[str, Any]:
-    """Return all measures of the audit; None if unknown."""
+    """All measures of the audit; None if unknown."""
     sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
     gains = np.concatenate([np.zeros(0), *sample.gains])
     return {
@@ -273,15 +249,17 @@ def _figures(
         "focal_px": camera.focal_px,
         "field_of_view_deg": camera.field_of_view_deg,
         "speed_m_per_s": float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else None,
-        **_row_figures(geometry.alignment),
-        **_depth_figures(geometry.alignment, geometry.disparity_px, camera),
+        **_alignment_figures(geometry.alignment, geometry.disparity_px, camera),
     }
 
 
-def _row_figures(alignment: RowAlignment | None) -> dict[str, Any]:
+def _alignment_figures(
+    alignment: RowAlignment | None, disparity_px: Float64, camera: RectifiedCamera
+) -> dict[str, Any]:
+    """Return row errors, disparities, and the depth error if columns are as accurate as rows."""
     if alignment is None:
         return {}
-    return {
+    figures = {
         "row_error_mean_px": alignment.mean_px,
         "row_error_spread_px": alignment.spread_px,
         "row_error_rms_px": alignment.rms_px,
@@ -289,52 +267,34 @@ def _row_figures(alignment: RowAlignment | None) -> dict[str, Any]:
         "mend_pitch_deg": float(np.degrees(alignment.pitch_rad)),
         "mend_roll_deg": float(np.degrees(alignment.roll_rad)),
     }
-
-
-def _depth_figures(
-    alignment: RowAlignment | None, disparity_px: Float64, camera: RectifiedCamera
-) -> dict[str, Any]:
-    """Return observed disparities, and the depth error if columns are as accurate as rows."""
-    if alignment is None or not len(disparity_px):
-        return {}
+    if not len(disparity_px):
+        return figures
     sigma_px = np.float32(max(alignment.residual_px, _LEAST_SIGMA_PX))
-    errors = depth_sigma(np.array(RANGES_M, np.float32), sigma_px, camera)
+    errors = depth_sigma(np.array(_RANGES_M, np.float32), sigma_px, camera)
     return {
+        **figures,
         "disparity_5_50_95_px": np.quantile(disparity_px, [0.05, 0.5, 0.95]).tolist(),
-        "depth_error_m": {f"{r:g}": float(e) for r, e in zip(RANGES_M, errors, strict=True)},
+        "depth_error_m": {f"{r:g}": float(e) for r, e in zip(_RANGES_M, errors, strict=True)},
     }
 
 
-#: Findings that images alone support, and those that need a calibration. The inspection of the
-#: frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
-#: is dense.
-_BY_IMAGES: Final = frozenset({"black", "gain", "blur"})
-_BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
-
-FEW_VALID_SHARE: Final = 0.25
-"""Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs,
-even of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %."""
+def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, ...]:
+    """Return findings of a quick audit, one line each; none if it is switched off."""
+    return tuple(f"{finding.text} [quick audit]" for finding in _quick_findings(source, config))
 
 
 def find_pair_faults(
     given: PairInput, config: AuditedSettings, *, metric: bool
 ) -> tuple[Finding, ...]:
-    """Return findings of a quick audit; none if it is switched off.
-
-    Args:
-        given: The pair.
-        config: The configuration; its ``audit`` and ``rectification`` sections are used.
-        metric: Whether depth is wanted, so that the calibration matters.
-    """
-    _check_two(given.pair)
-    if not config.audit.quick:
-        return ()
+    """Return findings of a quick audit; those of the calibration only if depth is wanted."""
+    pair = given.pair
+    # One image given twice: rectified by two cameras it looks like a swapped pair.
+    if np.array_equal(pair.left, pair.right) and np.ptp(pair.left):
+        hint = "name the image of each camera"
+        raise MatchingError("left and right are the same image", where=pair.name or None, hint=hint)
     codes = _BY_IMAGES | _BY_CALIBRATION if metric else _BY_IMAGES
-    try:
-        audit = audit_source(OnePair(given.pair, given.calibration), config, quick=True)
-    except CalibrationError:
-        return ()  # the run itself reports this later
-    return tuple(finding for finding in audit.findings if finding.code in codes)
+    findings = _quick_findings(OnePair(pair, given.calibration), config)
+    return tuple(finding for finding in findings if finding.code in codes)
 
 
 def check_found(
@@ -342,7 +302,7 @@ def check_found(
 ) -> tuple[str, ...]:
     """Return warnings about the share of pixels with a disparity."""
     share = float(disparity.valid.mean())
-    if share >= FEW_VALID_SHARE:
+    if share >= _FEW_VALID_SHARE:
         return ()
     found = f"{100 * share:.0f} % of the pixels have a disparity ({_reasons(disparity)})"
     advice = (
@@ -359,15 +319,19 @@ def check_found(
     )
 
 
-def _check_two(pair: StereoPair) -> None:
-    """Refuse one image given twice; rectified by two cameras it looks like a swapped pair."""
-    if np.array_equal(pair.left, pair.right) and np.ptp(pair.left):
-        hint = "name the image of each camera"
-        raise MatchingError("left and right are the same image", where=pair.name or None, hint=hint)
-
-
 def _reasons(disparity: Disparity) -> str:
     """Return the two most common reasons for having no disparity."""
     shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
     most = list(shares.items())[:2]
     return ", ".join(f"{share:.0f} % {r.name.lower().replace('_', ' ')}" for r, share in most)
+
+
+def _quick_findings(source: StereoSource, config: AuditedSettings) -> tuple[Finding, ...]:
+    """Return findings of a quick audit; none if it is switched off.
+
+    A calibration that cannot rectify is reported by the run itself, not here.
+    """
+    try:
+        return audit_source(source, config, quick=True).findings if config.audit.quick else ()
+    except CalibrationError:
+        return ()

@@ -20,8 +20,7 @@ _DARK: Final = 12.0
 _BRIGHT: Final = 243.0
 # Mean difference in grey levels; two exposures of a static scene differ more, by sensor noise.
 _SAME_DN: Final = 0.05
-_GAP_PERIODS: Final = 1.7
-"""Time step, in frame periods, above which frames count as missing."""
+_GAP_PERIODS: Final = 1.7  # time step, in frame periods, above which frames count as missing
 _MIN_POINTS: Final = 20
 _MIN_DISPARITY_PX: Final = 2.0
 _AGREE_PX: Final = 2.0
@@ -32,15 +31,7 @@ _MIN_FLOW_PX: Final = 1.0
 def measure_gain(left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32) -> Float64:
     """Return the brightness of the right image relative to the left, around matched features.
 
-    Args:
-        left: uint8 (H, W).
-        right: uint8 (H, W).
-        left_uv: float32 (N, 2), features in the left image.
-        right_uv: float32 (N, 2), the same features in the right image.
-
-    Returns:
-        float64 (M,), one ratio for each feature whose surroundings are mostly neither black
-        nor saturated.
+    float64 (M,), for each feature whose surroundings are mostly neither black nor saturated.
     """
     first, second = (_medians(image, uv) for image, uv in ((left, left_uv), (right, right_uv)))
     fair = (np.minimum(first, second) > _DARK) & (np.maximum(first, second) < _BRIGHT)
@@ -48,7 +39,6 @@ def measure_gain(left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32)
 
 
 def _medians(image: UInt8, uv: Float32) -> Float64:
-    """Return the median brightness around each feature."""
     smooth = cv2.medianBlur(np.ascontiguousarray(image), _AROUND_PX)
     height, width = image.shape
     column = np.clip(np.rint(uv[:, 0]).astype(int), 0, width - 1)
@@ -57,22 +47,19 @@ def _medians(image: UInt8, uv: Float32) -> Float64:
 
 
 def measure_sharpness(image: UInt8) -> float:
-    """Return the share of the finest detail in all detail of an image, in [0, 1].
+    """Return the share of the finest detail in all detail of a grey image, in [0, 1].
 
     Compares Laplacians at full and at quarter size: blur reduces the first, but not the second.
     Sensor noise is subtracted from both.
-
-    Args:
-        image: uint8 (H, W).
     """
     fine = image.astype(np.float32)
     coarse = cv2.resize(fine, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    energies = [_detail(layer) for layer in (fine, coarse)]
-    total = sum(energies)
-    return float(energies[0] / total) if total > 0 else 0.0
+    finest = _detail(fine)
+    total = finest + _detail(np.asarray(coarse))
+    return finest / total if total > 0 else 0.0
 
 
-def _detail(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:
+def _detail(image: Float32) -> float:
     """Return mean of the strongest 5 % of absolute Laplacians, minus twice the median of all."""
     size = np.abs(cv2.Laplacian(image, cv2.CV_32F))
     noise, strong = np.quantile(size, [0.5, 0.95])
@@ -81,16 +68,11 @@ def _detail(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:
 
 @dataclass
 class RepeatCounter:
-    """Counts repeats in a series of pairs.
+    """Counts repeats in a series of pairs."""
 
-    Attributes:
-        steps: Number of pairs compared with the previous pair.
-        both: Number of steps in which neither image changed.
-        frozen: Longest run of steps in which only the (left, right) image did not change.
-    """
-
-    steps: int = 0
-    both: int = 0
+    steps: int = 0  # number of pairs compared with the previous pair
+    both: int = 0  # number of steps in which neither image changed
+    # longest run of steps in which only the (left, right) image did not change
     frozen: list[int] = field(default_factory=lambda: [0, 0])
     _run: list[int] = field(default_factory=lambda: [0, 0])
     _last: tuple[UInt8, UInt8] | None = None
@@ -100,15 +82,13 @@ class RepeatCounter:
         self._last, self._run = None, [0, 0]
 
     def add(self, left: UInt8, right: UInt8) -> None:
-        """Compare a pair with the previous one.
-
-        Args:
-            left: uint8 (H, W) or (H, W, 3).
-            right: uint8, same shape as ``left``.
-        """
+        """Compare a pair with the previous one."""
         if self._last is not None:
             self.steps += 1
-            same = [_same(now, last) for now, last in zip((left, right), self._last, strict=True)]
+            same = [
+                now.shape == last.shape and bool(cv2.absdiff(now, last).mean() < _SAME_DN)
+                for now, last in zip((left, right), self._last, strict=True)
+            ]
             self.both += all(same)
             for side, alone in enumerate((same[0] and not same[1], same[1] and not same[0])):
                 self._run[side] = self._run[side] + 1 if alone else 0
@@ -116,21 +96,10 @@ class RepeatCounter:
         self._last = (left, right)
 
 
-def _same(now: UInt8, last: UInt8) -> bool:
-    return now.shape == last.shape and bool(cv2.absdiff(now, last).mean() < _SAME_DN)
-
-
 def track(now: UInt8, then: UInt8, uv: Float32) -> tuple[Float32, Bool]:
-    """Track features from one image to the next (Lucas-Kanade).
+    """Track features (N, 2) from one image to the next (Lucas-Kanade).
 
-    Args:
-        now: uint8 (H, W).
-        then: uint8 (H, W), a frame later.
-        uv: float32 (N, 2), features of ``now``.
-
-    Returns:
-        float32 (N, 2), positions in ``then``; and bool (N,), True where tracking back returns to
-        the start.
+    Returns their places there, and bool (N,), True where tracking back returns to the start.
     """
     if not len(uv):
         return uv, np.zeros(0, np.bool_)
@@ -145,14 +114,8 @@ def measure_speed(
 ) -> float | None:
     """Return how far the rig moves between two frames, metres, if the calibration is correct.
 
-    Args:
-        left_uv: float32 (N, 2), features in the left image.
-        right_uv: float32 (N, 2), the same features in the right image.
-        later_uv: float32 (N, 2), the same features in the left image of the next frame.
-        camera: The rectified camera.
-
-    Returns:
-        None if too few features agree on one motion.
+    The features (N, 2) are those of the left and of the right image, and of the left image of the
+    next frame. None if too few agree on one motion.
     """
     disparity = left_uv[:, 0] - right_uv[:, 0] + camera.doffs_px
     near = disparity > _MIN_DISPARITY_PX
@@ -176,17 +139,11 @@ def measure_speed(
 
 
 def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[float, float] | None:
-    """Return delay of the right camera in frames, from the vertical motion of features.
+    """Return the delay of the right camera in frames, and its standard error.
 
     A camera that is s frames late sees a feature whose row moves by v per frame v·s rows lower:
-    the slope of row error over row flow is the skew.
-
-    Args:
-        row_error_px: float64 (N,), right minus left row, with the rig's own row error removed.
-        row_flow_px: float64 (N,), rows that each feature moves from this frame to the next.
-
-    Returns:
-        The skew and its standard error, in frames; None if too few features move enough.
+    the slope of the row error (right minus left, (N,)) over the row flow is the skew. None if too
+    few features move enough.
     """
     moving = np.abs(row_flow_px) > _MIN_FLOW_PX
     if moving.sum() < _MIN_POINTS:
@@ -206,19 +163,12 @@ def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[floa
 
 @dataclass(frozen=True)
 class Gaps:
-    """Missing frames, from the timestamps of all pairs.
+    """Missing frames, from the timestamps of all pairs."""
 
-    Attributes:
-        count: Number of gaps; 0 if the timestamps are not known in advance.
-        longest_s: Longest time step.
-        after: Frame before that step.
-        usual_s: Median time step; NaN if unknown.
-    """
-
-    count: int = 0
-    longest_s: float = float("nan")
-    after: int = 0
-    usual_s: float = float("nan")
+    count: int = 0  # number of gaps; 0 if the timestamps are not known in advance
+    longest_s: float = float("nan")  # longest time step
+    after: int = 0  # frame before that step
+    usual_s: float = float("nan")  # median time step; NaN if unknown
 
 
 def find_gaps(source: StereoSource) -> Gaps:

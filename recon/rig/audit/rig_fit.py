@@ -6,9 +6,10 @@ Poses and points are eliminated, so that each window says something of the corre
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from itertools import repeat
+from typing import Final
 
 import numpy as np
 
@@ -26,20 +27,15 @@ from recon.odometry.window import (
     weighted,
 )
 
-_ROUNDS: Final = 6
-"""Times that all windows are adjusted with the places as corrected by then."""
-
-_ROW_SIGMA_PX: Final = 0.3
-"""Standard deviation of the row of a feature in the right image."""
+_ROUNDS: Final = 6  # times that all windows are adjusted with the places as corrected by then
+_ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the right image
 
 
 @dataclass(frozen=True, eq=False)
 class StereoTracks:
     """Tracks in the left images of a window, and the same features in the right ones.
 
-    Attributes:
-        window: Poses, points and their places in the left images.
-        right_uv: float64 (W, N, 2), columns and rows in the right images; NaN = not found.
+    ``right_uv``: float64 (W, N, 2), columns and rows; NaN = not found.
     """
 
     window: TrackWindow
@@ -50,11 +46,7 @@ class StereoTracks:
 class CorrectedPlaces:
     """Where features are after a correction, and how that follows its parameters (P).
 
-    Attributes:
-        left_uv: float64 (W, N, 2), columns and rows in the left images.
-        right_uv: float64 (W, N, 2), in the right ones.
-        by_left: float64 (W, N, 2, P), derivatives of ``left_uv``.
-        by_right: float64 (W, N, 2, P), of ``right_uv``.
+    Places are float64 (W, N, 2), columns and rows; their derivatives (W, N, 2, P).
     """
 
     left_uv: Float64
@@ -73,25 +65,18 @@ class CorrectedPlaces:
         return replace(window, uvd=np.concatenate([self.left_uv, disparity], axis=2))
 
 
-class RigCorrection(Protocol):
+@dataclass(frozen=True, eq=False)
+class RigCorrection:
     """What may be wrong with a rig, as parameters (P) that are 0 where nothing is."""
 
-    def place(self, tracks: StereoTracks, values: Float64) -> CorrectedPlaces:
-        """Return where the features of a window are after a correction."""
-
-    def prior(self) -> Float64:
-        """Return what is known beforehand: float64 (P,), information that a parameter is 0."""
+    # returns where the features of a window are after a correction
+    place: Callable[[StereoTracks, Float64], CorrectedPlaces]
+    prior: Float64  # (P,), what is known beforehand: information that a parameter is 0
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A fitted correction, and what each window says of it.
-
-    Attributes:
-        values: float64 (P,).
-        H: float64 (K, P, P), normal equations of the K windows at ``values``.
-        g: float64 (K, P).
-    """
+    """A fitted correction (P,), and the normal equations of each window: (K, P, P) and (K, P)."""
 
     values: Float64
     H: Float64
@@ -102,16 +87,14 @@ def fit_correction(
     tracks: Sequence[StereoTracks], camera: RectifiedCamera, correction: RigCorrection
 ) -> Fitted:
     """Fit a correction to windows of tracks."""
-    prior = correction.prior()
+    prior = correction.prior
     values, windows = np.zeros(len(prior)), [part.window for part in tracks]
     for _ in range(_ROUNDS):
         placed = [correction.place(part, values) for part in tracks]
         windows = [
             adjust(each.seen(window), camera) for each, window in zip(placed, windows, strict=True)
         ]
-        systems = [
-            _system(window, each, camera) for window, each in zip(windows, placed, strict=True)
-        ]
+        systems = map(_system, windows, placed, repeat(camera))
         H, g = (np.stack(parts) for parts in zip(*systems, strict=True))
         step = np.linalg.solve(H.sum(axis=0) + np.diag(prior), g.sum(axis=0) - prior * values)
         values = values + step
@@ -163,14 +146,7 @@ def _system(
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """What places say of the correction (P), with the poses and points that share them.
-
-    Attributes:
-        H: float64 (P, P).
-        g: float64 (P,).
-        H_pose: float64 (W, 6, P).
-        H_point: float64 (N, P, 3).
-    """
+    """What places say of the correction (P), with the poses (W, 6, P) and points (N, P, 3)."""
 
     H: Float64
     g: Float64

@@ -1,7 +1,7 @@
 """Row errors of a rectified pair, and the small rotation that corrects them.
 
-Two of the right camera's three rotations move rows: pitch moves all rows alike, roll in proportion
-to the column. Yaw moves columns, which cannot be distinguished from disparity.
+Pitch of the right camera moves all rows alike, roll in proportion to the column. Yaw moves columns,
+which cannot be distinguished from disparity.
 """
 
 from __future__ import annotations
@@ -15,40 +15,28 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Bool, Float32, Float64
 
-_NEAR_PX: Final = 1.5
-"""Features with a smaller row error after a rotation agree with it."""
-
+_NEAR_PX: Final = 1.5  # features with a smaller row error after a rotation agree with it
 _TRIALS: Final = 300
 _REFITS: Final = 8
 
 
 @dataclass(frozen=True)
 class RowAlignment:
-    """Row errors (right minus left), and the rotation that minimises them.
+    """Row errors (right minus left), and the rotation of the right camera that minimises them."""
 
-    Attributes:
-        features: Number of matched features.
-        agreeing: Number of features that agree with the rotation.
-        mean_px: Mean row error of the agreeing features.
-        spread_px: Standard deviation of their row error.
-        rms_px: Root mean square row error with the feature noise removed; 0 if rows are aligned.
-        residual_px: Robust standard deviation after the rotation: the feature noise.
-        pitch_rad: Correcting rotation of the right camera about x.
-        roll_rad: Correcting rotation of the right camera about z.
-    """
-
-    features: int
-    agreeing: int
-    mean_px: float
-    spread_px: float
+    features: int  # number of matched features
+    agreeing: int  # number of features that agree with the rotation
+    mean_px: float  # mean row error of the agreeing features
+    spread_px: float  # standard deviation of their row error
+    # root mean square row error with the feature noise removed; 0 if rows are aligned
     rms_px: float
-    residual_px: float
-    pitch_rad: float
-    roll_rad: float
+    residual_px: float  # robust standard deviation after the rotation: the feature noise
+    pitch_rad: float  # correcting rotation about x
+    roll_rad: float  # correcting rotation about z
 
     @property
     def turn(self) -> Float64:
-        """float64 (4,), what aligns the rows, as `correct_rig` takes it."""
+        """What aligns the rows, as `correct_rig` takes it."""
         return np.array([self.pitch_rad, 0.0, self.roll_rad, 0.0])
 
     def turned_rows(self, right_uv: Float32, camera: RectifiedCamera) -> Float64:
@@ -58,15 +46,9 @@ class RowAlignment:
 
 
 def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> RowAlignment | None:
-    """Fit the rotation of the right camera that aligns rows.
+    """Fit the rotation of the right camera that aligns the rows of features (N, 2).
 
-    Args:
-        left_uv: float32 (N, 2), features in the left image; some may be wrong matches.
-        right_uv: float32 (N, 2), the same features in the right image.
-        camera: The rectified camera.
-
-    Returns:
-        None if fewer than 12 features agree.
+    Some of them may be wrong matches. None if fewer than 12 agree.
     """
     if len(left_uv) < 12:
         return None
@@ -84,7 +66,6 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
     agree = np.abs(left_over) < _NEAR_PX
     left_over = left_over[agree]
     error = (right_uv[:, 1] - left_uv[:, 1])[agree].astype(np.float64)
-    residual = float(1.4826 * np.median(np.abs(left_over - np.median(left_over))))
     noise = float(np.mean(left_over**2))
     return RowAlignment(
         features=len(rows),
@@ -92,22 +73,16 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
         mean_px=float(error.mean()),
         spread_px=float(error.std()),
         rms_px=float(np.sqrt(max(0.0, np.mean(error**2) - noise))),
-        residual_px=residual,
+        residual_px=float(1.4826 * np.median(np.abs(left_over - np.median(left_over)))),
         pitch_rad=float(turn[0]),
         roll_rad=float(turn[1]),
     )
 
 
 def turn_features(right_uv: Float32, camera: RectifiedCamera, turn: Float64) -> Float64:
-    """Return positions of features of the right image after a rotation of the right camera.
+    """Return where features (N, 2) of the right image are after a rotation of its camera.
 
-    Args:
-        right_uv: float32 (N, 2).
-        camera: The rectified camera.
-        turn: float64 (2,), pitch and roll, radians.
-
-    Returns:
-        float64 (N, 2).
+    ``turn`` is pitch and roll, radians.
     """
     centre = np.array([camera.cx_right_px, camera.cy_px])
     rays = np.column_stack([(right_uv - centre) / camera.focal_px, np.ones(len(right_uv))])
@@ -116,7 +91,7 @@ def turn_features(right_uv: Float32, camera: RectifiedCamera, turn: Float64) -> 
 
 
 def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> int:
-    """Return number of features that agree with one rotation of the right camera, however large."""
+    """Return how many features agree with one rotation of the right camera, however large."""
     if len(left_uv) < 2:
         return 0
     return int(_consensus(*_linear(left_uv, right_uv, camera), camera.focal_px).sum())
@@ -132,7 +107,14 @@ def correct_rig(rig: Rig, turn: Float64, R_rect_left: Float64) -> StereoCalibrat
         R_rect_left: float64 (3, 3), rotation from the left camera to the rectified camera; the
             identity for a rectified rig.
     """
-    raw = _as_raw(rig)
+    raw = rig
+    if isinstance(raw, RectifiedCamera):
+        left, right = (
+            CameraIntrinsics(matrix, np.zeros(0), raw.width_px, raw.height_px)
+            for matrix in (raw.matrix, raw.right_matrix)
+        )
+        beside = make_transform(np.eye(3), np.array([-raw.baseline_m, 0.0, 0.0]))
+        raw = StereoCalibration(left, right, beside)
     R, t = raw.T_right_left[:3, :3], raw.T_right_left[:3, 3]
     centre = -R.T @ t
     # Rectified right rays are R_rect_left @ R.T @ ray; the correction turns them further.
@@ -140,22 +122,8 @@ def correct_rig(rig: Rig, turn: Float64, R_rect_left: Float64) -> StereoCalibrat
     # An image that is to be enlarged is that of a shorter focal length than was believed.
     matrix = raw.right.matrix.copy()
     matrix[[0, 1], [0, 1]] /= 1.0 + turn[3]
-    return replace(
-        raw,
-        right=replace(raw.right, matrix=matrix),
-        T_right_left=make_transform(turned, -turned @ centre),
-    )
-
-
-def _as_raw(rig: Rig) -> StereoCalibration:
-    if isinstance(rig, StereoCalibration):
-        return rig
-    cameras = [
-        CameraIntrinsics(matrix, np.zeros(0), rig.width_px, rig.height_px)
-        for matrix in (rig.matrix, rig.right_matrix)
-    ]
-    T_right_left = make_transform(np.eye(3), np.array([-rig.baseline_m, 0.0, 0.0]))
-    return StereoCalibration(cameras[0], cameras[1], T_right_left)
+    T_right_left = make_transform(turned, -turned @ centre)
+    return replace(raw, right=replace(raw.right, matrix=matrix), T_right_left=T_right_left)
 
 
 def _linear(
@@ -186,12 +154,8 @@ def _consensus(basis: Float64, rows: Float64, focal_px: float) -> Bool:
     good = np.abs(det) > 0.05
     a, b, det = a[good], b[good], det[good]
     first, second = rows[pick[good, 0]], rows[pick[good, 1]]
-    turns = np.stack(
-        [
-            (first * b[:, 1] - second * a[:, 1]) / det,
-            (a[:, 0] * second - b[:, 0] * first) / det,
-        ]
-    )
-    turns = np.concatenate([turns, np.zeros((2, 1))], axis=1)
+    pitch = (first * b[:, 1] - second * a[:, 1]) / det
+    roll = (a[:, 0] * second - b[:, 0] * first) / det
+    turns = np.concatenate([np.stack([pitch, roll]), np.zeros((2, 1))], axis=1)
     near = np.abs(basis @ turns - rows[:, None]) * focal_px < _NEAR_PX
     return np.asarray(near[:, int(np.argmax(near.sum(axis=0)))])

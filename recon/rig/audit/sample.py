@@ -1,11 +1,14 @@
-"""Sampling of a drive for an audit: stretches of frames, and pairs with matched features."""
+"""Sampling of a drive for an audit, and the stereo geometry that its features show together.
+
+Stretches of frames are read, and in some of their pairs features are matched.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -40,47 +43,29 @@ _LAG_PAIRS = 4
 _QUICK_REACH = 300
 # Smaller images have no features, and are too small to measure their sharpness.
 _LEAST_SIDE_PX = 16
-
-
-_RUNS: Final = 6
-"""Number of runs of consecutive frames on longer drives."""
-
-_PAIRS: Final = 12
-"""Pairs in which features are matched."""
-
-_FEATURES: Final = 1500
-"""Maximum number of features per image."""
-
-_QUICK_FEATURES: Final = 800
-"""The same in a quick audit."""
-
-_MAX_LAG: Final = 4
-"""Largest delay of one camera to look for, in frames."""
-
-_QUICK_LAG: Final = 3
-"""The same in a quick audit."""
-
-BLANK_DN: Final = 4.0
-"""An image counts as blank below this standard deviation, in grey levels."""
+_RUNS: Final = 6  # number of runs of consecutive frames on longer drives
+_PAIRS: Final = 12  # pairs in which features are matched
+_FEATURES: Final = 1500  # maximum number of features per image
+_QUICK_FEATURES: Final = 800  # the same in a quick audit
+_MAX_LAG: Final = 4  # largest delay of one camera to look for, in frames
+_QUICK_LAG: Final = 3  # the same in a quick audit
+BLANK_DN: Final = 4.0  # an image counts as blank below this standard deviation, in grey levels
+# Agreement at a lag, relative to that at lag 0, from which a delay is reported.
+_LAG_FACTOR: Final = 1.25
+# A larger skew, in frames, is closer to a lag of one frame.
+_LARGEST_SKEW: Final = 0.75
+MIN_FEATURES: Final = 60  # minimum number of features, in all, to judge geometry
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What was measured in one pair.
+    """What was measured in one pair, (left, right)."""
 
-    Attributes:
-        index: Number of the pair.
-        brightness_dn: (left, right) mean grey level.
-        sharpness: (left, right) share of the finest detail; NaN if unknown.
-        features: Matched features.
-        pair: The images; None where they are not kept.
-    """
-
-    index: int
-    brightness_dn: tuple[float, float]
-    sharpness: tuple[float, float]
-    features: PairFeatures
-    pair: RectifiedPair | None
+    index: int  # number of the pair
+    brightness_dn: tuple[float, float]  # mean grey levels
+    sharpness: tuple[float, float]  # shares of the finest detail; NaN if unknown
+    features: PairFeatures  # matched features
+    pair: RectifiedPair | None  # the images; None where they are not kept
 
     @property
     def rows_px(self) -> Float64:
@@ -89,41 +74,35 @@ class Look:
         return apart.astype(np.float64)
 
 
+class _Lagged(NamedTuple):
+    """A pair at a lag: its matched features, their `Sample.flows`, how many agree on a rotation."""
+
+    features: PairFeatures
+    flow: Float64
+    agreeing: int
+
+
 @dataclass(eq=False)
 class Sample:
-    """Measures of the sampled images.
+    """Measures of the sampled images; lists have an entry for each measured pair."""
 
-    Attributes:
-        frames: Number of pairs that were read.
-        repeats: Counts of repeated and frozen images.
-        contrast_dn: (left, right) standard deviation of the grey levels of each measured pair.
-        brightness_dn: (left, right) mean grey level.
-        sharpness: (left, right) share of the finest detail.
-        gains: Brightness ratios around features.
-        features: Matched features of each pair.
-        by_lag: Number of features that agree on one rotation, summed over pairs; the key is how
-            many frames after the left image the right image is taken from.
-        lagged: Matched features of the pairs at each lag, and their `flows`.
-        speeds_m_per_s: Speed of the rig at each pair where it could be measured.
-        flows: float64 (N,) per pair, rows by which each feature moves to the next frame; NaN if
-            unknown.
-        looks: Each measured pair; a few of them with their images.
-        broken: The error that ended the sampling, if any.
-    """
-
-    frames: int = 0
+    frames: int = 0  # number of pairs that were read
     repeats: RepeatCounter = field(default_factory=RepeatCounter)
+    # (left, right) standard deviation of the grey levels
     contrast_dn: list[tuple[float, float]] = field(default_factory=list)
+    # (left, right) mean grey level
     brightness_dn: list[tuple[float, float]] = field(default_factory=list)
+    # (left, right) share of the finest detail
     sharpness: list[tuple[float, float]] = field(default_factory=list)
-    gains: list[Float64] = field(default_factory=list)
-    features: list[PairFeatures] = field(default_factory=list)
-    by_lag: dict[int, int] = field(default_factory=dict)
-    lagged: dict[int, list[tuple[PairFeatures, Float64]]] = field(default_factory=dict)
-    speeds_m_per_s: list[float] = field(default_factory=list)
+    gains: list[Float64] = field(default_factory=list)  # brightness ratios around features
+    features: list[PairFeatures] = field(default_factory=list)  # matched features
+    # pairs by how many frames after the left image the right image is taken from
+    lagged: dict[int, list[_Lagged]] = field(default_factory=dict)
+    speeds_m_per_s: list[float] = field(default_factory=list)  # of the rig, where measured
+    # (N,), rows by which each feature moves to the next frame; NaN if unknown
     flows: list[Float64] = field(default_factory=list)
-    looks: list[Look] = field(default_factory=list)
-    broken: ReconError | None = None
+    looks: list[Look] = field(default_factory=list)  # each pair; a few of them with their images
+    broken: ReconError | None = None  # the error that ended the sampling, if any
 
 
 def take_sample(
@@ -142,14 +121,9 @@ def take_sample(
 
 
 def plan_stretches(frames: int, read: int, *, quick: bool) -> list[tuple[int, int]]:
-    """Return first frame and end of each stretch: the whole drive, or stretches spread over it.
+    """Return first frame and end of each stretch of a drive; ``read`` frames are read in all.
 
-    A quick audit stays near the start.
-
-    Args:
-        frames: Number of frames of the drive.
-        read: Number of frames to read in all.
-        quick: Whether the audit is a quick one.
+    A short drive is read whole. A quick audit stays near the start.
     """
     frames = min(frames, _QUICK_REACH) if quick else frames
     runs = _QUICK_RUNS if quick else _RUNS
@@ -178,12 +152,7 @@ class _Sampler:
     """Reads stretches, keeping the pairs around the current one."""
 
     def __init__(
-        self,
-        source: StereoSource,
-        rectifier: Rectifier,
-        centres: list[int],
-        *,
-        quick: bool,
+        self, source: StereoSource, rectifier: Rectifier, centres: list[int], *, quick: bool
     ) -> None:
         self.sample = Sample()
         self._source, self._rectifier = source, rectifier
@@ -201,25 +170,24 @@ class _Sampler:
         self._recent.clear()
         reach = self._lag
         waiting = [centre for centre in self._centres if start <= centre < stop]
-        for pair in self._pairs(start, stop):
+        for recorded in islice(self._source.frames(start), stop - start):
+            self.sample.frames += 1
+            self.sample.repeats.add(recorded.left, recorded.right)
+            pair = self._rectifier.rectify(recorded)
             self._recent[pair.index] = pair
             self._recent.pop(pair.index - 2 * reach - 1, None)
             while waiting and pair.index >= min(waiting[0] + reach, stop - 1):
                 self._measure(waiting.pop(0))
-
-    def _pairs(self, start: int, stop: int) -> Iterator[RectifiedPair]:
-        for recorded in islice(self._source.frames(start), stop - start):
-            self.sample.frames += 1
-            self.sample.repeats.add(recorded.left, recorded.right)
-            yield self._rectifier.rectify(recorded)
 
     def _measure(self, centre: int) -> None:
         """Measure one pair, alone and against its neighbours."""
         pair, sample = self._recent[centre], self.sample
         sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
         sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
+        kept = pair if pair.index in self._kept else None
+        look = Look(pair.index, sample.brightness_dn[-1], (np.nan, np.nan), NO_FEATURES, kept)
         if min(sample.contrast_dn[-1]) < BLANK_DN:
-            self._note(pair, (np.nan, np.nan), NO_FEATURES)
+            sample.looks.append(look)
             return
         if min(pair.left.shape) < _LEAST_SIDE_PX:
             sample.features.append(NO_FEATURES)
@@ -228,20 +196,12 @@ class _Sampler:
         sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
         features = match_features(pair.left, pair.right, self._features)
         sample.features.append(features)
-        self._note(pair, sample.sharpness[-1], features)
+        sample.looks.append(replace(look, sharpness=sample.sharpness[-1], features=features))
         gains = measure_gain(pair.left, pair.right, features.left_uv, features.right_uv)
         sample.gains.append(gains)
         if centre in self._with_lag:
             self._compare_lags(centre, features)
         self._measure_motion(centre, features)
-
-    def _note(
-        self, pair: RectifiedPair, sharpness: tuple[float, float], features: PairFeatures
-    ) -> None:
-        """Keep what the report shows of a pair."""
-        kept = pair if pair.index in self._kept else None
-        brightness = self.sample.brightness_dn[-1]
-        self.sample.looks.append(Look(pair.index, brightness, sharpness, features, kept))
 
     def _compare_lags(self, centre: int, features: PairFeatures) -> None:
         """Match the left image with the right images before and after it."""
@@ -254,9 +214,8 @@ class _Sampler:
                 right = self._recent[centre + lag].right
                 found = match_features(pair.left, right, self._features)
             agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
-            sample.by_lag[lag] = sample.by_lag.get(lag, 0) + agreeing
             flow, _ = self._follow(centre, found)
-            sample.lagged.setdefault(lag, []).append((found, flow))
+            sample.lagged.setdefault(lag, []).append(_Lagged(found, flow, agreeing))
 
     def _measure_motion(self, centre: int, features: PairFeatures) -> None:
         """Measure speed and row flow against the left image of the next frame."""
@@ -281,41 +240,20 @@ class _Sampler:
         return flow, there
 
 
-# Agreement at a lag, relative to that at lag 0, from which a delay is reported.
-_LAG_FACTOR: Final = 1.25
-
-# A larger skew, in frames, is closer to a lag of one frame.
-_LARGEST_SKEW: Final = 0.75
-
-
-MIN_FEATURES: Final = 60
-"""Minimum number of features, in all, to judge geometry."""
-
-
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Stereo geometry measured from the features of a drive.
+    """Stereo geometry measured from the features of a drive."""
 
-    Attributes:
-        pairs: Number of pairs whose features were matched.
-        features: Features of all pairs; if one camera is delayed, of pairs shifted by the lag.
-        matched: Number of features matched in pairs as recorded.
-        alignment: Row errors; None if there are too few features.
-        disparity_px: float64 (M,), of the features whose rows agree; 0 is at infinity.
-        swapped_share: Share of near features that lie farther right in the right image; NaN if
-            there are too few.
-        lag: Delay of the right camera in whole frames.
-        skew: Its delay as a fraction of a frame, and the standard error; None if there is too
-            little motion, or if the delay is whole frames.
-    """
-
-    pairs: int
-    features: PairFeatures
-    matched: int
-    alignment: RowAlignment | None
-    disparity_px: Float64
+    pairs: int  # whose features were matched
+    features: PairFeatures  # of all pairs; if one camera is delayed, of pairs shifted by the lag
+    matched: int  # number of features matched in pairs as recorded
+    alignment: RowAlignment | None  # row errors; None if there are too few features
+    disparity_px: Float64  # (M,), of the features whose rows agree; 0 is at infinity
+    # share of near features that lie farther right in the right image; NaN if there are too few
     swapped_share: float
-    lag: int
+    lag: int  # delay of the right camera in whole frames
+    # its delay as a fraction of a frame, and the standard error; None if there is too little
+    # motion, or if the delay is whole frames
     skew: tuple[float, float] | None
 
 
@@ -327,21 +265,25 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
     skew = _time_skew(sample.features, sample.flows, camera, alignment)
     lag = _best_lag(sample, skew, camera)
     if lag:
-        features, skew = pool_features(found for found, _ in sample.lagged[lag]), None
+        features, skew = pool_features(each.features for each in sample.lagged[lag]), None
         alignment = _align(features, camera)
-    swapped = inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share
-    disparity = _disparities(features, alignment, camera)
     return Geometry(
-        len(sample.features), features, matched, alignment, disparity, swapped, lag, skew
+        pairs=len(sample.features),
+        features=features,
+        matched=matched,
+        alignment=alignment,
+        disparity_px=_disparities(features, alignment, camera),
+        swapped_share=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share,
+        lag=lag,
+        skew=skew,
     )
 
 
 def _align(features: PairFeatures, camera: RectifiedCamera) -> RowAlignment | None:
     if len(features) < MIN_FEATURES:
         return None
-    alignment = align_rows(features.left_uv, features.right_uv, camera)
-    enough = alignment is not None and alignment.agreeing >= MIN_FEATURES
-    return alignment if enough else None
+    found = align_rows(features.left_uv, features.right_uv, camera)
+    return found if found is not None and found.agreeing >= MIN_FEATURES else None
 
 
 def _disparities(
@@ -361,19 +303,18 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: Rectifie
     A delay of half a frame fits both neighbours badly and is reported as skew, not as lag: what
     moves tells the two apart, where it is seen at that lag.
     """
-    if not sample.by_lag:
+    if not sample.lagged:
         return 0
     # Lags were tried on different numbers of pairs.
-    fit = {lag: n / len(sample.lagged[lag]) for lag, n in sample.by_lag.items()}
+    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in sample.lagged.items()}
     best = max(fit, key=lambda lag: (fit[lag], -abs(lag)))
     if abs(best) == 1:
-        found, flows = zip(*sample.lagged[best], strict=True)
+        found, flows, _ = zip(*sample.lagged[best], strict=True)
         left = _time_skew(found, flows, camera, _align(pool_features(found), camera))
         if left is not None:
             return best if abs(left[0]) < 1 - _LARGEST_SKEW else 0
-    between = skew is not None and 4 * skew[1] < abs(skew[0]) < _LARGEST_SKEW
-    if abs(best) == 1 and between:
-        return 0
+        if skew is not None and 4 * skew[1] < abs(skew[0]) < _LARGEST_SKEW:
+            return 0
     return best if fit[best] > _LAG_FACTOR * fit.get(0, 0.0) else 0
 
 

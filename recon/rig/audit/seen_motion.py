@@ -34,31 +34,19 @@ from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
-_MIN_FRAMES: Final = 4
-"""Windows of fewer frames, after a loss, are left out."""
-
-DEPTHS_M: Final = (10.0, 30.0)
-"""Distances for which the depth error is stated."""
-
-_FRAMES: Final = 6
-"""Frames in a window."""
-
-_READ: Final = 72
-"""Frames to read in all, in several runs."""
+_MIN_FRAMES: Final = 4  # windows of fewer frames, after a loss, are left out
+DEPTHS_M: Final = (10.0, 30.0)  # distances for which the depth error is stated
+_FRAMES: Final = 6  # frames in a window
+_READ: Final = 72  # frames to read in all, in several runs
 
 
 @dataclass(frozen=True, eq=False)
 class SeenMotion:
-    """What the motion of a drive shows of its rig.
+    """What the motion of a drive shows of its rig."""
 
-    Attributes:
-        turn: How the right camera is turned; None if there are too few windows.
-        tracks: The windows of tracks.
-        views: How their images were rectified; None if they were rectified before.
-    """
-
-    turn: RightTurn | None
-    tracks: tuple[StereoTracks, ...]
+    turn: RightTurn | None  # how the right camera is turned; None if there are too few windows
+    tracks: tuple[StereoTracks, ...]  # the windows of tracks
+    # how their images were rectified; None if they were rectified before
     views: RectifyingTurns | None
 
     def tracks_as_recorded(self, camera: RectifiedCamera) -> tuple[StereoTracks, ...]:
@@ -77,13 +65,7 @@ class SeenMotion:
 def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> SeenMotion | None:
     """Measure how the right camera of a drive is turned against a calibration.
 
-    Args:
-        source: The drive.
-        rig: The calibration, with which rows meet to a pixel or so.
-        config: How pairs are rectified and matched.
-
-    Returns:
-        None if the drive is too short.
+    With that calibration, rows have to meet to a pixel or so. None if the drive is too short.
     """
     if len(source) < MIN_WINDOWS * _FRAMES:
         return None
@@ -105,24 +87,23 @@ def turn_figures(turn: RightTurn, camera: RectifiedCamera) -> dict[str, Any]:
     # Disparities grow where the right image moves to the left.
     offset_px, sigma_px = camera.focal_px * np.array([-turn.values[1], turn.sigmas[1]])
     side = (camera.width_px / 2 / camera.focal_px) ** 2
+    lens_px = camera.focal_px * side
     return {
         "windows": turn.windows,
-        **{name: {"value": float(x), "sigma": float(s)} for name, x, s in named},
-        "focal_percent": {
-            "value": -100.0 * float(turn.values[3]),
-            "sigma": 100.0 * float(turn.sigmas[3]),
-        },
-        "disparity_px": {"value": float(offset_px), "sigma": float(sigma_px)},
-        "lens_px": {
-            "value": -camera.focal_px * side * float(turn.values[4]),
-            "sigma": camera.focal_px * side * float(turn.sigmas[4]),
-        },
+        **{name: _both(x, s) for name, x, s in named},
+        "focal_percent": _both(-100.0 * turn.values[3], 100.0 * turn.sigmas[3]),
+        "disparity_px": _both(offset_px, sigma_px),
+        "lens_px": _both(-lens_px * turn.values[4], lens_px * turn.sigmas[4]),
         "depth_percent": {
             f"{z:g}": 100.0 * float(offset_px) * z / (camera.focal_px * camera.baseline_m)
             for z in DEPTHS_M
         },
         "not_visible": "baseline",
     }
+
+
+def _both(value: float, sigma: float) -> dict[str, float]:
+    return {"value": float(value), "sigma": float(sigma)}
 
 
 def stereo_tracks(frames: Iterable[OdometryFrame]) -> Iterator[StereoTracks]:

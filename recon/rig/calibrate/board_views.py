@@ -1,8 +1,8 @@
-"""Detection of a calibration board in images, with clear errors if it is not found."""
+"""Still views of a video, and a calibration board found in all images of a rig."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, SourceError
 from recon.core.text import counted
-from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.board import CalibrationBoard
 from recon.io.images.image import read_image, write_image
 from recon.io.images.video import VIDEOS, VideoFile
@@ -30,31 +30,34 @@ from recon.sources.settings import SourceSettings
 from recon.sources.video import frames_of, open_videos, split_views, view_size
 from recon.stereo.rectify.grey import to_grey
 
+# Looks at a video per second: a hand holds a board still for longer than that.
+_LOOKS_HZ: Final = 10.0
+# Frames are compared at this width, at which noise of the sensor averages out.
+_SMALL_PX: Final = 80
+# A frame is still if it changes no more than this multiple of the stillest tenth of all frames, or
+# than this many grey levels, which is what remains of noise at that size.
+_STILL: Final = 2.0
+_STILL_SHARE: Final = 0.1
+_NOISE_DN: Final = 0.5
+# The most different frames are taken, up to this number; some of them will not show the board.
+_MOST: Final = 120
+
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """Views of a board in the images of a rig.
+    """Views of a board in the images of a rig."""
 
-    Attributes:
-        views: Views in which both cameras see the board, named by the left file.
-        pairs: Left and right file of each view, by name.
-        empty: Files in which the board is not found.
-        size_px: (width, height) of every image.
-        count: Number of image pairs.
-        board: The board as detected; its ``legacy`` pattern may differ from the one given.
-    """
-
-    views: tuple[View, ...]
-    pairs: dict[str, tuple[Path, Path]]
-    empty: tuple[Path, ...]
-    size_px: tuple[int, int]
-    count: int
-    board: CalibrationBoard
+    views: tuple[View, ...]  # views in which both cameras see the board, named by the left file
+    pairs: dict[str, tuple[Path, Path]]  # left and right file of each view, by name
+    empty: tuple[Path, ...]  # files in which the board is not found
+    size_px: tuple[int, int]  # (width, height) of every image
+    count: int  # number of image pairs
+    board: CalibrationBoard  # as detected; its ``legacy`` pattern may differ from that given
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """The detection in one image; the image itself is not kept."""
+    """The detection in one image, which is not kept; ``grown``: see `grown_size`."""
 
     size_px: tuple[int, int]
     seen: Sighting | None
@@ -80,19 +83,17 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
         )
     empty = tuple(path for path, look in zip(files, looks, strict=True) if look.seen is None)
     views, pairs = {}, {}
-    for number, pair in enumerate(images.pairs):
-        left, right = (look.seen for look in looks[2 * number : 2 * number + 2])
-        if left is not None and right is not None:
-            name = pair[0].name
-            views[name] = View(name, (left, _same_order(left, right, board)))
-            pairs[name] = pair
+    for pair, first, second in zip(images.pairs, looks[::2], looks[1::2], strict=True):
+        if first.seen is not None and second.seen is not None:
+            name, right = pair[0].name, _same_order(first.seen, second.seen, board)
+            views[name], pairs[name] = View(name, (first.seen, right)), pair
     return BoardViews(tuple(views.values()), pairs, empty, size, len(images.pairs), board)
 
 
 def _look_at_all(
     files: Sequence[Path], board: CalibrationBoard, threads: int
 ) -> tuple[CalibrationBoard, list[_Look]]:
-    """Return detections in all images, and the board, which may have OpenCV's legacy pattern."""
+    """Return detections in all images, and the board, which may have the legacy pattern."""
     with ThreadPoolExecutor(threads) as pool:
         looks = list(pool.map(lambda path: _look(path, board), files))
         if board.kind == "chess" or any(look.seen for look in looks):
@@ -125,27 +126,15 @@ def _one_size(files: Sequence[Path], looks: Sequence[_Look]) -> tuple[int, int]:
     first = looks[0].size_px
     for path, look in zip(files, looks, strict=True):
         if look.size_px != first:
+            got, expected = (f"{size[0]}x{size[1]}" for size in (look.size_px, first))
             raise SourceError(
                 "images differ in size",
                 where=path,
-                got=f"{look.size_px[0]}x{look.size_px[1]}",
-                expected=f"{first[0]}x{first[1]} as {files[0].name}",
+                got=got,
+                expected=f"{expected} as {files[0].name}",
                 hint="both cameras must record the same size",
             )
     return first
-
-
-# Looks at a video per second: a hand holds a board still for longer than that.
-_LOOKS_HZ: Final = 10.0
-# Frames are compared at this width, at which noise of the sensor averages out.
-_SMALL_PX: Final = 80
-# A frame is still if it changes no more than this multiple of the stillest tenth of all frames, or
-# than this many grey levels, which is what remains of noise at that size.
-_STILL: Final = 2.0
-_STILL_SHARE: Final = 0.1
-_NOISE_DN: Final = 0.5
-# The most different frames are taken, up to this number; some of them will not show the board.
-_MOST: Final = 120
 
 
 def is_video(where: str) -> bool:
@@ -156,12 +145,9 @@ def is_video(where: str) -> bool:
 def pick_views(
     files: Sequence[Path], settings: SourceSettings, path: Callable[[str], Path]
 ) -> ImagePairs:
-    """Write the still frames of one or two videos that differ most as image files.
+    """Write the still frames that differ most as image files, to the ``path`` of their names.
 
-    Args:
-        files: A left and a right video, or one with both views.
-        settings: Arrangement of the two views in one video.
-        path: Gives the path to write the file of a name to.
+    ``files`` are a left and a right video, or one with both views.
     """
     videos = open_videos(files)
     if len(videos) == 1:
@@ -178,24 +164,21 @@ def pick_views(
             hint="hold it still for a second or two in each place",
         )
     pairs = []
-    for number, (left, right) in zip(chosen, _frames(videos, chosen, settings), strict=True):
-        pairs.append((path(f"views/left{number:06d}.png"), path(f"views/right{number:06d}.png")))
-        write_image(pairs[-1][0], left)
-        write_image(pairs[-1][1], right)
+    for number, views in zip(chosen, _frames(videos, chosen, settings), strict=True):
+        pair = path(f"views/left{number:06d}.png"), path(f"views/right{number:06d}.png")
+        for file, view in zip(pair, views, strict=True):
+            write_image(file, view)
+        pairs.append(pair)
     return ImagePairs(tuple(pairs), by_order=False)
 
 
 def _frames(
-    videos: Sequence[VideoFile], numbers: Iterable[int], settings: SourceSettings
+    videos: Sequence[VideoFile], numbers: Sequence[int], settings: SourceSettings
 ) -> Iterator[tuple[UInt8, UInt8]]:
     """Yield both views of frames of increasing numbers."""
-    wanted = list(numbers)
-    if len(videos) == 1:
-        for _, image in videos[0].pick(wanted):
-            yield split_views(image, settings)
-        return
-    for (_, left), (_, right) in zip(*(video.pick(wanted) for video in videos), strict=True):
-        yield left, right
+    for images in zip(*(video.pick(list(numbers)) for video in videos), strict=True):
+        views = [image for _, image in images]
+        yield split_views(views[0], settings) if len(views) == 1 else (views[0], views[1])
 
 
 def _shrunk(both: tuple[UInt8, UInt8]) -> Float32:
@@ -210,7 +193,8 @@ def _choose(small: Float32) -> list[int]:
     """Return indices of still frames, each as different as can be from those chosen before it."""
     steps = _apart(small[1:], small[:-1])
     limit = max(_NOISE_DN, _STILL * float(np.quantile(steps, _STILL_SHARE))) if len(steps) else 0.0
-    still = np.flatnonzero(_still_frames(steps, limit))
+    calm = steps <= limit  # nothing moves before a still frame, nor after it
+    still = np.flatnonzero(np.concatenate([calm[:1], calm[:-1] & calm[1:], calm[-1:]]))
     if not len(still):
         return []
     chosen, apart = [int(still[0])], np.full(len(still), np.inf)
@@ -225,9 +209,3 @@ def _choose(small: Float32) -> list[int]:
 def _apart(first: Float32, second: Float32) -> Float64:
     """Return float64 (N,), rms difference of N images from others, or from one; grey levels."""
     return np.asarray(np.sqrt(((first - second) ** 2).mean(axis=(1, 2), dtype=np.float64)))
-
-
-def _still_frames(steps: Float64, limit: float) -> Bool:
-    """Return bool (N,), whether nothing moves before and after each frame, from N - 1 steps."""
-    calm = steps <= limit
-    return np.concatenate([calm[:1], calm[:-1] & calm[1:], calm[-1:]])

@@ -6,6 +6,7 @@ The step reuses the solver's normal equations, so hundreds take a fraction of a 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,7 +17,7 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
 from recon.core.values import StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.rig.calibrate.bundle import RigState, moved, solve_scaled
+from recon.rig.calibrate.bundle import moved, solve_scaled
 from recon.rig.calibrate.stereo import StereoFit, stereo_of
 from recon.rig.settings import CalibrationSettings
 from recon.stereo.rectify.lens import project_into_image, rays_of
@@ -24,58 +25,38 @@ from recon.stereo.rectify.lens import project_into_image, rays_of
 # The depth error is evaluated on a 3 by 3 grid in the left image, in fractions of its size.
 _PLACES: Final = (0.2, 0.5, 0.8)
 _MIDDLE: Final = 4
-MATCHED: Final = 0.02
-"""Depth error due to matching at the default working distance, relative to it."""
-
-
-MATCH_SIGMA_PX: Final = 0.25
-"""Assumed matching error, by which depth errors are predicted."""
-
-CONFIDENCE: Final = 0.95
-"""Confidence level of the intervals."""
+# Depth error due to matching at the default working distance, relative to it.
+_MATCHED: Final = 0.02
+MATCH_SIGMA_PX: Final = 0.25  # assumed matching error, by which depth errors are predicted
+CONFIDENCE: Final = 0.95  # confidence level of the intervals
 
 
 @dataclass(frozen=True)
 class DepthError:
-    """Predicted depth error at one distance.
+    """Predicted depth error at one distance along the optical axis of the left camera."""
 
-    Attributes:
-        depth_m: Distance along the optical axis of the left camera.
-        calibration_m: Root mean square error due to calibration, over the resamples and over the
-            image; NaN if the two views do not overlap at that depth.
-        low_m: Lower end of the interval of the error at the image centre; negative = measured too
-            near.
-        high_m: Upper end of that interval.
-        matching_m: Error due to matching, with `MATCH_SIGMA_PX`.
-    """
-
-    depth_m: float
+    depth_m: float  # the distance
+    # root mean square error due to calibration, over the resamples and over the image; NaN if the
+    # two views do not overlap at that depth
     calibration_m: float
+    # lower end of the interval of the error at the image centre; negative = measured too near
     low_m: float
-    high_m: float
-    matching_m: float
+    high_m: float  # upper end of that interval
+    matching_m: float  # error due to matching, with `MATCH_SIGMA_PX`
 
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Bootstrap intervals of the calibration.
+    """Bootstrap intervals (low, high) of the calibration."""
 
-    Attributes:
-        focal_px: Interval (low, high) of the left focal length.
-        baseline_m: Interval (low, high) of the baseline.
-        rotation_deg: Root mean square rotation of the right camera relative to the solution.
-        depths: Predicted depth error at each distance.
-        working: The same at the working distance, see `working_distance`.
-    """
-
-    focal_px: tuple[float, float]
-    baseline_m: tuple[float, float]
-    rotation_deg: float
-    depths: tuple[DepthError, ...]
-    working: DepthError
+    focal_px: tuple[float, float]  # of the left focal length
+    baseline_m: tuple[float, float]  # of the baseline
+    rotation_deg: float  # root mean square rotation of the right camera relative to the solution
+    depths: tuple[DepthError, ...]  # predicted depth error at each distance
+    working: DepthError  # the same at the working distance, see `_working_distance`
 
 
-def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibration]:
+def _resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibration]:
     """Return rigs calibrated from bootstrap resamples of the views; failed ones are left out."""
     rng = np.random.default_rng(0)
     count, info = len(fit.views), fit.information
@@ -86,9 +67,8 @@ def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibr
         A = info.prior + np.tensordot(drawn, info.matrices, axes=1)
         # At the solution the vectors sum to zero, up to the prior of rational lenses.
         step = solve_scaled(A, (drawn - 1.0) @ vectors)
-        rig = _try_rig(fit.state, step)
-        if rig is not None:
-            rigs.append(rig)
+        with suppress(CalibrationError):  # it does not determine a rig
+            rigs.append(stereo_of(moved(fit.state, step)))
     if len(rigs) < settings.bootstrap / 2:
         raise CalibrationError(
             "views do not determine the rig",
@@ -100,7 +80,7 @@ def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibr
 
 def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
     """Return bootstrap intervals of focal length, baseline, rotation and depth."""
-    rigs = resample(fit, settings)
+    rigs = _resample(fit, settings)
     turns = [rig.T_right_left[:3, :3] @ fit.calibration.T_right_left[:3, :3].T for rig in rigs]
     cosines = np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)
     return Spread(
@@ -108,21 +88,21 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
         baseline_m=_interval([rig.baseline_m for rig in rigs]),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2)))),
         depths=tuple(_depth_error(fit, rigs, depth) for depth in settings.depths_m),
-        working=_depth_error(fit, rigs, working_distance(fit.calibration, settings)),
+        working=_depth_error(fit, rigs, _working_distance(fit.calibration, settings)),
     )
 
 
-def working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
+def _working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
     """Return the distance at which depth matters, in metres.
 
-    It is `CalibrationSettings.working_m`, or else as far as the rig itself allows 2 % of error: an
-    error of calibration and of matching both grow with its square, so it is the same to ask there
-    whether the calibration is as good as the matching.
+    By default it is as far as the rig itself allows 2 % of error: errors of calibration and of
+    matching both grow with its square, so it is the same to ask there whether the calibration is as
+    good as the matching.
     """
     if settings.working_m is not None:
         return settings.working_m
     focal_px = float(rig.left.matrix[0, 0])
-    return MATCHED * focal_px * rig.baseline_m / MATCH_SIGMA_PX
+    return _MATCHED * focal_px * rig.baseline_m / MATCH_SIGMA_PX
 
 
 def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:
@@ -151,14 +131,6 @@ def _jackknife_vectors(fit: StereoFit) -> Float64:
             for matrix, vector in zip(info.matrices, info.vectors, strict=True)
         ]
     )
-
-
-def _try_rig(state: RigState, step: Float64) -> StereoCalibration | None:
-    """Return the rig after a step, or None if the resample does not determine one."""
-    try:
-        return stereo_of(moved(state, step))
-    except CalibrationError:
-        return None
 
 
 def _interval(values: list[float]) -> tuple[float, float]:

@@ -1,9 +1,8 @@
 """Bundle adjustment of the lenses, the pose of the right camera and every pose of the board.
 
-One solver handles one or two cameras, pinhole and fisheye lenses, and partly visible boards. All
-corners of a camera are projected at once. The board poses are eliminated view by view (Schur
-complement), which leaves the few parameters shared by all views and each view's information matrix
-for them. The bootstrap over views reweights these matrices.
+One solver handles one or two cameras, pinhole and fisheye lenses, and partly visible boards. The
+board poses are eliminated view by view (Schur complement), which leaves the few parameters shared
+by all views and each view's information about them, which the bootstrap reweights.
 
 Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6; Zhang 2000.
 """
@@ -36,13 +35,7 @@ _POSE: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Board corners that one camera saw in one view.
-
-    Attributes:
-        numbers: int32 (N,), indices of the corners on the board.
-        board_m: float64 (N, 3), their positions on the board.
-        pixels: float64 (N, 2), their positions in the image.
-    """
+    """Board corners that one camera saw in one view: (N,) numbers, (N, 3) metres, (N, 2) px."""
 
     numbers: Int32
     board_m: Float64
@@ -51,12 +44,7 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One pose of the board, seen by every camera.
-
-    Attributes:
-        name: Name shown to the user.
-        seen: One sighting for each camera.
-    """
+    """One pose of the board, named for the user, with a sighting of each camera."""
 
     name: str
     seen: tuple[Sighting, ...]
@@ -64,12 +52,9 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """Everything that is estimated.
+    """Everything that is estimated: one or two cameras, the first at the origin of the rig.
 
-    Attributes:
-        cameras: One or two cameras.
-        T_camera_rig: float64 (4, 4) for each; the first is the identity.
-        T_rig_board: float64 (V, 4, 4), one for each view.
+    Transforms are float64: (4, 4) of each camera, (V, 4, 4) of the board in each view.
     """
 
     cameras: tuple[CameraIntrinsics, ...]
@@ -79,13 +64,7 @@ class RigState:
 
 @dataclass(frozen=True, eq=False)
 class _Corners:
-    """All corners that one camera saw, view after view.
-
-    Attributes:
-        board_m: float64 (N, 3), their positions on the board.
-        pixels: float64 (N, 2), their positions in the image.
-        view: intp (N,), the number of the view, ascending.
-    """
+    """All corners that one camera saw, view after view; ``view`` (N,) numbers their views."""
 
     board_m: Float64
     pixels: Float64
@@ -101,32 +80,21 @@ class _Corners:
 class Information:
     """Information of each view about the shared parameters, at the solution.
 
-    The shared parameters are (fx, fy, cx, cy, distortion …) of each camera in turn, followed, with
-    two cameras, by the pose of the right camera: six parameters (rotation, translation) of a small
-    motion applied after it.
-
-    Attributes:
-        matrices: float64 (V, P, P), information matrix of each view, board poses eliminated.
-        vectors: float64 (V, P), gradient of each view; their weighted sum is zero.
-        prior: float64 (P, P), information matrix of the prior.
-        weights: float64 (V,), weights of the views.
+    These (P) are (fx, fy, cx, cy, distortion …) of each camera in turn and, with two cameras, the
+    pose of the right one: rotation and translation of a small motion after it.
     """
 
-    matrices: Float64
-    vectors: Float64
-    prior: Float64
-    weights: Float64
+    matrices: Float64  # (V, P, P), information matrix of each view, board poses eliminated
+    vectors: Float64  # (V, P), gradient of each view; their weighted sum is zero
+    prior: Float64  # (P, P), information matrix of the prior
 
 
 def solve(
     views: Sequence[View], start: RigState, weights: Float64 | None = None
 ) -> tuple[RigState, Information]:
-    """Minimise the sum of squared pixel errors (Levenberg-Marquardt).
+    """Minimise the sum of squared pixel errors, each view weighted by ``weights`` (V,); None = 1.
 
-    Args:
-        views: The views.
-        start: Initial guess, with every point in front of every camera.
-        weights: float64 (V,), weight of each view's squared errors; None = 1.
+    At ``start`` every point has to be in front of every camera.
     """
     w = np.ones(len(views)) if weights is None else weights
     corners = _gather(views)
@@ -143,15 +111,13 @@ def solve(
         min_gain=_STILL,
     )
     matrices, vectors, _ = _without_poses(_linearise(corners, state))
-    return state, Information(matrices, vectors, _prior(state), w)
+    return state, Information(matrices, vectors, _prior(state)[1])
 
 
 def squared_errors(views: Sequence[View], state: RigState) -> tuple[Float64, Float64]:
-    """Return how well each view fits each camera.
+    """Return sums of squared pixel errors, and numbers of corners: float64 (V, cameras) each.
 
-    Returns:
-        The sums of squared distances from the predicted corners, pixels², NaN where one is behind
-        the camera, and the numbers of corners; both float64 (V, cameras).
+    A sum is NaN where a corner is behind the camera.
     """
     corners = _gather(views)
     squares = zip(corners, _squares(corners, state), strict=True)
@@ -160,32 +126,19 @@ def squared_errors(views: Sequence[View], state: RigState) -> tuple[Float64, Flo
     return np.stack(sums, axis=1), np.stack(counts, axis=1).astype(np.float64)
 
 
-def shared_size(state: RigState) -> int:
-    """Return the number of shared parameters, P."""
-    return sum(_camera_size(camera) for camera in state.cameras) + _POSE * (len(state.cameras) - 1)
-
-
 def moved(state: RigState, step: Float64) -> RigState:
     """Return the state with ``step`` (P,) added to its shared parameters; board poses stay."""
     cameras, at = [], 0
     for camera in state.cameras:
-        size = _camera_size(camera)
-        cameras.append(_moved_camera(camera, step[at : at + size]))
-        at += size
+        matrix, end = np.array(camera.matrix), at + 4 + camera.distortion.size
+        matrix[[0, 1, 0, 1], [0, 1, 2, 2]] += step[at : at + 4]
+        distortion = camera.distortion + step[at + 4 : end]
+        cameras.append(replace(camera, matrix=matrix, distortion=distortion))
+        at = end
     T = state.T_camera_rig
     if len(cameras) > 1:
         T = (T[0], _moved_pose(T[1], step[at : at + _POSE]))
     return replace(state, cameras=tuple(cameras), T_camera_rig=T)
-
-
-def _camera_size(camera: CameraIntrinsics) -> int:
-    return 4 + camera.distortion.size
-
-
-def _moved_camera(camera: CameraIntrinsics, step: Float64) -> CameraIntrinsics:
-    matrix = np.array(camera.matrix)
-    matrix[[0, 1, 0, 1], [0, 1, 2, 2]] += step[:4]
-    return replace(camera, matrix=matrix, distortion=camera.distortion + step[4:])
 
 
 def _moved_pose(T: Float64, step: Float64) -> Float64:
@@ -193,13 +146,10 @@ def _moved_pose(T: Float64, step: Float64) -> Float64:
 
 
 def _gather(views: Sequence[View]) -> list[_Corners]:
-    """Return the corners that each camera saw."""
     corners = []
     for sightings in zip(*(view.seen for view in views), strict=True):
-        board_m, pixels = (
-            np.concatenate(each)
-            for each in zip(*((seen.board_m, seen.pixels) for seen in sightings), strict=True)
-        )
+        board_m = np.concatenate([seen.board_m for seen in sightings])
+        pixels = np.concatenate([seen.pixels for seen in sightings])
         counts = [len(seen.pixels) for seen in sightings]
         corners.append(_Corners(board_m, pixels, np.repeat(np.arange(len(views)), counts)))
     return corners
@@ -211,19 +161,19 @@ def _linearise(corners: Sequence[_Corners], state: RigState) -> Float64:
     They are JᵀJ with the columns of J by the shared parameters, the pose of the board, and the
     error itself.
     """
-    size, at = shared_size(state), 0
+    size, at = len(_prior(state)[0]), 0
     normals = np.zeros((len(state.T_rig_board), size + _POSE + 1, size + _POSE + 1))
     for camera, T, seen in zip(state.cameras, state.T_camera_rig, corners, strict=True):
         xyz_rig = seen.in_rig(state)
         xyz = apply(T, xyz_rig)
         pixels, by_point, by_lens = project_with_jacobian(camera, xyz)
         J = np.zeros((len(xyz), 2, size + _POSE + 1))
-        J[:, :, at : at + _camera_size(camera)] = by_lens
+        J[:, :, at : at + by_lens.shape[2]] = by_lens
         if at:
             J[:, :, size - _POSE : size] = by_point @ _by_motion(xyz)
         J[:, :, size:-1] = by_point @ T[:3, :3] @ _by_motion(xyz_rig)
         J[:, :, -1] = seen.pixels - pixels
-        at += _camera_size(camera)
+        at += by_lens.shape[2]
         ends = np.searchsorted(seen.view, np.arange(1, len(normals)))
         for number, each in enumerate(np.split(J, ends)):
             rows = each.reshape(-1, J.shape[2])
@@ -236,24 +186,22 @@ def _by_motion(xyz: Float64) -> Float64:
     return np.roll(step_jacobian(xyz), 3, axis=2)
 
 
-def _prior(state: RigState) -> Float64:
-    """Return float64 (P, P), information that keeps coefficients of rational lenses near zero."""
-    diagonal, at = np.zeros(shared_size(state)), 0
+def _prior(state: RigState) -> tuple[Float64, Float64]:
+    """Return what a prior keeps near zero, coefficients of rational lenses: numbers, information.
+
+    float64 (P,) and (P, P); 0 for all other shared parameters.
+    """
+    numbers, information = [], []
     for camera in state.cameras:
-        if camera.distortion.size >= 8:
-            diagonal[at + 4 : at + _camera_size(camera)] = (_PRIOR_PX / _PRIOR_SPREAD) ** 2
-        at += _camera_size(camera)
-    return np.diag(diagonal)
-
-
-def _shared_numbers(state: RigState) -> Float64:
-    """Return float64 (P,), the distortion at its place; 0 elsewhere, where the prior is zero."""
-    numbers = [np.concatenate([np.zeros(4), camera.distortion]) for camera in state.cameras]
-    return np.concatenate([*numbers, np.zeros(_POSE * (len(state.cameras) - 1))])
+        kept = (_PRIOR_PX / _PRIOR_SPREAD) ** 2 if camera.distortion.size >= 8 else 0.0
+        numbers += [np.zeros(4), camera.distortion]
+        information += [np.zeros(4), np.full(camera.distortion.size, kept)]
+    pose = np.zeros(_POSE * (len(state.cameras) - 1))
+    return np.concatenate([*numbers, pose]), np.diag(np.concatenate([*information, pose]))
 
 
 def _squares(corners: Sequence[_Corners], state: RigState) -> list[Float64]:
-    """Return for each camera float64 (N,), squared distances in the image, pixels²."""
+    """Return float64 (N,) of each camera, squared distances in the image, pixels²."""
     return [
         ((seen.pixels - project_raw(camera, apply(T, seen.in_rig(state)))) ** 2).sum(axis=1)
         for camera, T, seen in zip(state.cameras, state.T_camera_rig, corners, strict=True)
@@ -262,18 +210,17 @@ def _squares(corners: Sequence[_Corners], state: RigState) -> list[Float64]:
 
 def _cost(corners: Sequence[_Corners], state: RigState, weights: Float64) -> float:
     """Return the sum of squared errors and of the prior; NaN for a point behind a camera."""
-    numbers = _shared_numbers(state)
+    numbers, prior = _prior(state)
     squares = zip(corners, _squares(corners, state), strict=True)
     total = sum(float(weights[seen.view] @ each) for seen, each in squares)
-    return total + float(numbers @ _prior(state) @ numbers)
+    return total + float(numbers @ prior @ numbers)
 
 
 def _without_poses(normals: Float64, damping: float = 0.0) -> tuple[Float64, Float64, Float64]:
-    """Remove the pose of the board from the normal equations of each view.
+    """Eliminate the pose of the board from the normal equations of each view.
 
-    Returns:
-        Matrices (V, P, P) and vectors (V, P) of the shared parameters, and (V, 6, P + 1), which
-        give the pose's step from theirs: the last column less the others times it.
+    Returns matrices (V, P, P) and vectors (V, P) of the shared parameters, and (V, 6, P + 1), from
+    which the pose's step follows: the last column less the others times the step of the shared.
     """
     P = normals.shape[1] - _POSE - 1
     shared, own = normals[:, :P], normals[:, P:-1]
@@ -285,11 +232,11 @@ def _without_poses(normals: Float64, damping: float = 0.0) -> tuple[Float64, Flo
 
 def _step(normals: Float64, state: RigState, weights: Float64, damping: float) -> RigState | None:
     """Return the state after one damped step; None if a focal length would not be positive."""
-    prior = _prior(state)
+    numbers, prior = _prior(state)
     matrices, vectors, back = _without_poses(normals, damping)
     A = prior + np.tensordot(weights, matrices, axes=1)
     A[np.diag_indices_from(A)] += damping * np.diag(A) + 1e-15
-    step = solve_scaled(A, weights @ vectors - prior @ _shared_numbers(state))
+    step = solve_scaled(A, weights @ vectors - prior @ numbers)
     own = back[:, :, -1] - back[:, :, :-1] @ step
     poses = np.stack(list(map(_moved_pose, state.T_rig_board, own)))
     try:

@@ -18,7 +18,6 @@ from recon.core.values.board import CalibrationBoard
 from recon.rig.calibrate.bundle import Sighting
 
 Inner = tuple[int, int]
-
 # Corners are detected at this width at most, and refined at full resolution.
 _SEARCH_WIDTH_PX: Final = 1280
 # Half the window of the subpixel search, relative to the corner spacing: as wide as possible

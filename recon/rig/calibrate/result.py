@@ -11,7 +11,6 @@ import numpy as np
 
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
-from recon.core.values.board import CalibrationBoard
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import write_camera_info, write_kalibr
@@ -25,7 +24,8 @@ from recon.run.run import plain
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
-
+# Image cells: in a cell without corners, the lens model is extrapolated.
+_CELLS: Final = (8, 6)
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
     "verdict", "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
@@ -35,27 +35,15 @@ _KEPT: Final = (
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """The results of a run.
+    """The results of a run."""
 
-    Attributes:
-        board: The board.
-        config: The configuration.
-        seen: The views of the board.
-        fit: The calibrated rig.
-        spread: Its bootstrap intervals.
-        turns: Its rectifying rotations.
-        rows_px: float64 (N,), row errors of all corners after rectification.
-        summary: The figures of ``summary.json``.
-    """
-
-    board: CalibrationBoard
     config: CalibratedSettings
     seen: BoardViews
     fit: StereoFit
     spread: Spread
     turns: RectifyingTurns
-    rows_px: Float64
-    summary: dict[str, Any]
+    rows_px: Float64  # (N,), row errors of all corners after rectification
+    summary: dict[str, Any]  # the figures of ``summary.json``
 
 
 def describe_calibration(
@@ -64,17 +52,13 @@ def describe_calibration(
     """Rectify the views with the calibrated rig, and measure how well it describes them."""
     turns = plan_turns(fit.calibration, config.rectification)
     rows_px = np.concatenate([_rows_apart(turns, fit, view) for view in fit.views])
-    summary = summarise(seen, fit, spread, rows_px)
+    summary = _summarise(seen, fit, spread, rows_px)
     summary["rectified_focal_px"] = turns.camera.focal_px
-    return CalibrationRun(seen.board, config, seen, fit, spread, turns, rows_px, summary)
+    return CalibrationRun(config, seen, fit, spread, turns, rows_px, summary)
 
 
 def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) -> tuple[Path, ...]:
-    """Write the calibrated rig in a given format.
-
-    Returns:
-        The files: two for ROS, else one.
-    """
+    """Write the calibrated rig in a given format, and return the files: two for ROS, else one."""
     rig = run.fit.calibration
     if form == "ros":
         rotations = (run.turns.R_left, run.turns.R_right)
@@ -96,13 +80,11 @@ def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
     return np.asarray(left[:, 1] - right[:, 1])
 
 
-# Image cells, 8 by 6: in a cell without corners, the lens model is extrapolated.
-_CELLS: Final = (8, 6)
-
-
-def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64) -> dict[str, Any]:
+def _summarise(
+    seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
+) -> dict[str, Any]:
     """Return the figures of ``summary.json``, without time and memory of the run."""
-    rig, tilts_deg, away_m = fit.calibration, tilt_deg(fit), distances_m(fit)
+    rig, tilts_deg, away_m = fit.calibration, _tilt_deg(fit), _distances_m(fit)
     return {
         "board": str(seen.board),
         "model": rig.left.model,
@@ -130,8 +112,8 @@ def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
             view.name: [float(value) for value in errors]
             for view, errors in zip(fit.views, fit.errors_px, strict=True)
         },
-        "coverage_left": coverage([view.seen[0].pixels for view in fit.views], rig.left),
-        "coverage_right": coverage([view.seen[1].pixels for view in fit.views], rig.right),
+        "coverage_left": _coverage([view.seen[0].pixels for view in fit.views], rig.left),
+        "coverage_right": _coverage([view.seen[1].pixels for view in fit.views], rig.right),
         "tilt_max_deg": float(tilts_deg.max()),
         "tilted_share": float((tilts_deg >= TILT_DEG).mean()),
         "far_to_near": float(away_m.max() / away_m.min()),
@@ -142,6 +124,41 @@ def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
             "matching_share": spread.working.matching_m / spread.working.depth_m,
         },
     }
+
+
+def _depth_cm(each: DepthError) -> dict[str, float | None]:
+    names = ("calibration", "low", "high", "matching")
+    return {name: plain(100.0 * getattr(each, f"{name}_m")) for name in names}
+
+
+def shared_pixels(view: View) -> tuple[Float64, Float64]:
+    """Return the corners that both cameras saw, in the left and right image: float64 (N, 2)."""
+    left, right = view.seen
+    _, of_left, of_right = np.intersect1d(left.numbers, right.numbers, return_indices=True)
+    return left.pixels[of_left], right.pixels[of_right]
+
+
+def _coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
+    """Return the share of the 8 by 6 image cells in which a corner was seen, in [0, 1]."""
+    size = np.array([camera.width_px, camera.height_px])
+    cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
+    inside = np.clip(cells, 0, np.array(_CELLS) - 1)
+    return len(np.unique(inside, axis=0)) / (_CELLS[0] * _CELLS[1])
+
+
+def _tilt_deg(fit: StereoFit) -> Float64:
+    """Return float64 (V,), angle between the board's normal and the left camera's optical axis."""
+    normals = np.array([T[2, 2] for T in fit.state.T_rig_board])
+    return np.asarray(np.degrees(np.arccos(np.clip(np.abs(normals), 0.0, 1.0))))
+
+
+def _distances_m(fit: StereoFit) -> Float64:
+    """Return float64 (V,), distance of the middle of the board from the left camera."""
+    middles = [
+        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
+        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
+    ]
+    return np.asarray(np.linalg.norm(middles, axis=1))
 
 
 def describe_depths(summary: dict[str, Any]) -> dict[str, str]:
@@ -162,48 +179,3 @@ def describe_depths(summary: dict[str, Any]) -> dict[str, str]:
 def _short(value: float) -> str:
     """Return two significant digits, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
-
-
-def _depth_cm(each: DepthError) -> dict[str, float | None]:
-    metres = {
-        "calibration": each.calibration_m,
-        "low": each.low_m,
-        "high": each.high_m,
-        "matching": each.matching_m,
-    }
-    return {name: plain(100.0 * value) for name, value in metres.items()}
-
-
-def shared_pixels(view: View) -> tuple[Float64, Float64]:
-    """Return the corners that both cameras saw, in the left and right image: float64 (N, 2)."""
-    left, right = view.seen
-    _, of_left, of_right = np.intersect1d(left.numbers, right.numbers, return_indices=True)
-    return left.pixels[of_left], right.pixels[of_right]
-
-
-def coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
-    """Return the share of the 8 by 6 image cells in which a corner was seen, in [0, 1].
-
-    Args:
-        pixels: float64 (N, 2) for each view.
-        camera: The camera.
-    """
-    size = np.array([camera.width_px, camera.height_px])
-    cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
-    inside = np.clip(cells, 0, np.array(_CELLS) - 1)
-    return len(np.unique(inside, axis=0)) / (_CELLS[0] * _CELLS[1])
-
-
-def tilt_deg(fit: StereoFit) -> Float64:
-    """Return float64 (V,), angle between the board's normal and the left camera's optical axis."""
-    normals = np.array([T[2, 2] for T in fit.state.T_rig_board])
-    return np.asarray(np.degrees(np.arccos(np.clip(np.abs(normals), 0.0, 1.0))))
-
-
-def distances_m(fit: StereoFit) -> Float64:
-    """Return float64 (V,), distance of the middle of the board from the left camera."""
-    middles = [
-        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
-        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
-    ]
-    return np.asarray(np.linalg.norm(middles, axis=1))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -13,34 +14,25 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import exp_so3, invert, log_so3, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
-from recon.core.values.arrays import Bool, Float64
-from recon.rig.calibrate.bundle import (
-    Information,
-    RigState,
-    Sighting,
-    View,
-    solve,
-    squared_errors,
-)
+from recon.core.values.arrays import Float64
+from recon.rig.calibrate.bundle import Information, RigState, Sighting, View, solve, squared_errors
 from recon.rig.settings import CalibrationSettings
 from recon.stereo.rectify.lens import rays_of
 
+Size = tuple[int, int]
+# Half fields of view that are tried for a fisheye lens.
+_HALF_ANGLES: Final = tuple(math.radians(angle) for angle in (35, 45, 55, 65, 75, 85, 95, 110))
+_COEFFICIENTS: Final = {"rational": 8}
+# Rounds of reweighting; outlying views stand out after two.
+_REWEIGHTED: Final = 4
 _DROPPING_ROUNDS: Final = 4
 # An rms error this many times that of each camera alone: the images were not taken together.
 _MISMATCH: Final = 3.0
-
+# Views whose error exceeds this multiple of the median of all views are dropped …
 _OUTLIER_RATIO: Final = 3.0
-"""Views whose error exceeds this multiple of the median of all views are dropped …"""
-
-_OUTLIER_PX: Final = 0.3
-"""… but never those with an rms error below this."""
-
-_MAX_RMS_PX: Final = 2.0
-"""Largest rms error of an accepted calibration."""
-
-_MIN_VIEWS: Final = 5
-"""Minimum number of views with the board."""
-
+_OUTLIER_PX: Final = 0.3  # … but never those with an rms error below this
+_MAX_RMS_PX: Final = 2.0  # largest rms error of an accepted calibration
+_MIN_VIEWS: Final = 5  # minimum number of views with the board
 # A view repeats another if the corners moved by less than this share of the board's own size (rms
 # distance of its corners from their mean, in the image). A hand that holds a board still moves it
 # by that much (8 mm on a board of 9 by 6 squares of 25 mm); it is a roll of 6 degrees, or a tenth
@@ -50,144 +42,79 @@ _STILL: Final = 0.1
 
 @dataclass(frozen=True, eq=False)
 class StereoFit:
-    """A calibrated rig, and how well it fits.
-
-    Attributes:
-        calibration: The rig.
-        state: The rig with the poses of the board.
-        information: Information of each view about the shared parameters.
-        views: The views that were used.
-        repeated: Names of the views that were left out since they repeat another.
-        dropped: Names of the views that were dropped, with their rms errors in pixels.
-        errors_px: float64 (V, 2), rms error of each used view in the left and right image.
-        alone_px: Rms errors of the left and the right camera, each calibrated alone.
-        rms_px: Rms reprojection error over all corners of both cameras.
-    """
+    """A calibrated rig, and how well it fits."""
 
     calibration: StereoCalibration
-    state: RigState
+    state: RigState  # the rig with the poses of the board
     information: Information
-    views: tuple[View, ...]
-    repeated: tuple[str, ...]
-    dropped: dict[str, float]
-    errors_px: Float64
-    alone_px: tuple[float, float]
-    rms_px: float
+    views: tuple[View, ...]  # that were used
+    repeated: tuple[str, ...]  # names of the views that were left out since they repeat another
+    dropped: dict[str, float]  # rms errors of the views that were dropped, by name, in pixels
+    errors_px: Float64  # (V, 2), rms error of each used view in the left and right image
+    alone_px: tuple[float, float]  # rms error of each camera, calibrated alone
+    rms_px: float  # rms reprojection error over all corners of both cameras
 
 
 def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
-    """Calibrate two cameras.
+    """Calibrate two cameras: each alone, then all parameters of both together.
 
-    Each camera is calibrated alone, then all parameters of both are refined together. Of views that
-    repeat each other, one is used. Views whose error exceeds three
-    times the median are dropped.
+    Of views that repeat each other, one is used. Views whose error exceeds three times the median
+    are dropped.
 
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
-    groups = group_views(views)
+    groups = _group_views(views)
     kept = [group[0] for group in groups]
     repeated = tuple(view.name for group in groups for view in group[1:])
-    _check_count(kept, repeated=len(repeated))
+    _check_count(kept, {}, repeated)
     left, right = (
-        calibrate_one([view.seen[side] for view in kept], size, settings) for side in (0, 1)
+        _calibrate_one([view.seen[side] for view in kept], size, settings) for side in (0, 1)
     )
     alone = tuple(
-        view_errors([replace(v, seen=(v.seen[side],)) for v in kept], state)
+        _view_errors([replace(v, seen=(v.seen[side],)) for v in kept], state)
         for side, state in enumerate((left, right))
     )
-    state = solve_robustly(kept, join_cameras(left, right))
+    state = _solve_robustly(kept, _join_cameras(left, right))
     dropped: dict[str, float] = {}
     for _ in range(_DROPPING_ROUNDS):
-        errors = view_errors(kept, state)
+        errors = _view_errors(kept, state)
         limit = max(_OUTLIER_RATIO * float(np.median(errors)), _OUTLIER_PX)
         good = errors <= limit
         dropped |= {v.name: float(e) for v, e, g in zip(kept, errors, good, strict=True) if not g}
-        kept, state = _keep(kept, state, good)
+        kept = [view for view, keep in zip(kept, good, strict=True) if keep]
+        state = replace(state, T_rig_board=state.T_rig_board[good])
         alone = tuple(each[good] for each in alone)
-        _check_count(kept, dropped, len(repeated))
+        _check_count(kept, dropped, repeated)
         state, information = solve(kept, state)
         if good.all():
             break
-    fit = _finish(kept, state, information, (_rms(alone[0]), _rms(alone[1])))
-    return replace(fit, dropped=dropped, repeated=repeated)
+    sums, counts = squared_errors(kept, state)
+    rms_px, alone_px = math.sqrt(float(sums.sum() / counts.sum())), (_rms(alone[0]), _rms(alone[1]))
+    _check_fit(rms_px, alone_px)
+    return StereoFit(
+        calibration=stereo_of(state),
+        state=state,
+        information=information,
+        views=tuple(kept),
+        repeated=repeated,
+        dropped=dropped,
+        errors_px=np.sqrt(sums / counts),
+        alone_px=alone_px,
+        rms_px=rms_px,
+    )
 
 
 def stereo_of(state: RigState) -> StereoCalibration:
-    """Return the rig of a state."""
+    """The rig of a state."""
     left, right = state.cameras
     return StereoCalibration(left, right, state.T_camera_rig[1])
 
 
-def _finish(
-    views: list[View],
-    state: RigState,
-    information: Information,
-    alone_px: tuple[float, float],
-) -> StereoFit:
-    sums, counts = squared_errors(views, state)
-    rms_px = math.sqrt(float(sums.sum() / counts.sum()))
-    if rms_px > _MAX_RMS_PX:
-        raise _no_fit(rms_px, alone_px)
-    errors_px = np.sqrt(sums / counts)
-    return StereoFit(
-        stereo_of(state), state, information, tuple(views), (), {}, errors_px, alone_px, rms_px
-    )
-
-
-def _keep(views: list[View], state: RigState, good: Bool) -> tuple[list[View], RigState]:
-    kept = [views[number] for number in np.flatnonzero(good)]
-    return kept, replace(state, T_rig_board=state.T_rig_board[good])
-
-
-def _length_rms(apart: Float64) -> float:
-    return math.sqrt(float((apart**2).sum(axis=1).mean()))
-
-
-def _rms(errors: Float64) -> float:
-    return math.sqrt(float((errors**2).mean()))
-
-
-def _check_count(
-    views: Sequence[View],
-    dropped: dict[str, float] | None = None,
-    repeated: int = 0,
-) -> None:
-    if len(views) >= _MIN_VIEWS:
-        return
-    lost = f", after {', '.join(dropped)} did not fit" if dropped else ""
-    lost += f", and {repeated} that repeat them" if repeated else ""
-    raise CalibrationError(
-        "too few views show the board in both images",
-        got=f"{len(views)}{lost}",
-        expected=f"at least {_MIN_VIEWS}",
-        hint="take more, with the board tilted, and near and far",
-    )
-
-
-def _no_fit(rms_px: float, alone_px: tuple[float, float]) -> CalibrationError:
-    if rms_px > _MISMATCH * max(alone_px):
-        what = "each camera fits alone, but not both together"
-        hint = "were left and right taken at the same time, and do their names pair them correctly?"
-    else:
-        what = "no lens of this model fits the corners"
-        hint = "is the board flat, and does --model (radtan, rational, fisheye) suit the lens?"
-    return CalibrationError(
-        what,
-        got=f"{rms_px:.1f} px rms (alone: left {alone_px[0]:.1f}, right {alone_px[1]:.1f})",
-        expected=f"at most {_MAX_RMS_PX:g} px",
-        hint=hint,
-    )
-
-
-def group_views(views: Sequence[View]) -> list[list[View]]:
-    """Group the views by pose of the board: those of one group show the board where it was.
+def _group_views(views: Sequence[View]) -> list[list[View]]:
+    """Group the views by pose of the board, the view that represents a group first.
 
     Errors of corners on a still board are mostly the same in every image (flatness, lens, blur), so
     a repeated view is hardly a new measurement, and it never adds a pose.
-
-    Returns:
-        The groups in order of their first view. The first of each group represents it: the one
-        that is nearest to the others.
     """
     groups: list[list[View]] = []
     for view in views:
@@ -224,16 +151,46 @@ def _middle_first(group: list[View]) -> list[View]:
     return [group[middle], *group[:middle], *group[middle + 1 :]]
 
 
-Size = tuple[int, int]
+def _check_count(
+    views: Sequence[View], dropped: Collection[str], repeated: tuple[str, ...]
+) -> None:
+    if len(views) >= _MIN_VIEWS:
+        return
+    lost = f", after {', '.join(dropped)} did not fit" if dropped else ""
+    lost += f", and {len(repeated)} that repeat them" if repeated else ""
+    raise CalibrationError(
+        "too few views show the board in both images",
+        got=f"{len(views)}{lost}",
+        expected=f"at least {_MIN_VIEWS}",
+        hint="take more, with the board tilted, and near and far",
+    )
 
-# Half fields of view that are tried for a fisheye lens.
-_HALF_ANGLES: Final = tuple(math.radians(angle) for angle in (35, 45, 55, 65, 75, 85, 95, 110))
-_COEFFICIENTS: Final = {"rational": 8, "fisheye": 4}
-# Rounds of reweighting; outlying views stand out after two.
-_REWEIGHTED: Final = 4
+
+def _check_fit(rms_px: float, alone_px: tuple[float, float]) -> None:
+    if rms_px <= _MAX_RMS_PX:
+        return
+    what = "no lens of this model fits the corners"
+    hint = "is the board flat, and does --model (radtan, rational, fisheye) suit the lens?"
+    if rms_px > _MISMATCH * max(alone_px):
+        what = "each camera fits alone, but not both together"
+        hint = "were left and right taken at the same time, and do their names pair them correctly?"
+    raise CalibrationError(
+        what,
+        got=f"{rms_px:.1f} px rms (alone: left {alone_px[0]:.1f}, right {alone_px[1]:.1f})",
+        expected=f"at most {_MAX_RMS_PX:g} px",
+        hint=hint,
+    )
 
 
-def calibrate_one(
+def _length_rms(apart: Float64) -> float:
+    return math.sqrt(float((apart**2).sum(axis=1).mean()))
+
+
+def _rms(errors: Float64) -> float:
+    return math.sqrt(float((errors**2).mean()))
+
+
+def _calibrate_one(
     sightings: Sequence[Sighting], size: Size, settings: CalibrationSettings
 ) -> RigState:
     """Return the lens and board poses of one camera, with views that do not fit down-weighted."""
@@ -242,44 +199,51 @@ def calibrate_one(
         state = _guess_fisheye(sightings, size)
     else:
         camera = _guess_pinhole(sightings, size)
-        count = _COEFFICIENTS.get(settings.model, 2 + settings.radial_terms)
-        distortion = np.zeros(count)
+        distortion = np.zeros(_COEFFICIENTS.get(settings.model, 2 + settings.radial_terms))
         distortion[:2] = camera.distortion[:2]
         state = _with_poses(replace(camera, distortion=distortion), sightings)
-    return solve_robustly(views, state)
+    return _solve_robustly(views, state)
 
 
-def solve_robustly(views: Sequence[View], start: RigState) -> RigState:
-    """Solve with each view weighted by how well it fits (Cauchy weights of its rms error)."""
-    state, weights = start, np.ones(len(views))
-    for _ in range(_REWEIGHTED):
-        state, _ = solve(views, state, weights)
-        errors = view_errors(views, state)
-        scale = 2.0 * float(np.median(errors)) + 1e-6
-        weights = 1.0 / (1.0 + (errors / scale) ** 2)
-    return state
+def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsics:
+    """Return OpenCV's calibration: Zhang's closed form, refined with two radial terms."""
+    boards = [seen.board_m.astype(np.float32) for seen in sightings]
+    pixels = [seen.pixels.astype(np.float32) for seen in sightings]
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    try:
+        _, matrix, distortion, *_ = cv2.calibrateCamera(
+            boards, pixels, size, None, None, flags=flags
+        )
+    except cv2.error as error:
+        raise CalibrationError("views do not determine a camera", got=error.err) from error
+    return CameraIntrinsics(matrix, np.array(distortion, dtype=np.float64).ravel(), *size)
 
 
-def view_errors(views: Sequence[View], state: RigState) -> Float64:
-    """Return float64 (V,), rms reprojection error of each view, pixels."""
-    sums, counts = squared_errors(views, state)
-    return np.asarray(np.sqrt(sums.sum(axis=1) / counts.sum(axis=1)))
+def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
+    """Return the undistorted fisheye lens, of several fields of view, that fits the board best."""
+    radius, (cx, cy) = math.hypot(*size) / 2, ((n - 1) / 2 for n in size)
+    views = [View("", (seen,)) for seen in sightings]
+    best: RigState | None = None
+    least = math.inf
+    for angle in _HALF_ANGLES:
+        matrix = np.array([[radius / angle, 0, cx], [0, radius / angle, cy], [0, 0, 1]])
+        camera = CameraIntrinsics(matrix, np.zeros(4), *size, "fisheye")
+        with suppress(CalibrationError):
+            state = _with_poses(camera, sightings)
+            error = float(np.median(_view_errors(views, state)))
+            if error < least:  # never where it is NaN
+                best, least = state, error
+    if best is None:
+        raise CalibrationError("views do not determine a fisheye lens")
+    return best
 
 
-def join_cameras(left: RigState, right: RigState) -> RigState:
-    """Return both cameras in one rig, with the median pose of the right camera over all views."""
-    T_right_left = [
-        T_right @ invert(T_left)
-        for T_left, T_right in zip(left.T_rig_board, right.T_rig_board, strict=True)
-    ]
-    rotation = np.median([log_so3(T[:3, :3]) for T in T_right_left], axis=0)
-    shift = np.median([T[:3, 3] for T in T_right_left], axis=0)
-    T = make_transform(exp_so3(rotation), shift)
-    cameras = (*left.cameras, *right.cameras)
-    return RigState(cameras, (np.eye(4), T), left.T_rig_board)
+def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigState:
+    poses = np.stack([_locate_board(camera, seen) for seen in sightings])
+    return RigState((camera,), (np.eye(4),), poses)
 
 
-def locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
+def _locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
     """Return float64 (4, 4), T_camera_board of one sighting."""
     rays = rays_of(camera, seen.pixels)
     known = np.isfinite(rays).all(axis=1)
@@ -294,48 +258,28 @@ def locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
     return make_transform(cv2.Rodrigues(rotation)[0], shift.ravel())
 
 
-def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigState:
-    poses = np.stack([locate_board(camera, seen) for seen in sightings])
-    return RigState((camera,), (np.eye(4),), poses)
+def _join_cameras(left: RigState, right: RigState) -> RigState:
+    """Return both cameras in one rig, with the median pose of the right camera over all views."""
+    boards = zip(left.T_rig_board, right.T_rig_board, strict=True)
+    T_right_left = [T_right @ invert(T_left) for T_left, T_right in boards]
+    rotation = np.median([log_so3(T[:3, :3]) for T in T_right_left], axis=0)
+    shift = np.median([T[:3, 3] for T in T_right_left], axis=0)
+    T = make_transform(exp_so3(rotation), shift)
+    return RigState((*left.cameras, *right.cameras), (np.eye(4), T), left.T_rig_board)
 
 
-def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsics:
-    """Return OpenCV's calibration: Zhang's closed form, refined with two radial terms."""
-    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    try:
-        _, matrix, distortion, *_ = cv2.calibrateCamera(
-            [seen.board_m.astype(np.float32) for seen in sightings],
-            [seen.pixels.astype(np.float32) for seen in sightings],
-            size,
-            None,
-            None,
-            flags=flags,
-        )
-    except cv2.error as error:
-        raise CalibrationError("views do not determine a camera", got=error.err) from error
-    return CameraIntrinsics(matrix, np.array(distortion, dtype=np.float64).ravel(), *size)
+def _solve_robustly(views: Sequence[View], start: RigState) -> RigState:
+    """Solve with each view weighted by how well it fits (Cauchy weights of its rms error)."""
+    state, weights = start, np.ones(len(views))
+    for _ in range(_REWEIGHTED):
+        state, _ = solve(views, state, weights)
+        errors = _view_errors(views, state)
+        scale = 2.0 * float(np.median(errors)) + 1e-6
+        weights = 1.0 / (1.0 + (errors / scale) ** 2)
+    return state
 
 
-def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
-    """Return the undistorted fisheye lens, of several fields of view, that fits the board best."""
-    radius = math.hypot(*size) / 2
-    guesses: list[tuple[float, int, RigState]] = []
-    for angle in _HALF_ANGLES:
-        matrix = np.array(
-            [
-                [radius / angle, 0, (size[0] - 1) / 2],
-                [0, radius / angle, (size[1] - 1) / 2],
-                [0, 0, 1],
-            ]
-        )
-        camera = CameraIntrinsics(matrix, np.zeros(4), *size, "fisheye")
-        try:
-            state = _with_poses(camera, sightings)
-        except CalibrationError:
-            continue
-        views = [View("", (seen,)) for seen in sightings]
-        error = float(np.median(view_errors(views, state)))
-        guesses.append((error if math.isfinite(error) else math.inf, len(guesses), state))
-    if not guesses or math.isinf(min(guesses)[0]):
-        raise CalibrationError("views do not determine a fisheye lens")
-    return min(guesses)[2]
+def _view_errors(views: Sequence[View], state: RigState) -> Float64:
+    """Return float64 (V,), rms reprojection error of each view, pixels."""
+    sums, counts = squared_errors(views, state)
+    return np.asarray(np.sqrt(sums.sum(axis=1) / counts.sum(axis=1)))

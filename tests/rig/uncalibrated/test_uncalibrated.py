@@ -65,7 +65,7 @@ def test_with_noise_rows_are_off_by_no_more_than_noise() -> None:
     found = rectify_features([scene(sigma_px=0.3)], SIZE)
     assert np.abs(true_rows_of(found)).mean() < 0.1
     # Rows of both images are noisy: mean |N(0, 0.3 sqrt 2)|.
-    assert found.held_out_px == pytest.approx(0.34, rel=0.3)
+    assert found.row_error_held_out_px == pytest.approx(0.34, rel=0.3)
 
 
 def test_wrong_matches_do_no_harm() -> None:
@@ -88,8 +88,8 @@ def test_images_stay_upright_in_size_and_disparities_positive() -> None:
             np.linalg.det(np.stack([lower_right - upper_left, upper_right - lower_left]))
         )
         assert area == pytest.approx(640 * 480, rel=0.25)
-    assert found.disparity_px[0] == pytest.approx(4.0, abs=0.5)
-    assert found.disparity_px[1] > 20
+    assert found.disparity_range_px[0] == pytest.approx(4.0, abs=0.5)
+    assert found.disparity_range_px[1] > 20
 
 
 def test_near_points_have_the_larger_disparity() -> None:
@@ -227,7 +227,7 @@ def test_a_pitched_right_camera_is_turned_back_and_nothing_else(first: str) -> N
         pairs[0] = (pairs[0][0], cv2.warpPerspective(pairs[0][0], oblique, (400, 300)))
     found = rectify_images(pairs, count=600)
     assert found.model == "rotation"
-    assert found.before_px == pytest.approx(3.1, abs=0.4)
+    assert found.row_error_before_px == pytest.approx(3.1, abs=0.4)
     _, _, disparity = planes_pair((400, 300))
     assert np.abs(true_rows(found, np.eye(3), B, disparity)).max() < 0.3
     for H in (found.H_left, found.H_right):
@@ -240,7 +240,7 @@ def test_pairs_on_equal_rows_stay_as_they_are() -> None:
     assert found.model == "raw"
     assert np.array_equal(found.H_left, np.eye(3))
     assert np.array_equal(found.H_right, np.eye(3))
-    assert found.after_px == found.before_px
+    assert found.row_error_after_px == found.row_error_before_px
 
 
 def test_matches_of_images_made_alike_are_places_in_those_recorded() -> None:
