@@ -1,0 +1,219 @@
+"""Middlebury's metrics against plain implementations of their definitions, pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.core.errors import EvaluationError, ShapeError
+from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedCamera
+from recon.evaluation.confidence import share_within_sigma
+from recon.evaluation.disparity import evaluate_depth
+from recon.evaluation.middlebury.bench import weighted_confidence, weighted_figures
+from recon.evaluation.middlebury.score import (
+    MiddleburyRules,
+    at_truth_size,
+    confidence_figures,
+    evaluate_middlebury,
+    fill_holes,
+    scene_weight,
+)
+
+N = float("nan")
+
+
+def plain_figures(
+    disp: np.ndarray, gt: np.ndarray, mask: np.ndarray | None, ndisp: int, rounded: bool, full: int
+) -> dict[str, float]:
+    """What SDK 1.6 describes, in loops: infinity is unknown, limits are in full-size pixels."""
+    scale = gt.shape[1] // disp.shape[1]
+    n = invalid = 0
+    errors = []
+    for y in range(gt.shape[0]):
+        for x in range(gt.shape[1]):
+            if math.isinf(gt[y, x]) or (mask is not None and mask[y, x] != 255):
+                continue
+            n += 1
+            d = scale * float(disp[y // scale, x // scale])
+            if math.isinf(d):
+                invalid += 1
+                continue
+            d = max(0.0, min(float(scale * ndisp), d))
+            if rounded:
+                d = math.floor(d + 0.5)
+            errors.append(abs(d - float(gt[y, x])) * full)
+    errors.sort()
+    figures = {f"bad{t}": 100 * sum(e > t for e in errors) / n for t in (0.5, 1, 2, 4)}
+    figures["invalid"] = 100 * invalid / n
+    figures["avgerr"] = sum(errors) / len(errors)
+    figures["rms"] = math.sqrt(sum(e * e for e in errors) / len(errors))
+    for q in (50, 90, 95, 99):
+        figures[f"a{q}"] = errors[math.ceil(q / 100 * len(errors)) - 1]
+    return figures
+
+
+@given(
+    seed=st.integers(0, 2**16),
+    scale=st.sampled_from([1, 2, 4]),
+    full=st.sampled_from([1, 2, 4]),
+    rounded=st.booleans(),
+    masked=st.booleans(),
+)
+def test_figures_are_those_of_the_plain_definitions(
+    seed: int, scale: int, full: int, rounded: bool, masked: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    # Multiples of 1/4 are exact, so errors of exactly a limit occur and must not be bad.
+    gt = (rng.integers(0, 80 * scale, (12, 16)) / 4).astype(np.float32)
+    small = gt[::scale, ::scale] / scale + rng.integers(-12, 13, (12 // scale, 16 // scale)) / 4
+    disp = small.astype(np.float32)
+    disp[rng.random(disp.shape) < 0.2] = np.inf
+    disp[0, 0] = 3.0
+    gt[rng.random(gt.shape) < 0.2] = np.inf
+    gt[0, 0] = 3.0
+    mask = np.where(rng.random(gt.shape) < 0.8, 255, 128)
+    mask[0, 0] = 255
+    expected = plain_figures(disp, gt, mask if masked else None, 20, rounded, full)
+
+    truth = DisparityTruth(np.where(np.isinf(gt), np.float32(np.nan), gt), mask == 255)
+    rules = MiddleburyRules(full_size_factor=full, largest_px=20.0 * scale, isint=rounded)
+    values = np.where(np.isinf(disp), np.float32(np.nan), disp)
+    found = evaluate_middlebury(values, truth, rules, occluded=not masked)
+
+    named = {f"bad{t:g}": share for t, share in found.bad.items()}
+    named |= {"invalid": found.invalid, "avgerr": found.avgerr_px, "rms": found.rms_px}
+    named |= {f"a{q}": error for q, error in found.quantiles_px.items()}
+    # float32 in, float64 sums: what differs is the order of addition.
+    assert named == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_a_result_is_taken_to_the_size_of_the_truth_up_to_the_rest_of_a_division() -> None:
+    values = np.arange(24, dtype=np.float32).reshape(4, 6)
+    assert at_truth_size(values, (2, 3)).tolist() == [[0, 1, 2], [6, 7, 8]]
+    smaller = at_truth_size(np.array([[1, N]], dtype=np.float32), (2, 4))
+    assert np.array_equal(smaller, [[2, 2, N, N], [2, 2, N, N]], equal_nan=True)
+    for shape in ((5, 7), (6, 8), (5, 8)):
+        assert at_truth_size(np.ones(shape, np.float32), (3, 4)).shape == (3, 4)
+
+
+def test_sizes_that_are_no_multiples_are_refused() -> None:
+    with pytest.raises(EvaluationError, match="differ in size"):
+        at_truth_size(np.ones((10, 10), np.float32), (10, 15))
+
+
+def test_five_scenes_count_half() -> None:
+    halved = {"PianoL", "Playroom", "Playtable", "Shelves", "Vintage", "trainingQ/Playroom"}
+    assert {scene_weight(name) for name in halved} == {4}
+    assert {scene_weight(name) for name in ("PlaytableP", "Piano", "Teddy")} == {8}
+    assert weighted_figures({"Teddy": 10.0, "Vintage": 40.0}) == pytest.approx(20.0)
+
+
+def test_depth_errors_of_a_case_counted_by_hand() -> None:
+    # f·b = 10, doffs 1: disparities 1, 4, 9 are 5 m, 2 m, 1 m.
+    camera = RectifiedCamera(100.0, 1.0, 0.0, 2.0, 0.1, 4, 1)
+    truth = DisparityTruth(np.array([[1, 4, 9, 9]], np.float32), np.ones((1, 4), dtype=bool))
+    values = np.array([[4, 4, -1, N]], np.float32)
+    found = evaluate_depth(values, truth, camera)
+    assert found.mean_m == pytest.approx(1.5)
+    assert found.rms_m == pytest.approx(math.sqrt(4.5))
+    assert found.median_m == pytest.approx(3.0)
+    assert found.median_percent == pytest.approx(60.0)
+    assert found.over_5_percent == pytest.approx(200 / 3)
+    assert found.infinite == pytest.approx(100 / 3)
+
+
+def plainly_filled(row: list[float]) -> list[float]:
+    """The rule for one row, pixel by pixel: the smaller of both neighbours, or the only one."""
+    out = []
+    for x, value in enumerate(row):
+        left = next((v for v in row[:x][::-1] if not math.isnan(v)), None)
+        right = next((v for v in row[x + 1 :] if not math.isnan(v)), None)
+        beside = [v for v in (left, right) if v is not None]
+        out.append(min(beside) if math.isnan(value) else value)
+    return out
+
+
+@given(st.integers(0, 2**16), st.integers(1, 12))
+def test_known_values_stay_and_holes_follow_the_rule(seed: int, width: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.integers(0, 50, (5, width)).astype(np.float32)
+    values[rng.random(values.shape) < 0.6] = np.nan
+    values[:, rng.integers(width)] = 7
+    expected = [plainly_filled(row) for row in values.tolist()]
+    assert fill_holes(values).tolist() == expected
+
+
+def test_rows_without_values_are_filled_from_the_nearest_the_upper_one_first() -> None:
+    rows = [[N, N], [1, N], [N, N], [N, 2], [N, N], [N, N]]
+    filled = fill_holes(np.array(rows, np.float32))
+    assert filled[:, 0].tolist() == [1, 1, 1, 2, 2, 2]
+    assert np.isnan(fill_holes(np.full((2, 2), N, np.float32))).all()
+    with pytest.raises(ShapeError, match="values"):
+        fill_holes(np.zeros((2, 2)))
+
+
+SHAPE = (60, 100)
+
+
+def made(
+    error_px: np.ndarray | float, confidence: float = 0.8, sigma_px: float = 0.5, truth: float = 20
+) -> tuple[Disparity, DisparityTruth]:
+    true = np.full(SHAPE, truth, np.float32)
+    estimate = Disparity(
+        values=(true + error_px).astype(np.float32),
+        confidence=np.full(SHAPE, confidence, np.float32),
+        sigma_px=np.full(SHAPE, sigma_px, np.float32),
+        reason=np.full(SHAPE, Reason.VALID, np.uint8),
+    )
+    return estimate, DisparityTruth(true, np.ones(SHAPE, bool))
+
+
+def test_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
+    fifth_wrong = np.where(np.arange(np.prod(SHAPE)).reshape(SHAPE) % 5 == 0, 3.0, 0.25)
+    figures = confidence_figures(*made(fifth_wrong))
+    assert figures is not None
+    # 1e-6: confidence is float32.
+    assert figures["ece"] == pytest.approx(0, abs=1e-6)
+    assert figures["within_1_sigma"] == figures["within_2_sigma"] == pytest.approx(0.8)
+    assert figures["reliability"]["right"].count(None) == 9
+    assert sum(figures["reliability"]["share"]) == pytest.approx(1)
+
+
+def test_share_within_sigma_counts_what_is_less_than_it() -> None:
+    errors = np.tile(np.array([0.2, 0.7, 1.2, 5.0]), (SHAPE[0], SHAPE[1] // 4))
+    estimate, truth = made(errors)
+    assert [share_within_sigma(estimate, truth, n) for n in (1, 2, 3)] == [0.25, 0.5, 0.75]
+
+
+@pytest.mark.parametrize(
+    ("factor", "error_px", "right"), [(2, 0.75, 1), (4, 0.75, 1), (4, 1.25, 0)]
+)
+def test_a_map_larger_than_the_truth_is_judged_in_its_own_pixels(
+    factor: int, error_px: float, right: int
+) -> None:
+    """Off by 0.75 of its own pixels is right; at half the size that is 0.375 px of the truth."""
+    small = tuple(n // factor for n in SHAPE)
+    truth = DisparityTruth(np.full(small, 20 / factor, np.float32), np.ones(small, bool))
+    figures = confidence_figures(made(error_px, sigma_px=1.0)[0], truth)
+    assert figures is not None
+    assert figures["reliability"]["right"][8] == figures["within_1_sigma"] == right
+
+
+def test_the_mean_counts_scenes_by_weight_and_leaves_out_those_without() -> None:
+    """PianoL counts half: two thirds and one third."""
+    estimate, truth = made(0.0)
+    nothing = confidence_figures(estimate.reject(np.ones(SHAPE, bool), Reason.AMBIGUOUS), truth)
+    assert nothing is None
+    assert weighted_confidence({"Piano": None}) is None
+    right, wrong = confidence_figures(estimate, truth), confidence_figures(*made(5.0))
+    mean = weighted_confidence({"Piano": right, "PianoL": wrong, "Teddy": nothing})
+    assert mean is not None
+    assert mean["ece"] == pytest.approx(2 / 3 * 0.2 + 1 / 3 * 0.8, abs=1e-6)
+    assert mean["within_1_sigma"] == pytest.approx(2 / 3)
+    # 1e-5: the lists have six digits.
+    assert mean["reliability"]["right"][8] == pytest.approx(2 / 3, abs=1e-5)
+    assert mean["sparsification"]["wrong"][0] == pytest.approx(1 / 3, abs=1e-5)
