@@ -49,11 +49,7 @@ class Submap:
     occupancy: OccupancyPart
 
     def moved(
-        self,
-        T_corrected_world: Float64,
-        T_map_world: Float64,
-        voxel_m: float,
-        resolution_m: float,
+        self, T_corrected_world: Float64, T_map_world: Float64, voxel_m: float, resolution_m: float
     ) -> Submap:
         """Return the submap after a correction of its pose."""
         T_corrected_map = T_map_world @ T_corrected_world @ invert(T_map_world)
@@ -136,11 +132,7 @@ class SubmapBuilder:
     def current(self) -> Submap:
         """Return the submap so far; without frames it is empty."""
         return Submap(
-            self._index,
-            self._first_frame,
-            self._frames,
-            self._fused.part(),
-            self._occupancy.part(),
+            self._index, self._first_frame, self._frames, self._fused.part(), self._occupancy.part()
         )
 
     def close(self) -> Submap:
@@ -158,11 +150,7 @@ class SubmapBuilder:
 
     def state(self) -> dict[str, Any]:
         """Return all that decides what comes later, as a tree of arrays and plain values."""
-        return {
-            "submap": self.current().to_tree(),
-            "path_m": self._path_m,
-            "last_m": self._last_m,
-        }
+        return {"submap": self.current().to_tree(), "path_m": self._path_m, "last_m": self._last_m}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a `state`."""

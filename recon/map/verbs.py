@@ -22,11 +22,8 @@ class Map(MapFile):
     def merge(self, other: Map) -> list[Session]:
         """Add the drives of another finished map, and place those that saw the same places.
 
-        Args:
-            other: The other map; it stays as it is. `commit` makes the change permanent.
-
-        Returns:
-            The drives that are new here; those that could be placed are in `linked`.
+        Returns the drives that are new here; those that could be placed are in `linked`. `commit`
+        makes the change permanent; ``other`` stays as it is.
 
         Raises:
             FormatError: A map is damaged, or a drive is in both.
@@ -39,8 +36,7 @@ class Map(MapFile):
     def tiles(self, settings: DriveSettings | None = None) -> Tiles:
         """Return the linked drives in tiles: cloud, what moved, and occupancy from their rays.
 
-        Args:
-            settings: How to make them; None = the settings of the first drive.
+        ``settings`` = None takes those of the first drive.
 
         Raises:
             FormatError: A drive kept no rays, or the map is damaged.
@@ -56,15 +52,9 @@ class Map(MapFile):
     ) -> Located:
         """Find where a single pair was taken, without knowing anything else.
 
-        A drive is found more surely, and faster, by `recon.run_localize`.
-
-        Args:
-            pair: The images.
-            calibration: Of the cameras that took them; None = those of the map, rectified.
-            config: How to match them; None = the defaults.
-
-        Returns:
-            State ``tracking`` with the pose in the world of the map, or ``searching``.
+        Returns state ``tracking`` with the pose in the world of the map, or ``searching``. A drive
+        is found more surely, and faster, by `recon.run_localize`. Without a calibration, the pair
+        is rectified and of the cameras of the map.
 
         Raises:
             ReconError: The map has no keyframes or is damaged, or images and calibration do not

@@ -28,21 +28,15 @@ _BIN_M: Final = 0.05
 _DEEPEST_M: Final = 5.0
 """Points farther below the path are not what the camera is carried on."""
 _NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
-
-
 CELL_M: Final = 1.0
 """Edge of a cell of the surface."""
-
 WINDOW_M: Final = 0.3
 """Points this far from the expected height may be ground: also the largest step from one cell to
 the next."""
-
 MAX_TILT_DEG: Final = 35.0
 """Points with normals tilted more are no ground."""
-
 MIN_POINTS: Final = 3
 """Points that make a measured cell."""
-
 _MAX_GAP_M: Final = 4.0
 """How far a height is carried over cells without points."""
 

@@ -33,16 +33,12 @@ from recon.stereo.frame import FrameReconstructor
 
 _VIEWS: Final = 2
 """Nearest views of the map that each frame is compared with."""
-
 _SURFACES_EVERY: Final = 3
 """Frames between two corrections by surfaces, where features confirm the pose."""
-
 _SURE_SIGMA_M: Final = 0.5 * MAX_SIGMA_M
 """Poses that are more certain than this need not be compared with the map if time is short."""
-
 _LOST_SIGMA_M: Final = 0.05
 """Standard deviation of a motion without features, beside the drift over it."""
-
 _LOST_SIGMA_DEG: Final = 0.3
 """That of its rotation."""
 
@@ -252,7 +248,6 @@ def localize_pair(
 
 _REMEMBERED: Final = 10
 """Frames whose recognised places still count."""
-
 _NEIGHBOURS: Final = 3
 """Views around a recognised place that must show it, too."""
 

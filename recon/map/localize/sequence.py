@@ -26,7 +26,6 @@ from recon.stereo.frame import FrameReconstructor
 
 START_WITHIN_M: Final = 10.0
 """How far from the start that is given the first fix may be."""
-
 START_WITHIN_DEG: Final = 60.0
 """How far its heading may be from the one that is given."""
 

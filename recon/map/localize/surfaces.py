@@ -13,15 +13,12 @@ from recon.core.values.arrays import Bool, Float64
 
 MIN_POINTS = 10
 """Least number of points in a cell with a surface."""
-
 THIN_SHARE = 0.1
 """A cell is thin along an axis where its points spread by less than this share of its edge.
 
 Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
-
 NOISE_M = 0.02
 """Standard deviation that is added to that of every surface."""
-
 FAR_CHI2 = 9.0
 """Points three standard deviations from the surface of their cell count like those without one."""
 

@@ -17,13 +17,7 @@ from recon.core.geometry.se3 import adjoint, apply, as_step, as_transform, inver
 from recon.core.values.arrays import Float64
 from recon.io.files import reading
 from recon.map.localize.belief import MAX_SIGMA_DEG, MAX_SIGMA_M, Belief
-from recon.map.localize.surfaces import (
-    Fit,
-    Surfaces,
-    describe_surfaces,
-    fit_surfaces,
-    misfit,
-)
+from recon.map.localize.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces, misfit
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
@@ -34,23 +28,17 @@ from recon.places.places import SIGMAS
 
 _VOXEL_M: Final = 0.3
 """Edge of a voxel of the map of ICP."""
-
 _THRESHOLD_M: Final = 0.3
 """Scale of the robust kernel; points pair up to thrice as far."""
-
 _SURFACE_M: Final = 1.0
 """Edge of the cells in which surfaces are fitted to the map."""
-
 _RELOAD_M: Final = 10.0
 """Way after which the points around the camera are read again."""
-
 _MIN_POINTS: Final = 300
 """Frames with fewer points are not corrected."""
-
 _OFFSET_FRAMES: Final = 30
 """Corrections of poses that features confirm are averaged over as many frames and subtracted: their
 mean is the bias of stereo depth, not an error of the pose."""
-
 _ASIDE: Final = SIGMAS * np.repeat([MAX_SIGMA_M, np.deg2rad(MAX_SIGMA_DEG)], 3)
 """Steps along and about each axis to poses that no pose given out may be mistaken for."""
 
@@ -178,23 +166,17 @@ def _fit(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> Fi
 
 _MIN_OVERLAP: Final = 0.5
 """Least share of points that lie in a cell of the map."""
-
 _MIN_RESIDUAL_GAIN: Final = 0.02
 """Least relative decrease of the median residual."""
-
 _MIN_SHARE: Final = 0.1
 """Least Kalman gain, in the direction in which it is largest: with less, ICP knows no more than the
 prior."""
-
 _ICP_INDEPENDENCE: Final = 0.05
 """Share of the points whose errors count as independent."""
-
 _MIN_CONTRAST: Final = 2.0 * math.log(1000.0)
 """Chi-square by which any pose that is wrong must fit worse: it is a thousand times less likely."""
-
 _ICP_FLOOR_M: Final = 0.02
 """Standard deviation of ICP's translation that more points do not improve."""
-
 _ICP_FLOOR_DEG: Final = 0.05
 """That of its rotation."""
 

@@ -112,11 +112,7 @@ def _count(cells: int, pairs: NDArray[np.int64], looks: Iterable[Int8]) -> _Seen
 
 
 def _disagreement(
-    seen: _Seen,
-    pairs: NDArray[np.int64],
-    upright: Bool,
-    placed: Bool,
-    piece: NDArray[np.int64],
+    seen: _Seen, pairs: NDArray[np.int64], upright: Bool, placed: Bool, piece: NDArray[np.int64]
 ) -> Float64:
     """Return float64, the disagreement in each piece; NaN where too little is known.
 

@@ -24,26 +24,18 @@ from recon.map.occupancy.part import OccupancyPart, points_of, sum_points
 _FIRST_POINTS: Final = 1 << 12
 _LEAST_SIGMA_CELLS: Final = 0.1
 """Least standard deviation of a point, so that none outweighs all others in a mean."""
-
-
 _HIT_PROBABILITY: Final = 0.7
 """Occupancy of a voxel after one certain hit; OctoMap's, as the next three."""
-
 _MISS_PROBABILITY: Final = 0.4
 """Occupancy of a voxel after one ray went through it."""
-
 MIN_PROBABILITY: Final = 0.12
 """Lower clamp: keeps the map able to change."""
-
 MAX_PROBABILITY: Final = 0.97
 """Upper clamp."""
-
 FREE_MARGIN_SIGMAS: Final = 2.0
 """Free space ends this many standard deviations before the point."""
-
 SPREAD_SIGMAS: Final = 1.0
 """Voxels within this many standard deviations of the point share its hit."""
-
 _MIN_POINTS: Final = 2
 """Voxels with fewer points in a frame start no ray."""
 
@@ -224,11 +216,7 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
     grain = ray_grain(settings)
     sigma_m, sure = sigma_and_confidence(cloud)
     xyz, sigma_m = raycast.limit_points(
-        cloud.xyz,
-        sigma_m,
-        settings.max_range_m,
-        _beyond_m(settings),
-        FREE_MARGIN_SIGMAS,
+        cloud.xyz, sigma_m, settings.max_range_m, _beyond_m(settings), FREE_MARGIN_SIGMAS
     )
     points = voxels.VoxelPoints(
         xyz, (sure > 0).astype(np.float32), np.stack([sigma_m, sure], axis=1)

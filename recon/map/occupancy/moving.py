@@ -54,7 +54,6 @@ _AROUND: Final = np.array(list(product((-1, 0, 1), repeat=3)))
 """Steps to a cell itself and to those that touch it."""
 _BESIDE: Final = _AROUND[(_AROUND[:, 2] == 0) & _AROUND[:, :2].any(axis=1)]
 """Steps to the cells that touch a cell at its own height."""
-
 CellEvidence = tuple[NDArray[np.int64], Float32]
 """Packed cells int64 (N,), sorted, and what a drive saw in each, log-odds float32 (N,)."""
 

@@ -31,14 +31,12 @@ MAP_FILE: Final = "map/map.recon"
 class MapFile:
     """What is known of one or several drives, on disk; memory holds the poses and a cache.
 
-    Open one with `create`, `open` or `temporary`.
+    Open one with `create`, `open` or `temporary`. Whatever reads raises `FormatError` where the map
+    is damaged, whatever writes `OutputError` where the file cannot be written.
 
     Attributes:
         store: The records.
         sessions: The drives in it, in the order in which they were begun.
-
-    Raises:
-        FormatError: The records are damaged.
     """
 
     def __init__(self, store: Store) -> None:
@@ -48,11 +46,7 @@ class MapFile:
 
     @classmethod
     def create(cls, path: StrPath, *, cache_bytes: int = CACHE_BYTES) -> Self:
-        """Begin an empty map; a file at ``path`` is replaced.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Begin an empty map; a file at ``path`` is replaced."""
         return cls(Store.create(Path(path), cache_bytes=cache_bytes))
 
     @classmethod
@@ -88,11 +82,7 @@ class MapFile:
         )
 
     def session(self, number: int = 0) -> Session:
-        """Return a drive in the map.
-
-        Raises:
-            FormatError: There is none of this number.
-        """
+        """Return a drive in the map; `FormatError` if there is none of this number."""
         for session in self.sessions:
             if session.number == number:
                 return session
@@ -102,22 +92,12 @@ class MapFile:
         )
 
     def T_world_session(self, session: Session) -> Float64:
-        """Return float64 (4, 4), from the world of a drive to that of the map, its first drive's.
-
-        Drives that are linked share the axes of the map.
-
-        Raises:
-            FormatError: The axes are not known.
-        """
+        """Return float64 (4, 4), from the world of a linked drive to that of the map."""
         return invert(self.first.T_map_world) @ session.T_map_world
 
     @property
     def links(self) -> list[Link]:
-        """The places that two drives saw, those that contradict the others included.
-
-        Raises:
-            FormatError: The record of the links is damaged.
-        """
+        """The places that two drives saw, those that contradict the others included."""
         if not self.store.has(LINKS, 0):
             return []
         with reading(self.store.name):
@@ -130,11 +110,7 @@ class MapFile:
 
     @property
     def linked(self) -> list[Session]:
-        """The drives that share the axes of the map; others are in it, but nobody knows where.
-
-        Raises:
-            FormatError: The record of the links is damaged.
-        """
+        """The drives that share the axes of the map; others are in it, but nobody knows where."""
         if not self.store.has(LINKS, 0):
             return self.sessions[:1]
         with reading(self.store.name):
@@ -143,11 +119,7 @@ class MapFile:
 
     @property
     def first(self) -> Session:
-        """The drive whose world and axes are those of the map.
-
-        Raises:
-            FormatError: The map has no drive.
-        """
+        """The drive whose world and axes are those of the map; `FormatError` if it has no drive."""
         if not (linked := self.linked):
             raise FormatError("the map has no drive", where=self.store.name)
         return linked[0]
@@ -167,46 +139,27 @@ class MapFile:
         """Which frames of each linked drive, by its number, have a place in the map; bool (N,).
 
         Only these are in its products, and to be recognised.
-
-        Raises:
-            FormatError: The map is damaged.
         """
         return placed_frames(self.linked, self.links)
 
     @property
     def doubts(self) -> list[str]:
-        """Lines of what is not to be trusted in the linked drives; whoever uses the map says so.
-
-        Raises:
-            FormatError: The map is damaged.
-        """
+        """Lines of what is not to be trusted in the linked drives; whoever uses the map says so."""
         return doubts_of_drives(self.linked, self.placed)
 
     def set_links(self, links: Sequence[Link], linked: Collection[int]) -> None:
-        """Keep the links, and the numbers of the drives that share the axes of the map.
-
-        Raises:
-            OutputError: They cannot be written.
-        """
+        """Keep the links, and the numbers of the drives that share the axes of the map."""
         content = {"links": [link.to_tree() for link in links], "linked": sorted(linked)}
         self.store.put(LINKS, 0, content, compress=True)
 
     def begin(self, info: SessionInfo) -> Session:
-        """Add a drive.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Add a drive."""
         number = max((session.number for session in self.sessions), default=-1) + 1
         self.sessions.append(Session.begin(self.store, number, info))
         return self.sessions[-1]
 
     def commit(self) -> None:
-        """Make everything so far permanent: all of it or, after an error, nothing.
-
-        Raises:
-            OutputError: The disk is full or cannot be written; the file keeps the last commit.
-        """
+        """Make everything so far permanent: all of it or, after an error, nothing."""
         for session in self.sessions:
             session.flush()
         self.store.commit()
@@ -224,7 +177,6 @@ class MapFile:
 
 _Stretch = tuple[int, int]
 """Number of a drive, and of a stretch of it."""
-
 _SURVEY: Final[_Stretch] = (-1, -1)
 _FEWEST_FIXES: Final = 2
 """Measured positions that say where a stretch is, and which way it goes."""
