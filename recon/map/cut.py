@@ -45,20 +45,29 @@ class Cut:
     Attributes:
         frames: Number of frames of each.
         known: Attributes of points that all have.
-        extent: Smallest x and y of the cells that they observed, and the largest plus one.
+        corners: Lowest and highest (plus one) x and y of the cells that each observed.
         nbytes: What joining the parts of a kind in a tile takes.
     """
 
     frames: list[int] = field(default_factory=list)
     known: set[str] = field(default_factory=lambda: set(KNOWABLE))
-    extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
+    corners: list[TileKey] = field(default_factory=list)
     nbytes: Counter[tuple[str, TileKey]] = field(default_factory=Counter)
 
     def add(self, submap: Submap) -> None:
         """Add the next submap, where it was put."""
         self.frames.append(submap.frames)
         self.known &= set(submap.fused.known if len(submap.fused) else KNOWABLE)
-        self.extent = _hull(self.extent, _extent(submap.occupancy))
+        columns = submap.occupancy.cells[:, :2]
+        if len(columns):
+            low, high = columns.min(axis=0).tolist(), (columns.max(axis=0) + 1).tolist()
+            self.corners += [(low[0], low[1]), (high[0], high[1])]
+
+    @property
+    def extent(self) -> tuple[TileKey, TileKey]:
+        """Smallest x and y of the cells that they observed, and the largest plus one."""
+        x, y = zip(*(self.corners or [(0, 0)]), strict=True)
+        return (min(x), min(y)), (max(x), max(y))
 
     def fits(self, limit: int | None) -> bool:
         """Return whether every tile can be joined within some bytes; None = no limit."""
@@ -78,7 +87,7 @@ class Cut:
         return {
             "frames": self.frames,
             "known": sorted(self.known),
-            "extent": self.extent,
+            "corners": self.corners,
             "nbytes": [[kind, x, y, size] for (kind, (x, y)), size in self.nbytes.items()],
         }
 
@@ -87,10 +96,9 @@ class Cut:
         """Return the cut of all submaps, from the `to_tree` of their parts in order."""
         whole = cls()
         for tree in trees:
-            (x0, y0), (x1, y1) = tree["extent"]
             whole.frames += tree["frames"]
             whole.known &= set(tree["known"])
-            whole.extent = _hull(whole.extent, ((x0, y0), (x1, y1)))
+            whole.corners += [(x, y) for x, y in tree["corners"]]
             whole.nbytes.update({(kind, (x, y)): size for kind, x, y, size in tree["nbytes"]})
         return whole
 
@@ -172,23 +180,6 @@ class Cutter:
             yield FUSED, key, fused.select(inside), int(inside.sum()) * _FUSED_BYTES
         for key, inside in parts.near(self.centres_m(occupancy), self.grid_margin_m):
             yield OCCUPANCY, key, occupancy.select(inside), int(inside.sum()) * _BLOCK_BYTES
-
-
-def _extent(part: OccupancyPart) -> tuple[TileKey, TileKey]:
-    columns = part.cells[:, :2]
-    if not len(columns):
-        return (0, 0), (0, 0)
-    (x0, y0), (x1, y1) = columns.min(axis=0).tolist(), (columns.max(axis=0) + 1).tolist()
-    return (x0, y0), (x1, y1)
-
-
-def _hull(one: tuple[TileKey, TileKey], other: tuple[TileKey, TileKey]) -> tuple[TileKey, TileKey]:
-    """Return the extent of two; one that is empty does not count."""
-    if one[0] == one[1] or other[0] == other[1]:
-        return one if other[0] == other[1] else other
-    (a, b), (c, d) = one
-    (e, f), (g, h) = other
-    return (min(a, e), min(b, f)), (max(c, g), max(d, h))
 
 
 _NOTE: Final = "note"

@@ -93,8 +93,8 @@ def test_tiles_of_the_occupancy_together_are_the_whole(store: Submaps) -> None:
 def test_a_tile_is_made_once(store: Submaps, monkeypatch: pytest.MonkeyPatch) -> None:
     tiles = _tiles(store)
     first = [(tile.cloud.xyz, tile.voxels.keys) for tile in tiles]
-    for name in ("tiles.join_fused", "drive_chain.join_occupancy"):
-        monkeypatch.delattr(f"recon.map.{name}")
+    for name in ("join_fused", "join_occupancy"):
+        monkeypatch.delattr(f"recon.map.tiles.{name}")
     again = [(tile.cloud.xyz, tile.voxels.keys) for tile in tiles]
     for ours, theirs in zip(again, first, strict=True):
         np.testing.assert_array_equal(ours[0], theirs[0])

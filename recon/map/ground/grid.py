@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -43,20 +42,6 @@ class GridSettings(Settings):
     is free."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """What the voxels of each column say; all bool (rows, columns).
-
-    ``blocked``: surely occupied in the height band. ``seen_through``: free, low enough. ``hit``:
-    hit in the band, surely or not. ``low_hit``: the same, as low as what frees.
-    """
-
-    blocked: Bool
-    seen_through: Bool
-    hit: Bool
-    low_hit: Bool
-
-
 def flatten(
     voxels: OccupancyVoxels, ground: GroundSurface, settings: GridSettings
 ) -> OccupancyGrid:
@@ -88,25 +73,15 @@ def flatten(
     low_air = (height >= 0) & (height <= s.free_height_m)
     full = voxels.log_odds >= log_odds(s.occupied_probability)
     empty = voxels.log_odds <= log_odds(s.free_probability)
-    found = _Found(
-        blocked=any_in(hit & full),
-        seen_through=any_in(empty & low_air),
-        hit=any_in(hit),
-        low_hit=any_in(hit & low_air),
-    )
-    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
-    return OccupancyGrid(_decide(found, s), voxels.resolution_m, origin)
-
-
-def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
-    blocked = _without_small_blobs(found.blocked, s.min_blob_cells)
-    free = found.seen_through & ~blocked & ~(found.low_hit & _beside(blocked))
-    unsure = found.hit & ~free & ~_beside(free)
+    blocked = _without_small_blobs(any_in(hit & full), s.min_blob_cells)
+    free = any_in(empty & low_air) & ~blocked & ~(any_in(hit & low_air) & _beside(blocked))
+    unsure = any_in(hit) & ~free & ~_beside(free)
     for _ in range(JOINED_CELLS):
         blocked |= unsure & _beside(blocked)
     cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
     cells[blocked] = OCCUPIED
-    return np.asarray(cells, dtype=np.int8)
+    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
+    return OccupancyGrid(cells, voxels.resolution_m, origin)
 
 
 def ground_depths(

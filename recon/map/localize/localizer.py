@@ -133,8 +133,7 @@ class Localizer:
     ) -> None:
         self._known = known
         self._surroundings = surroundings
-        self._among = among
-        self._search = Search(known, frames)
+        self._first_fix = FirstFix(known, frames, among)
         self._visual = VisualOdometry()
         self._belief: Belief | None = None
         self._T_odometry = np.eye(4)
@@ -156,7 +155,9 @@ class Localizer:
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity, focal_px=focal_px)
         if self._belief is not None:
             return self._result(self._confirm(self._belief, keyframe, frame))
-        if (fix := self._first_fix(keyframe, frame)) is None:
+        camera = frame.pair.camera
+        fix = self._first_fix.find(keyframe, camera, self._T_odometry, self._path_m)
+        if fix is None:
             return Located(State.SEARCHING, note="no place is recognised for certain")
         confirmed = self._confirm(Belief(*self._measured(fix)), keyframe, frame)
         return self._result(replace(confirmed, loops=confirmed.loops or (fix,)))
@@ -167,24 +168,12 @@ class Localizer:
         steps = np.stack([self._T_odometry, T_now])
         step_m = float(path_lengths(steps, np.array([True, seen or not self._frames]))[-1])
         if self._belief is not None:
-            covariance = (
-                step_covariance(_LOST_SIGMA_M, _LOST_SIGMA_DEG)
-                if visual.information is None
-                else covariance_of(visual.information)
-            )
+            covariance = step_covariance(_LOST_SIGMA_M, _LOST_SIGMA_DEG)
+            if visual.information is not None:
+                covariance = covariance_of(visual.information)
             T_before_now = invert(self._T_odometry) @ T_now
             self._belief = self._belief.moved(T_before_now, covariance, step_m)
         self._T_odometry, self._path_m = T_now, self._path_m + step_m
-
-    def _first_fix(self, keyframe: Keyframe, frame: OdometryFrame) -> Loop | None:
-        """Return the best of the loops that are believed; None = no place is recognised."""
-        camera = frame.pair.camera
-        loops = self._search.add(keyframe, camera, self._T_odometry, self._path_m, self._among)
-        if not loops:
-            return None
-        self._search.forget()
-        self._among = None
-        return max(loops, key=lambda loop: loop.inliers)
 
     def _measured(self, loop: Loop) -> tuple[Float64, Float64]:
         """Return the pose by a loop from a view of the map, and its covariance."""
@@ -252,66 +241,48 @@ _NEIGHBOURS: Final = 3
 """Views around a recognised place that must show it, too."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sight:
-    """A frame, where it is by odometry, and the loops to it from views that show the same place."""
-
-    T_odometry_camera: Float64
-    path_m: float
-    loops: list[Loop]
-
-
-class Search:
-    """Looks for a drive in a map until enough views of it agree.
+class FirstFix:
+    """Looks for a drive in a map until enough of its frames agree where they are.
 
     Where two places look alike both are found, contradict each other, and neither is believed.
     """
 
-    def __init__(self, known: KnownPlaces, frames: int) -> None:
+    def __init__(self, known: KnownPlaces, frames: int, among: Bool | None) -> None:
         self._known = known
         self._frames = frames
-        self._seen: deque[_Sight] = deque(maxlen=_REMEMBERED)
+        self._among = among
+        self._seen: deque[tuple[Float64, float, list[Loop]]] = deque(maxlen=_REMEMBERED)
 
-    def add(
-        self,
-        keyframe: Keyframe,
-        camera: RectifiedCamera,
-        T_odometry_camera: Float64,
-        path_m: float,
-        among: Bool | None = None,
-    ) -> list[Loop]:
-        """Add the next frame; return its loops that are believed, perhaps none.
-
-        ``path_m`` is the path up to it; ``among``, bool (N,), the views that may be compared, None
-        = all.
-        """
-        loops = self._loops(keyframe, camera, among)
-        self._seen.append(_Sight(T_odometry_camera, path_m, loops))
-        return [loop for loop in self._agreeing() if loop.last == keyframe.frame]
-
-    def forget(self) -> None:
-        """Begin again."""
+    def find(
+        self, keyframe: Keyframe, camera: RectifiedCamera, T_odometry_camera: Float64, path_m: float
+    ) -> Loop | None:
+        """Return the best believed loop to the next frame, ``path_m`` into the drive, if any."""
+        self._seen.append((T_odometry_camera, path_m, self._loops(keyframe, camera)))
+        believed = [loop for loop in self._agreeing() if loop.last == keyframe.frame]
+        if not believed:
+            return None
         self._seen.clear()
+        self._among = None  # once lost, the drive may be anywhere
+        return max(believed, key=lambda loop: loop.inliers)
 
-    def _loops(self, keyframe: Keyframe, camera: RectifiedCamera, among: Bool | None) -> list[Loop]:
-        found = {loop.first: loop for loop in self._known.recognise(keyframe, camera, among).loops}
+    def _loops(self, keyframe: Keyframe, camera: RectifiedCamera) -> list[Loop]:
+        """Return loops from recognised views and from those around them, each view once."""
+        known = self._known
+        found = {loop.first: loop for loop in known.recognise(keyframe, camera, self._among).loops}
         for loop in list(found.values()):
-            T = self._known.T_world_camera[loop.first] @ loop.T_first_last
-            for number in self._known.near(T, _NEIGHBOURS):
-                other = None if number in found else self._known.compare(number, keyframe, camera)
+            for number in known.near(
+                known.T_world_camera[loop.first] @ loop.T_first_last, _NEIGHBOURS
+            ):
+                other = None if number in found else known.compare(number, keyframe, camera)
                 if other is not None and other.loop is not None:
                     found[number] = other.loop
         return list(found.values())
 
     def _agreeing(self) -> list[Loop]:
-        loops = [loop for sight in self._seen for loop in sight.loops]
+        loops = [loop for _, _, loops in self._seen for loop in loops]
         if not loops:
             return []
         # The map is a rigid thing: only the drive in it drifts.
         firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0) for loop in loops}
-        lasts = {
-            loop.last: (sight.T_odometry_camera, sight.path_m)
-            for sight in self._seen
-            for loop in sight.loops
-        }
+        lasts = {loop.last: (T, path_m) for T, path_m, loops in self._seen for loop in loops}
         return agreeing_loops(loops, firsts, lasts, keyframes=self._frames)

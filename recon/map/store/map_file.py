@@ -138,14 +138,37 @@ class MapFile:
     def placed(self) -> dict[int, Bool]:
         """Which frames of each linked drive, by its number, have a place in the map; bool (N,).
 
-        Only these are in its products, and to be recognised.
+        Those whose pose is to be trusted; in a map of several drives only those of stretches that
+        loops, links or measured positions hold to the longest one of the first drive. Behind a lost
+        pose odometry guesses, and a guess does not enter what other drives saw. Only these frames
+        are in products, and to be recognised.
         """
-        return placed_frames(self.linked, self.links)
+        sessions = self.linked
+        of = {session.number: stretches(session.health) for session in sessions}
+        if len(sessions) < 2:
+            return {number: stretch >= 0 for number, stretch in of.items()}
+        ties, first = [*_ties(sessions, self.links, of)], sessions[0].number
+        held = {(first, int(np.bincount(of[first] + 1)[1:].argmax()))}
+        while more := {b for tie in ties for a, b in (tie, tie[::-1]) if a in held} - held:
+            held |= more
+        return {
+            number: (stretch >= 0) & np.isin(stretch, [s for drive, s in held if drive == number])
+            for number, stretch in of.items()
+        }
 
     @property
     def doubts(self) -> list[str]:
         """Lines of what is not to be trusted in the linked drives; whoever uses the map says so."""
-        return doubts_of_drives(self.linked, self.placed)
+        lines, placed, many = [], self.placed, len(self.linked) > 1
+        for session in self.linked:
+            of = f"session {session.number} ({session.info.source}): " if many else ""
+            lines += [of + line for line in doubt_about(session.health)]
+            apart = np.flatnonzero(session.trusted & ~placed[session.number]).tolist()
+            if apart:
+                why = "follow a lost pose, and nothing that was seen again says where"
+                left_out = "not in cloud, grid, OctoMap and mesh, nor to be recognised"
+                lines.append(f"{of}{name_frames(apart)} {why}: {left_out}")
+        return lines
 
     def set_links(self, links: Sequence[Link], linked: Collection[int]) -> None:
         """Keep the links, and the numbers of the drives that share the axes of the map."""
@@ -180,41 +203,6 @@ _Stretch = tuple[int, int]
 _SURVEY: Final[_Stretch] = (-1, -1)
 _FEWEST_FIXES: Final = 2
 """Measured positions that say where a stretch is, and which way it goes."""
-
-
-def placed_frames(sessions: Sequence[Session], links: Sequence[Link]) -> dict[int, Bool]:
-    """Return by number of the drive bool (N,), which frames have a place in the map.
-
-    Those whose pose is to be trusted; in a map of several drives only those of stretches that
-    loops, links or measured positions hold to the longest one of the first drive. Behind a lost
-    pose odometry guesses, and a guess does not enter what other drives saw.
-    """
-    of = {session.number: stretches(session.health) for session in sessions}
-    if len(sessions) < 2:
-        return {number: stretch >= 0 for number, stretch in of.items()}
-    ties, first = [*_ties(sessions, links, of)], sessions[0].number
-    held = {(first, int(np.bincount(of[first] + 1)[1:].argmax()))}
-    while more := {b for tie in ties for a, b in (tie, tie[::-1]) if a in held} - held:
-        held |= more
-    return {
-        number: (stretch >= 0) & np.isin(stretch, [s for drive, s in held if drive == number])
-        for number, stretch in of.items()
-    }
-
-
-def doubts_of_drives(sessions: Sequence[Session], placed: Mapping[int, Bool]) -> list[str]:
-    """Return lines of poses that are not to be trusted, and of what has no place after them."""
-    lines = []
-    for session in sessions:
-        of = f"session {session.number} ({session.info.source}): " if len(sessions) > 1 else ""
-        lines += [of + line for line in doubt_about(session.health)]
-        trusted = session.trusted
-        apart = np.flatnonzero(trusted & ~placed[session.number]).tolist()
-        if apart:
-            why = "follow a lost pose, and nothing that was seen again says where"
-            left_out = "not in cloud, grid, OctoMap and mesh, nor to be recognised"
-            lines.append(f"{of}{name_frames(apart)} {why}: {left_out}")
-    return lines
 
 
 def _ties(

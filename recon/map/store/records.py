@@ -6,8 +6,8 @@ import sqlite3
 import weakref
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from threading import Lock, RLock
@@ -127,7 +127,7 @@ class Store:
         map says: a small file can claim very large ones.
         """
         name = _name(key)
-        with self._lock, self._reading():
+        with self._lock, reading(self.name):
             text, content, checksum = self._row(kind, name)
             try:
                 most = min(most_bytes, max(_SMALL_BYTES, _MOST_GROWTH * content.left))
@@ -147,7 +147,7 @@ class Store:
 
     def keys(self, kind: str) -> list[Key]:
         """Return the keys of a kind, in order."""
-        with self._lock, self._reading():
+        with self._lock, reading(self.name):
             rows = self._database.execute("SELECT key FROM record WHERE kind = ?", (kind,))
             found = [_key(name) for (name,) in rows]
         return sorted(found, key=lambda key: key if isinstance(key, tuple) else (key,))
@@ -159,14 +159,14 @@ class Store:
 
     def kinds(self) -> list[str]:
         """Return the kinds of which there are records, in order."""
-        with self._lock, self._reading():
+        with self._lock, reading(self.name):
             rows = self._database.execute("SELECT DISTINCT kind FROM record ORDER BY kind")
             return [str(kind) for (kind,) in rows]
 
     def has(self, kind: str, key: Key) -> bool:
         """Return whether there is such a record."""
         query = "SELECT 1 FROM record WHERE kind = ? AND key = ?"
-        with self._lock, self._reading():
+        with self._lock, reading(self.name):
             return self._database.execute(query, (kind, _name(key))).fetchone() is not None
 
     def alike(self, kind: str, one: Key, other: Key) -> bool:
@@ -176,13 +176,9 @@ class Store:
             " FROM record AS one, record AS other"
             " WHERE one.kind = ? AND one.key = ? AND other.kind = one.kind AND other.key = ?"
         )
-        with self._lock, self._reading():
+        with self._lock, reading(self.name):
             found = self._database.execute(query, (kind, _name(one), _name(other))).fetchone()
         return found is not None and bool(found[0])
-
-    def items(self, kind: str) -> Iterator[tuple[Key, dict[str, Any]]]:
-        """Read the records of a kind in the order of their keys, one at a time, past the cache."""
-        return ((key, self.read(kind, key)) for key in self.keys(kind))
 
     def copy(self, kind: str, other: Store, keys: Mapping[Key, Key] | None = None) -> None:
         """Copy records of a kind to another store without unpacking them.
@@ -190,7 +186,7 @@ class Store:
         ``keys`` are those to copy, with their keys in the other store; None = all, under their own.
         """
         for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
-            with self._lock, self._reading():
+            with self._lock, reading(self.name):
                 text, content, checksum = self._row(kind, _name(key))
                 whole = content.read(content.left)
                 content.close()
@@ -237,11 +233,6 @@ class Store:
         row, size, text, checksum = found
         content = Content(self._database, row, size, _checksum(kind, name, text))
         return text, content, checksum
-
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        with reading(self.name):
-            yield
 
 
 def _name(key: Key) -> str:

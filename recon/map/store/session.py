@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
@@ -136,7 +136,9 @@ class Session:
     def T_map_world(self) -> Float64:
         """float64 (4, 4), from the world of the session to map axes; known after one frame."""
         with reading(self._store.name):
-            T: Float64 = array_in(self._axes, "T_map_world", np.float64, (4, 4)).copy()
+            T: Float64 = array_in(
+                self._store.get(AXES, self.number), "T_map_world", np.float64, (4, 4)
+            ).copy()
             check_rigid("T_map_world", T)
         return T
 
@@ -144,7 +146,7 @@ class Session:
     def camera(self) -> RectifiedCamera:
         """The rectified camera; known after the first frame."""
         with reading(self._store.name):
-            return value_in(RectifiedCamera, self._axes["camera"])
+            return value_in(RectifiedCamera, self._store.get(AXES, self.number)["camera"])
 
     @property
     def loops(self) -> dict[str, Any]:
@@ -232,10 +234,6 @@ class Session:
         content = frames_record(self._poses[first:], self._times_s[first:], self._health[first:])
         self._store.put(FRAMES, (self.number, first), content, compress=True)
 
-    @property
-    def _axes(self) -> dict[str, Any]:
-        return self._store.get(AXES, self.number)
-
     def _read_frames(self) -> None:
         for first in self._store.numbers(FRAMES, self.number):
             if first != len(self):
@@ -292,25 +290,20 @@ class Submaps:
         self.store = store
         with reading(store.name):
             found = store.numbers(ENTRY, session)
-            self._entries = [value_in(SubmapEntry, store.read(ENTRY, (session, n))) for n in found]
+            self.entries = [value_in(SubmapEntry, store.read(ENTRY, (session, n))) for n in found]
             frames = 0
-            for index, entry in enumerate(self._entries):
+            for index, entry in enumerate(self.entries):
                 if (entry.index, entry.first_frame) != (index, frames) or entry.frames < 1:
                     raise FormatError("submaps of the drive are missing", got=f"{entry}")
                 frames += entry.frames
 
     def __len__(self) -> int:
-        return len(self._entries)
-
-    @property
-    def entries(self) -> Sequence[SubmapEntry]:
-        """One for each submap."""
-        return tuple(self._entries)
+        return len(self.entries)
 
     @property
     def frames(self) -> int:
         """Number of frames in all submaps."""
-        return sum(entry.frames for entry in self._entries)
+        return sum(entry.frames for entry in self.entries)
 
     def add(self, submap: Submap, *, compress: bool = False) -> None:
         """Store the next submap."""
@@ -318,15 +311,15 @@ class Submaps:
         key = (self._session, submap.index)
         self.store.put(SUBMAP, key, submap.to_tree(), compress=compress)
         self.store.put(ENTRY, key, asdict(entry))
-        self._entries.append(entry)
+        self.entries.append(entry)
 
     def __getitem__(self, index: int) -> Submap:
         """Return a submap, read from the map: it is large, and used once."""
         with reading(self.store.name):
-            most_bytes = self._entries[index].nbytes
+            most_bytes = self.entries[index].nbytes
             record = self.store.read(SUBMAP, (self._session, index), most_bytes=most_bytes)
             submap = Submap.from_tree(record)
-            if _entry_of(submap) != self._entries[index]:
+            if _entry_of(submap) != self.entries[index]:
                 raise FormatError("a submap of the map is another one", got=f"submap {index}")
             return submap
 
