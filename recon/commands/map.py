@@ -7,7 +7,7 @@ from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions, with_resume_hint
-from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
+from recon.commands.map_pieces import begun_in_pieces, map_pieces, pieces_of
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
 from recon.evaluation.drive_errors import DriveErrors, compare_with_truth
@@ -105,8 +105,9 @@ def run_map(
         with_resume_hint(run, source),
         options.begin(run, source, config) as map_,
     ):
-        apart = options.workers is not None or begun_in_pieces(run)
-        mapped = (map_in_pieces if apart else map_whole)(source, config, options, run, map_)
+        if options.workers is not None or begun_in_pieces(run):
+            map_pieces(source, config, options, run, map_)
+        mapped = map_drive(source, config, options, run, map_)
         with run.stage("cloud"):
             check_map(mapped, source.name, findings)
         made = make(Order(map_, mapped.placed, run, config.mesh), options.products)
@@ -131,10 +132,10 @@ def run_map(
     return result
 
 
-def map_whole(
+def map_drive(
     source: StereoSource, config: ReconConfig, options: MapOptions, run: Run, map_: Map
 ) -> MappedSequence:
-    """Map a drive in one piece, in this process, into the map of a run."""
+    """Map what is left of a drive, into the map of a run."""
     return map_sequence(
         source,
         config,

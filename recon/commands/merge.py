@@ -9,7 +9,7 @@ from typing import Any
 
 from recon.commands.config import ReconConfig, run_settings
 from recon.commands.joined import copied, joined_settings, make_joined
-from recon.commands.map import map_whole
+from recon.commands.map import map_drive
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, SettingsError
 from recon.io.files import resolved
@@ -125,7 +125,7 @@ def _mapped(
 ) -> list[int]:
     """Map a drive, and copy it into a map; its number."""
     with Map.create(run.state("drive.recon")) as drive:
-        mapped = map_whole(source, settings, options, run, drive)
+        mapped = map_drive(source, settings, options, run, drive)
         check_map(mapped, source.name)
         kept = run.state("kept.recon")
         keep_map(drive, kept)

@@ -13,9 +13,8 @@ from recon.cli import app
 from recon.cli.program import _NOT_OPTIONS, COMMANDS, _command, plan_jobs
 from recon.cli.tables import print_batch
 from recon.commands import config
-from recon.commands.map_pieces import piece_job
+from recon.commands.map_pieces import Piece, piece_job
 from recon.core.errors import SettingsError
-from recon.map.drive.pieces import Piece
 from recon.run.batch.job import Job
 from recon.run.batch.job_file import JobList
 from tests.docs.blocks import ROOT

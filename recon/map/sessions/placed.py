@@ -1,10 +1,16 @@
-"""The drives of a map in their places, cut into tiles: what products are made of."""
+"""The drives of a map in their places, cut into tiles: what products are made of.
+
+By several processes, which share files: first each cuts some submaps into tiles, into a file of its
+own; then each makes voxels and points of some tiles from all these files, into another one. What
+comes of it is what one process makes: parts are numbered by submap, and joined in that order.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +32,11 @@ from recon.map.store.session import Session, Submaps
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
 from recon.run.threads import side_by_side
+
+Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
+"""Calls a function with each of several values, somewhere, and waits until all are done."""
+_SHARE: Final = 4
+"""Tasks for each process, so that none waits long for another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +62,10 @@ def settings_of(session: Session) -> DriveSettings:
 
 
 def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> PlacedMap:
-    """Cut the linked drives of a map into tiles.
+    """Cut the linked drives of a map into tiles, with the settings of its products.
 
     Occupancy that the drive kept is taken where it was made with these settings; else it is made
-    from its rays. A map without rays has a cloud, and no occupancy.
-
-    Args:
-        map_: The map.
-        settings: The settings of its products.
-        threads: Submaps whose rays are cast at a time. Changes no result.
+    from its rays, of so many submaps at a time. A map without rays has a cloud, and no occupancy.
     """
     placed = PlacedSubmaps(map_, settings)
     tiles = Tiles.of_submaps(
@@ -69,7 +75,35 @@ def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> Place
         placed.corrections,
         drives=placed.drives,
     )
-    return with_path(map_, tiles.with_looks(looks_in(map_, settings)))
+    return _with_path(map_, tiles.with_looks(_looks(map_, settings)))
+
+
+def place_map_on(
+    map_: MapFile, settings: DriveSettings, folder: Path, each: Each, workers: int
+) -> PlacedMap:
+    """Do what `place_map` does, and make all tiles, on so many processes.
+
+    The map is in a file, and the folder one that all processes see; what they leave there is read
+    as long as the tiles are used.
+    """
+    if map_.store.path is None:
+        raise MappingError("other processes cannot read a temporary map")
+    file = resolved(map_.store.path)
+    placed, halvings, tiles = PlacedSubmaps(map_, settings), -1, None
+    folder.mkdir(parents=True, exist_ok=True)
+    while tiles is None:
+        halvings += 1
+        shares = _shares(range(len(placed)), workers)
+        parts = [folder / f"submaps-{halvings}-{n}" for n in range(len(shares))]
+        each(partial(_cut_submaps, file, settings, halvings), [*zip(shares, parts, strict=True)])
+        axes, drives = map_.first.T_map_world, placed.drives
+        taken = partial(Tiles.of_files, parts, settings, axes, halvings=halvings, drives=drives)
+        tiles = taken()
+    groups = _shares([tile.key for tile in tiles], workers)
+    files = [folder / f"tiles-{n}" for n in range(len(groups))]
+    each(partial(_make_tiles, file, settings, taken), [*zip(groups, files, strict=True)])
+    tiles.adopt(files)
+    return _with_path(map_, tiles.with_looks(_looks(map_, settings)))
 
 
 class PlacedSubmaps:
@@ -79,10 +113,6 @@ class PlacedSubmaps:
     the world of the first: sums are moved, rays cast where they were seen. Frames without a place
     in the map give none, and their submaps, in which frames cannot be told apart, no sums.
 
-    Args:
-        map_: The map.
-        settings: How occupancy is made.
-
     Attributes:
         drives: Number of submaps of each drive.
         corrections: float64 (S, 4, 4), what is still to be applied to each; None = nothing.
@@ -91,13 +121,13 @@ class PlacedSubmaps:
 
     def __init__(self, map_: MapFile, settings: DriveSettings) -> None:
         sessions = map_.linked
-        self.ready = len(sessions) == 1 and not _to_be_cast(sessions[0], settings)
+        alone = len(sessions) == 1
+        self.ready = alone and not _to_be_cast(sessions[0], settings)
         for session in [] if self.ready else sessions:
             check_rays(session, settings)
         self._settings = settings
         self._apart = [_without_place(map_, session) for session in sessions]
         self.drives = [len(session.submaps) for session in sessions]
-        alone = len(sessions) == 1
         self.corrections = sessions[0].corrections() if alone else None
         self._parts = (
             [(sessions[0].submaps if self.ready else CastSubmaps(sessions[0], settings), None)]
@@ -124,15 +154,6 @@ class PlacedSubmaps:
         if T is None or np.array_equal(T[own], np.eye(4)):
             return submap
         return replace(submap, fused=submap.fused.moved(T[own], self._settings.fusion.voxel_m))
-
-
-def with_path(map_: MapFile, tiles: Tiles) -> PlacedMap:
-    """Return the tiles of a map with the paths of its linked drives."""
-    sessions = map_.linked
-    paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
-    placed = map_.placed
-    good = [placed[session.number] for session in sessions]
-    return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
 
 
 def has_occupancy(map_: MapFile) -> bool:
@@ -172,26 +193,32 @@ def _beside(
     return CastSubmaps(session, settings, map_.first.T_map_world, poses, without), moves
 
 
-def looks_in(map_: MapFile, settings: DriveSettings) -> Looks | None:
+def _looks(map_: MapFile, settings: DriveSettings) -> Looks | None:
     """Return what single frames of the linked drives saw, where they lie; None = not known."""
-    return looks_of(
-        (
-            (s, s.T_map_world @ s.trajectory.T_world_camera, _no_evidence(map_, s))
-            for s in map_.linked
-        ),
-        settings.occupancy,
+    seen = (
+        (s, s.T_map_world @ s.trajectory.T_world_camera, _no_evidence(map_, s)) for s in map_.linked
     )
+    return looks_of(seen, settings.occupancy)
 
 
 def _no_evidence(map_: MapFile, session: Session) -> frozenset[int]:
     """Return the frames without a place, and those whose images an earlier drive has, too."""
-    return frozenset(seen_before(map_, session) | _without_place(map_, session))
+    return seen_before(map_, session) | _without_place(map_, session)
 
 
 def _without_place(map_: MapFile, session: Session) -> frozenset[int]:
     """Return the frames of a drive that saw something, but have no place in the map."""
     frames = np.flatnonzero(session.trusted & ~map_.placed[session.number])
     return frozenset(frames.tolist())
+
+
+def _with_path(map_: MapFile, tiles: Tiles) -> PlacedMap:
+    """Return the tiles of a map with the paths of its linked drives."""
+    sessions = map_.linked
+    paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
+    placed = map_.placed
+    good = [placed[session.number] for session in sessions]
+    return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
 
 
 def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:
@@ -202,136 +229,44 @@ def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:
     return np.concatenate(rows)
 
 
-Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
-"""Calls a function with each of several values, somewhere, and waits until all are done."""
-_SHARE: Final = 4
-"""Tasks for each process, so that none waits long for another."""
-
-
-@dataclass(frozen=True)
-class SubmapTask:
-    """Submaps to be cut, for a process that can read the map.
-
-    Attributes:
-        map: File of the map.
-        settings: The settings of its products.
-        halvings: How often tiles are halved.
-        numbers: The submaps.
-        file: Where their parts go.
-    """
-
-    map: Path
-    settings: DriveSettings
-    halvings: int
-    numbers: range
-    file: Path
-
-
-@dataclass(frozen=True, eq=False)
-class TileTask:
-    """Tiles whose content is to be made.
-
-    Attributes:
-        map: File of the map.
-        parts: Files with what all submaps observed, in order.
-        settings: The settings of the products.
-        T_map_world: float64 (4, 4).
-        halvings: How often tiles are halved.
-        drives: Number of submaps of each drive.
-        keys: The tiles.
-        file: Where their content goes.
-    """
-
-    map: Path
-    parts: tuple[Path, ...]
-    settings: DriveSettings
-    T_map_world: Float64
-    halvings: int
-    drives: tuple[int, ...]
-    keys: tuple[TileKey, ...]
-    file: Path
-
-
-def place_map_on(
-    map_: MapFile, settings: DriveSettings, folder: Path, each: Each, workers: int
-) -> PlacedMap:
-    """Do what `place_map` does, and make all tiles, on several processes.
-
-    Args:
-        map_: The map, in a file.
-        settings: The settings of its products.
-        folder: For files that all processes see; they are read as long as the tiles are used.
-        each: The processes.
-        workers: How many there are.
-    """
-    if map_.store.path is None:
-        raise MappingError("other processes cannot read a temporary map")
-    file = resolved(map_.store.path)
-    placed, halvings, tiles = PlacedSubmaps(map_, settings), -1, None
-    T_map_world, drives = map_.first.T_map_world, tuple(placed.drives)
-    folder.mkdir(parents=True, exist_ok=True)
-    while tiles is None:
-        halvings += 1
-        shares = _shares(range(len(placed)), workers)
-        parts = tuple(folder / f"submaps-{halvings}-{n}" for n in range(len(shares)))
-        each(
-            cut_submaps,
-            [
-                SubmapTask(file, settings, halvings, share, part)
-                for share, part in zip(shares, parts, strict=True)
-            ],
-        )
-        tiles = Tiles.of_files(parts, settings, T_map_world, halvings=halvings, drives=drives)
-    groups = _shares([tile.key for tile in tiles], workers)
-    files = [folder / f"tiles-{n}" for n in range(len(groups))]
-    each(
-        make_tiles,
-        [
-            TileTask(file, parts, settings, T_map_world, halvings, drives, tuple(keys), made)
-            for keys, made in zip(groups, files, strict=True)
-        ],
-    )
-    tiles.adopt(files)
-    return with_path(map_, tiles.with_looks(looks_in(map_, settings)))
-
-
-def cut_submaps(task: SubmapTask) -> None:
-    """Cut some submaps of a map into tiles."""
-    with closing(MapFile.open(task.map)) as map_:
-        placed = PlacedSubmaps(map_, task.settings)
-        T = placed.corrections
-        cutter = Cutter(task.settings, map_.first.T_map_world, task.halvings)
-        parts = TileParts(cutter.edge_m, task.file)
-        cut = cutter.cut(
-            (placed[number] for number in task.numbers),
-            parts,
-            None if T is None else T[task.numbers.start : task.numbers.stop],
-            first=task.numbers.start,
-        )
-        parts.save(cut.to_tree())
-
-
-def make_tiles(task: TileTask) -> None:
-    """Make the voxels and points of some tiles, and find the floors in them."""
-    tiles = Tiles.of_files(
-        task.parts,
-        task.settings,
-        task.T_map_world,
-        halvings=task.halvings,
-        drives=task.drives,
-        path=task.file,
-    )
-    if tiles is not None:  # as known when the task was made
-        with closing(MapFile.open(task.map)) as map_:
-            tiles.with_looks(looks_in(map_, task.settings))
-            for key in task.keys:
-                tiles.make_voxels(key)
-                tiles.cloud(key)
-        tiles.save()
-
-
 def _shares(items: Sequence[Any], workers: int) -> list[Any]:
     """Return items in shares of neighbours, several for each process."""
     count = max(1, min(len(items), _SHARE * workers))
     ends = [len(items) * n // count for n in range(count + 1)]
     return [items[a:b] for a, b in pairwise(ends)]
+
+
+def _cut_submaps(
+    map_file: Path, settings: DriveSettings, halvings: int, task: tuple[range, Path]
+) -> None:
+    """Cut some submaps of a map into tiles, in a file."""
+    numbers, file = task
+    with closing(MapFile.open(map_file)) as map_:
+        placed = PlacedSubmaps(map_, settings)
+        T = placed.corrections
+        cutter = Cutter(settings, map_.first.T_map_world, halvings)
+        parts = TileParts(cutter.edge_m, file)
+        cut = cutter.cut(
+            (placed[number] for number in numbers),
+            parts,
+            None if T is None else T[numbers.start : numbers.stop],
+            first=numbers.start,
+        )
+        parts.save(cut.to_tree())
+
+
+def _make_tiles(
+    map_file: Path,
+    settings: DriveSettings,
+    taken: Callable[..., Any],
+    task: tuple[Sequence[TileKey], Path],
+) -> None:
+    """Make the voxels and points of some tiles, and find the floors in them, in a file."""
+    keys, file = task
+    tiles = taken(path=file)
+    with closing(MapFile.open(map_file)) as map_:
+        tiles.with_looks(_looks(map_, settings))
+        for key in keys:
+            tiles.make_voxels(key)
+            tiles.cloud(key)
+    tiles.save()

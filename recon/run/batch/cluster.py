@@ -136,7 +136,7 @@ class Cluster:
         What it makes it leaves in files. One whose worker dies is called again on another, at most
         as often as Dask allows.
         """
-        futures = self._client.map(function, items, key=f"{function.__name__}-{uuid4().hex[:12]}")
+        futures = self._client.map(function, items, key=uuid4().hex)
         for future in require("distributed", extra=EXTRA).as_completed(futures):
             if future.status == "finished":
                 continue

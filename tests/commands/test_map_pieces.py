@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from recon.commands.config import ReconConfig, load_config
-from recon.map.drive.pieces import LEAD, Piece, cut_drive, join_pieces, joined_drive
+from recon.commands.map_pieces import LEAD, Piece, cut_drive
+from recon.map.drive.drive_odometry import odometry_of
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace, session_info
+from recon.map.sessions.copying import join_parts
 from recon.map.verbs import Map
 from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
@@ -58,18 +60,18 @@ def whole(source: Film, config: ReconConfig) -> MappedSequence:
 
 @pytest.fixture(scope="module")
 def joined(source: Film, config: ReconConfig) -> MappedSequence:
-    work = Workspace(threads=1)
-
-    def mapped() -> Iterator[Map]:
+    def mapped() -> Iterator[tuple[Map, int]]:
         for piece in PIECES:
-            work = Workspace(threads=1)
-            map_sequence(piece.of(source), config, workspace=work)
-            yield work.map
+            part = Workspace(threads=1)
+            map_sequence(SourcePart(source, *piece), config, workspace=part)
+            yield part.map, piece.lead
 
-    work.map.begin(session_info(source, config))
-    join_pieces(work.map, PIECES, mapped(), config)
-    work.map.session().set_state({"seconds": 1.0})
-    return joined_drive(source, config, work)
+    work = Workspace(threads=1)
+    session = work.map.begin(session_info(source, config))
+    join_parts(work.map, mapped(), config)
+    odometry = odometry_of(config, source, None, None, None).state()
+    session.set_state({"mapper": {"odometry": odometry, "builder": None}, "seconds": 1.0})
+    return map_sequence(source, config, workspace=work)
 
 
 def test_the_path_has_every_frame_once_and_is_that_of_one_run(
