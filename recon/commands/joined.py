@@ -43,19 +43,13 @@ def make_joined(
 ) -> dict[str, Any]:
     """Fill the map of a run, link and place its drives, and make its products and its report.
 
-    The folder appears, or takes the place of an earlier run, in one step when all is done.
-
     Args:
         options: Folder, threads, mesh and progress of the run.
         settings: Its settings.
         fill: Puts the drives into its map.
         inputs: The files that are read.
         replaced: The run whose place it takes; None = it is a new one.
-        survey: Measured positions that the paths are bent to run through; None = no more than the
-            drives have already.
-
-    Returns:
-        The figures of ``summary.json``.
+        survey: Measured positions beside those that the drives have already.
     """
     with (
         WholeRun(

@@ -77,19 +77,21 @@ def run_map_into(
     """Map a drive into the map of a finished run: what `recon map SOURCE --into RUN` does.
 
     The folder is replaced in one step when all is done; until then it keeps the run as it was.
-
-    Args:
-        folder: Folder of the run.
-        source: The drive.
-        config: Settings of the run with changes; None = its own.
-        options: Options of the mapping, as for `run_map`; None = the defaults.
+    The settings are those of the run, perhaps with changes; options are as for `run_map`.
     """
     options = options or MapOptions()
     settings = config or run_settings(folder)
 
     def fill(run: Run, map_: Map) -> list[int]:
         copied(folder / MAP_FILE, map_, settings)
-        return _mapped(source, settings, options, run, map_)
+        kept = run.state("kept.recon")
+        with Map.create(run.state("drive.recon")) as drive:
+            check_map(map_drive(source, settings, options, run, drive), source.name)
+            keep_map(drive, kept)
+        try:
+            return copied(kept, map_, settings)
+        except (FormatError, SettingsError) as error:  # not the file, which does not stay
+            raise error.but(where=source.name) from error
 
     files = [folder / MAP_FILE, *source.files]
     return make_joined(options, settings, fill, files, replaced=folder)
@@ -100,11 +102,7 @@ def run_remove(
 ) -> dict[str, Any]:
     """Take a drive out of the map of a run: what `recon map --into RUN --remove SESSION` does.
 
-    Args:
-        folder: Folder of the run, which is replaced in one step.
-        number: Number of the drive, as ``sessions`` of the summary lists them.
-        config: Settings of the run with changes; None = its own.
-        options: Threads, mesh and progress of the run; None = the defaults.
+    Its number is that of ``sessions`` in the summary; the folder is replaced in one step.
     """
     options = options or MapOptions()
     settings = joined_settings(folder, config)
@@ -118,21 +116,6 @@ def run_remove(
         return []
 
     return make_joined(options, settings, fill, [folder / MAP_FILE], replaced=folder)
-
-
-def _mapped(
-    source: StereoSource, settings: ReconConfig, options: MapOptions, run: Run, map_: Map
-) -> list[int]:
-    """Map a drive, and copy it into a map; its number."""
-    with Map.create(run.state("drive.recon")) as drive:
-        mapped = map_drive(source, settings, options, run, drive)
-        check_map(mapped, source.name)
-        kept = run.state("kept.recon")
-        keep_map(drive, kept)
-    try:
-        return copied(kept, map_, settings)
-    except (FormatError, SettingsError) as error:  # not the file, which does not stay
-        raise error.but(where=source.name) from error
 
 
 def _refuse_twice(folders: Sequence[Path]) -> None:

@@ -12,14 +12,7 @@ from recon.core.geometry.alignment import fit_points
 from recon.core.values.arrays import Float64
 from recon.export.product import Made, Order
 from recon.io.models.las import check_inside, write_las
-from recon.map.sessions.measured import (
-    LARGEST_MISFIT,
-    Survey,
-    drift_of,
-    measure_along,
-    span_m,
-    trusted_path,
-)
+from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, span_m
 from recon.map.verbs import Map
 
 _LARGEST_STRETCH: Final = 0.05
@@ -101,13 +94,10 @@ def survey_product(suffix: str) -> Callable[[Order], Made]:
 def georeference(map_: Map, survey: Survey) -> Georeference:
     """Place a map so that the path of the drive that began it runs through measured positions.
 
-    Between frames that are trusted, the path is interpolated at their times. The map stays rigid,
-    and upright where the positions do not say otherwise (`fit_upright`); positions that contradict
-    most others are left out.
+    The map stays rigid, and upright where the positions do not say otherwise (`fit_upright`);
+    positions that contradict most others are left out.
     """
-    session = map_.first
-    path, drift_m = trusted_path(session), drift_of(session)
-    measured = measure_along(path, session.T_map_world, survey, drift_m)
+    measured = measure_along(map_.first, survey)
     if survey.crs is not None:
         check_inside(survey.crs, np.median(measured.position_m, axis=0), survey.positions)
     agree = measured.agree

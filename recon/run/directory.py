@@ -62,9 +62,7 @@ def default_folder(command: str) -> Path:
 def refuse_links(folder: Path, *, below: Path | None = None) -> None:
     """Refuse a folder of ours that has links in it, which may lead to files of anybody.
 
-    Args:
-        folder: The folder, which need not exist.
-        below: A folder around it; from there on it is reached by no link either.
+    From a folder around it on, ``below``, it is reached by no link either.
     """
     way = [] if below is None else [folder, *folder.parents][: -len(below.parents) - 1]
     inside = (
@@ -88,8 +86,7 @@ class RunDirectory:
 
     Attributes:
         begun: Whether there is a map from which the run can be resumed; who begins one says so.
-        whole: Write beside the folder, and put the new one in its place in one step: there is
-            the old run or the new one at any time, never some files of each.
+        whole: Write beside the folder, and put the new one in its place in one step.
     """
 
     whole: ClassVar[bool] = False

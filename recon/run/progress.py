@@ -35,39 +35,27 @@ class Step(Protocol):
 
 @runtime_checkable
 class Progress(Protocol):
-    """Receives the progress of a run, in the thread that runs it."""
+    """Receives the progress of a run, in its thread; what is not overridden does nothing."""
 
     def on_start(self, name: str, total: int, unit: str = "frames") -> None:
         """Begin a series of ``total`` items."""
-        ...
+        return
 
     def on_step(self, step: Step) -> None:
         """Count an item that is done."""
-        ...
+        return
 
     def on_stage(self, name: str) -> None:
         """Begin a stage that is not per item, such as ``mesh``."""
-        ...
+        return
 
     def on_finish(self) -> None:
         """End the series, successfully or not."""
-        ...
+        return
 
 
-class Silent:
+class Silent(Progress):
     """Shows no progress."""
-
-    def on_start(self, name: str, total: int, unit: str = "frames") -> None:
-        """Ignore it."""
-
-    def on_step(self, step: Step) -> None:
-        """Ignore it."""
-
-    def on_stage(self, name: str) -> None:
-        """Ignore it."""
-
-    def on_finish(self) -> None:
-        """Ignore it."""
 
 
 SILENT = Silent()

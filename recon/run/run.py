@@ -43,7 +43,7 @@ class Run(RunDirectory):
             run.finish(summary, source="im0.png", inputs=files)
 
     Args:
-        command: The name of the command, for the record and the default folder.
+        command: Its name, for the record and the default folder.
         out: The result folder; None = a new one below ``outputs/<command>/``.
         config: The configuration; None = the command has none.
         threads: Threads to use; None = all cores. `threads` is their number.
@@ -65,11 +65,7 @@ class Run(RunDirectory):
         folder = standard if out is None else Path(out)
         # A run in a default folder keeps its link when it is resumed.
         stamped = out is not None and resolved(folder.parent) == resolved(standard.parent)
-        super().__init__(
-            folder,
-            latest=out is None or (resume and stamped),
-            resume=resume,
-        )
+        super().__init__(folder, latest=out is None or (resume and stamped), resume=resume)
         self.command = command
         self.threads = use_threads(threads)
         self.progress = progress
@@ -109,11 +105,8 @@ class Run(RunDirectory):
     ) -> None:
         """Write ``summary.json`` and ``run.json``; the last thing that a run does.
 
-        Args:
-            summary: The figures; the cost of the run and its folder are added.
-            source: What was processed.
-            inputs: The files that were read, of which the record has a hash.
-            record: What else the record has.
+        The cost of the run and its folder are added to the figures, a hash of the inputs and what
+        else there is to ``record`` to the record.
         """
         inputs = tuple(inputs)
         self.check_targets(inputs)
@@ -140,10 +133,7 @@ class Run(RunDirectory):
 
     @cached_property
     def _cost(self) -> dict[str, Any]:
-        """Seconds in all and per stage (stages overlap), and peak memory, until the report.
-
-        Taken once: report, summary and record have the same figures.
-        """
+        """Seconds in all and per stage (stages overlap), and peak memory, taken once."""
         return {
             "seconds": round(time.perf_counter() - self._start, 3),
             "stages": self._timings(),
@@ -167,12 +157,8 @@ _PIECE_BYTES: Final = 1 << 20
 def fingerprint(files: Iterable[Path], *, head_bytes: int | None = None) -> dict[str, Any]:
     """Return the number, size and one SHA-256 of a list of files, in that order.
 
-    The hash covers each file's name and bytes, so a renamed frame changes it too.
-
-    Args:
-        files: The files.
-        head_bytes: Hash only the first bytes of each, to tell sources apart without the delay of
-            reading a large drive; None = all.
+    The hash covers each file's name and bytes, so a renamed frame changes it too; or only the first
+    bytes of each, to tell sources apart without reading a large drive.
     """
     digest, count, size = hashlib.sha256(), 0, 0
     for path in files:

@@ -57,8 +57,8 @@ def look_ahead(
 ) -> Iterator[Result]:
     """Yield ``function(item)`` in order, computed up to ``depth`` items ahead in one thread.
 
-    The iterator is advanced in that thread too, so reading overlaps as well. At most ``depth + 1``
-    results exist at a time. An error in an item or in the function is raised at its turn.
+    Items are read in that thread, too. At most ``depth + 1`` results exist at a time. An error in
+    an item or in the function is raised at its turn.
     """
     source = iter(items)
 
@@ -86,8 +86,8 @@ def side_by_side(
 ) -> Iterator[Result]:
     """Yield ``function(item)`` in order, computed in several threads.
 
-    At most ``threads + 1`` results exist at a time. An error is raised at its item's turn. When
-    the caller stops early, running items are waited for and no others start.
+    At most ``threads + 1`` results exist at a time. An error is raised at its turn. When the caller
+    stops early, running items are waited for and no others start.
     """
     pool = ThreadPoolExecutor(threads, thread_name_prefix="side-by-side")
     waiting: deque[Future[Result]] = deque()
@@ -103,11 +103,7 @@ def side_by_side(
 
 
 class OneBehind:
-    """Runs jobs in one background thread, in order and one at a time.
-
-    `begin` blocks until the previous job has ended, so at most one job is running and only its
-    data stays in memory.
-    """
+    """Runs jobs in one background thread, in order; only the data of one stay in memory."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="one-behind")

@@ -5,6 +5,5 @@
 - `mapper.py`: what is done with one frame: its pose, then its part of a submap;
 - `drive_odometry.py`: which odometry finds the poses; `drive_loops.py`: loops, in a thread;
 - `map_behind.py`: the same while images arrive: poses first, matching as far as there is time;
-- `pieces.py`: a long drive cut into pieces, which several processes map, and joined again;
 - `workspace.py`: the map, threads and stopwatch of a drive;
 """

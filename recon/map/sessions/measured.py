@@ -37,7 +37,6 @@ _LEAST_SPAN_M: Final = 1.0
 """Positions closer together than this say nothing of the direction of the map."""
 _LONGEST_GAP_S: Final = 1.0
 """Between frames farther apart than this, nobody knows where the camera was."""
-
 _FEWEST_TO_BEND: Final = 5
 _LEAST_BEND_M: Final = 0.1
 """Positions of so many places, and so far from a straight line, tell left from right."""
@@ -59,9 +58,6 @@ class Survey:
         antenna_m: Where what they are the positions of (antenna, prism) is, from the left camera:
             metres forward, left and up.
         crs: Name of the coordinate system, such as ``EPSG:25832``; None = not stated.
-
-    Raises:
-        SettingsError: No vehicle has an antenna so far from its camera.
     """
 
     positions: Path
@@ -80,11 +76,7 @@ class Survey:
 
     @cached_property
     def rows(self) -> Float64:
-        """float64 (N, 5), time, easting, northing, height, sigma (or NaN), in the order of time.
-
-        Raises:
-            FormatError: The file is missing or damaged.
-        """
+        """float64 (N, 5), time, easting, northing, height, sigma (or NaN), in the order of time."""
         return _read_positions(self.positions)
 
 
@@ -183,18 +175,12 @@ def _off_m(ours_m: Float64, there_m: Float64) -> Float64:
     return np.asarray(apply(fit_upright(ours_m, there_m).T_to_from, ours_m) - there_m)
 
 
-def measure_along(
-    path: Trajectory, T_map_world: Float64, survey: Survey, drift_m: float
-) -> Measured:
+def measure_along(session: Session, survey: Survey) -> Measured:
     """Return the positions that were measured during a drive, and where its path has them.
 
-    Args:
-        path: The path, interpolated at their times.
-        T_map_world: float64 (4, 4), from its world to map axes.
-        survey: What was measured.
-        drift_m: By how much the path may be off at its end, standard deviation.
+    Between frames that are trusted, the path is interpolated at their times.
     """
-    rows = survey.rows
+    rows, path = survey.rows, _trusted_path(session)
     here = rows[_during(path, rows[:, 0])]
     if not len(here):
         raise EvaluationError(
@@ -213,42 +199,32 @@ def measure_along(
             expected=f"{_LEAST_SPAN_M:g} m or more",
             hint="eastings and northings are in metres, not degrees",
         )
+    T_map_world = session.T_map_world
     antenna_m = _in_camera(survey, T_map_world)
     ours_m = _placed(T_map_world @ interpolate_poses(path, here[:, 0]), antenna_m)
     agree = find_agreeing(ours_m, position_m, LARGEST_MISFIT * span_m(ours_m))
     stated_m = None if np.isnan(sigma_m).any() else float(np.sqrt(np.mean(sigma_m[agree] ** 2)))
     measured = Measured(here[:, 0], position_m, ours_m, agree, stated_m)
-    measured.check(drift_m, survey.positions)
+    measured.check(_drift_m(session), survey.positions)
     return measured
 
 
 def hold(map_: MapFile, survey: Survey) -> list[str]:
-    """Keep the positions that were measured during the drives of a map, with these drives.
+    """Keep what was measured during any drive of a map with that drive; returns warnings.
 
-    `join_sessions` then bends their paths to run through them.
-
-    Args:
-        map_: The map, which is written.
-        survey: What was measured, in any of the drives.
-
-    Returns:
-        Warnings of positions that are left out.
+    `join_sessions` then bends their paths to run through these positions.
     """
     times_s, lines = survey.rows[:, 0], list[str]()
-    sessions = [each for each in map_.sessions if _during(trusted_path(each), times_s).any()]
+    sessions = [each for each in map_.sessions if _during(_trusted_path(each), times_s).any()]
     for session in sessions or map_.sessions[:1]:  # of none, the first says why
-        path, drift_m = trusted_path(session), drift_of(session)
-        measured = measure_along(path, session.T_map_world, survey, drift_m)
-        session.set_fixes(_fixes(session, path, measured, survey))
+        measured = measure_along(session, survey)
+        session.set_fixes(_fixes(session, measured, survey))
         lines += measured.warnings()
     return lines
 
 
 def misfit_rms_m(map_: MapFile) -> float | None:
-    """Return how far paths and measured positions are apart, root mean square; None = none are.
-
-    The positions are those of linked drives, moved rigidly to where they fit best.
-    """
+    """Return by how much linked paths and positions differ (RMS), fitted rigidly; None = none."""
     held = [session for session in map_.linked if len(session.fixes)]
     if not held:
         return None
@@ -269,8 +245,9 @@ def doubts_of_positions(map_: MapFile) -> list[str]:
     return [f"the paths are {off_m:.2f} m from the measured positions (RMS): {why}"]
 
 
-def _fixes(session: Session, path: Trajectory, measured: Measured, survey: Survey) -> Fixes:
+def _fixes(session: Session, measured: Measured, survey: Survey) -> Fixes:
     """Return the positions of a drive that agree, by frame; between frames its path is trusted."""
+    path = _trusted_path(session)
     times_s, T_world_frame = measured.times_s[measured.agree], session.trajectory.T_world_camera
     frames = nearest_sorted(times_s, session.trajectory.timestamps_s)
     T_frame_camera = invert(T_world_frame[frames]) @ interpolate_poses(path, times_s)
@@ -296,17 +273,15 @@ def _in_camera(survey: Survey, T_map_world: Float64) -> Float64:
     return np.asarray(R_map_camera.T @ R_map_vehicle @ np.asarray(survey.antenna_m))
 
 
-def trusted_path(session: Session) -> Trajectory:
-    """Return the path of a drive without frames that are not trusted."""
+def _trusted_path(session: Session) -> Trajectory:
     return session.trajectory.select(session.trusted)
 
 
-def drift_of(session: Session) -> float:
+def _drift_m(session: Session) -> float:
     """Return by how much the path of a drive may be off at its end, standard deviation."""
     path = session.odometry
     stated = expected_drift(path, session.health, session.camera)
-    percent = None if stated is None else stated.percent
-    return drift_at_end(path, session.trusted, percent)
+    return drift_at_end(path, session.trusted, None if stated is None else stated.percent)
 
 
 def span_m(positions: Float64) -> float:

@@ -52,7 +52,6 @@ class BatchOptions:
         scheduler: Address of Dask's scheduler; None = workers on this machine.
         workers: How many of these; None = one per core.
         fail_fast: Whether the first job that fails ends the batch.
-        progress: Shown each job that ends.
     """
 
     out: Path | None = None
@@ -62,7 +61,7 @@ class BatchOptions:
     progress: Progress = SILENT
 
     def connect(self) -> AbstractContextManager[Cluster]:
-        """Return the workers, for ``with``; see `local_cluster` and `join_cluster`."""
+        """Return the workers, for ``with``."""
         if self.scheduler is not None:
             return join_cluster(self.scheduler)
         return local_cluster(self.workers or available_cores())
@@ -75,12 +74,7 @@ class BatchOptions:
 
 
 class Cluster:
-    """Workers that run jobs; from `local_cluster` or `join_cluster`.
-
-    Args:
-        client: Dask's client of it.
-        work: What a worker does for a job; None = what the job says.
-    """
+    """Workers that run jobs, by a client of Dask; from `local_cluster` or `join_cluster`."""
 
     def __init__(self, client: Any, work: Work | None = None) -> None:
         self._client, self._work = client, work or _work
@@ -102,13 +96,9 @@ class Cluster:
         return sum(self.workers.values())
 
     def run(self, jobs: Iterable[Job], folder: Path) -> Iterator[tuple[Job, Outcome]]:
-        """Run jobs, and yield how each ended.
+        """Run jobs into a folder that all workers see, and yield how each ended.
 
         One that broke (its workers died, it was killed or late) is tried again, up to its retries.
-
-        Args:
-            jobs: The jobs.
-            folder: Folder of the batch, seen by all workers.
         """
         dask, waiting = require("distributed", extra=EXTRA), iter(jobs)
         ended, tries = dask.as_completed(with_results=True, raise_errors=False), dict[str, _Try]()
@@ -133,8 +123,7 @@ class Cluster:
     def each(self, function: Callable[[Any], None], items: Sequence[Any]) -> None:
         """Run a function with each item on some worker, and wait until all is done.
 
-        What it makes it leaves in files. One whose worker dies is called again on another, at most
-        as often as Dask allows.
+        One whose worker dies is called again on another, at most as often as Dask allows.
         """
         futures = self._client.map(function, items, key=uuid4().hex)
         for future in require("distributed", extra=EXTRA).as_completed(futures):
@@ -150,7 +139,11 @@ class Cluster:
     ) -> Iterator[tuple[Job, Any]]:
         """Give jobs to Dask, all with the same needs in one message."""
         declared = self._declared() if any(job.needs for job in jobs) else ()
-        for needs, group in groupby(sorted(jobs, key=_needs), _needs):
+
+        def needs_of(job: Job) -> list[tuple[str, float]]:
+            return sorted(job.needs.items())
+
+        for needs, group in groupby(sorted(jobs, key=needs_of), needs_of):
             alike = list(group)
             futures = self._client.map(
                 self._work,
@@ -196,11 +189,7 @@ def local_cluster(workers: int) -> Iterator[Cluster]:
 
 @contextmanager
 def join_cluster(address: str) -> Iterator[Cluster]:
-    """Use the workers of a scheduler.
-
-    Args:
-        address: Its address, or the file that it was told to write it to.
-    """
+    """Use the workers of a scheduler, by its address or the file that it writes this to."""
     distributed = require("distributed", extra=EXTRA)
     _be_quiet()
     try:
@@ -235,17 +224,12 @@ async def _greet(address: str) -> None:
     await comm.close()
 
 
-def _needs(job: Job) -> list[tuple[str, float]]:
-    return sorted(job.needs.items())
-
-
 def _work(job: Job, folder: str) -> Outcome:
     """Run a job on a worker."""
     distributed = require("distributed", extra=EXTRA)
     worker, key = distributed.get_worker(), distributed.worker.thread_state.key
 
-    def stopped() -> bool:
-        """Return whether the task was cancelled, or its client is gone."""
+    def stopped() -> bool:  # the task was cancelled, or its client is gone
         task = worker.state.tasks.get(key)
         return task is None or task.state in ("cancelled", "released")
 
@@ -275,7 +259,7 @@ def _reaching() -> Iterator[None]:
 
 
 def _be_quiet() -> None:
-    """Keep the messages of Dask from standard error: what matters of them is told by us."""
+    """Keep the messages of Dask from standard error: what matters of them we say."""
     # Dask gives each part of it a level of its own.
     parts = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
     for name in (*parts, "distributed", "tornado", "bokeh", "asyncio"):

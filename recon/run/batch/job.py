@@ -154,16 +154,11 @@ _LONGEST: Final = 400
 
 
 def run_job(job: Job, folder: Path, worker: str = "", stopped: Asked = lambda: False) -> Outcome:
-    """Run the command of a job in a process of its own, into a folder of its own.
+    """Run the command of a job in a process of its own, which ends with this one.
 
-    The process ends with this one. A result that is there is not made again; what an earlier try
-    of `recon map` has committed is gone on with, unless that has failed already.
-
-    Args:
-        job: The job.
-        folder: Folder of the batch, seen by all workers.
-        worker: Address of the worker.
-        stopped: Asked whether nobody waits for the job any more; its process is then killed.
+    A result that is there is not made again; what an earlier try of `recon map` has committed is
+    gone on with, unless that has failed already. The process is killed when it is ``stopped``:
+    nobody waits for the job any more.
     """
     out, last = folder / job.name, last_outcome(folder, job.name)
     if last.state == "succeeded":

@@ -44,8 +44,8 @@ class JobResult:
     Attributes:
         job: The job.
         last: How its last try ended.
-        figures: Numbers of its summary by dotted name; none if it has none.
-        warnings: Warnings of its summary.
+        figures: Numbers of its summary by dotted name.
+        warnings: Those of its summary.
         remark: The figure of drift or trust that is most unusual, if any is.
     """
 
@@ -101,15 +101,7 @@ class JobResult:
 def work_off(
     jobs: Sequence[Job], folder: Path, cluster: Cluster, options: BatchOptions, unit: str = "jobs"
 ) -> Iterator[JobResult]:
-    """Run jobs on workers and show how many are done; yields the result of each that ends.
-
-    Args:
-        jobs: The jobs.
-        folder: Folder of the batch.
-        cluster: The workers.
-        options: How they are run.
-        unit: What they are called.
-    """
+    """Run jobs on workers and show how many are done; yields the result of each that ends."""
     progress = options.progress
     log_file(folder, "").parent.mkdir(parents=True, exist_ok=True)
     progress.on_stage(f"{len(cluster.workers)} workers, dashboard {cluster.dashboard}")
