@@ -71,7 +71,7 @@ def calibrate(
 
     The verdict is good, usable or repeat, with what to do about it. Views that
     do not fit are dropped and named, repeated ones count once; intervals come
-    from a bootstrap over the views. Good images: docs/board-capture.md.
+    from a bootstrap over the views. Good images: docs/calibration.md.
 
     Examples:
       recon calibrate "left*.png" "right*.png" --board chess:9x6:25mm -o rig.yaml
