@@ -1,23 +1,4 @@
-"""The exceptions of the project: one hierarchy, one clear line each.
-
-::
-
-    ReconError
-    ├── SettingsError            a setting is unknown or out of range
-    ├── ShapeError               an array has the wrong dtype, shape or values
-    ├── CalibrationError         cameras that cannot give metric depth
-    ├── FormatError              a file is missing, truncated or not what it claims to be
-    ├── SourceError              a folder or device cannot give stereo pairs
-    ├── MatchingError            a pair cannot be matched
-    ├── RegistrationError        frames cannot be registered
-    ├── MappingError             a map cannot be built
-    ├── MeshingError             a surface cannot be reconstructed
-    ├── EvaluationError          an estimate cannot be compared with ground truth
-    ├── DownloadError            a data set cannot be fetched
-    ├── ClusterError             jobs cannot be run on workers
-    ├── OutputError              a result cannot be written
-    ├── MemoryLimitError         a run exceeds its memory limit
-    └── MissingDependencyError   an optional package is not installed
+"""The exceptions of the project: one tree, one clear line each, and the gate of optional packages.
 
 The command line prints ``str(error)`` and exits with 1; the library only raises.
 """
@@ -85,7 +66,7 @@ def _clip(text: str) -> str:
 
 
 def _visible(letter: str) -> str:
-    """Return a letter of a message; control characters and bytes of odd file names are escaped."""
+    """Escape control characters, and bytes of odd file names."""
     if letter.isprintable() or letter.isspace():
         return letter
     return letter.encode("unicode_escape", "backslashreplace").decode()
@@ -152,11 +133,7 @@ class MissingDependencyError(ReconError):
 
 
 def require(module: str, *, extra: str) -> ModuleType:
-    """Import an optional package.
-
-    Returns:
-        The imported module.
-    """
+    """Import an optional package, which the extra of that name installs."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:

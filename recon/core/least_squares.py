@@ -1,7 +1,7 @@
 """Levenberg-Marquardt: the loop that every non-linear least-squares fit here shares.
 
-Each fit brings its own cost, linearisation and step, which is where they differ: some eliminate
-points or board poses (Schur complement), one runs compiled.
+Each fit brings its own cost, linearisation and step: some eliminate points or board poses
+(Schur complement), one runs compiled.
 
 Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 4.
 """
@@ -22,16 +22,12 @@ _LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
 
 @dataclass(frozen=True)
 class Problem(Generic[State, Linear]):
-    """What is fitted.
+    """What is fitted."""
 
-    Attributes:
-        cost: Gives the cost of a state; NaN or infinite where it is impossible.
-        linearise: Gives the normal equations at a state.
-        step: Gives the state after a step with so much damping; None = impossible.
-    """
-
+    # gives the cost of a state; NaN or infinite where it is impossible
     cost: Callable[[State], float]
-    linearise: Callable[[State], Linear]
+    linearise: Callable[[State], Linear]  # gives the normal equations at a state
+    # gives the state after a step with so much damping; None = impossible
     step: Callable[[State, Linear, float], State | None]
 
 
@@ -45,12 +41,9 @@ def minimise(
 ) -> State:
     """Minimise a cost by damped Gauss-Newton steps, each of which must lower it.
 
-    Args:
-        problem: What is fitted.
-        start: Initial guess, of finite cost.
-        rounds: Largest number of steps tried.
-        min_gain: Relative decrease of the cost below which a step is the last.
-        damping: The first damping, relative to the diagonal of the normal equations.
+    The cost of ``start`` is finite. ``rounds`` is the largest number of steps tried, ``min_gain``
+    the relative decrease below which a step is the last, ``damping`` the first, relative to the
+    diagonal of the normal equations.
     """
     state, lowest, linear = start, problem.cost(start), problem.linearise(start)
     for _ in range(rounds):

@@ -15,14 +15,10 @@ _NO_HIT = np.uint32(0xFFFFFFFF)
 
 
 class RayScene:
-    """A set of triangles for ray casting.
+    """Triangles (F, 3, 3) for ray casting, by so many threads; 0 = one per core.
 
     Open3D computes in single precision and returns only the triangle; for an exact distance,
     intersect the ray with the plane of that triangle in double precision.
-
-    Args:
-        triangles: (F, 3, 3) corners, metres.
-        threads: Number of threads; 0 = one per core. The result does not depend on it.
     """
 
     def __init__(self, triangles: NDArray[Any], threads: int = 0) -> None:
@@ -40,15 +36,7 @@ class RayScene:
         )
 
     def first_hit(self, origin: Float64, directions: NDArray[Any]) -> Int32:
-        """Return the first triangle on each ray.
-
-        Args:
-            origin: (3,), common origin of the rays.
-            directions: (N, 3), of any nonzero length.
-
-        Returns:
-            int32 (N,), index of the triangle; -1 = the ray hits nothing.
-        """
+        """Return int32 (N,): the first triangle on each ray (N, 3) from a point (3,); -1 = none."""
         hits = self._scene.cast_rays(_rays(origin, directions), nthreads=self._threads)
         faces = hits["primitive_ids"].numpy()
         return np.where(faces == _NO_HIT, -1, faces.astype(np.int64)).astype(np.int32)
@@ -60,15 +48,10 @@ class RayScene:
         return np.asarray(found.numpy(), dtype=np.float32)
 
     def blocked(self, origins: NDArray[Any], reaches: NDArray[Any], far: float = 1.0) -> Bool:
-        """Return whether a triangle intersects the segment from ``origin`` to ``origin + reach``.
+        """Return bool (N,): whether a triangle intersects the segment from ``origin`` to its reach.
 
-        Args:
-            origins: (3,) or (N, 3), metres.
-            reaches: (N, 3), metres.
-            far: Fraction of the reach at which it ends; below 1 ignores the surface there.
-
-        Returns:
-            bool (N,).
+        Origins are (3,) or (N, 3), reaches (N, 3). The segment ends at the share ``far`` of its
+        reach; below 1 this ignores the surface there.
         """
         rays = _rays(origins, reaches)
         hit = self._scene.test_occlusions(rays, tfar=far, nthreads=self._threads)
@@ -76,7 +59,6 @@ class RayScene:
 
 
 def _rays(origins: NDArray[Any], directions: NDArray[Any]) -> Any:
-    """Return Open3D's (N, 6) single-precision rays."""
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origins
     rays[:, 3:] = directions

@@ -49,7 +49,6 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _check_decimals(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse what only Python takes for numbers, see `recon.core.text`."""
         if _is_numeric(cls.model_fields[str(info.field_name)].annotation):
             for part in value if isinstance(value, list | tuple) else [value]:
                 if isinstance(part, str):
@@ -70,12 +69,7 @@ class Settings(BaseModel):
 
     @classmethod
     def parse(cls, values: Mapping[str, Any], *, where: str | None = None) -> Self:
-        """Build settings from plain values.
-
-        Args:
-            values: Nested mapping, as read from YAML.
-            where: The file or option that the values came from, for the error message.
-        """
+        """Build settings from plain values; ``where`` is the file or option that they came from."""
         try:
             return cls.model_validate(values)
         except ValidationError as error:
@@ -104,7 +98,6 @@ def _complete(field: FieldInfo, value: Any) -> Any:
 
 
 def _is_numeric(annotation: Any) -> bool:
-    """Return whether a field takes a number, or several."""
     return annotation in (int, float) or any(map(_is_numeric, get_args(annotation)))
 
 
@@ -129,13 +122,7 @@ def setting_names(settings: type[BaseModel]) -> Iterator[str]:
 def settings_error(
     error: ValidationError, *, where: str | None = None, names: Sequence[str] = ()
 ) -> SettingsError:
-    """Describe pydantic's first error in one line.
-
-    Args:
-        error: The error of pydantic.
-        where: The file or option, for the error message.
-        names: Dotted names of all settings, to suggest one for an unknown name.
-    """
+    """Describe pydantic's first error in one line; ``names`` are suggested for an unknown one."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":

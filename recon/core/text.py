@@ -1,4 +1,8 @@
-"""Words that depend on a number."""
+"""Numbers in text: read as ASCII decimals alone, written with what they count or their unit.
+
+Python's own ``float`` and ``int`` also take ``1_0`` for ten, and the digits of every script. Where
+a file has those, something else is meant, or it is damaged.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,7 @@ from typing import Final
 def counted(number: int, one: str, many: str = "", *, form: str = "") -> str:
     """Return a number of things, such as ``1 frame``, ``2 frames`` or, signed, ``-1 frame``.
 
-    Args:
-        number: How many.
-        one: What one of them is called.
-        many: What several are called, if that is not the same with an s.
-        form: How the number is written, such as ``,`` for commas between thousands.
+    ``form`` is how the number is written, such as ``,`` for commas between thousands.
     """
     return f"{number:{form}} {one if abs(number) == 1 else many or one + 's'}"
 
@@ -51,7 +51,6 @@ def refuse_other_numbers(text: str) -> None:
 
 
 def _check(text: str | bytes) -> None:
-    """Refuse underscores, and digits of other scripts."""
     plain = text.decode("latin-1") if isinstance(text, bytes) else text
     if not plain.isascii() or "_" in plain:
         raise ValueError(f"not a decimal number: {plain!r}")
@@ -71,13 +70,9 @@ _ENDING: Final = re.compile(rf"_({'|'.join(_UNITS)})$")
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a figure, by its name or that of the group it is in.
+    """Return the unit of a figure by its name, such as ``live.latency_ms.p50``, or its group's.
 
-    Args:
-        name: Such as ``peak_memory_mb``, ``disparity.bad.1.0`` or ``live.latency_ms.p50``.
-
-    Returns:
-        The unit; "" = it has none, as numbers of things, shares and texts.
+    It is "" for numbers of things, shares and texts.
     """
     for part in reversed(re.split(r"[. ]", name)):
         ending = _ENDING.search(part)
@@ -87,5 +82,5 @@ def unit_of(name: str) -> str:
 
 
 def with_unit(text: str, name: str) -> str:
-    """Return the text of a figure with its unit, see `unit_of`."""
+    """Return the text of a figure with its unit."""
     return f"{text} {unit_of(name)}".rstrip()

@@ -1,4 +1,4 @@
-"""Atomic file writes: temporary file, fsync, rename."""
+"""Atomic file writes: temporary file, fsync, rename. Locks on files."""
 
 from __future__ import annotations
 
@@ -24,12 +24,8 @@ _RENAME_EXCHANGE: Final = 2
 def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     """Give a temporary path to write to, which is renamed to ``path`` if the block succeeds.
 
-    The temporary file is in the same folder and has the same suffix, so a library that chooses the
-    format by the suffix chooses the same one. Missing folders are created. If the block raises,
-    the temporary file is removed and an existing file at ``path`` is left untouched.
-
-    Yields:
-        The temporary path, which does not exist yet.
+    It is in the same folder, created if missing, and has the same suffix, by which a library may
+    choose the format. If the block raises, it is removed and a file at ``path`` stays as it was.
     """
     target = Path(path)
     check_targets([target])
@@ -47,12 +43,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
 
 
 def check_targets(targets: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to write to what is no regular file, or is read by the same command.
-
-    Args:
-        targets: Files to be written, which need not exist.
-        inputs: Files that are read; links to them are the same files.
-    """
+    """Refuse to write to what is no regular file, or is read by the same command under any name."""
     read = {file for path in inputs if (file := _file_of(path)) is not None}
     for target in targets:
         if (kind := special_kind(target)) is not None:
@@ -119,7 +110,6 @@ def _sync(path: Path) -> None:
 
 
 def _remove(temporary: Path) -> None:
-    """Remove the temporary file of a failed block; an error here must not hide the first one."""
     try:
         temporary.unlink(missing_ok=True)
     except OSError:
@@ -151,16 +141,10 @@ def is_locked(path: Path) -> bool:
 
 
 def take_lock(path: Path, what: str, *, where: Path, hint: str) -> int:
-    """Lock a file, which is created with its folders; closing the handle releases it.
+    """Lock a file, which is created with its folders; closing the returned handle releases it.
 
-    Args:
-        path: The file. It may be removed while it is locked.
-        what: Who else holds the lock, for the error message.
-        where: What is locked, for the error message.
-        hint: What to do then.
-
-    Returns:
-        The handle of the file.
+    So does the end of the process. The file may be removed while it is locked. In the error,
+    ``what`` is who else holds the lock.
     """
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)

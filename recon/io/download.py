@@ -1,4 +1,4 @@
-"""Downloads over HTTP that go on where they broke off."""
+"""Downloads over HTTP that go on where they broke off, and archives, which may be hostile."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class _BrokenOffError(Exception):
 def download(
     address: str, path: Path, size: int | None = None, on_bytes: OnBytes = lambda *_: None
 ) -> None:
-    """Download a file, or the rest of one that an earlier call began.
+    """Download a file of that size, if it is known, or the rest of one that an earlier call began.
 
     What is there is kept beside ``path`` with its version at the server, and continued if the
     server still has that one. A connection that breaks off is opened again, up to five times in a
-    row without a byte. ``size`` is what the file must have, in bytes, if that is known.
+    row without a byte.
     """
     part, tries = path.with_name(path.name + ".part"), 0
     while True:
@@ -135,7 +135,6 @@ def _open(address: str, asked: Mapping[str, str]) -> Any:
 
 @contextmanager
 def _network(address: str = "") -> Iterator[None]:
-    """Tell passing faults of the network from those that stay."""
     try:
         yield
     except urllib.error.HTTPError as error:
@@ -214,18 +213,12 @@ def unpack(
     without: Collection[str] = (),
     zips: bool = False,
 ) -> None:
-    """Unpack a zip or tar archive into a folder.
+    """Unpack a zip or tar archive, of which only what is ``below`` a folder, into a folder.
 
     Nothing is written outside of the folder, and no link at all: a link that stays in the archive
     is left out, any other refuses the archive. A later archive may replace files of an earlier
-    one in the same folder.
-
-    Args:
-        archive: The archive; tar archives may be compressed.
-        folder: Where to; created if missing.
-        below: Folder of the archive whose content is unpacked; "" = everything.
-        without: Suffixes of files that are left out.
-        zips: Whether archives in the archive are unpacked beside themselves, and left out.
+    one. Files with a suffix in ``without`` are left out; with ``zips``, archives in the archive
+    are unpacked beside themselves, and left out.
     """
     most_bytes = _SMALL_BYTES + _MOST_GROWTH * archive.stat().st_size
     with naming(archive):

@@ -1,4 +1,4 @@
-"""Typed access to the fields of a file, from YAML or lines of text; errors name the field."""
+"""YAML and TOML files, and typed access to their fields, in errors that name the field."""
 
 from __future__ import annotations
 
@@ -23,24 +23,23 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-
-def numbers_of(value: Any) -> Float64:
-    """Return a number or text, or lists of them, as float64 of that shape."""
-    words = np.array(value, dtype=np.str_)
-    return np.array(parse_numbers(words.ravel().tolist())).reshape(words.shape)
+#: More values than any calibration has; an alias can repeat a list of lists of … without end.
+_MOST_VALUES: Final = 1_000_000
+_DEEPEST: Final = 100
+_BRACKET: Final = re.compile(r"[\[\]{}]")
+# The line break stays, so that errors name the right line.
+_OPENCV_HEADER: Final = re.compile(r"\A%YAML:\s*1\.\d.*")
+_OPENCV_TAG: Final = re.compile(r"!!opencv-[a-z-]+")
 
 
 class Fields:
-    """A mapping read from a file.
+    """A mapping from a file; to be used inside of `reading`, which names the file in errors.
 
-    Args:
-        values: The mapping.
-        path: The file, for error messages.
-        prefix: Path of the mapping in the file, such as ``left.``.
+    The ``prefix`` is the path of the mapping in the file, such as ``left.``.
     """
 
-    def __init__(self, values: Mapping[str, Any], path: StrPath, prefix: str = "") -> None:
-        self._values, self._path, self._prefix = values, path, prefix
+    def __init__(self, values: Mapping[str, Any], prefix: str = "") -> None:
+        self._values, self._prefix = values, prefix
 
     def __contains__(self, name: str) -> bool:
         return name in self._values
@@ -49,9 +48,7 @@ class Fields:
         """Return the value of a field, of any type."""
         if name not in self._values:
             got = ", ".join(str(key) for key in self._values) or "nothing"
-            raise FormatError(
-                f"calibration has no {self._prefix + name!r}", where=self._path, got=got
-            )
+            raise FormatError(f"calibration has no {self._prefix + name!r}", got=got)
         return self._values[name]
 
     def below(self, name: str) -> Fields:
@@ -59,7 +56,7 @@ class Fields:
         value = self.get(name)
         if not isinstance(value, Mapping):
             raise self._wrong(name, value, "a mapping")
-        return Fields(value, self._path, f"{self._prefix}{name}.")
+        return Fields(value, f"{self._prefix}{name}.")
 
     def text(self, name: str) -> str:
         """Return the value of a field as text."""
@@ -80,10 +77,9 @@ class Fields:
             raise self._wrong(name, value, "finite numbers")
         if shape is None:
             return array.ravel()
-        if array.size != np.prod(shape):
-            raise self._wrong(
-                name, counted(array.size, "number"), counted(int(np.prod(shape)), "number")
-            )
+        size = int(np.prod(shape))
+        if array.size != size:
+            raise self._wrong(name, counted(array.size, "number"), counted(size, "number"))
         return array.reshape(shape)
 
     def number(self, name: str) -> float:
@@ -98,18 +94,43 @@ class Fields:
         return int(value)
 
     def _wrong(self, name: str, got: Any, expected: str) -> FormatError:
-        return FormatError(
-            f"{self._prefix + name!r} is wrong",
-            where=self._path,
-            got=str(got)[:60],
-            expected=expected,
-        )
+        what = f"{self._prefix + name!r} is wrong"
+        return FormatError(what, got=str(got)[:60], expected=expected)
 
 
-#: More values than any calibration has; an alias can repeat a list of lists of … without end.
-_MOST_VALUES: Final = 1_000_000
-_DEEPEST: Final = 100
-_BRACKET: Final = re.compile(r"[\[\]{}]")
+def numbers_of(value: Any) -> Float64:
+    """Return a number or text, or lists of them, as float64 of that shape."""
+    words = np.array(value, dtype=np.str_)
+    return np.array(parse_numbers(words.ravel().tolist())).reshape(words.shape)
+
+
+def read_yaml(path: StrPath) -> dict[str, Any]:
+    """Read a YAML file whose top level is a mapping; OpenCV's header and tags are permitted."""
+    content = parse_yaml(plain_yaml(read_text(path, SMALL_FILE_BYTES)), path)
+    if not isinstance(content, dict):
+        raise FormatError("YAML file is not a mapping", where=path, got=type(content).__name__)
+    return {str(key): value for key, value in content.items()}
+
+
+def plain_yaml(text: str) -> str:
+    """Return the text without what makes OpenCV's dialect invalid YAML: header and matrix tags."""
+    return _OPENCV_TAG.sub("", _OPENCV_HEADER.sub("", text))
+
+
+def parse_yaml(text: str, where: StrPath) -> Any:
+    """Parse YAML into plain values."""
+    with reading(where):
+        if _depth(text) > _DEEPEST:
+            raise FormatError("content is nested too deeply")
+        try:
+            content = _Loader(text).get_single_data()
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            place = f"{where}:{mark.line + 1}" if mark is not None else where
+            raise FormatError("not a YAML file", where=place) from error
+        if _count(content, {}) > _MOST_VALUES:
+            raise FormatError("aliases expand to too many values")
+        return content
 
 
 class _Loader(yaml.SafeLoader):
@@ -130,20 +151,6 @@ for _kind in ("int", "float"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.number)
 
 
-def parse_yaml(text: str, where: StrPath) -> Any:
-    """Parse YAML into plain values."""
-    with reading(where):
-        if _depth(text) > _DEEPEST:
-            raise FormatError("content is nested too deeply", where=where)
-        try:
-            content = _Loader(text).get_single_data()
-        except yaml.YAMLError as error:
-            raise FormatError("not a YAML file", where=_place(where, error)) from error
-        if _count(content, {}) > _MOST_VALUES:
-            raise FormatError("aliases expand to too many values", where=where)
-        return content
-
-
 def _depth(text: str) -> int:
     """Return the most brackets open at once; PyYAML's time grows with their square."""
     steps = (1 if bracket in "[{" else -1 for bracket in _BRACKET.findall(text))
@@ -161,19 +168,6 @@ def _count(value: Any, known: dict[int, int]) -> int:
     return known[id(value)]
 
 
-# The line break stays, so that errors name the right line.
-_OPENCV_HEADER: Final = re.compile(r"\A%YAML:\s*1\.\d.*")
-_OPENCV_TAG: Final = re.compile(r"!!opencv-[a-z-]+")
-
-
-def read_yaml(path: StrPath) -> dict[str, Any]:
-    """Read a YAML file whose top level is a mapping; OpenCV's header and tags are permitted."""
-    content = parse_yaml(plain_yaml(read_text(path, SMALL_FILE_BYTES)), path)
-    if not isinstance(content, dict):
-        raise FormatError("YAML file is not a mapping", where=path, got=type(content).__name__)
-    return {str(key): value for key, value in content.items()}
-
-
 def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:
     """Write plain values as YAML, in their order, atomically."""
     try:
@@ -183,16 +177,6 @@ def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:
     write_text(path, text)
 
 
-def plain_yaml(text: str) -> str:
-    """Return the text without what makes OpenCV's dialect invalid YAML: header and matrix tags."""
-    return _OPENCV_TAG.sub("", _OPENCV_HEADER.sub("", text))
-
-
-def _place(path: StrPath, error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None)
-    return f"{path}:{mark.line + 1}" if mark is not None else str(path)
-
-
 def read_toml(path: StrPath) -> dict[str, Any]:
     """Read a TOML file."""
     text = read_text(path, SMALL_FILE_BYTES)
@@ -200,4 +184,4 @@ def read_toml(path: StrPath) -> dict[str, Any]:
         try:
             return dict(tomllib.loads(text))
         except tomllib.TOMLDecodeError as error:
-            raise FormatError("not a TOML file", where=path, got=error) from error
+            raise FormatError("not a TOML file", got=error) from error

@@ -54,10 +54,7 @@ def reading(path: StrPath) -> Iterator[None]:
 
     Content from outside can make a parser raise anything. Around parsing, and only there, every
     exception is a fault of the file; elsewhere it is a fault of ours and must not pass as one.
-
-    Args:
-        path: The file, or another name of the content. Pipes and devices, whose reading may never
-            end, are refused.
+    Pipes and devices, whose reading may never end, are refused.
     """
     try:
         _refuse_special(path)
@@ -115,12 +112,7 @@ def special_kind(path: StrPath) -> str | None:
 
 @reader
 def read_bytes(path: StrPath, at_most: int | None = None) -> bytes:
-    """Read a file that must not be empty.
-
-    Args:
-        path: The file.
-        at_most: Largest size in bytes; None = any.
-    """
+    """Read a file that must not be empty, nor have more than that many bytes."""
     with Path(path).open("rb") as file:
         if at_most is not None and os.fstat(file.fileno()).st_size > at_most:
             expected = f"at most {at_most / 1e6:.0f} MB"
@@ -132,12 +124,7 @@ def read_bytes(path: StrPath, at_most: int | None = None) -> bytes:
 
 
 def read_text(path: StrPath, at_most: int | None = None) -> str:
-    """Read a UTF-8 text file that must not be empty.
-
-    Args:
-        path: The file.
-        at_most: Largest size in bytes; None = any.
-    """
+    """Read a UTF-8 text file that must not be empty, nor have more than that many bytes."""
     try:
         return read_bytes(path, at_most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -150,12 +137,8 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
 def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[int]]:
     """Read rows of numbers separated by spaces or commas; ``#`` starts a comment.
 
-    Args:
-        path: The text file.
-        columns: The permitted numbers of columns; all rows must have the same.
-
-    Returns:
-        float64 (N, C), finite, N ≥ 1, and the line number of each row, counted from 1.
+    All rows have the same of the permitted numbers of columns. The result is float64 (N, C),
+    finite, N ≥ 1, and the line number of each row, counted from 1.
     """
     rows: list[list[float]] = []
     lines: list[int] = []
@@ -174,9 +157,8 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
 def _parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[float]:
     if len(words) not in columns:
         expected = " or ".join(str(count) for count in columns)
-        raise FormatError(
-            "wrong number of columns", where=where, got=str(len(words)), expected=expected
-        )
+        what, got = "wrong number of columns", str(len(words))
+        raise FormatError(what, where=where, got=got, expected=expected)
     try:
         row = parse_numbers(words)
     except ValueError as error:

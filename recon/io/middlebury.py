@@ -1,4 +1,7 @@
-"""Middlebury stereo scenes of 2001, 2003, 2005, 2006, 2014 and MiddEval3, with their truth."""
+"""Middlebury stereo scenes of 2001, 2003, 2005, 2006, 2014 and MiddEval3, with their truth.
+
+Ref: https://vision.middlebury.edu/stereo/data/
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,54 @@ from recon.io.files import StrPath, read_table, read_text, reader, resolved
 from recon.io.images.disparity import read_disparity_png, read_pfm
 from recon.io.images.image import read_grey_levels, read_image
 
+Generation = Literal["2001", "2003", "2005", "2014"]
+
+_IMAGES: Final = (".png", ".ppm", ".pgm", ".jpg")
 _MASKS: Final = ("mask0nocc.png", "mask_nocc_derived.png", "v2eval/nonocc.png", "nonocc.png")
 _SEEN_BY_BOTH: Final = 255
 _TOLERANCE_PX: Final = 1.0
+_VARIANT: Final = re.compile(r"(Illum|Exp)\d+", re.IGNORECASE)
+_CALIB_LINE: Final = re.compile(r"^\s*(\w+)\s*=\s*(.*?)\s*$", re.MULTILINE)
+_2003_FACTORS: Final = {1800: 1.0, 900: 2.0, 450: 4.0}
+# Ref: https://vision.middlebury.edu/stereo/data/scenes2005/ and scenes2006/, at full size.
+_2005_FOCAL_PX: Final = 3740.0
+_2005_BASELINE_M: Final = 0.160
+_2005_FULL_HEIGHT_PX: Final = 1110
+_EVAL3_FACTORS: Final = {"F": 1.0, "H": 2.0, "Q": 4.0}
+_EVAL3_WIDTHS_PX: Final = {"ArtL": 1390, "Computer": 1330, "Teddy": 1800}
+_EVAL3_WIDTH_PX: Final = 2800
+_EVAL3_SCENES: Final = frozenset({
+    "Adirondack", "ArtL", "Jadeplant", "Motorcycle", "MotorcycleE", "Piano", "PianoL", "Pipes",
+    "Playroom", "Playtable", "PlaytableP", "Recycle", "Shelves", "Teddy", "Vintage",
+    "Australia", "AustraliaP", "Bicycle2", "Classroom2", "Classroom2E", "Computer", "Crusade",
+    "CrusadeP", "Djembe", "DjembeL", "Hoops", "Livingroom", "Newkuba", "Plants", "Staircase",
+})  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Stems of the two images of a scene and of the true disparity of each.
+
+    The truth is PFM where a ``calib.txt`` is expected, else grey: ``levels`` per pixel.
+    """
+
+    left: str
+    right: str
+    truth_left: str
+    truth_right: str
+    levels: float = 8.0
+    calibrated: bool = False
+
+
+_TSUKUBA: Final = Layout("im3", "im4", "disp3", "disp4", levels=16.0)
+_TSUKUBA_2001: Final = Layout(
+    "scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3", "truedisp.row3.col4", levels=16.0
+)
+_MAP: Final = Layout("im0", "im1", "disp0", "disp1")
+_2001_2003: Final = Layout("im2", "im6", "disp2", "disp6")
+_2005: Final = Layout("view1", "view5", "disp1", "disp5")
+_2014: Final = Layout("im0", "im1", "disp0", "disp1", calibrated=True)
+_EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +110,12 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
     path = resolved(folder)
     layout = find_layout(path)
     if layout is None:
-        raise FormatError(
-            "folder is not a Middlebury scene",
-            where=folder,
-            expected="im0 and im1 with calib.txt, view1 and view5, im2 and im6, or im3 and im4",
-        )
+        expected = "im0 and im1 with calib.txt, view1 and view5, im2 and im6, or im3 and im4"
+        raise FormatError("folder is not a Middlebury scene", expected=expected)
     pair = _read_pair(path, layout)
     height_px, width_px = pair.left.shape[:2]
     units, root = units_of(layout, width_px, height_px, path), scene_root(path)
-    calib = _read_calib(root, units, pair.left)
+    calib = _read_calib(root, units, width_px, height_px)
     return MiddleburyScene(
         name=path.name,
         generation=units.generation,
@@ -83,189 +128,21 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
     )
 
 
-def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
-    """Return a camera for uncalibrated images: its width as focal length, a baseline of 1.
-
-    It is valid for matching; depth has an unknown scale.
-    """
-    cx_px = (width_px - 1) / 2
-    return RectifiedCamera(
-        focal_px=float(width_px),
-        cx_px=cx_px,
-        cy_px=(height_px - 1) / 2,
-        cx_right_px=cx_px,
-        baseline_m=1.0,
-        width_px=width_px,
-        height_px=height_px,
-        ndisp=ndisp,
-    )
-
-
-def _read_pair(path: Path, layout: Layout) -> StereoPair:
-    left, right = (_read_image(path, stem) for stem in (layout.left, layout.right))
-    if left.shape != right.shape:
-        raise FormatError(
-            "left and right images differ in size",
-            where=path,
-            got=f"{layout.left} {size_text(left)}, {layout.right} {size_text(right)}",
-        )
-    return StereoPair(left, right, name=path.name)
-
-
-def _read_image(path: Path, stem: str) -> UInt8:
-    file = find_image(path, stem)
-    if file is None:
-        raise FormatError("image is missing", where=path, expected=f"{stem}.png")
-    return read_image(file)
-
-
-def _read_calib(path: Path, units: Units, left: UInt8) -> MiddleburyCalib | None:
-    height_px, width_px = left.shape[:2]
-    if units.generation == "2005" and (path / "dmin.txt").is_file():
-        dmin_px = float(read_table(path / "dmin.txt", (1,))[0][0, 0])
-        return MiddleburyCalib(nominal_camera_2005(width_px, height_px, dmin_px, units.factor))
-    if units.generation != "2014" or not (path / "calib.txt").is_file():
-        return None
-    calib = read_middlebury_calib(path / "calib.txt")
-    check_size(calib.camera, width_px, height_px, path / "calib.txt")
-    return calib
-
-
-def _read_ndisp(path: Path) -> int | None:
-    """Read ``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
-    info = path / "v2eval" / "info.txt"
-    return int(read_table(info, (1, 2))[0].ravel()[-1]) + 1 if info.is_file() else None
-
-
-def _read_truth(
-    folder: Path, layout: Layout, levels: float | None, shape: tuple[int, int]
-) -> DisparityTruth | None:
-    """Read the truth of the left image, and which pixels both cameras see.
-
-    That is what a mask says; without one, where the true disparities of both images agree; without
-    a right one, everywhere.
-    """
-    values = _read_disparity(folder, layout.truth_left, levels, shape)
-    if values is None:
-        return None
-    seen = _read_mask(folder, shape)
-    if seen is None:
-        right = _read_disparity(folder, layout.truth_right, levels, shape)
-        everywhere = np.ones(shape, bool)
-        seen = everywhere if right is None else cross_check(values, right, _TOLERANCE_PX)
-    return DisparityTruth(values, np.isfinite(values) & seen)
-
-
-def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
-    """Return bool (H, W), where the left and the right disparity describe the same point.
-
-    Args:
-        left: float32 (H, W), disparity of the left image; NaN = unknown.
-        right: float32 (H, W), disparity of the right image, also ``x_left - x_right``.
-        tolerance_px: Largest difference.
-    """
-    height, width = left.shape
-    columns = np.rint(np.arange(width) - np.nan_to_num(left, nan=2.0 * width)).astype(np.int64)
-    inside = (columns >= 0) & (columns < width)
-    there = right[np.arange(height)[:, None], np.clip(columns, 0, width - 1)]
-    return np.asarray(inside & (np.abs(there - left) <= tolerance_px))
-
-
-def _read_disparity(
-    folder: Path, stem: str, levels: float | None, shape: tuple[int, int]
-) -> Float32 | None:
-    path = folder / f"{stem}.pfm" if levels is None else find_image(folder, stem)
-    if path is None or not path.is_file():
-        return None
-    values = read_pfm(path) if levels is None else read_disparity_png(path, scale=levels)
-    _check_shape(path, values.shape, shape)
-    return values
-
-
-def _read_mask(folder: Path, shape: tuple[int, int]) -> Bool | None:
-    path = next((folder / name for name in _MASKS if (folder / name).is_file()), None)
-    if path is None:
-        return None
-    levels = read_grey_levels(path)
-    _check_shape(path, levels.shape, shape)
-    return np.asarray(levels == _SEEN_BY_BOTH)
-
-
-def _check_shape(path: Path, got: tuple[int, ...], expected: tuple[int, int]) -> None:
-    if got != expected:
-        raise FormatError(
-            "size differs from the images",
-            where=path,
-            got=f"{got[1]}x{got[0]}",
-            expected=f"{expected[1]}x{expected[0]}",
-        )
-
-
-Generation = Literal["2001", "2003", "2005", "2014"]
-
-_IMAGES: Final = (".png", ".ppm", ".pgm", ".jpg")
-_2003_FACTORS: Final = {1800: 1.0, 900: 2.0, 450: 4.0}
-_2005_FULL_HEIGHT_PX: Final = 1110
-_EVAL3_FACTORS: Final = {"F": 1.0, "H": 2.0, "Q": 4.0}
-_EVAL3_WIDTHS_PX: Final = {"ArtL": 1390, "Computer": 1330, "Teddy": 1800}
-_EVAL3_WIDTH_PX: Final = 2800
-_EVAL3_SCENES: Final = frozenset({
-    "Adirondack", "ArtL", "Jadeplant", "Motorcycle", "MotorcycleE", "Piano", "PianoL", "Pipes",
-    "Playroom", "Playtable", "PlaytableP", "Recycle", "Shelves", "Teddy", "Vintage",
-    "Australia", "AustraliaP", "Bicycle2", "Classroom2", "Classroom2E", "Computer", "Crusade",
-    "CrusadeP", "Djembe", "DjembeL", "Hoops", "Livingroom", "Newkuba", "Plants", "Staircase",
-})  # fmt: skip
-_VARIANT: Final = re.compile(r"(Illum|Exp)\d+", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Stems of the two images of a scene and of the true disparity of each.
-
-    The truth is PFM where a ``calib.txt`` is expected, else grey: ``levels`` per pixel.
-    """
-
-    left: str
-    right: str
-    truth_left: str
-    truth_right: str
-    levels: float = 8.0
-    calibrated: bool = False
-
-
-_TSUKUBA: Final = Layout("im3", "im4", "disp3", "disp4", levels=16.0)
-_TSUKUBA_2001: Final = Layout(
-    "scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3", "truedisp.row3.col4", levels=16.0
-)
-_MAP: Final = Layout("im0", "im1", "disp0", "disp1")
-_2001_2003: Final = Layout("im2", "im6", "disp2", "disp6")
-_2005: Final = Layout("view1", "view5", "disp1", "disp5")
-_2014: Final = Layout("im0", "im1", "disp0", "disp1", calibrated=True)
-_EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
-
-
-class Units(NamedTuple):
-    """The year of a scene, grey levels per pixel of its truth, full-size pixels per pixel."""
-
-    generation: Generation
-    levels: float | None
-    factor: float
-
-
 def find_layout(folder: Path) -> Layout | None:
     """Return the layout that matches the files of a folder, or None; one of the images suffices."""
 
-    def has_image(layout: Layout) -> bool:
-        return any(find_image(folder, stem) for stem in (layout.left, layout.right))
+    def with_image(*layouts: Layout) -> Layout | None:
+        there = (
+            one for one in layouts if any(find_image(folder, s) for s in (one.left, one.right))
+        )
+        return next(there, None)
 
     if (folder / "disp0GT.pfm").is_file():
-        return _EVAL3 if has_image(_EVAL3) else None
+        return with_image(_EVAL3)
     if (folder / "calib.txt").is_file() or (folder / "disp0.pfm").is_file():
-        return _2014 if has_image(_2014) else None
-    known = [one for one in (_2005, _2001_2003, _TSUKUBA, _TSUKUBA_2001) if has_image(one)]
-    if not known and has_image(_MAP) and find_image(folder, _MAP.truth_left):
-        return _MAP
-    return next(iter(known), None)
+        return with_image(_2014)
+    older = with_image(_2005, _2001_2003, _TSUKUBA, _TSUKUBA_2001)
+    return older or (with_image(_MAP) if find_image(folder, _MAP.truth_left) else None)
 
 
 def find_image(folder: Path, stem: str) -> Path | None:
@@ -279,6 +156,29 @@ def scene_root(folder: Path) -> Path:
     while _VARIANT.fullmatch(folder.name):
         folder = folder.parent
     return folder
+
+
+def _read_pair(path: Path, layout: Layout) -> StereoPair:
+    left, right = (_read_image(path, stem) for stem in (layout.left, layout.right))
+    if left.shape != right.shape:
+        got = f"{layout.left} {size_text(left)}, {layout.right} {size_text(right)}"
+        raise FormatError("left and right images differ in size", where=path, got=got)
+    return StereoPair(left, right, name=path.name)
+
+
+def _read_image(path: Path, stem: str) -> UInt8:
+    file = find_image(path, stem)
+    if file is None:
+        raise FormatError("image is missing", where=path, expected=f"{stem}.png")
+    return read_image(file)
+
+
+class Units(NamedTuple):
+    """The year of a scene, grey levels per pixel of its truth, full-size pixels per pixel."""
+
+    generation: Generation
+    levels: float | None
+    factor: float
 
 
 def units_of(layout: Layout, width_px: int, height_px: int, folder: Path) -> Units:
@@ -308,22 +208,12 @@ def _factor_of_2014(folder: Path, width_px: int) -> float:
     return 2.0 ** min(max(round(math.log2(full_px / width_px)), 0), 2)
 
 
-_LINE: Final = re.compile(r"^\s*(\w+)\s*=\s*(.*?)\s*$", re.MULTILINE)
-
-# Ref: https://vision.middlebury.edu/stereo/data/scenes2005/ and scenes2006/, at full size.
-_2005_FOCAL_PX: Final = 3740.0
-_2005_BASELINE_M: Final = 0.160
-
-
 @dataclass(frozen=True)
 class MiddleburyCalib:
-    """The content of a ``calib.txt``.
+    """The content of a ``calib.txt``, in metres.
 
-    Attributes:
-        camera: The rectified camera, in metres.
-        isint: True if the truth is in whole pixels, so that results are rounded as well.
-        doffs_px: As in the file; that of the camera is the difference of its rounded principal
-            points. None = not in the file.
+    ``doffs_px`` is as in the file, None = not there; that of the camera is the difference of its
+    rounded principal points. ``isint``: the truth is in whole pixels, so results are rounded.
     """
 
     camera: RectifiedCamera
@@ -334,16 +224,37 @@ class MiddleburyCalib:
 @reader
 def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     """Read a ``calib.txt`` of the 2014 data or of MiddEval3."""
-    fields = Fields(dict(_LINE.findall(read_text(path))), path)
+    fields = Fields(dict(_CALIB_LINE.findall(read_text(path))))
     cam0, cam1 = (fields.numbers(key, (3, 3)) for key in ("cam0", "cam1"))
     doffs_px = fields.number("doffs")
-    _check_views(cam0, cam1, doffs_px, path)
+    _check_views(cam0, cam1, doffs_px)
     size = (fields.count("width"), fields.count("height"))
     camera = RectifiedCamera.from_matrices(cam0, cam1, fields.number("baseline") / 1000, *size)
     if "ndisp" in fields:
         camera = replace(camera, ndisp=fields.count("ndisp"))
     isint = "isint" in fields and fields.number("isint") != 0
     return MiddleburyCalib(camera, isint, doffs_px)
+
+
+def _check_views(cam0: Float64, cam1: Float64, doffs_px: float) -> None:
+    if not np.allclose(cam0[[0, 1, 1], [0, 1, 2]], cam1[[0, 1, 1], [0, 1, 2]], rtol=1e-4):
+        raise CalibrationError("cam0 and cam1 have different focal lengths or rows")
+    apart_px = cam1[0, 2] - cam0[0, 2]
+    # Each value is printed with three decimals.
+    if abs(apart_px - doffs_px) > 0.01:
+        what = "doffs is not the difference of the principal points"
+        raise CalibrationError(what, got=f"{doffs_px:g}", expected=f"{apart_px:g}")
+
+
+def _read_calib(path: Path, units: Units, width_px: int, height_px: int) -> MiddleburyCalib | None:
+    if units.generation == "2005" and (path / "dmin.txt").is_file():
+        dmin_px = float(read_table(path / "dmin.txt", (1,))[0][0, 0])
+        return MiddleburyCalib(nominal_camera_2005(width_px, height_px, dmin_px, units.factor))
+    if units.generation != "2014" or not (path / "calib.txt").is_file():
+        return None
+    calib = read_middlebury_calib(path / "calib.txt")
+    check_size(calib.camera, width_px, height_px, path / "calib.txt")
+    return calib
 
 
 def nominal_camera_2005(
@@ -354,26 +265,79 @@ def nominal_camera_2005(
     The images are cropped so that disparities are too small by ``dmin`` full-size pixels. The
     principal point is unknown and assumed at the image centre.
     """
-    cx_px = (width_px - 1) / 2
-    return RectifiedCamera(
+    camera = stand_in_camera(width_px, height_px)
+    return replace(
+        camera,
         focal_px=_2005_FOCAL_PX / factor,
-        cx_px=cx_px,
-        cy_px=(height_px - 1) / 2,
-        cx_right_px=cx_px + dmin_px / factor,
+        cx_right_px=camera.cx_px + dmin_px / factor,
         baseline_m=_2005_BASELINE_M,
-        width_px=width_px,
-        height_px=height_px,
     )
 
 
-def _check_views(cam0: Float64, cam1: Float64, doffs_px: float, path: StrPath) -> None:
-    if not np.allclose(cam0[[0, 1, 1], [0, 1, 2]], cam1[[0, 1, 1], [0, 1, 2]], rtol=1e-4):
-        raise CalibrationError("cam0 and cam1 have different focal lengths or rows", where=path)
-    # Each value is printed with three decimals.
-    if abs(cam1[0, 2] - cam0[0, 2] - doffs_px) > 0.01:
-        raise CalibrationError(
-            "doffs is not the difference of the principal points",
-            where=path,
-            got=f"{doffs_px:g}",
-            expected=f"{cam1[0, 2] - cam0[0, 2]:g}",
-        )
+def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
+    """Return a camera for uncalibrated images: its width as focal length, a baseline of 1.
+
+    It is valid for matching; depth has an unknown scale.
+    """
+    cx_px, cy_px = (width_px - 1) / 2, (height_px - 1) / 2
+    return RectifiedCamera(float(width_px), cx_px, cy_px, cx_px, 1.0, width_px, height_px, ndisp)
+
+
+def _read_ndisp(path: Path) -> int | None:
+    """Read ``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
+    info = path / "v2eval" / "info.txt"
+    return int(read_table(info, (1, 2))[0].ravel()[-1]) + 1 if info.is_file() else None
+
+
+def _read_truth(
+    folder: Path, layout: Layout, levels: float | None, shape: tuple[int, int]
+) -> DisparityTruth | None:
+    """Read the truth of the left image, and which pixels both cameras see.
+
+    That is what a mask says; without one, where the true disparities of both images agree; without
+    a right one, everywhere.
+    """
+    values = _read_disparity(folder, layout.truth_left, levels, shape)
+    if values is None:
+        return None
+    seen = _read_mask(folder, shape)
+    if seen is None:
+        right = _read_disparity(folder, layout.truth_right, levels, shape)
+        everywhere = np.ones(shape, bool)
+        seen = everywhere if right is None else cross_check(values, right, _TOLERANCE_PX)
+    return DisparityTruth(values, np.isfinite(values) & seen)
+
+
+def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
+    """Return bool (H, W), where both disparities ``x_left - x_right`` describe the same point."""
+    height, width = left.shape
+    columns = np.rint(np.arange(width) - np.nan_to_num(left, nan=2.0 * width)).astype(np.int64)
+    inside = (columns >= 0) & (columns < width)
+    there = right[np.arange(height)[:, None], np.clip(columns, 0, width - 1)]
+    return np.asarray(inside & (np.abs(there - left) <= tolerance_px))
+
+
+def _read_disparity(
+    folder: Path, stem: str, levels: float | None, shape: tuple[int, int]
+) -> Float32 | None:
+    path = folder / f"{stem}.pfm" if levels is None else find_image(folder, stem)
+    if path is None or not path.is_file():
+        return None
+    values = read_pfm(path) if levels is None else read_disparity_png(path, scale=levels)
+    _check_shape(path, values, shape)
+    return values
+
+
+def _read_mask(folder: Path, shape: tuple[int, int]) -> Bool | None:
+    path = next((folder / name for name in _MASKS if (folder / name).is_file()), None)
+    if path is None:
+        return None
+    levels = read_grey_levels(path)
+    _check_shape(path, levels, shape)
+    return np.asarray(levels == _SEEN_BY_BOTH)
+
+
+def _check_shape(path: Path, image: Float32 | UInt8, expected: tuple[int, int]) -> None:
+    if image.shape != expected:
+        size, what = f"{expected[1]}x{expected[0]}", "size differs from the images"
+        raise FormatError(what, where=path, got=size_text(image), expected=size)

@@ -1,4 +1,4 @@
-"""Trajectories: KITTI (a 3×4 pose per line) and TUM (``t x y z qx qy qz qw`` per line)."""
+"""Text with a line per frame: trajectories of KITTI and TUM, and lists of image pairs."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ _RIGID_TOLERANCE = 1e-3
 _UNIT_TOLERANCE = 1e-2
 # Geocentric and projected map coordinates stay below 1e7 m.
 _FARTHEST_M = 1e8
+FRAMES: Final = "frames.csv"
+HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
 
 
 @reader
@@ -37,7 +39,7 @@ def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Traje
         timestamps_s: float64 (N,), the times for a KITTI file; TUM files contain theirs.
 
     Raises:
-        FormatError: As in `read_kitti_poses` and `read_tum`.
+        FormatError: The file is damaged, or has another number of poses than times.
     """
     table, lines = read_table(path, (12, 8))
     if table.shape[1] == 12:
@@ -55,11 +57,8 @@ def holds_times(path: StrPath) -> bool:
 def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
     """Read poses of the left camera, one row-major 3×4 matrix per line.
 
-    The rotations are re-orthonormalised, as they are printed with few digits.
-
-    Args:
-        path: The text file.
-        timestamps_s: float64 (N,), one time per pose; without it pose ``i`` gets ``i`` seconds.
+    The rotations are re-orthonormalised, as they are printed with few digits. Without times, pose
+    ``i`` gets ``i`` seconds.
     """
     return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
 
@@ -78,13 +77,8 @@ def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
 
 def write_tum(path: StrPath, trajectory: Trajectory) -> None:
     """Write poses in TUM's format, 12 decimals (9 for the time), ``qw ≥ 0``, atomically."""
-    write_text(
-        path,
-        "".join(
-            _tum_line(T, float(time_s))
-            for T, time_s in zip(trajectory.T_world_camera, trajectory.timestamps_s, strict=True)
-        ),
-    )
+    stamped = zip(trajectory.T_world_camera, trajectory.timestamps_s, strict=True)
+    write_text(path, "".join(_tum_line(T, float(time_s)) for T, time_s in stamped))
 
 
 def _tum_line(T: Float64, time_s: float) -> str:
@@ -97,12 +91,8 @@ def _from_kitti(
 ) -> Trajectory:
     times = np.arange(len(table), dtype=np.float64) if timestamps_s is None else timestamps_s
     if len(times) != len(table):
-        raise FormatError(
-            "numbers of poses and timestamps differ",
-            where=path,
-            got=counted(len(table), "pose"),
-            expected=f"{len(times)}",
-        )
+        what, got = "numbers of poses and timestamps differ", counted(len(table), "pose")
+        raise FormatError(what, got=got, expected=f"{len(times)}")
     check_positions(table[:, 3::4], lines, path)
     poses = np.zeros((len(table), 4, 4))
     poses[:, :3, :] = table.reshape(-1, 3, 4)
@@ -117,9 +107,8 @@ def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
     norms = np.linalg.norm(table[:, 4:], axis=1)
     for norm, line in zip(norms, lines, strict=True):
         if abs(norm - 1) > _UNIT_TOLERANCE:
-            raise FormatError(
-                "quaternion is not of unit length", where=f"{path}:{line}", got=f"{norm:g}"
-            )
+            what = "quaternion is not of unit length"
+            raise FormatError(what, where=f"{path}:{line}", got=f"{norm:g}")
     backwards = np.diff(table[:, 0]) < 0
     if backwards.any():
         line = lines[int(np.argmax(backwards)) + 1]
@@ -144,27 +133,13 @@ def check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
 def _check_rotation(rotation: Float64, where: str) -> None:
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
     if not orthonormal or np.linalg.det(rotation) < 0:
-        raise FormatError(
-            "pose is not a rigid transform",
-            where=where,
-            expected="a row-major 3x4 matrix of rotation and translation",
-        )
-
-
-FRAMES: Final = "frames.csv"
-HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
+        expected = "a row-major 3x4 matrix of rotation and translation"
+        raise FormatError("pose is not a rigid transform", where=where, expected=expected)
 
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One line: a pair of images and their times.
-
-    Attributes:
-        left: Left image, relative to the folder of the list.
-        right: Right image, likewise.
-        left_s: Time of the left image.
-        right_s: Time of the right image.
-    """
+    """A pair of images, relative to the folder of their list, and their times."""
 
     left: str
     right: str
@@ -178,7 +153,10 @@ class CapturedFrame:
 
 @reader
 def read_frames(path: StrPath) -> list[CapturedFrame]:
-    """Read the list."""
+    """Read ``frames.csv``: the image pairs of a recording with their times.
+
+    A line is written after both of its images, so a pair is complete once its line exists.
+    """
     lines = enumerate(read_text(path).splitlines(), start=1)
     frames = [_parse(line, f"{path}:{n}") for n, line in lines if line and line[0] != "#"]
     if not frames:

@@ -32,7 +32,7 @@ from recon.io.images.video import open_video
 from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.nav2 import read_nav2, write_nav2
 from recon.io.models.octomap import read_octomap
-from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
+from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import read_frames, read_trajectory
 from recon.map.occupancy.builder import OccupancySettings, ray_grain
 from recon.map.store.session import SessionInfo
@@ -195,9 +195,6 @@ KINDS: Final[dict[str, Kind]] = {
     "pfm": Kind("d.pfm", lambda p: write_pfm(p, np.ones((4, 5), np.float32)), read_pfm),
     "ply": Kind("c.ply", lambda p: write_ply(p, _cloud()), read_ply),
     "ply, ascii": Kind("c.ply", lambda p: write_ply(p, _cloud(), ascii=True), read_ply),
-    "ply, in pieces": Kind(
-        "c.ply", lambda p: write_ply(p, _cloud()), lambda p: list(read_ply_pieces(p, 7))
-    ),
     "mesh ply": Kind("m.ply", lambda p: write_mesh(p, _mesh()), read_mesh),
     **{
         f"mesh {suffix}": Kind(f"m.{suffix}", lambda p: write_mesh(p, _mesh()), read_mesh, every)

@@ -1,4 +1,4 @@
-"""Least-squares alignment of corresponding points and of trajectories."""
+"""Alignment of points and trajectories by least squares; poses and numbers between others."""
 
 from __future__ import annotations
 
@@ -25,12 +25,7 @@ _SIGMAS: Final = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """A scaling followed by a rigid transform: ``to = T_to_from · (scale · from)``.
-
-    Attributes:
-        T_to_from: float64 (4, 4).
-        scale: Scale factor; 1 = rigid.
-    """
+    """A scaling, then a rigid transform (4, 4): ``to = T_to_from · (scale · from)``."""
 
     T_to_from: Float64
     scale: float = 1.0
@@ -39,22 +34,17 @@ class Similarity:
         freeze(self, "T_to_from", np.float64, (4, 4))
 
     def move(self, trajectory: Trajectory) -> Trajectory:
-        """Return the trajectory in the other frame; its timestamps do not change."""
+        """Return the trajectory in the other frame."""
         poses = trajectory.T_world_camera.copy()
         poses[:, :3, 3] *= self.scale
         return Trajectory(self.T_to_from @ poses, trajectory.timestamps_s)
 
 
 def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Similarity:
-    """Return the least-squares similarity between corresponding points.
+    """Return the least-squares similarity between corresponding points, float64 (N, 3), N ≥ 1.
 
     A rotation that the points do not determine, such as that about a straight line, is left as
-    small as the others allow.
-
-    Args:
-        from_m: float64 (N, 3), N ≥ 1.
-        to_m: float64 (N, 3), the corresponding points.
-        scaled: Whether to estimate the scale; it stays 1 if all points coincide.
+    small as the others allow. The scale is 1 unless ``scaled``, and where all points coincide.
 
     Ref: S. Umeyama, "Least-squares estimation of transformation parameters between two point
     patterns", PAMI 13(4), 1991, equations 40 to 42.
@@ -71,30 +61,19 @@ def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Simil
 
 
 def fit_upright(from_m: Float64, to_m: Float64) -> Similarity:
-    """Return the least-squares rigid transform between points in two frames whose z is up.
+    """Return the least-squares rigid transform between points (N, 3) of two frames whose z is up.
 
     Each point counts with the one three metres above it. The points of a straight street alone,
     such as positions by GNSS, would leave the roll about it to noise, and a map on its side.
-
-    Args:
-        from_m: float64 (N, 3), N ≥ 1.
-        to_m: float64 (N, 3), the corresponding points.
     """
     return fit_points(np.vstack([from_m, from_m + _UP_M]), np.vstack([to_m, to_m + _UP_M]))
 
 
 def find_agreeing(from_m: Float64, to_m: Float64, allowed_m: float) -> Bool:
-    """Return which points fit the transform (`fit_upright`) that suits half of them best.
+    """Return bool (N,): which points fit the transform (`fit_upright`) that suits half of them.
 
-    Transforms are those of two points far apart.
-
-    Args:
-        from_m: float64 (N, 3), N ≥ 1.
-        to_m: float64 (N, 3), the corresponding points, of which fewer than half may be wrong.
-        allowed_m: Distance that is no contradiction; nor is one of four standard deviations.
-
-    Returns:
-        bool (N,); all True where three points or fewer cannot outvote one another.
+    Transforms of two points far apart are tried. A distance of ``allowed_m``, or of four standard
+    deviations, is no contradiction. Three points or fewer cannot outvote one another: all True.
 
     Ref: P. J. Rousseeuw, "Least median of squares regression", JASA 79, 1984.
     """
@@ -125,9 +104,8 @@ def _distances_m(from_m: Float64, to_m: Float64, chosen: NDArray[Any]) -> Float6
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
     """Return the rigid transform that brings a trajectory closest to another, pose by pose.
 
-    Each pose contributes its camera centre and the ends of its axes, whose length is the typical
-    distance of mapped points. On a nearly straight street, the centres alone would leave the
-    rotation about it to noise, and the map would rotate with it.
+    Each pose contributes its centre and the ends of its axes, as long as mapped points are
+    typically away: the centres of a nearly straight street leave the rotation about it to noise.
     """
     return fit_points(_axes_m(from_path), _axes_m(to_path))
 
@@ -140,15 +118,9 @@ def _axes_m(path: Trajectory) -> Float64:
 
 
 def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
-    """Return poses at given times, interpolated between the poses before and after each.
+    """Return poses (N, 4, 4) at given times, between the poses before and after each.
 
-    Args:
-        trajectory: At least one pose.
-        stamps_s: float64 (N,); outside the time range of the trajectory, its first or last pose
-            is returned.
-
-    Returns:
-        float64 (N, 4, 4).
+    Outside the time range of the trajectory it is the first or last pose.
     """
     times = trajectory.timestamps_s
     after = np.clip(np.searchsorted(times, stamps_s), 1, max(1, len(times) - 1))
@@ -166,14 +138,14 @@ def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
 
 
 def pose_between(first: Float64, second: Float64, share: float) -> Float64:
-    """Return the pose (4, 4) at a fraction (0 to 1) of the way from one pose to another."""
+    """Return the pose (4, 4) at a share (0 to 1) of the way from one pose to another."""
     turn = log_so3(first[:3, :3].T @ second[:3, :3])
     position = (1 - share) * first[:3, 3] + share * second[:3, 3]
     return make_transform(first[:3, :3] @ exp_so3(share * turn), position)
 
 
 def nearest_sorted(numbers: NDArray[Any], others: NDArray[Any]) -> Int32:
-    """Return int32 (N,): for each number, the index of the nearest of the others (M ≥ 1, sorted).
+    """Return int32 (N,): for each number the index of the nearest of the others (M ≥ 1, sorted).
 
     Of two that are equally near, it is the first.
     """

@@ -14,17 +14,7 @@ from recon.core.values.camera import RectifiedCamera
 def unproject(
     u: NDArray[Any], v: NDArray[Any], depth_m: NDArray[Any], camera: RectifiedCamera
 ) -> NDArray[Any]:
-    """Back-project pixels of known depth to points in camera axes.
-
-    Args:
-        u: (N,) columns, pixels.
-        v: (N,) rows, pixels.
-        depth_m: (N,) depth along the optical axis.
-        camera: The rectified camera.
-
-    Returns:
-        (N, 3) in the dtype of ``depth_m``.
-    """
+    """Return points (N, 3), camera axes, of pixels (N,) of known depth along the optical axis."""
     x = (u - camera.cx_px) * depth_m / camera.focal_px
     y = (v - camera.cy_px) * depth_m / camera.focal_px
     return np.stack([x, y, depth_m], axis=-1).astype(depth_m.dtype)
@@ -51,14 +41,9 @@ def map_pixels(H: Float64, pixels: NDArray[Any]) -> Float64:
 
 
 def depth_from_disparity(disparity_px: NDArray[Any], camera: RectifiedCamera) -> Float32:
-    """Return the depth along the optical axis, ``Z = f·b / (d + doffs)``.
+    """Return the depth along the optical axis, ``Z = f·b / (d + doffs)``, float32.
 
-    Args:
-        disparity_px: Any shape, pixels; NaN = unknown.
-        camera: The rectified camera.
-
-    Returns:
-        float32, metres; NaN where the disparity is unknown or not in front of the camera.
+    It is NaN where the disparity is unknown (NaN) or not in front of the camera.
     """
     shifted = np.asarray(disparity_px, dtype=np.float64) + camera.doffs_px
     # A depth that overflows float32 is infinite.
@@ -68,7 +53,7 @@ def depth_from_disparity(disparity_px: NDArray[Any], camera: RectifiedCamera) ->
 
 
 def disparity_from_depth(depth_m: NDArray[Any], camera: RectifiedCamera) -> Float32:
-    """Return inverse of `depth_from_disparity`; NaN where the depth is unknown or not positive."""
+    """Return the disparity of a depth; NaN where the depth is unknown or not positive."""
     depth = np.asarray(depth_m, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         disparity = camera.focal_px * camera.baseline_m / depth - camera.doffs_px
@@ -78,13 +63,7 @@ def disparity_from_depth(depth_m: NDArray[Any], camera: RectifiedCamera) -> Floa
 def depth_sigma(
     depth_m: NDArray[Any], sigma_px: NDArray[Any] | float, camera: RectifiedCamera
 ) -> Float32:
-    """Return the standard deviation of the depth, ``sigma_z = Z²·sigma_d / (f·b)`` (first order).
-
-    Args:
-        depth_m: Any shape, metres.
-        sigma_px: Standard deviation of the disparity, pixels.
-        camera: The rectified camera.
-    """
+    """Return the standard deviation of the depth, to first order: ``Z²·sigma_d / (f·b)``."""
     fb = camera.focal_px * camera.baseline_m
     sigma = np.asarray(depth_m, dtype=np.float64) ** 2 * sigma_px / fb
     return np.asarray(sigma, dtype=np.float32)

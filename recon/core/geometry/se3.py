@@ -1,4 +1,4 @@
-"""Rigid transforms as 4×4 matrices, rotations as matrices, vectors and quaternions (x, y, z, w).
+"""Rigid transforms (4×4), rotations as matrices, vectors and quaternions (x, y, z, w), axes.
 
 ``T_a_b`` maps points of frame b to frame a.
 """
@@ -104,7 +104,7 @@ def as_step(T: NDArray[Any]) -> Float64:
 
 
 def as_transform(step: NDArray[Any]) -> Float64:
-    """Return the rigid transform (4, 4) of a step; inverse of `as_step`."""
+    """Return the rigid transform (4, 4) of a step (`as_step`)."""
     return make_transform(exp_so3(step[3:]), step[:3])
 
 
@@ -168,8 +168,8 @@ def rotation_from_quaternion(xyzw: NDArray[Any]) -> Float64:
 def quaternion_from_rotation(rotation: NDArray[Any]) -> Float64:
     """Return the unit quaternion (4,) of a rotation matrix (3, 3), with ``w ≥ 0``.
 
-    The eigenvector method used is accurate at all angles; the formula based on the trace divides
-    by almost zero near 180 degrees.
+    By eigenvectors, which are accurate at all angles; the formula with the trace divides by almost
+    zero near 180 degrees.
 
     Ref: Bar-Itzhack, New method for extracting the quaternion from a rotation matrix, 2000.
     """
@@ -199,12 +199,6 @@ what a camera saw in front of it is in front of the viewer."""
 
 
 def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> PointCloud:
-    """Transform a cloud to another frame; only positions and normals change.
-
-    Args:
-        cloud: Cloud in any frame.
-        T: float64 (4, 4), maps points of ``cloud.frame`` to ``frame``.
-        frame: Name of the new frame.
-    """
+    """Transform a cloud to another frame by ``T`` (4, 4); only positions and normals change."""
     normals = None if cloud.normals is None else rotate(T, cloud.normals)
     return replace(cloud, xyz=apply(T, cloud.xyz), normals=normals, frame=frame)

@@ -1,8 +1,7 @@
-"""Where the machine code of kernels is kept: in a folder of its own for each state of the sources.
+"""Where the machine code of kernels is kept: a folder for each state of their sources.
 
-numba by itself keeps machine code beside the source, and checks only the file of the outermost
-function. After an update a kernel would go on running old code that it calls in another file, or
-fail because a type in its signature is gone.
+numba alone keeps it beside the source and checks only the file of the outermost function: after
+an update a kernel would go on running old code that it calls in another file.
 """
 
 from __future__ import annotations
@@ -33,17 +32,16 @@ def when_compiling(notify: Callable[[str], None]) -> Iterator[None]:
 
 
 def announce(kernel: str) -> None:
-    """Notify all listeners that a kernel is not in the cache and is about to be compiled."""
+    """Notify all listeners that a kernel is about to be compiled."""
     for notify in tuple(_LISTENERS):
         notify(kernel)
 
 
 def cache_parent() -> Path:
-    """The folder that holds the cache: ``NUMBA_CACHE_DIR``, else beside the sources, else in home.
+    """The folder of the cache: ``NUMBA_CACHE_DIR``, else beside the sources, else in home.
 
-    Beside the sources it is where Python keeps its own compiled files; where that cannot be
-    written, as in a system-wide installation, it is the user's cache folder. A user without one,
-    as in a container that runs under any number, gets a folder for temporary files.
+    Where the sources cannot be written, as in a system-wide installation, it is the user's cache
+    folder; a user without one, as in a container, gets a folder for temporary files.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
@@ -76,14 +74,9 @@ def _temporary() -> Path:
 
 
 def cache_folder(parent: Path, package: Path = _PACKAGE) -> Path:
-    """The folder for the sources as they are; if it is new, those of earlier states are removed.
+    """Return the folder for the sources as they are; those of earlier states are removed.
 
-    Args:
-        parent: Holds the cache.
-        package: The kernels are in the folders ``kernels`` below it, and in folders of these.
-
-    Returns:
-        The folder, which numba makes when it first writes to it.
+    The kernels are in the folders ``kernels`` of the package, and below.
     """
     digest = hashlib.sha256()
     for path in sorted(path for path in package.rglob("*.py") if "kernels" in path.parts):

@@ -31,8 +31,8 @@ _CACHE: Final = str(cache_folder(cache_parent()))
 class _KernelCache(FunctionCache):  # type: ignore[misc]
     """numba's cache of one kernel, which one process at a time writes.
 
-    Two that add machine code for different types at once would choose the same file, and the index
-    of one would name the code of the other: a later run would call code for the wrong types.
+    Two that add machine code at once would choose the same file, and a later run would call code
+    for the wrong types.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -62,12 +62,7 @@ def kernel(
 
 
 def kernel(function: Any = None, **options: str) -> Any:
-    """Compile a function to run without the interpreter lock, and cache the machine code.
-
-    Args:
-        function: What is compiled.
-        **options: ``inline`` and ``error_model`` of `numba.njit`.
-    """
+    """Compile a function to run without the interpreter lock, and cache the machine code."""
     if function is None:
         return lambda function: kernel(function, **options)
     kept = config.CACHE_DIR

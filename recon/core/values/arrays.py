@@ -21,13 +21,9 @@ Bool = NDArray[np.bool_]
 def frozen_array(
     name: str, value: Any, dtype: DTypeLike, shape: tuple[int | None, ...]
 ) -> NDArray[Any]:
-    """Check an array and return a read-only view of it.
+    """Check an array and return a read-only view of it; a length of None is any.
 
-    Args:
-        name: Name used in the error message.
-        value: Array to check; never converted, so float64 in place of float32 is an error.
-        dtype: Required dtype.
-        shape: Required shape; ``None`` stands for any length.
+    Nothing is converted: float64 in place of float32 is an error.
     """
     if not isinstance(value, np.ndarray):
         got, expected = type(value).__name__, _field_text(dtype, shape)
@@ -65,16 +61,9 @@ def array_in(
 
 
 def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Float32:
-    """Convert what a caller gives to a map of floats.
+    """Convert what a caller gives, any array of real numbers, to float32 (H, W).
 
-    Args:
-        name: Name used in the error message.
-        values: Anything that numpy takes for an array of real numbers. Masked elements of a
-            masked array become NaN.
-        shape: (H, W) that it must have unless it is a single number; None = any (H, W).
-
-    Returns:
-        float32 (H, W), or () for a single number where ``shape`` is given.
+    Masked elements become NaN. Where a ``shape`` is given, a single number is allowed too: ().
     """
     try:
         given = values if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
@@ -92,7 +81,7 @@ def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None
 
 
 def size_text(image: NDArray[Any]) -> str:
-    """Return the size of an image or map as it is read aloud: width x height."""
+    """Return width x height."""
     return f"{image.shape[1]}x{image.shape[0]}"
 
 

@@ -163,7 +163,7 @@ class RectifiedCamera:
 
     @property
     def field_of_view_deg(self) -> float:
-        """Horizontal field of view of the left view, degrees."""
+        """Horizontal field of view of the left view."""
         left = math.atan((self.cx_px + 0.5) / self.focal_px)
         return math.degrees(left + math.atan((self.width_px - 0.5 - self.cx_px) / self.focal_px))
 
@@ -184,8 +184,7 @@ class RectifiedCamera:
         """Return the camera of the same view at another image size; the baseline does not change.
 
         Pixel centres are at integers, so a principal point scales as ``(c + 0.5)·s - 0.5``.
-        Middlebury multiplies ``c`` and ``doffs`` by ``s``: the same for ``doffs``, but up to half
-        a pixel off for ``c``.
+        Middlebury multiplies ``c`` and ``doffs`` by ``s``: up to half a pixel off for ``c``.
         """
         s = width_px / self.width_px
         return replace(
@@ -203,7 +202,6 @@ class RectifiedCamera:
 def _check_view(
     focal_px: tuple[float, float], centre_px: tuple[float, float], size_px: tuple[int, int]
 ) -> None:
-    """Refuse numbers that no camera has, along rows and columns."""
     size = f"{size_px[0]}x{size_px[1]}"
     if min(size_px) < 1:
         raise CalibrationError("image size is empty", got=size)
@@ -221,7 +219,6 @@ def _check_view(
 
 
 def _check_baseline(baseline_m: float) -> None:
-    """Refuse a distance that no two cameras have."""
     if baseline_m <= 0:
         raise CalibrationError(
             "baseline is zero" if baseline_m == 0 else "baseline is negative",
@@ -252,7 +249,7 @@ def check_size(
 def other_size(
     width_px: int, height_px: int, expected: str, where: str | PathLike[str] | None
 ) -> CalibrationError:
-    """Return the error for images that have another size than their calibration."""
+    """Return the error for images of another size than their calibration."""
     return CalibrationError(
         "images have another size than the calibration",
         where=where,

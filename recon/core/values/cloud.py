@@ -1,4 +1,4 @@
-"""Point clouds with per-point attributes."""
+"""Point clouds with per-point attributes, rays of a frame, triangle meshes."""
 
 from __future__ import annotations
 
@@ -118,36 +118,22 @@ _CERTAIN: Final = 255
 
 @dataclass(frozen=True)
 class RayGrain:
-    """Resolution of stored rays.
+    """Resolution of stored rays."""
 
-    Attributes:
-        cell_m: Edge length of the cubes in which points are averaged.
-        unit_m: Quantisation step of the end points.
-        max_range_m: Points farther away are moved along their rays to just beyond this range.
-    """
-
-    cell_m: float
-    unit_m: float
-    max_range_m: float
+    cell_m: float  # edge length of the cubes in which points are averaged
+    unit_m: float  # quantisation step of the end points
+    max_range_m: float  # points farther away are moved along their rays to just beyond this range
 
 
 @dataclass(frozen=True, eq=False)
 class RayCloud:
-    """Rays of one frame, from the camera to the observed points, in camera axes.
+    """Rays of one frame from the camera to what it saw, in camera axes: evidence of free space."""
 
-    Attributes:
-        places: int16 (N, 3), end points of the rays, multiples of ``unit_m``.
-        sigma_m: float16 (N,), standard deviation of the depth.
-        confidence: uint8 (N,), 255 = certain.
-        count: uint8 (N,), number of averaged points; 255 = 255 or more.
-        unit_m: Quantisation step of ``places``.
-    """
-
-    places: NDArray[np.int16]
-    sigma_m: NDArray[np.float16]
-    confidence: UInt8
-    count: UInt8
-    unit_m: float
+    places: NDArray[np.int16]  # int16 (N, 3), end points of the rays, multiples of ``unit_m``
+    sigma_m: NDArray[np.float16]  # float16 (N,), standard deviation of the depth
+    confidence: UInt8  # uint8 (N,), 255 = certain
+    count: UInt8  # uint8 (N,), number of averaged points; 255 = 255 or more
+    unit_m: float  # quantisation step of ``places``
 
     def __post_init__(self) -> None:
         freeze(self, "places", np.int16, (None, 3))

@@ -19,7 +19,7 @@ UNKNOWN: Final = -1
 
 
 def log_odds(probability: float) -> float:
-    """Return ``ln(p / (1 - p))`` of a probability in (0, 1): independent evidence adds up."""
+    """Return ``ln(p / (1 - p))``: independent evidence adds up."""
     return math.log(probability / (1.0 - probability))
 
 

@@ -1,4 +1,4 @@
-"""Stereo image pairs: as recorded, and rectified."""
+"""Stereo pairs, as recorded and rectified, and their disparity."""
 
 from __future__ import annotations
 
@@ -231,7 +231,6 @@ def _where(mask: Bool, inside: Float32, outside: float) -> Float32:
 
 
 def _put(array: NDArray[Any], places: NDArray[np.intp], value: float) -> NDArray[Any]:
-    """Return a copy with a value at some places, counted row by row."""
     changed: NDArray[Any] = array.copy()
     changed.flat[places] = value
     return changed

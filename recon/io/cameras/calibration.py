@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Final
 
-from recon.core.errors import CalibrationError, FormatError
+from recon.core.errors import CalibrationError, FormatError, ReconError
 from recon.core.values import Rig, check_size
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import read_opencv_calibration
@@ -14,13 +15,23 @@ from recon.io.cameras.ros import read_camera_info, read_kalibr
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury import read_middlebury_calib
 
-_KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE | re.ASCII)
-_MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)
-_OURS: Final = re.compile(rf"^format:\s*{MARK}", re.MULTILINE)
-_CAMERA_INFO: Final = re.compile(r"^projection_matrix:", re.MULTILINE)
-_KALIBR: Final = re.compile(r"^cam0:", re.MULTILINE)
-_HOMOGRAPHIES: Final = re.compile(r"^H_left:", re.MULTILINE)
-_OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
+#: What a file of each format contains. OpenCV's comes after the others that may have its header,
+#: and before KITTI's: it may contain a ``P1:``.
+_SIGNS: Final = {
+    "recon": re.compile(rf"^format:\s*{MARK}", re.MULTILINE),
+    "ros": re.compile(r"^projection_matrix:", re.MULTILINE),
+    "kalibr": re.compile(r"^cam0:", re.MULTILINE),
+    "opencv": re.compile(r"^%YAML|<opencv_storage>|opencv-matrix"),
+    "middlebury": re.compile(r"^\s*cam[01]\s*=", re.MULTILINE),
+    "kitti": re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE | re.ASCII),
+    "homographies": re.compile(r"^H_left:", re.MULTILINE),
+}
+_READERS: Final[dict[str, Callable[[StrPath], Rig]]] = {
+    "recon": read_recon_calibration,
+    "ros": read_camera_info,
+    "kalibr": read_kalibr,
+    "middlebury": lambda path: read_middlebury_calib(path).camera,
+}
 
 
 @reader
@@ -55,56 +66,44 @@ def read_calibration(
         CalibrationError: The calibration cannot give depth, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)
-    rig = _read(path, size, metres_per_unit, cameras)
+    text = read_text(path, SMALL_FILE_BYTES)
+    form = next((form for form, sign in _SIGNS.items() if sign.search(text)), "")
+    if form == "opencv":
+        rig: Rig = read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
+    elif form == "kitti":
+        rig = _read_kitti(path, size, cameras)
+    elif form in _READERS:
+        rig = _READERS[form](path)
+    else:
+        raise _unknown(form)
     if size is not None:
         check_size(rig, *size, path)
     return rig
 
 
-def _read(
-    path: StrPath,
-    size: tuple[int, int] | None,
-    metres_per_unit: float,
-    cameras: tuple[int, int] | None,
+def _read_kitti(
+    path: StrPath, size: tuple[int, int] | None, cameras: tuple[int, int] | None
 ) -> Rig:
-    """Recognise the format; ``size`` is for files that do not state one, or more than one."""
-    text = read_text(path, SMALL_FILE_BYTES)
-    if _OURS.search(text):
-        return read_recon_calibration(path)
-    if _CAMERA_INFO.search(text):
-        return read_camera_info(path)
-    if _KALIBR.search(text):
-        return read_kalibr(path)
-    # OpenCV after the others that may have its header, before KITTI: it may contain a ``P1:``.
-    if _OPENCV.search(text):
-        return read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
-    if _MIDDLEBURY.search(text):
-        return read_middlebury_calib(path).camera
-    if _KITTI.search(text):
-        if size is None:
-            raise FormatError(
-                "a KITTI calibration does not say which images it is of",
-                where=path,
-                hint="pass width_px and height_px, or give the file itself to recon.reconstruct or "
-                "recon.match, which take the size from the images",
-            )
-        return read_kitti_rig(path, *size, cameras or _kitti_cameras(path))
-    if _HOMOGRAPHIES.search(text):
-        raise CalibrationError(
+    if size is None:
+        raise FormatError(
+            "a KITTI calibration does not say which images it is of",
+            hint="pass width_px and height_px, or give the file itself to recon.reconstruct or "
+            "recon.match, which take the size from the images",
+        )
+    known = list_kitti_cameras(path)
+    grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
+    return read_kitti_rig(path, *size, cameras or (GREY_CAMERAS if grey else COLOUR_CAMERAS))
+
+
+def _unknown(form: str) -> ReconError:
+    if form == "homographies":
+        return CalibrationError(
             "homographies know no focal length and no baseline: there is no depth in them",
-            where=path,
             hint="recon disparity takes the rectified images as they are; for depth use a "
             "calibration of the cameras (recon calibrate)",
         )
-    raise FormatError(
+    return FormatError(
         "not a calibration file",
-        where=path,
         expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
         "OpenCV YAML/XML (M1 …), ROS CameraInfo or a kalibr camchain (cam0: …)",
     )
-
-
-def _kitti_cameras(path: StrPath) -> tuple[int, int]:
-    known = list_kitti_cameras(path)
-    grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
-    return GREY_CAMERAS if grey else COLOUR_CAMERAS

@@ -1,4 +1,4 @@
-"""KITTI calibration: projection matrices ``P0`` … ``P3`` of the rectified cameras.
+"""KITTI calibration: projection matrices ``P0`` … ``P3`` of the rectified cameras (``calib.txt``).
 
 ``calib_cam_to_cam.txt`` of a raw drive has four cameras, each raw and rectified.
 """
@@ -36,23 +36,15 @@ _RAW_LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE | r
 def read_kitti_calib(
     path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int] = GREY_CAMERAS
 ) -> RectifiedCamera:
-    """Read the rectified camera of one stereo pair.
+    """Read the rectified camera of one stereo pair, from either kind of file.
 
     ``P = K·[I | t]`` with ``t`` relative to camera 0. The baseline is the distance of the two
     cameras along x, so it holds for the colour pair too.
-
-    Args:
-        path: ``calib.txt`` of a KITTI odometry sequence (``P0:`` …), or ``calib_cam_to_cam.txt``
-            of a raw drive (``P_rect_00:`` …).
-        width_px: Image width; the first kind of file does not contain it.
-        height_px: Image height.
-        cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
     """
     left, right = (_projection(path, camera) for camera in cameras)
     if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
         raise CalibrationError(
             f"P{cameras[0]} and P{cameras[1]} have different focal lengths or rows",
-            where=path,
             hint="a rectified pair shares them; rectify the images first",
         )
     check_unsized((float(left[0, 2]), float(left[1, 2])), width_px, height_px, path)
@@ -62,10 +54,7 @@ def read_kitti_calib(
 
 @reader
 def read_kitti_offset(path: StrPath, camera: int) -> Float64:
-    """Return the pose of a camera: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
-
-    KITTI's trajectories are those of camera 0.
-    """
+    """Return ``T_camera_camera0`` (4, 4), a translation: KITTI's trajectories are of camera 0."""
     T = np.eye(4)
     T[:3, 3] = _centre_m(_projection(path, camera))
     return T
@@ -89,23 +78,17 @@ def list_kitti_cameras(path: StrPath) -> frozenset[int]:
 def _projection(path: StrPath, camera: int) -> Float64:
     """Read float64 (3, 4), the projection matrix of one camera."""
     rows = {int(number): row for number, row in _LINE.findall(read_text(path))}
-    if camera not in rows:
-        raise FormatError(
-            f"calibration has no P{camera}",
-            where=path,
-            got=", ".join(f"P{number}" for number in sorted(rows)) or "no projection matrix",
-            hint="a stereo pair needs P0 and P1, or P2 and P3",
-        )
     name = f"P{camera}"
-    matrix = Fields({name: rows[camera]}, path).numbers(name, (3, 4))
+    if camera not in rows:
+        got = ", ".join(f"P{number}" for number in sorted(rows)) or "no projection matrix"
+        hint = "a stereo pair needs P0 and P1, or P2 and P3"
+        raise FormatError(f"calibration has no {name}", got=got, hint=hint)
+    matrix = Fields({name: rows[camera]}).numbers(name, (3, 4))
     if not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
-        raise FormatError(
-            f"P{camera} is not the projection matrix of a rectified camera", where=path
-        )
+        raise FormatError(f"{name} is not the projection matrix of a rectified camera")
     if min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise CalibrationError(
-            f"focal length of P{camera} is not positive", where=path, got=f"{matrix[0, 0]:g} px"
-        )
+        got = f"{matrix[0, 0]:g} px"
+        raise CalibrationError(f"focal length of {name} is not positive", got=got)
     return matrix
 
 
@@ -119,17 +102,11 @@ def read_kitti_rig(path: StrPath, width_px: int, height_px: int, cameras: tuple[
     """Read the cameras of one stereo pair, rectified or raw according to the image size.
 
     Rectified images (``_sync`` drives) are smaller than raw ones (``_extract`` drives). A file
-    without sizes is of rectified images.
-
-    Args:
-        path: ``calib_cam_to_cam.txt`` of a raw drive, or ``calib.txt`` of an odometry sequence.
-        width_px: Image width.
-        height_px: Image height.
-        cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
+    without sizes (``calib.txt``) is of rectified images.
 
     Ref: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, section 4.
     """
-    fields = Fields(dict(_RAW_LINE.findall(read_text(path))), path)
+    fields = Fields(dict(_RAW_LINE.findall(read_text(path))))
     if f"S_rect_{cameras[0]:02d}" not in fields:
         return read_kitti_calib(path, width_px, height_px, cameras)
     recorded, rectified = (

@@ -43,6 +43,8 @@ _DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
 # Longer than any stereo rig: a longer baseline means millimetres read as metres.
 _LONGEST_BASELINE_M: Final = 20.0
 
+_NOT_FINITE: Final = re.compile(r"\.(?:Nan|Inf)\b")
+_XML_ROOT: Final = "opencv_storage"
 Nodes = dict[str, Float64 | str]
 
 
@@ -50,45 +52,48 @@ Nodes = dict[str, Float64 | str]
 def read_opencv_calibration(
     path: StrPath, *, size_px: tuple[int, int] | None = None, metres_per_unit: float = 1.0
 ) -> StereoCalibration:
-    """Read two raw cameras from one file, or from OpenCV's pair of files.
+    """Read two raw cameras (``M1 D1 M2 D2``, or ``cameraMatrix1`` …) and their pose (``R T``).
 
     Args:
-        path: File with ``M1 D1 M2 D2`` (or ``cameraMatrix1`` …), and ``R T``; if not, they are in
-            the file beside it that has ``extrinsics`` in place of ``intrinsics`` in its name.
-        size_px: (width, height) of the images, for files without ``image_width`` and
-            ``image_height``.
+        path: One file, or the first of OpenCV's pair: if it has no ``R``, the file beside it that
+            has ``extrinsics`` in place of ``intrinsics`` in its name is read too.
+        size_px: (width, height) of the images, for files that do not state it.
         metres_per_unit: Unit of ``T`` in metres: 0.001 for millimetres, or the square size if the
             board was calibrated with squares of size 1.
     """
     nodes = read_file_storage(path)
-    outer = _find_extrinsics(path, nodes)
     stated = _size(nodes)
     size = stated or size_px
     if size is None:
         raise FormatError(
             "calibration does not contain the image size",
-            where=path,
             expected="image_width and image_height",
             hint="from Python: pass width_px and height_px, or give the file itself to "
             "recon.reconstruct or recon.match, which take the size from the images",
         )
     model = _model(nodes)
     lens: LensModel = model or "pinhole"
-    left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, lens, path)
-    right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, lens, path)
+    left = _camera(nodes, _LEFT_MATRIX, _LEFT_DISTORTION, size, lens)
+    right = _camera(nodes, _RIGHT_MATRIX, _RIGHT_DISTORTION, size, lens)
     if model is None:
         for camera in (left, right):
-            _check_model(camera, path)
+            _check_model(camera)
     if stated is None:
         check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, path)
-    outer_nodes = read_file_storage(outer)
-    rotation = _matrix(outer_nodes, _ROTATION, (3, 3), outer)
-    translation = _matrix(outer_nodes, _TRANSLATION, (3,), outer)
+    beside = Path(path).with_name(Path(path).name.replace("intrinsics", "extrinsics"))
+    outer = beside if _find(nodes, _ROTATION) is None and beside.is_file() else path
     with reading(outer):
-        calibration = StereoCalibration(
-            left, right, make_transform(rotation, translation * metres_per_unit)
-        )
-    _check_baseline(calibration.baseline_m, outer)
+        outer_nodes = read_file_storage(outer)
+        rotation = _matrix(outer_nodes, _ROTATION, (3, 3))
+        translation_m = _matrix(outer_nodes, _TRANSLATION, (3,)) * metres_per_unit
+        calibration = StereoCalibration(left, right, make_transform(rotation, translation_m))
+        if calibration.baseline_m > _LONGEST_BASELINE_M:
+            raise CalibrationError(
+                "baseline is implausibly long",
+                got=f"{calibration.baseline_m:g} m",
+                expected=f"at most {_LONGEST_BASELINE_M:g} m",
+                hint="if the file is in millimetres, pass 0.001 metres per unit",
+            )
     return calibration
 
 
@@ -121,14 +126,13 @@ def _model(nodes: Nodes) -> LensModel | None:
     return "fisheye" if named & _FISHEYE_NAMES else "pinhole"
 
 
-def _check_model(camera: CameraIntrinsics, path: StrPath) -> None:
+def _check_model(camera: CameraIntrinsics) -> None:
     """Raise if a camera of an unnamed lens model may as well be a fisheye."""
     wide = camera.width_px / 2 > camera.matrix[0, 0]
     largest = np.abs(camera.distortion).max(initial=0.0)
     if camera.distortion.size == 4 and wide and 0 < largest < _FISHEYE_LIKE:
         raise FormatError(
             "calibration does not say which lens model its four coefficients belong to",
-            where=path,
             expected="a line 'distortion_model: fisheye', or 'distortion_model: pinhole'",
         )
 
@@ -139,40 +143,29 @@ def _find(nodes: Nodes, names: Sequence[str]) -> Float64 | None:
     return next((value for value in found if isinstance(value, np.ndarray)), None)
 
 
-def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...], path: StrPath) -> Float64:
-    value = _find(nodes, names)
+def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...]) -> Float64:
+    value, what = _find(nodes, names), repr(names[0])
     if value is None:
-        raise FormatError(
-            f"calibration has no {names[0]!r}",
-            where=path,
-            got=", ".join(nodes) or "nothing",
-            expected=" or ".join(names),
-        )
+        got, expected = ", ".join(nodes) or "nothing", " or ".join(names)
+        raise FormatError(f"calibration has no {what}", got=got, expected=expected)
     if value.size != np.prod(shape):
-        raise FormatError(
-            f"{names[0]!r} has the wrong size", where=path, got=value.shape, expected=shape
-        )
+        raise FormatError(f"{what} has the wrong size", got=value.shape, expected=shape)
     return value.reshape(shape)
 
 
 def _camera(
     nodes: Nodes,
-    names: tuple[Sequence[str], Sequence[str]],
+    matrix_names: Sequence[str],
+    distortion_names: Sequence[str],
     size_px: tuple[int, int],
     model: LensModel,
-    path: StrPath,
 ) -> CameraIntrinsics:
-    matrix_names, distortion_names = names
-    matrix = _matrix(nodes, matrix_names, (3, 3), path)
+    matrix = _matrix(nodes, matrix_names, (3, 3))
     found = _find(nodes, distortion_names)
     distortion = np.zeros(0) if found is None else found.ravel()
     if distortion.size not in _DISTORTION_COUNTS:
-        raise FormatError(
-            f"{distortion_names[0]!r} has the wrong size",
-            where=path,
-            got=counted(distortion.size, "coefficient"),
-            expected="4, 5, 8, 12 or 14",
-        )
+        what, got = repr(distortion_names[0]), counted(distortion.size, "coefficient")
+        raise FormatError(f"{what} has the wrong size", got=got, expected="4, 5, 8, 12 or 14")
     return CameraIntrinsics(matrix, distortion, *size_px, model)
 
 
@@ -186,42 +179,21 @@ def _size(nodes: Nodes) -> tuple[int, int] | None:
     return None
 
 
-def _find_extrinsics(path: StrPath, nodes: Nodes) -> StrPath:
-    """Return the file with ``R`` and ``T``."""
-    beside = Path(path).with_name(Path(path).name.replace("intrinsics", "extrinsics"))
-    return beside if _find(nodes, _ROTATION) is None and beside.is_file() else path
-
-
-def _check_baseline(baseline_m: float, path: StrPath) -> None:
-    if baseline_m > _LONGEST_BASELINE_M:
-        raise CalibrationError(
-            "baseline is implausibly long",
-            where=path,
-            got=f"{baseline_m:g} m",
-            expected=f"at most {_LONGEST_BASELINE_M:g} m",
-            hint="if the file is in millimetres, pass 0.001 metres per unit",
-        )
-
-
-_NOT_FINITE: Final = re.compile(r"\.(?:Nan|Inf)\b")
-_XML_ROOT: Final = "opencv_storage"
-
-
 @reader
-def read_file_storage(path: StrPath) -> dict[str, Float64 | str]:
-    """Read the numbers and texts at the top level of a file.
+def read_file_storage(path: StrPath) -> Nodes:
+    """Read what is at the top level of a file: numbers, lists and matrices of them, and texts.
 
-    Returns:
-        float64 () for a number, (N,) for a list of numbers or the data of a matrix, row by row, and
-        text. Anything else is left out.
+    They are float64 () or (N,), the data of a matrix row by row. OpenCV's own parser is not used:
+    on content from outside it overflows its stack, does not end, or allocates whatever size a
+    matrix claims.
     """
     text = read_text(path, SMALL_FILE_BYTES)
     try:
         nodes = _parse(text, path)
     except (ET.ParseError, json.JSONDecodeError) as error:
-        raise FormatError("not an OpenCV FileStorage file", where=path, got=error) from error
+        raise FormatError("not an OpenCV FileStorage file", got=error) from error
     if not isinstance(nodes, dict):
-        raise FormatError("not an OpenCV FileStorage file", where=path)
+        raise FormatError("not an OpenCV FileStorage file")
     values = {str(name): _value(node) for name, node in nodes.items()}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -229,12 +201,22 @@ def read_file_storage(path: StrPath) -> dict[str, Float64 | str]:
 def _parse(text: str, path: StrPath) -> Any:
     start = text.lstrip()[:1]
     if start == "<":
-        return _parse_xml(text)
+        root = ET.fromstring(text.encode())  # noqa: S314 - see the import
+        return {node.tag: _xml_node(node) for node in root} if root.tag == _XML_ROOT else None
     if start == "{":
         return json.loads(text)
     # OpenCV capitalises only the first letter of .Nan and .Inf.
     plain = _NOT_FINITE.sub(lambda found: found[0].lower(), plain_yaml(text))
     return parse_yaml(plain, path)
+
+
+def _xml_node(element: ET.Element) -> Any:
+    """Return a list or text, and a mapping for a matrix."""
+    data = element.find("data")
+    if data is not None:
+        return {"data": (data.text or "").split()}
+    words = (element.text or "").split()
+    return words if len(words) > 1 else "".join(words).strip('"')
 
 
 def _value(node: Any) -> Float64 | str | None:
@@ -247,17 +229,3 @@ def _value(node: Any) -> Float64 | str | None:
         return numbers_of(node)
     except ValueError:
         return node if isinstance(node, str) else None
-
-
-def _parse_xml(text: str) -> dict[str, Any] | None:
-    root = ET.fromstring(text.encode())  # noqa: S314 - see the import
-    return {node.tag: _xml_node(node) for node in root} if root.tag == _XML_ROOT else None
-
-
-def _xml_node(element: ET.Element) -> Any:
-    """Return a list or text, and a mapping for a matrix."""
-    data = element.find("data")
-    if data is not None:
-        return {"data": (data.text or "").split()}
-    words = (element.text or "").split()
-    return words if len(words) > 1 else "".join(words).strip('"')

@@ -31,16 +31,11 @@ _RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
 
 
 def write_recon_calibration(
-    path: StrPath,
-    calibration: Rig,
-    quality: Mapping[str, Any] | None = None,
+    path: StrPath, calibration: Rig, quality: Mapping[str, Any] | None = None
 ) -> None:
     """Write a calibration atomically; `read_recon_calibration` restores it bit by bit.
 
-    Args:
-        path: The file.
-        calibration: A raw stereo calibration or a rectified camera.
-        quality: Quality figures to store with it, as plain values; not read back.
+    Figures of its ``quality`` are stored with it as plain values, and not read back.
     """
     content = {"format": MARK, "version": _VERSION, **_content(calibration)}
     if quality:
@@ -52,19 +47,14 @@ def write_recon_calibration(
 @reader
 def read_recon_calibration(path: StrPath) -> Rig:
     """Read what `write_recon_calibration` wrote."""
-    fields = Fields(read_yaml(path), path)
+    fields = Fields(read_yaml(path))
     if fields.text("format") != MARK or fields.number("version") != _VERSION:
-        raise FormatError(
-            "version of the calibration file is not supported",
-            where=path,
-            got=f"{fields.get('format')} {fields.get('version')}",
-            expected=f"{MARK} {_VERSION}",
-        )
+        got, expected = f"{fields.get('format')} {fields.get('version')}", f"{MARK} {_VERSION}"
+        what = "version of the calibration file is not supported"
+        raise FormatError(what, got=got, expected=expected)
     kind = fields.text("kind")
     if kind not in ("stereo", "rectified"):
-        raise FormatError(
-            "unknown kind of calibration", where=path, got=kind, expected="stereo or rectified"
-        )
+        raise FormatError("unknown kind of calibration", got=kind, expected="stereo or rectified")
     return _read_rectified(fields) if kind == "rectified" else _read_stereo(fields)
 
 
@@ -103,9 +93,8 @@ def _names(model: LensModel) -> tuple[str, ...]:
 def _read_stereo(fields: Fields) -> StereoCalibration:
     pose = fields.below("right_from_left")
     T = make_transform(pose.numbers("rotation", (3, 3)), pose.numbers("translation_m", (3,)))
-    return StereoCalibration(
-        _read_camera(fields.below("left")), _read_camera(fields.below("right")), T
-    )
+    left, right = (_read_camera(fields.below(side)) for side in ("left", "right"))
+    return StereoCalibration(left, right, T)
 
 
 def _read_camera(fields: Fields) -> CameraIntrinsics:

@@ -1,8 +1,10 @@
-"""ROS CameraInfo as YAML: one file per camera."""
+"""Calibrations around ROS: CameraInfo (a YAML file per camera), kalibr's chains, EuRoC's sensors.
+
+They name lens models alike, with numbers of coefficients of their own.
+"""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -26,18 +28,37 @@ from recon.io.atomic import write_text
 from recon.io.fields import Fields, read_yaml
 from recon.io.files import StrPath, read_table, reader, reading
 
+# Name -> our model and the permitted numbers of coefficients; a writer uses the first that fits.
+Models = Mapping[str, tuple[LensModel, tuple[int, ...]]]
+
+ROS_MODELS: Final[Models] = {
+    "plumb_bob": ("pinhole", (5, 4, 0)),
+    "rational_polynomial": ("pinhole", (8, 12, 14)),
+    "equidistant": ("fisheye", (4,)),
+    "fisheye": ("fisheye", (4,)),
+}
+_KALIBR_MODELS: Final[Models] = {
+    "radtan": ("pinhole", (4,)),
+    "equidistant": ("fisheye", (4,)),
+    "none": ("pinhole", (0,)),
+}
+_EUROC_MODELS: Final[Models] = {
+    "radial-tangential": ("pinhole", (4, 5)),
+    "equidistant": ("fisheye", (4,)),
+}
+NS: Final = 1e-9
 _SIDES: Final = ("left", "right")
 
 
 def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
     """Return both paths: ``left`` or ``right`` in the name is swapped, or added."""
     given = Path(path)
-    for side in _SIDES:
-        if re.search(side, given.stem):
-            names = [re.sub(side, other, given.stem) + given.suffix for other in _SIDES]
-            return given.with_name(names[0]), given.with_name(names[1])
-    names = [f"{given.stem}_{side}{given.suffix}" for side in _SIDES]
-    return given.with_name(names[0]), given.with_name(names[1])
+    found = next((side for side in _SIDES if side in given.stem), None)
+    stems = [
+        given.stem.replace(found, side) if found else f"{given.stem}_{side}" for side in _SIDES
+    ]
+    left, right = (given.with_name(stem + given.suffix) for stem in stems)
+    return left, right
 
 
 @reader
@@ -50,11 +71,8 @@ def read_camera_info(path: StrPath) -> StereoCalibration:
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
-        raise FormatError(
-            "CameraInfo of the other camera is missing",
-            where=missing,
-            hint="give both files the same name but for 'left' and 'right'",
-        )
+        hint = "give both files the same name but for 'left' and 'right'"
+        raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
     left, R_left, _ = _read_one(left_path)
     right, R_right, P_right = _read_one(right_path)
     return rig_of_camera_infos((left, R_left), (right, R_right), P_right, right_path)
@@ -66,13 +84,10 @@ def rig_of_camera_infos(
     P_right: Float64,
     where: StrPath,
 ) -> StereoCalibration:
-    """Return the rig described by two CameraInfos, from files or messages.
+    """Return the rig of two CameraInfos, from files or messages (``where``: file or topic).
 
-    Args:
-        left: The left camera and its rectifying rotation, float64 (3, 3).
-        right: The right camera, likewise.
-        P_right: float64 (3, 4), projection matrix of the rectified right camera.
-        where: File or topic, for error messages.
+    Each camera has its rectifying rotation (3, 3); ``P_right`` is the projection matrix (3, 4) of
+    the rectified right one.
     """
     check_shift(P_right, 0.0, where)
     offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
@@ -82,33 +97,42 @@ def rig_of_camera_infos(
 
 
 def check_shift(P_right: Float64, left_shift: float, where: StrPath) -> None:
-    """Check that the projection matrix of the right camera contains a baseline.
+    """Check that the projection matrix (3, 4) of the right camera contains a baseline.
 
-    Args:
-        P_right: float64 (3, 4).
-        left_shift: ``P[0, 3]`` of the left camera, usually 0.
-        where: File or topic, for the error message.
+    ``left_shift`` is ``P[0, 3]`` of the left camera, usually 0.
     """
     shift = float(P_right[0, 3]) - left_shift
     if shift < 0:
         return
-    got, expected = f"P[0, 3] = {P_right[0, 3]:g}", "-fx * baseline, below 0"
-    if shift > 0:
-        raise CalibrationError(
-            "right camera is to the left of the left camera",
-            where=where,
-            got=got,
-            expected=expected,
-            hint="swap left and right",
+    what, hint = "right camera is to the left of the left camera", "swap left and right"
+    if shift == 0:
+        what = "CameraInfo has no baseline"
+        hint = (
+            "the right camera was calibrated alone: calibrate both as a pair, or name a "
+            "calibration file with --calib"
         )
-    raise CalibrationError(
-        "CameraInfo has no baseline",
-        where=where,
-        got=got,
-        expected=expected,
-        hint="the right camera was calibrated alone: calibrate both as a pair, or name a "
-        "calibration file with --calib",
+    got, expected = f"P[0, 3] = {P_right[0, 3]:g}", "-fx * baseline, below 0"
+    raise CalibrationError(what, where=where, got=got, expected=expected, hint=hint)
+
+
+@reader
+def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
+    """Read a camera, its rectifying rotation (3, 3) and its projection matrix (3, 4)."""
+    fields = Fields(read_yaml(path))
+    matrix, coefficients, rotation, projection = (
+        fields.below(name)
+        for name in (
+            "camera_matrix",
+            "distortion_coefficients",
+            "rectification_matrix",
+            "projection_matrix",
+        )
     )
+    name = fields.text("distortion_model")
+    model, distortion = lens_of(ROS_MODELS, name, coefficients.numbers("data"), path)
+    size = fields.count("image_width"), fields.count("image_height")
+    camera = CameraIntrinsics(matrix.numbers("data", (3, 3)), distortion, *size, model)
+    return camera, rotation.numbers("data", (3, 3)), projection.numbers("data", (3, 4))
 
 
 def write_camera_info(
@@ -117,16 +141,9 @@ def write_camera_info(
     rotations: tuple[Float64, Float64],
     rectified: RectifiedCamera,
 ) -> tuple[Path, Path]:
-    """Write the two files of a rig, each atomically.
+    """Write the two files of a rig (`camera_info_paths`), each atomically.
 
-    Args:
-        path: See `camera_info_paths`.
-        calibration: The raw cameras.
-        rotations: float64 (3, 3) per camera, from its raw axes to the rectified axes.
-        rectified: The rectified camera.
-
-    Returns:
-        The two files.
+    The rotations (3, 3) are those from the raw axes of each camera to the rectified axes.
     """
     paths = camera_info_paths(path)
     cameras = (calibration.left, calibration.right)
@@ -135,14 +152,14 @@ def write_camera_info(
     for side, camera, rotation, shift in zip(_SIDES, cameras, rotations, shifts, strict=True):
         P = np.hstack([rectified.matrix, [[shift], [0.0], [0.0]]])
         P[0, 2] = rectified.cx_right_px if side == "right" else rectified.cx_px
-        texts.append(_text(side, camera, rotation, P))
+        texts.append(_camera_info(side, camera, rotation, P))
     for target, text in zip(paths, texts, strict=True):
         write_text(target, text)
     return paths
 
 
-def _text(side: str, camera: CameraIntrinsics, rotation: Float64, P: Float64) -> str:
-    name, coefficients = name_lens(ROS_MODELS, camera, "ROS CameraInfo")
+def _camera_info(side: str, camera: CameraIntrinsics, rotation: Float64, P: Float64) -> str:
+    name, coefficients = _name_lens(ROS_MODELS, camera, "ROS CameraInfo")
     content = {
         "image_width": camera.width_px,
         "image_height": camera.height_px,
@@ -162,112 +179,42 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
 
 
 @reader
-def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
-    """Read a camera, its rectifying rotation (3, 3) and its projection matrix (3, 4)."""
-    fields = Fields(read_yaml(path), path)
-    data = {
-        name: fields.below(name)
-        for name in ("camera_matrix", "distortion_coefficients", "rectification_matrix")
-    }
-    model, distortion = lens_of(
-        ROS_MODELS,
-        fields.text("distortion_model"),
-        data["distortion_coefficients"].numbers("data"),
-        path,
-    )
-    camera = CameraIntrinsics(
-        data["camera_matrix"].numbers("data", (3, 3)),
-        distortion,
-        fields.count("image_width"),
-        fields.count("image_height"),
-        model,
-    )
-    rotation = data["rectification_matrix"].numbers("data", (3, 3))
-    return camera, rotation, fields.below("projection_matrix").numbers("data", (3, 4))
-
-
-# Name -> our model and the permitted numbers of coefficients; a writer uses the first that fits.
-Models = Mapping[str, tuple[LensModel, tuple[int, ...]]]
-
-ROS_MODELS: Final[Models] = {
-    "plumb_bob": ("pinhole", (5, 4, 0)),
-    "rational_polynomial": ("pinhole", (8, 12, 14)),
-    "equidistant": ("fisheye", (4,)),
-    "fisheye": ("fisheye", (4,)),
-}
-KALIBR_MODELS: Final[Models] = {
-    "radtan": ("pinhole", (4,)),
-    "equidistant": ("fisheye", (4,)),
-    "none": ("pinhole", (0,)),
-}
-
-
-def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
-    """Return float64 (3, 3) camera matrix, pixels."""
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def lens_of(
-    models: Models, name: str, coefficients: Float64, path: StrPath
-) -> tuple[LensModel, Float64]:
-    """Return our lens model for a format's name, and its coefficients."""
-    if name not in models:
-        raise FormatError(
-            "lens model is not supported", where=path, got=name, expected=", ".join(models)
-        )
-    model, counts = models[name]
-    if coefficients.size not in counts:
-        raise FormatError(
-            f"lens model {name!r} has the wrong number of coefficients",
-            where=path,
-            got=coefficients.size,
-            expected=" or ".join(str(count) for count in counts),
-        )
-    return model, coefficients
-
-
-def name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str, Float64]:
-    """Return a format's name for the lens of a camera, and the coefficients padded as it needs.
-
-    Args:
-        models: The models of the format.
-        camera: The camera.
-        form: Name of the format, for the error message.
-    """
-    most = int(np.flatnonzero(camera.distortion).max(initial=-1)) + 1
-    for name, (model, counts) in models.items():
-        count = next((count for count in counts if count >= most), None)
-        if model == camera.model and count is not None:
-            padded = np.zeros(count)
-            padded[:most] = camera.distortion[:most]
-            return name, padded
-    raise CalibrationError(
-        f"a {form} file cannot store this lens model",
-        got=f"{camera.model} with {counted(most, 'coefficient')}",
-        expected=", ".join(models),
-        hint="calibrate with --set calibration.radial_terms=2, or write another format",
-    )
-
-
-@reader
 def read_kalibr(path: StrPath) -> StereoCalibration:
-    """Read ``cam0`` as the left and ``cam1`` as the right camera of a camera chain.
+    """Read ``cam0`` as the left and ``cam1`` as the right camera of kalibr's camera chain.
 
     Ref: Kalibr's wiki, "Yaml formats": ``T_cn_cnm1`` maps points of camera n-1 to camera n.
     """
-    fields = Fields(read_yaml(path), path)
+    fields = Fields(read_yaml(path))
     right = fields.below("cam1")
     T_right_left = orthonormalise(right.numbers("T_cn_cnm1", (4, 4)))
-    return StereoCalibration(
-        _camera(fields.below("cam0"), path), _camera(right, path), T_right_left
-    )
+    left_camera, right_camera = (_kalibr_camera(fields.below(n), path) for n in ("cam0", "cam1"))
+    return StereoCalibration(left_camera, right_camera, T_right_left)
+
+
+def _kalibr_camera(fields: Fields, path: StrPath) -> CameraIntrinsics:
+    kind = fields.text("camera_model")
+    if kind != "pinhole":
+        expected = "pinhole (with radtan or equidistant distortion)"
+        raise FormatError("camera model is not supported", got=kind, expected=expected)
+    name = fields.text("distortion_model")
+    return _camera(fields, _KALIBR_MODELS, name, "distortion_coeffs", path)
+
+
+def _camera(
+    fields: Fields, models: Models, name: str, coefficients: str, path: StrPath
+) -> CameraIntrinsics:
+    """Return the camera of ``resolution``, ``intrinsics`` and the field of coefficients."""
+    model, distortion = lens_of(models, name, fields.numbers(coefficients), path)
+    width, height = fields.numbers("resolution", (2,))
+    matrix = pinhole_matrix(*fields.numbers("intrinsics", (4,)))
+    return CameraIntrinsics(matrix, distortion, int(width), int(height), model)
 
 
 def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:
     """Write a camera chain atomically."""
     chain: dict[str, Any] = {}
     for number, camera in enumerate((calibration.left, calibration.right)):
-        name, coefficients = name_lens(KALIBR_MODELS, camera, "kalibr")
+        name, coefficients = _name_lens(_KALIBR_MODELS, camera, "kalibr")
         K = camera.matrix
         chain[f"cam{number}"] = {
             "cam_overlaps": [1 - number],
@@ -282,62 +229,61 @@ def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:
     write_text(path, yaml.safe_dump(chain, default_flow_style=None))
 
 
-def _camera(fields: Fields, path: StrPath) -> CameraIntrinsics:
-    if fields.text("camera_model") != "pinhole":
-        raise FormatError(
-            "camera model is not supported",
-            where=path,
-            got=fields.text("camera_model"),
-            expected="pinhole (with radtan or equidistant distortion)",
-        )
-    model, distortion = lens_of(
-        KALIBR_MODELS, fields.text("distortion_model"), fields.numbers("distortion_coeffs"), path
-    )
-    width, height = fields.numbers("resolution", (2,))
-    matrix = pinhole_matrix(*fields.numbers("intrinsics", (4,)))
-    return CameraIntrinsics(matrix, distortion, int(width), int(height), model)
-
-
-_MODELS: Final[Models] = {
-    "radial-tangential": ("pinhole", (4, 5)),
-    "equidistant": ("fisheye", (4,)),
-}
-NS: Final = 1e-9
-
-
 @reader
 def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
-    """Read one camera.
-
-    Args:
-        path: ``sensor.yaml`` in the folder of a camera.
-
-    Returns:
-        The camera, and float64 (4, 4) ``T_body_camera``, metres.
-    """
-    fields = Fields(read_yaml(path), path)
-    width_px, height_px = fields.numbers("resolution", (2,)).astype(int)
-    name = "distortion_model"
-    model, distortion = lens_of(
-        _MODELS,
-        fields.text(name) if name in fields else "radial-tangential",
-        fields.numbers("distortion_coefficients"),
-        path,
-    )
-    matrix = pinhole_matrix(*fields.numbers("intrinsics", (4,)))
-    camera = CameraIntrinsics(matrix, distortion, int(width_px), int(height_px), model)
+    """Read a camera from its ``sensor.yaml``, and ``T_body_camera`` (4, 4), metres."""
+    fields = Fields(read_yaml(path))
+    key = "distortion_model"
+    name = fields.text(key) if key in fields else "radial-tangential"
+    camera = _camera(fields, _EUROC_MODELS, name, "distortion_coefficients", path)
     T = fields.below("T_BS").numbers("data", (4, 4))
     return camera, make_transform(T[:3, :3], T[:3, 3])
 
 
 @reader
 def read_euroc_truth(path: StrPath) -> Trajectory:
-    """Read the true trajectory of the body: ``time [ns], x y z, qw qx qy qz``, and more columns.
+    """Read the true ``T_world_body``: ``time [ns], x y z, qw qx qy qz``, and more columns.
 
-    Returns:
-        ``T_world_body``, in the frame of the motion capture.
+    The world is the frame of the motion capture.
     """
     # Position and quaternion, with or without velocity and biases.
     table, _ = read_table(path, (17, 8))
     poses = [make_transform(rotation_from_quaternion(row[[5, 6, 7, 4]]), row[1:4]) for row in table]
     return Trajectory(np.stack(poses), table[:, 0] * NS)
+
+
+def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
+    """Return float64 (3, 3) camera matrix, pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def lens_of(
+    models: Models, name: str, coefficients: Float64, where: StrPath
+) -> tuple[LensModel, Float64]:
+    """Return our lens model for a format's name, and its coefficients."""
+    if name not in models:
+        expected = ", ".join(models)
+        raise FormatError("lens model is not supported", where=where, got=name, expected=expected)
+    model, counts = models[name]
+    if coefficients.size not in counts:
+        what = f"lens model {name!r} has the wrong number of coefficients"
+        expected = " or ".join(str(count) for count in counts)
+        raise FormatError(what, where=where, got=coefficients.size, expected=expected)
+    return model, coefficients
+
+
+def _name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str, Float64]:
+    """Return a format's name for the lens of a camera, and the coefficients padded as it needs."""
+    most = int(np.flatnonzero(camera.distortion).max(initial=-1)) + 1
+    for name, (model, counts) in models.items():
+        count = next((count for count in counts if count >= most), None)
+        if model == camera.model and count is not None:
+            padded = np.zeros(count)
+            padded[:most] = camera.distortion[:most]
+            return name, padded
+    raise CalibrationError(
+        f"a {form} file cannot store this lens model",
+        got=f"{camera.model} with {counted(most, 'coefficient')}",
+        expected=", ".join(models),
+        hint="calibrate with --set calibration.radial_terms=2, or write another format",
+    )

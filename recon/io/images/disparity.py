@@ -1,4 +1,4 @@
-"""PFM: disparity as 32-bit floats; unknown is inf in the file and NaN in memory."""
+"""Disparity maps: PFM (32-bit floats, unknown = inf), PNG (KITTI's ``256·d``, unknown = 0)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,11 @@ from recon.io.images.image import read_grey_levels, write_image
 _HEADER: Final = re.compile(rb"(Pf|PF)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s")
 
 
+def read_disparity(path: StrPath) -> Float32:
+    """Return a disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown."""
+    return read_pfm(path) if Path(path).suffix.lower() == ".pfm" else read_disparity_png(path)
+
+
 @reader
 def read_pfm(path: StrPath) -> Float32:
     """Read a grey PFM file.
@@ -35,21 +40,29 @@ def read_pfm(path: StrPath) -> Float32:
     content = read_bytes(path)
     header = _HEADER.match(content)
     if header is None:
-        raise FormatError("not a PFM file", where=path, expected="header 'Pf', width height, scale")
-    kind, width, height, scale = header.groups()
+        raise FormatError("not a PFM file", expected="header 'Pf', width height, scale")
+    kind, *size, word = header.groups()
     if kind == b"PF":
-        raise FormatError("PFM file is in colour", where=path, expected="grey (header 'Pf')")
-    order = "<f4" if _parse_scale(scale, path) < 0 else ">f4"
-    shape = (int(height), int(width))
-    return _unpack(content[header.end() :], order, shape, path)
+        raise FormatError("PFM file is in colour", expected="grey (header 'Pf')")
+    try:
+        scale = float(word)
+    except ValueError:
+        scale = 0.0
+    if scale == 0 or not np.isfinite(scale):
+        raise FormatError("scale of the PFM file is invalid", got=word.decode())
+    width, height = map(int, size)
+    body, pixels = content[header.end() :], width * height
+    if pixels == 0 or len(body) < 4 * pixels:
+        expected = f"{4 * pixels} for {width}x{height} pixels"
+        got = counted(len(body), "byte")
+        raise FormatError("PFM file is truncated", got=got, expected=expected)
+    stored = np.frombuffer(body, "<f4" if scale < 0 else ">f4", pixels)
+    values = stored.reshape(height, width)[::-1]
+    return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
 
 
 def write_pfm(path: StrPath, values: Float32) -> None:
-    """Write a grey little-endian PFM file atomically; NaN becomes inf.
-
-    Args:
-        path: File to write.
-        values: float32 (H, W).
+    """Write a grey little-endian PFM file, float32 (H, W), atomically; NaN becomes inf.
 
     Raises:
         ShapeError: The array has another dtype or shape.
@@ -61,63 +74,24 @@ def write_pfm(path: StrPath, values: Float32) -> None:
     write_bytes(path, f"Pf\n{width} {height}\n-1.0\n".encode() + rows.astype("<f4").tobytes())
 
 
-def _parse_scale(word: bytes, path: StrPath) -> float:
-    try:
-        scale = float(word)
-    except ValueError:
-        scale = 0.0
-    if scale == 0 or not np.isfinite(scale):
-        raise FormatError("scale of the PFM file is invalid", where=path, got=word.decode())
-    return scale
-
-
-def _unpack(body: bytes, order: str, shape: tuple[int, int], path: StrPath) -> Float32:
-    pixels = shape[0] * shape[1]
-    if pixels == 0 or len(body) < 4 * pixels:
-        raise FormatError(
-            "PFM file is truncated",
-            where=path,
-            got=counted(len(body), "byte"),
-            expected=f"{4 * pixels} for {shape[1]}x{shape[0]} pixels",
-        )
-    values = np.frombuffer(body, dtype=order, count=pixels).reshape(shape)[::-1]
-    return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
-
-
-def read_disparity(path: StrPath) -> Float32:
-    """Return a disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown."""
-    return read_pfm(path) if Path(path).suffix.lower() == ".pfm" else read_disparity_png(path)
-
-
 @reader
 def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
-    """Read a disparity stored as grey levels.
+    """Read a disparity stored as grey levels of 8 or 16 bits: float32 (H, W), NaN where it is 0.
 
-    Args:
-        path: PNG or PGM of 8 or 16 bits.
-        scale: Grey levels per pixel of disparity: 256 in KITTI; 4, 8 or 16 in Middlebury.
-
-    Returns:
-        float32 (H, W), pixels; NaN where the level is 0.
+    The scale is in levels per pixel: 256 in KITTI; 4, 8 or 16 in Middlebury.
     """
     levels = read_grey_levels(path)
     if levels.dtype == np.uint8 and scale > 255:
-        raise FormatError("disparity image has 8 bits", where=path, expected="16 bits")
+        raise FormatError("disparity image has 8 bits", expected="16 bits")
     values: Float32 = levels.astype(np.float32) / np.float32(scale)
     values[levels == 0] = np.nan
     return values
 
 
 def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0) -> None:
-    """Write a disparity as a 16-bit PNG atomically.
+    """Write a disparity, float32 (H, W), as a 16-bit PNG atomically; for ``scale`` see above.
 
-    A disparity that would round to 0 becomes level 1, as in KITTI's own writer, because level 0
-    means unknown.
-
-    Args:
-        path: Ends in .png.
-        values: float32 (H, W), pixels; NaN = unknown.
-        scale: Grey levels per pixel; see `fitting_scale`.
+    A disparity that would round to 0, unknown, becomes level 1, as in KITTI's own writer.
     """
     frozen_array("values", values, np.float32, (None, None))
     known = np.isfinite(values)

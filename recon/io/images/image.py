@@ -1,4 +1,4 @@
-"""Images: PNG, JPEG, PGM, PPM, BMP and TIFF; damaged files are rejected."""
+"""Images: PNG, JPEG, PGM, PPM, BMP and TIFF, messages of ROS; what is damaged is rejected."""
 
 from __future__ import annotations
 
@@ -29,12 +29,34 @@ _GREY_ONLY: Final = frozenset({".pgm"})
 _COLOUR_ONLY: Final = frozenset({".ppm"})
 _EIGHT_BIT_ONLY: Final = frozenset({".jpg", ".jpeg"})
 _WRITABLE: Final = _GREY_ONLY | _COLOUR_ONLY | _EIGHT_BIT_ONLY | {".png", ".tif", ".tiff"}
+# Encoding: channels, bits per channel, and how OpenCV makes RGB of it, if it is not there already.
+# OpenCV names a Bayer pattern from pixel (1, 1) on, ROS from pixel (0, 0) on.
+_ENCODINGS: Final[dict[str, tuple[int, int, int | None]]] = {
+    "mono8": (1, 8, None),
+    "8uc1": (1, 8, None),
+    "mono16": (1, 16, None),
+    "16uc1": (1, 16, None),
+    "rgb8": (3, 8, None),
+    "bgr8": (3, 8, cv2.COLOR_BGR2RGB),
+    "8uc3": (3, 8, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
+    "8uc4": (4, 8, cv2.COLOR_BGRA2RGB),
+    "bayer_rggb8": (1, 8, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
+    "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
+}
 
 
 def read_image(
     path: StrPath, white: int = FULL_WHITE, max_megapixels: float = MAX_MEGAPIXELS
 ) -> UInt8:
-    """Read an image for display or matching, as 8 bits.
+    """Read an image for display or matching: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
     16-bit images are scaled to 8 bits, linearly. An alpha channel is dropped. The EXIF orientation
     is ignored: a calibration refers to the pixels as the sensor recorded them.
@@ -44,9 +66,6 @@ def read_image(
         white: The 16-bit value that becomes 255, see `find_white`; the same for all images of a
             drive.
         max_megapixels: Refuse larger images, in 10⁶ pixels.
-
-    Returns:
-        uint8 (H, W) if the file is grey, else (H, W, 3) RGB.
 
     Raises:
         FormatError: The file is missing, empty, truncated, not an image, too large, or has
@@ -74,54 +93,39 @@ def find_white(images: Iterable[NDArray[Any]]) -> int:
 
 @reader
 def read_levels(path: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> NDArray[Any]:
-    """Read an image with its values as stored, such as a mask or a scaled disparity.
-
-    Returns:
-        uint8 or uint16, (H, W) or (H, W, 3) RGB.
-    """
+    """Read an image as stored, such as a mask: uint8 or uint16, (H, W) or (H, W, 3) RGB."""
     content = read_bytes(path, int(max_megapixels * 1e6 * _PIXEL_BYTES) + SMALL_FILE_BYTES)
-    return decode_levels(content, path, max_megapixels)
+    return _decode(content, max_megapixels)
 
 
 def decode_image(content: bytes, where: StrPath) -> UInt8:
     """Read an image like `read_image`, from bytes in memory."""
-    return eight_bits(decode_levels(content, where))
+    with reading(where):
+        return eight_bits(_decode(content, MAX_MEGAPIXELS))
 
 
-def decode_levels(
-    content: bytes, path: StrPath, max_megapixels: float = MAX_MEGAPIXELS
-) -> NDArray[Any]:
-    """Read an image like `read_levels`, from the bytes of a file."""
-    with reading(path):
-        _check_size(stated_size(content), path, max_megapixels)
-        check_image_bytes(content, path)
-    try:
-        with silent_opencv() if is_tiff(content) else nullcontext():
-            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise FormatError("image cannot be decoded", where=path, got=error.err) from error
-    if image is None:
-        raise FormatError("image cannot be decoded", where=path, hint="copy the file again")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise FormatError(
-            "pixel type of the image is not supported",
-            where=path,
-            got=image.dtype.name,
-            expected="8 or 16 bits",
-        )
-    return image if image.ndim == 2 else swap_red_and_blue(image[:, :, :3])
-
-
-def _check_size(size: tuple[int, int] | None, path: StrPath, max_megapixels: float) -> None:
-    """Refuse an image by the size in its header: a small file can hold very many pixels."""
+def _decode(content: bytes, max_megapixels: float) -> NDArray[Any]:
+    size = stated_size(content)
+    # A small file can hold very many pixels.
     if size is not None and size[0] * size[1] > max_megapixels * 1e6:
         raise FormatError(
             "image has too many pixels",
-            where=path,
             got=f"{size[0]}x{size[1]}",
             expected=f"at most {max_megapixels:g} million",
             hint="make it smaller; --set source.max_megapixels= allows more",
         )
+    check_image_bytes(content)
+    try:
+        with silent_opencv() if is_tiff(content) else nullcontext():
+            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise FormatError("image cannot be decoded", got=error.err) from error
+    if image is None:
+        raise FormatError("image cannot be decoded", hint="copy the file again")
+    if image.dtype not in (np.uint8, np.uint16):
+        got, what = image.dtype.name, "pixel type of the image is not supported"
+        raise FormatError(what, got=got, expected="8 or 16 bits")
+    return image if image.ndim == 2 else swap_red_and_blue(image[:, :, :3])
 
 
 def read_grey_levels(path: StrPath) -> NDArray[Any]:
@@ -135,15 +139,12 @@ def read_grey_levels(path: StrPath) -> NDArray[Any]:
 
 
 def write_image(path: StrPath, image: NDArray[Any]) -> None:
-    """Write an image atomically, in the format given by the suffix.
+    """Write an image, uint8 or uint16, grey (H, W) or RGB (H, W, 3), atomically.
 
-    Args:
-        path: Ends in .png, .tif, .tiff, .jpg, .jpeg, .pgm (grey) or .ppm (colour).
-        image: uint8 or uint16 (not JPEG), (H, W) grey or (H, W, 3) RGB.
+    The suffix gives the format: .png, .tif, .tiff, .jpg, .jpeg, .pgm (grey) or .ppm (colour).
     """
-    _check_pixels(image)
     suffix = Path(path).suffix.lower()
-    _check_suffix(path, suffix, image)
+    _check_writable(path, suffix, image)
     pixels = image if image.ndim == 2 else swap_red_and_blue(image)
     try:
         done, content = cv2.imencode(suffix, pixels)
@@ -175,58 +176,22 @@ def swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(image[:, :, ::-1])
 
 
-def _check_pixels(image: NDArray[Any]) -> None:
-    shaped = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
-    if image.dtype not in (np.uint8, np.uint16) or not shaped or image.size == 0:
-        raise ShapeError(
-            "array is not an image",
-            got=f"{image.dtype.name} {image.shape}",
-            expected="uint8 or uint16 (H, W) or (H, W, 3)",
-        )
-
-
-def _check_suffix(path: StrPath, suffix: str, image: NDArray[Any]) -> None:
+def _check_writable(path: StrPath, suffix: str, image: NDArray[Any]) -> None:
+    got = f"{image.dtype.name} {image.shape}"
+    grey, colour = image.ndim == 2, image.ndim == 3 and image.shape[2] == 3
+    if image.dtype not in (np.uint8, np.uint16) or not (grey or colour) or image.size == 0:
+        expected = "uint8 or uint16 (H, W) or (H, W, 3)"
+        raise ShapeError("array is not an image", got=got, expected=expected)
     if suffix not in _WRITABLE:
-        expected = ", ".join(sorted(_WRITABLE))
-        raise OutputError(
-            "unknown image format", where=path, got=suffix or "no suffix", expected=expected
-        )
-    fits = (
-        not (suffix in _GREY_ONLY and image.ndim == 3)
-        and not (suffix in _COLOUR_ONLY and image.ndim == 2)
-        and not (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
-    )
-    if not fits:
-        raise OutputError(
-            f"a {suffix} file cannot hold this image",
-            where=path,
-            got=f"{image.dtype.name} {image.shape}",
-            hint="write .png",
-        )
-
-
-# Encoding: channels, bits per channel, and how OpenCV makes RGB of it, if it is not there already.
-# OpenCV names a Bayer pattern from pixel (1, 1) on, ROS from pixel (0, 0) on.
-_ENCODINGS: Final[dict[str, tuple[int, int, int | None]]] = {
-    "mono8": (1, 8, None),
-    "8uc1": (1, 8, None),
-    "mono16": (1, 16, None),
-    "16uc1": (1, 16, None),
-    "rgb8": (3, 8, None),
-    "bgr8": (3, 8, cv2.COLOR_BGR2RGB),
-    "8uc3": (3, 8, cv2.COLOR_BGR2RGB),
-    "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
-    "8uc4": (4, 8, cv2.COLOR_BGRA2RGB),
-    "bayer_rggb8": (1, 8, cv2.COLOR_BayerBG2RGB),
-    "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
-    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB),
-    "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
-    "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
-}
+        what, expected = "unknown image format", ", ".join(sorted(_WRITABLE))
+        raise OutputError(what, where=path, got=suffix or "no suffix", expected=expected)
+    if (
+        (suffix in _GREY_ONLY and colour)
+        or (suffix in _COLOUR_ONLY and grey)
+        or (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
+    ):
+        what = f"a {suffix} file cannot hold this image"
+        raise OutputError(what, where=path, got=got, hint="write .png")
 
 
 def pixels_of_ros_image(
@@ -238,40 +203,25 @@ def pixels_of_ros_image(
     big_endian: bool = False,
     where: str = "",
 ) -> UInt8:
-    """Decode the bytes of an image message.
+    """Decode the bytes (N,) of a ROS image message: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    16-bit pixels are scaled over their full range to 8 bits, as in image files.
-
-    Args:
-        data: uint8 (N,), all rows, each ``step`` bytes long.
-        encoding: Name of the encoding in ROS.
-        shape: Height and width.
-        step: Bytes per row, including padding.
-        big_endian: Whether 16-bit pixels are big-endian.
-        where: Topic or message, for the error message.
-
-    Returns:
-        uint8 (H, W) if the encoding is grey, else (H, W, 3) RGB.
+    Each row of the ``shape`` (H, W) is ``step`` bytes long. 16-bit pixels are scaled over their
+    full range to 8 bits, as in image files.
 
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """
     name = encoding.lower()
     if name not in _ENCODINGS:
-        raise FormatError(
-            "image encoding is not supported",
-            where=where,
-            got=encoding,
-            expected=", ".join(sorted(_ENCODINGS)),
-        )
+        what, expected = "image encoding is not supported", ", ".join(sorted(_ENCODINGS))
+        raise FormatError(what, where=where, got=encoding, expected=expected)
     height_px, width_px = shape
     channels, bits, to_rgb = _ENCODINGS[name]
     row = width_px * channels * bits // 8
     if step < row or data.size < step * (height_px - 1) + row or min(shape) < 1:
+        got = f"{counted(data.size, 'byte')}, {step} per row"
+        expected = f"{width_px}x{height_px} pixels of {name}"
         raise FormatError(
-            "image message has too few bytes",
-            where=where,
-            got=f"{counted(data.size, 'byte')}, {step} per row",
-            expected=f"{width_px}x{height_px} pixels of {name}",
+            "image message has too few bytes", where=where, got=got, expected=expected
         )
     rows = np.lib.stride_tricks.as_strided(data, (height_px, row), (step, 1))
     pixels = np.ascontiguousarray(rows)

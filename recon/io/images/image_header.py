@@ -1,8 +1,9 @@
-"""Sizes in headers of image files, and detection of damage, which decoders fill in silently.
+"""What the bytes of an image file say: damage, which decoders fill in silently; size; focal length.
 
 Ref:
     PNG: ISO/IEC 15948, section 5 (chunks). JPEG: ITU-T T.81, annex B (markers).
     PGM and PPM: the netpbm manual. BMP: BITMAPINFOHEADER in the Windows GDI reference.
+    EXIF: CIPA DC-008 (Exif 2.32), section 4.6.5; CIPA DCG-001 for the 35 mm equivalent.
 """
 
 from __future__ import annotations
@@ -42,24 +43,28 @@ _READERS: Final[dict[bytes, type[ImageFile]]] = {
     b"P": PpmImageFile,
 }
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
-UNDERSTOOD: Final = "PNG, JPEG, PGM, PPM, BMP or TIFF"
+_EXIF_IFD: Final = 0x8769
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
+_SENSOR_RESOLUTION, _SENSOR_UNIT, _SENSOR_WIDTH_PX = 0xA20E, 0xA210, 0xA002
+_MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_DIAGONAL_35MM: Final = math.hypot(36.0, 24.0)
 
 
-def check_image_bytes(content: bytes, path: StrPath) -> None:
+def check_image_bytes(content: bytes) -> None:
     """Check that the content of a file is a complete image of a supported format.
 
     For TIFF only the format is checked: its decoder does reject truncated files.
     """
     if content.startswith(_PNG_START):
-        _check_png(content, path)
+        _check_png(content)
     elif content.startswith(_JPEG_START):
-        _check_jpeg(content, path)
+        _check_jpeg(content)
     elif content[:1] == b"P" and content[1:2] in b"2356":
-        _check_pnm(content, path)
+        _check_pnm(content)
     elif content.startswith(b"BM"):
-        _check_bmp(content, path)
+        _check_bmp(content)
     elif not is_tiff(content):
-        raise FormatError("not an image", where=path, expected=UNDERSTOOD)
+        raise FormatError("not an image", expected="PNG, JPEG, PGM, PPM, BMP or TIFF")
 
 
 def is_tiff(content: bytes) -> bool:
@@ -67,49 +72,43 @@ def is_tiff(content: bytes) -> bool:
     return content.startswith(_TIFF_STARTS)
 
 
-def _truncated(kind: str, path: StrPath, got: str) -> FormatError:
-    return FormatError(
-        f"{kind} image is truncated or damaged", where=path, got=got, hint="copy the file again"
-    )
+def _truncated(kind: str, got: str) -> FormatError:
+    what = f"{kind} image is truncated or damaged"
+    return FormatError(what, got=got, hint="copy the file again")
 
 
-def _check_png(content: bytes, path: StrPath) -> None:
+def _check_png(content: bytes) -> None:
     """Walk the chunks up to IEND; each must be complete and match its checksum."""
-    at = len(_PNG_START)
-    name = b""
+    at, name, size = len(_PNG_START), b"", counted(len(content), "byte")
     while name != b"IEND":
         if at + 12 > len(content):
-            raise _truncated(
-                "PNG", path, f"the file ends after {counted(len(content), 'byte')}, before IEND"
-            )
+            raise _truncated("PNG", f"the file ends after {size}, before IEND")
         length = int.from_bytes(content[at : at + 4], "big")
         name = content[at + 4 : at + 8]
         end = at + 8 + length
         if end + 4 > len(content):
-            raise _truncated(
-                "PNG", path, f"the file ends inside a chunk of {counted(length, 'byte')}"
-            )
+            raise _truncated("PNG", f"the file ends inside a chunk of {counted(length, 'byte')}")
         if zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
-            raise _truncated("PNG", path, f"checksum of chunk {name!r} differs")
+            raise _truncated("PNG", f"checksum of chunk {name!r} differs")
         at = end + 4
 
 
-def _check_jpeg(content: bytes, path: StrPath) -> None:
+def _check_jpeg(content: bytes) -> None:
     """Look for the end marker after the start of scan; an embedded thumbnail has its own."""
     at = 2
     while content[at : at + 2] != b"\xff\xda":
         if at + 4 > len(content) or content[at] != 0xFF:
-            raise _truncated("JPEG", path, "no start of scan")
+            raise _truncated("JPEG", "no start of scan")
         # A marker may be preceded by any number of fill bytes 0xFF.
         at += 1 if content[at + 1] == 0xFF else 2 + struct.unpack_from(">H", content, at + 2)[0]
     if content.rfind(b"\xff\xd9") < at:
-        raise _truncated("JPEG", path, "no end-of-image marker")
+        raise _truncated("JPEG", "no end-of-image marker")
 
 
-def _check_pnm(content: bytes, path: StrPath) -> None:
+def _check_pnm(content: bytes) -> None:
     header = _PNM_HEADER.match(content)
     if header is None:
-        raise _truncated("PGM/PPM", path, "no readable header")
+        raise _truncated("PGM/PPM", "no readable header")
     kind, width, height, top = (int(group) for group in header.groups())
     samples = width * height * (3 if kind in {3, 6} else 1)
     if kind in {2, 3}:
@@ -117,22 +116,21 @@ def _check_pnm(content: bytes, path: StrPath) -> None:
     else:
         found = (len(content) - header.end()) // (2 if top > 255 else 1)
     if found < samples:
-        raise _truncated("PGM/PPM", path, f"{found} of {counted(samples, 'sample')}")
+        raise _truncated("PGM/PPM", f"{found} of {counted(samples, 'sample')}")
 
 
-def _check_bmp(content: bytes, path: StrPath) -> None:
+def _check_bmp(content: bytes) -> None:
     """Compute the size from rows padded to four bytes, as a header may declare a size of 0."""
     if len(content) < _BMP_HEADER.size:
-        raise _truncated(
-            "BMP", path, f"the file ends after {counted(len(content), 'byte')}, in its header"
-        )
+        size = counted(len(content), "byte")
+        raise _truncated("BMP", f"the file ends after {size}, in its header")
     header = _BMP_HEADER.unpack_from(content)
     _, offset, width, height, _, bits, compression, stored = header
     rows = (width * bits + 31) // 32 * 4 * abs(height)
     run_lengths = compression in {1, 2}
     needed = offset + (stored if run_lengths else rows)
     if len(content) < needed:
-        raise _truncated("BMP", path, f"{len(content)} of {counted(needed, 'byte')}")
+        raise _truncated("BMP", f"{len(content)} of {counted(needed, 'byte')}")
 
 
 def stated_size(content: bytes) -> tuple[int, int] | None:
@@ -161,21 +159,9 @@ def _tiff_size(content: bytes) -> tuple[int, int]:
     return directory[_TIFF_WIDTH], directory[_TIFF_HEIGHT]
 
 
-_EXIF_IFD: Final = 0x8769
-_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
-_SENSOR_RESOLUTION, _SENSOR_UNIT, _SENSOR_WIDTH_PX = 0xA20E, 0xA210, 0xA002
-_MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_DIAGONAL_35MM: Final = math.hypot(36.0, 24.0)
-
-
 @dataclass(frozen=True)
 class ExifFocal:
-    """A focal length as a camera recorded it.
-
-    Attributes:
-        focal_px: In pixels of the image.
-        basis: What it was computed from.
-    """
+    """A focal length in pixels of the image, and what the camera recorded for it."""
 
     focal_px: float
     basis: str
@@ -184,13 +170,8 @@ class ExifFocal:
 def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal | None:
     """Read the focal length of a photograph: from its sensor data, or else the 35 mm equivalent.
 
-    Args:
-        path: The image.
-        width_px: Its width, which may be less than the camera's if it was made smaller.
-        height_px: Its height.
-
-    Returns:
-        The focal length; None = the file does not say, or is no image.
+    The size may be less than the camera's if the image was made smaller. None = the file does not
+    say, or is no image.
     """
     try:
         with reading(path), Image.open(path) as image:

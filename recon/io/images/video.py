@@ -28,12 +28,7 @@ _COUNT_TOLERANCE: Final = 2
 class VideoFile:
     """A video file as its container describes it, checked against its packets.
 
-    Attributes:
-        path: The file.
-        frames: Number of frames.
-        width_px: Width of a frame as recorded; an orientation tag is ignored.
-        height_px: Height of a frame.
-        rate_hz: Frames per second.
+    The size is that of a frame as recorded; an orientation tag is ignored.
     """
 
     path: Path
@@ -43,11 +38,7 @@ class VideoFile:
     rate_hz: float
 
     def pick(self, numbers: Iterable[int]) -> Iterator[tuple[float, UInt8]]:
-        """Decode frames of increasing numbers; those before and between are decoded and dropped.
-
-        Yields:
-            Seconds from the start of the file, and uint8 (H, W, 3) RGB.
-        """
+        """Yield frames of increasing numbers: seconds from the start, and uint8 (H, W, 3) RGB."""
         with _opened(self.path) as capture:
             after = 0
             for index in numbers:

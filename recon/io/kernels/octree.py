@@ -1,9 +1,8 @@
 """Finds the leaves of an octree from the bits that say which children each node has.
 
 Nodes come depth first, the children of a node in the order of their numbers (bit 0 is x, bit 1 y,
-bit 2 z). A walk can stop after any node and continue with the next ones, so a tree of any size can
-be read in pieces. The reference implementation is in
-`tests/io/kernels/octree_reference.py`.
+bit 2 z). A walk can stop after any node and go on, so a tree of any size is read in pieces. The
+reference implementation is in `tests/io/kernels/octree_reference.py`.
 """
 
 from __future__ import annotations
@@ -17,31 +16,21 @@ from recon.core.kernels.compiled import kernel
 
 
 class TreeWalk(NamedTuple):
-    """The nodes above the next one, which a walk goes on from.
+    """The nodes above the next one, which a walk goes on from."""
 
-    Attributes:
-        level: int64 (1,), that of the next node: 0 = the root, -1 = none, all were seen.
-        left: uint8 (D,), for the node above on each level, the children that are still to come.
-        places: int32 (D, 3), where that node is, in cubes of its level.
-    """
-
+    # int64 (1,), that of the next node: 0 = the root, -1 = none, all were seen
     level: NDArray[np.int64]
+    # uint8 (D,), for the node above on each level, the children that are still to come
     left: NDArray[np.uint8]
-    places: NDArray[np.int32]
+    places: NDArray[np.int32]  # int32 (D, 3), where that node is, in cubes of its level
 
 
 class Leaves(NamedTuple):
-    """Nodes without children.
+    """Nodes without children."""
 
-    Attributes:
-        nodes: int64 (N,), their numbers among those walked over.
-        levels: int64 (N,).
-        places: int32 (N, 3), in cubes of their level, from 0 to ``2^level - 1``.
-    """
-
-    nodes: NDArray[np.int64]
-    levels: NDArray[np.int64]
-    places: NDArray[np.int32]
+    nodes: NDArray[np.int64]  # int64 (N,), their numbers among those walked over
+    levels: NDArray[np.int64]  # int64 (N,)
+    places: NDArray[np.int32]  # int32 (N, 3), in cubes of their level, from 0 to ``2^level - 1``
 
 
 def begin_walk(depth: int) -> TreeWalk:
@@ -52,15 +41,10 @@ def begin_walk(depth: int) -> TreeWalk:
 
 
 def find_leaves(children: NDArray[np.uint8], walk: TreeWalk) -> tuple[int, Leaves]:
-    """Walk over the next nodes of a tree.
+    """Walk over the next nodes (N,), a bit for each child; the walk is moved on.
 
-    Args:
-        children: uint8 (N,), a bit for each child of each node.
-        walk: Where the walk is; it is moved on.
-
-    Returns:
-        How many of the nodes belong to the tree: fewer than N where it ends before, or where a
-        node has children below the deepest level. And the leaves among them.
+    The result is how many of them belong to the tree (fewer than N where it ends before, or where a
+    node has children below the deepest level), and the leaves among them.
     """
     found = Leaves(
         np.empty(len(children), np.int64),
@@ -97,7 +81,6 @@ def _find_leaves(children: NDArray[np.uint8], walk: TreeWalk, found: Leaves) -> 
 
 @kernel
 def _next_place(level: int, walk: TreeWalk) -> tuple[int, int, int]:
-    """Take the next child of the node above; where it is."""
     if level == 0:
         return 0, 0, 0
     child = 0

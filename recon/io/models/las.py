@@ -34,19 +34,11 @@ def write_las(
     """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
 
     Positions are rounded to millimetres; colours, and the standard deviation of the depth as the
-    extra dimension ``sigma``, are written where the clouds have them.
+    extra dimension ``sigma``, are written where the clouds have them. One cloud is in memory at a
+    time; ``T_to_from`` (4, 4) leads from their frame to the coordinates of the file, whose system
+    is ``crs``. The number of points is returned.
 
-    Args:
-        path: The file.
-        clouds: Clouds in one frame; one is in memory at a time.
-        T_to_from: float64 (4, 4), from their frame to the coordinates of the file, in doubles.
-        crs: Coordinate system of the file, see `check_crs`; None = not stated.
-
-    Returns:
-        The number of points.
-
-    Ref:
-        ASPRS, "LAS specification 1.4 - R15", 2019.
+    Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
     laspy = require("laspy", extra=_EXTRA)
     header = laspy.LasHeader(point_format=_COLOURED, version="1.4")
@@ -132,7 +124,6 @@ def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> 
 
 
 def _record(laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64) -> Any:
-    """Return the points of a cloud, as laspy writes them."""
     record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
     record.return_number[:] = record.number_of_returns[:] = 1  # 0 is not permitted
     record.x, record.y, record.z = apply(T_to_from, cloud.xyz.astype(np.float64)).T

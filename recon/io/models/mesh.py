@@ -19,7 +19,13 @@ from recon.core.values.arrays import Int32, UInt8
 from recon.core.values.cloud import Frame
 from recon.io.atomic import atomic_path, write_bytes
 from recon.io.files import StrPath, reader
-from recon.io.models.ply import colours_of, fill_vertices, normals_of, vertex_dtype
+from recon.io.models.ply import (
+    colours_of,
+    fill_vertices,
+    normals_of,
+    positions_of,
+    vertex_dtype,
+)
 from recon.io.models.ply_tables import (
     Table,
     list_length,
@@ -31,6 +37,12 @@ from recon.io.models.ply_tables import (
 MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
 #: Both names are in use for this property of a face.
 _INDICES: Final = ("vertex_indices", "vertex_index")
+_COMPONENTS: Final = {"float32": 5126, "uint32": 5125, "uint16": 5123}
+_KINDS: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
+_MATTE: Final = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+#: Colours taken from images already include the lighting.
+_UNLIT: Final = "KHR_materials_unlit"
 
 
 def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
@@ -68,21 +80,16 @@ def check_mesh_formats(formats: Sequence[str]) -> None:
     """Refuse unknown formats, given as suffixes without the dot, before the work is done."""
     unknown = [name for name in formats if f".{name}" not in MESH_SUFFIXES]
     if unknown:
-        raise SettingsError(
-            "unknown mesh format",
-            where="--format",
-            got=unknown[0],
-            expected=", ".join(suffix.lstrip(".") for suffix in MESH_SUFFIXES),
-        )
+        expected = ", ".join(suffix.lstrip(".") for suffix in MESH_SUFFIXES)
+        what = "unknown mesh format"
+        raise SettingsError(what, where="--format", got=unknown[0], expected=expected)
 
 
 def join_meshes(path: StrPath, parts: Sequence[tuple[Path, int, int]]) -> None:
     """Join the meshes of several PLY files into one PLY, with at most two in memory.
 
-    Args:
-        path: The file, written atomically.
-        parts: File, number of vertices and number of faces of each part, at least one; all with
-            the same fields.
+    Each of the ``parts``, at least one, is a file and its numbers of vertices and faces; all have
+    the same fields. The file is written atomically.
     """
     files, vertices, faces = zip(*parts, strict=True)
     starts = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)
@@ -98,10 +105,7 @@ def join_meshes(path: StrPath, parts: Sequence[tuple[Path, int, int]]) -> None:
 
 @reader
 def read_mesh(path: StrPath) -> TriangleMesh:
-    """Read a mesh.
-
-    Args:
-        path: The file; its suffix (.ply, .obj, .stl or .glb) gives the format.
+    """Read a mesh; the suffix of the file (.ply, .obj, .stl or .glb) gives the format.
 
     Raises:
         FormatError: The file is missing, of an unknown format, truncated, has no faces, or has
@@ -109,7 +113,7 @@ def read_mesh(path: StrPath) -> TriangleMesh:
     """
     suffix = Path(path).suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise FormatError("unknown kind of mesh file", where=path, expected=" ".join(MESH_SUFFIXES))
+        raise FormatError("unknown kind of mesh file", expected=" ".join(MESH_SUFFIXES))
     if suffix == ".ply":
         mesh = _read_ply(path)
     elif Path(path).is_file():
@@ -119,8 +123,13 @@ def read_mesh(path: StrPath) -> TriangleMesh:
         if suffix == ".glb" and mesh.rgb is not None:
             mesh = replace(mesh, rgb=srgb_from_linear(mesh.rgb))
     else:
-        raise FormatError("no such file", where=path)
-    return _checked(mesh, path)
+        raise FormatError("no such file")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        what, got = "a face refers to a vertex that does not exist", f"{int(mesh.faces.max())}"
+        raise FormatError(what, got=got, expected=f"less than {len(mesh.vertices)}")
+    if not np.isfinite(mesh.vertices).all():
+        raise FormatError("a vertex of the mesh is not finite")
+    return mesh
 
 
 def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
@@ -139,15 +148,8 @@ def _read_ply(path: StrPath) -> TriangleMesh:
     _, tables = read_tables(path, ["vertex", "face"])
     vertex, faces = tables.get("vertex"), _faces(tables.get("face"))
     if vertex is None or faces is None or len(faces) == 0:
-        raise FormatError("the PLY file has no faces: it is a point cloud", where=path)
-    if not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
-        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
-    return TriangleMesh(
-        vertices=np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32),
-        faces=faces,
-        normals=normals_of(vertex),
-        rgb=colours_of(vertex),
-    )
+        raise FormatError("the PLY file has no faces: it is a point cloud")
+    return TriangleMesh(positions_of(vertex), faces, normals_of(vertex), colours_of(vertex))
 
 
 def _faces(table: Table | None) -> Int32 | None:
@@ -157,35 +159,13 @@ def _faces(table: Table | None) -> Int32 | None:
     return None
 
 
-def _checked(mesh: TriangleMesh, path: StrPath) -> TriangleMesh:
-    """Check that all faces refer to existing vertices and all vertices are finite."""
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise FormatError(
-            "a face refers to a vertex that does not exist",
-            where=path,
-            got=f"{int(mesh.faces.max())}",
-            expected=f"less than {len(mesh.vertices)}",
-        )
-    if not np.isfinite(mesh.vertices).all():
-        raise FormatError("a vertex of the mesh is not finite", where=path)
-    return mesh
-
-
-_COMPONENTS: Final = {"float32": 5126, "uint32": 5125, "uint16": 5123}
-_KINDS: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
-_MATTE: Final = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-#: Colours taken from images already include the lighting.
-_UNLIT: Final = "KHR_materials_unlit"
-
-
 def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh as GLB with float vertices, without changing its coordinates.
 
-    The y axis of glTF is up, so the node of the mesh is rotated upright if the frame is known.
+    The y axis of glTF is up, so the node of the mesh is rotated upright if the frame is known. Its
+    colours are linear: sRGB is converted, to 16 bits to keep dark tones distinct.
 
-    Vertex colours of glTF are linear, so sRGB colours are converted, to 16 bits to keep dark tones
-    distinct.
+    Ref: Khronos Group, "glTF 2.0 specification", sections 3.6 (buffers), 3.7 (meshes), 4.4 (GLB).
     """
     vertices: dict[str, NDArray[Any]] = {"POSITION": mesh.vertices}
     if mesh.normals is not None:

@@ -26,12 +26,7 @@ _SENSOR_MM: Final = 36.0
 
 @dataclass(frozen=True)
 class Photo:
-    """The image of a camera at the origin of the layers, looking along their z axis.
-
-    Attributes:
-        file: The image.
-        camera: Its camera.
-    """
+    """The image of a camera at the origin of the layers, looking along their z axis."""
 
     file: Path
     camera: RectifiedCamera
@@ -43,17 +38,11 @@ def write_mlp(
     frame: Frame | None = None,
     photo: Photo | None = None,
 ) -> None:
-    """Write a MeshLab project.
+    """Write a MeshLab project of layers (label and file, which must exist), atomically.
 
     File paths are relative to the project, so the folder can be moved as a whole. MeshLab opens a
-    project with y up and looks along -z, so the layers are rotated if their frame is known.
-
-    Args:
-        path: The project file, written atomically.
-        layers: Label and file of each layer, such as ``{"cloud": "map/cloud.ply"}``; the files
-            must exist.
-        frame: Axes of the layers; None = unknown, not rotated.
-        photo: Image of a camera at the origin of the frame ``camera``; None = no raster layer.
+    project with y up and looks along -z, so the layers are rotated if their frame is known. The
+    camera of a photo is at the origin of the frame ``camera``.
     """
     T = _IDENTITY if frame is None else T_YUP_FRAME[frame]
     project = ET.Element("MeshLabProject")
@@ -100,7 +89,6 @@ def _rows(T: Float64) -> str:
 
 
 def _relative(file: StrPath, project: Path) -> str:
-    """Return the path of a layer's file relative to the project's folder."""
     if not Path(file).is_file():
         raise OutputError(
             "a layer of the MeshLab project does not exist", where=file, hint="write it first"

@@ -35,12 +35,7 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s
 def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
     """Write ``path.pgm``, ``path.wld`` for a GIS, and ``path.yaml``, each atomically.
 
-    Args:
-        path: Both names without their suffixes, such as ``map/grid``.
-        grid: The grid.
-
-    Returns:
-        Two of the paths: image, YAML.
+    The path has no suffix, such as ``map/grid``; those of the image and the YAML are returned.
     """
     stem = Path(path)
     image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
@@ -79,7 +74,6 @@ def _grey(cells: NDArray[np.int8]) -> UInt8:
 
 
 def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
-    """Return the content of the YAML file."""
     return {
         "image": image,
         "mode": "trinary",
@@ -107,28 +101,21 @@ def _shortest(number: float) -> str:
 
 
 def _fields(path: Path) -> dict[str, Any]:
-    """Read and validate the content of the YAML file."""
+    """Read the YAML file; fields that are not numbers, and rotated maps, are rejected."""
     fields = read_yaml(path)
     missing = [key for key in _KEYS if key not in fields]
     if missing:
-        raise FormatError(f"the map's YAML file has no {missing[0]!r}", where=path)
-    if fields.get("mode", "trinary") != "trinary":
-        raise FormatError(
-            "mode of the map is not supported", where=path, got=fields["mode"], expected="trinary"
-        )
-    _check_numbers(fields, path)
-    return fields
-
-
-def _check_numbers(fields: dict[str, Any], path: Path) -> None:
-    """Reject fields that are not numbers, and rotated maps."""
-    origin = fields["origin"]
+        raise FormatError(f"the map's YAML file has no {missing[0]!r}")
+    mode, origin = fields.get("mode", "trinary"), fields["origin"]
+    if mode != "trinary":
+        raise FormatError("mode of the map is not supported", got=mode, expected="trinary")
     numbers = [fields[key] for key in ("resolution", "occupied_thresh", "free_thresh")]
     whole = isinstance(origin, list) and len(origin) == 3
     if not whole or not all(isinstance(n, (int, float)) for n in (*numbers, *origin)):
-        raise FormatError("the map's YAML file holds a value that is not a number", where=path)
+        raise FormatError("the map's YAML file holds a value that is not a number")
     if origin[2] != 0:
-        raise FormatError("the map is rotated", where=path, got=f"yaw {origin[2]:g}", expected="0")
+        raise FormatError("the map is rotated", got=f"yaw {origin[2]:g}", expected="0")
+    return fields
 
 
 @reader
@@ -137,15 +124,11 @@ def _read_pgm(path: Path) -> UInt8:
     content = read_bytes(path)
     header = _PGM_HEADER.match(content)
     if header is None or int(header[3]) != 255:
-        raise FormatError("the map's image is not a binary 8-bit PGM", where=path)
+        raise FormatError("the map's image is not a binary 8-bit PGM")
     columns, rows = int(header[1]), int(header[2])
     body = content[header.end() :]
     if len(body) != rows * columns:
-        raise FormatError(
-            "the map's image is truncated",
-            where=path,
-            got=counted(len(body), "byte"),
-            expected=f"{rows * columns}",
-        )
+        what, got = "the map's image is truncated", counted(len(body), "byte")
+        raise FormatError(what, got=got, expected=f"{rows * columns}")
     pixels: NDArray[np.uint8] = np.frombuffer(body, np.uint8)
     return pixels.reshape(rows, columns)

@@ -1,6 +1,9 @@
 """OctoMap files: ``.ot`` with log-odds, ``.bt`` with only occupied and free.
 
-Both are written and read piece by piece, without a whole tree in memory.
+Both are written and read piece by piece, without a whole tree in memory. A branch is a cube with a
+side of ``2^depth`` cells. Its cells are sorted in Morton order (x is the lowest bit), so the nodes
+of each level are runs of cells. Files list nodes depth first, so the position of every node
+follows from the sizes of the branches.
 
 Ref: A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on
 octrees", Autonomous Robots 34, 2013, section 3.4; the format is that of OctoMap 1.9.
@@ -34,7 +37,16 @@ FREE, OCCUPIED, INNER = 1, 2, 3
 _COARSEST: Final = DEPTH - 8
 _Index = NDArray[np.int64]
 Cube = tuple[int, int, int]
-FULL_TREE: Final = b"# Octomap OcTree file"
+_FULL_TREE, _BINARY_TREE = b"# Octomap OcTree file", b"# Octomap OcTree binary file"
+_HEADER: Final = """
+# (feel free to add / change comments, but leave the first line as it is!)
+#
+id OcTree
+size {}
+res {:g}
+data
+"""
+_DAMAGED: Final = "the OctoMap is truncated or damaged"
 _NODE: Final = np.dtype([("log_odds", "<f4"), ("children", "u1")])
 _LONGEST_HEADER_LINES: Final = 100
 _FEW_CELLS: Final = 1 << 22
@@ -45,16 +57,9 @@ _MOST_GROWTH: Final = 64
 def write_octomap_tiles(
     path: StrPath, tiles: Iterable[OccupancyVoxels], depth: int, resolution_m: float
 ) -> tuple[Path, Path]:
-    """Write both files from tiles of a map, with one tile in memory at a time.
+    """Write ``path.bt`` and ``path.ot`` from tiles of a map, with one tile in memory at a time.
 
-    Args:
-        path: The common path without suffix.
-        tiles: Tiles of the map; every cube with a side of ``2^depth`` cells lies in one tile.
-        depth: Tree depth of these cubes, 1 to 15.
-        resolution_m: Cell size.
-
-    Returns:
-        The two paths written: ``.bt``, ``.ot``.
+    Every cube with a side of ``2^depth`` cells (depth 1 to 15) lies in one tile.
     """
     stem = Path(path)
     binary, full = (stem.with_name(f"{stem.name}.{end}") for end in ("bt", "ot"))
@@ -74,20 +79,14 @@ def write_octomap_tiles(
 class _Node:
     """A node of the tree above the cubes, or the root of a cube.
 
-    Attributes:
-        cube: Its index among the cubes of its size.
-        branch: Its branch; the bytes are those of the node alone, or empty for a cube, whose
-            bytes are in the temporary file.
-        children: Child nodes, by their index 0 to 7.
-        full: Start and end of the bytes of a cube in the temporary file, for the ``.ot``.
-        binary: The same, for the ``.bt``.
+    The branch of a node has its own bytes; that of a cube has none, they are in the temporary file.
     """
 
-    cube: Cube
+    cube: Cube  # its index among the cubes of its size
     branch: Branch
-    children: dict[int, _Node] = field(default_factory=dict)
-    full: tuple[int, int] = (0, 0)
-    binary: tuple[int, int] = (0, 0)
+    children: dict[int, _Node] = field(default_factory=dict)  # child nodes, by their index 0 to 7
+    full: tuple[int, int] = (0, 0)  # bytes of a cube in the temporary file, for the ``.ot``
+    binary: tuple[int, int] = (0, 0)  # the same, for the ``.bt``
 
 
 def _nodes(voxels: OccupancyVoxels, depth: int, pieces: IO[bytes]) -> list[_Node]:
@@ -134,12 +133,13 @@ def _tree(nodes: list[_Node], depth: int) -> _Node | None:
 def _write_tree(
     file: IO[bytes], root: _Node | None, pieces: IO[bytes], resolution_m: float, *, binary: bool
 ) -> None:
-    if root is None:
-        file.write(file_header(binary=binary, nodes=0, resolution_m=resolution_m))
-        return
-    nodes = root.branch.pruned_nodes if binary else root.branch.nodes
-    file.write(file_header(binary=binary, nodes=nodes, resolution_m=resolution_m))
-    _write_node(file, root, pieces, binary=binary)
+    nodes = 0
+    if root is not None:
+        nodes = root.branch.pruned_nodes if binary else root.branch.nodes
+    kind = _BINARY_TREE if binary else _FULL_TREE
+    file.write(kind + _HEADER.format(nodes, resolution_m).encode())
+    if root is not None:
+        _write_node(file, root, pieces, binary=binary)
 
 
 def _write_node(file: IO[bytes], node: _Node, pieces: IO[bytes], *, binary: bool) -> None:
@@ -172,29 +172,22 @@ def read_octomap(path: StrPath) -> OccupancyVoxels:
 
 
 def octomap_pieces(path: Path, nodes_each: int = 1 << 19) -> Iterator[OccupancyVoxels]:
-    """Read the cells of an ``.ot`` file in file order, in at least one piece.
-
-    Leaves that cover several cells are expanded.
-    """
+    """Read the cells of an ``.ot`` file in file order, in at least one piece."""
     with reading(path), path.open("rb") as file:
-        yield from _pieces(file, path, nodes_each)
-
-
-def _pieces(file: IO[bytes], path: Path, nodes_each: int) -> Iterator[OccupancyVoxels]:
-    left, resolution_m = _read_header(file, path)
-    if not left:
-        yield OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), resolution_m)
-    walk = begin_walk(DEPTH)
-    while left:
-        count = min(left, nodes_each)
-        left -= count
-        content = file.read(count * _NODE.itemsize)
-        nodes = np.frombuffer(content, _NODE, len(content) // _NODE.itemsize)
-        found = _cells(nodes, walk, resolution_m)
-        ends = walk.level[0] < 0
-        if len(nodes) < count or found is None or ends == bool(left):
-            raise FormatError("the OctoMap is truncated or damaged", where=path)
-        yield found
+        left, resolution_m = _read_header(file)
+        if not left:
+            yield OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), resolution_m)
+        walk = begin_walk(DEPTH)
+        while left:
+            count = min(left, nodes_each)
+            left -= count
+            content = file.read(count * _NODE.itemsize)
+            nodes = np.frombuffer(content, _NODE, len(content) // _NODE.itemsize)
+            found = _cells(nodes, walk, resolution_m)
+            ends = walk.level[0] < 0
+            if len(nodes) < count or found is None or ends == bool(left):
+                raise FormatError(_DAMAGED)
+            yield found
 
 
 def _cells(nodes: NDArray[np.void], walk: TreeWalk, resolution_m: float) -> OccupancyVoxels | None:
@@ -226,11 +219,11 @@ def _expand(leaves: Leaves) -> tuple[Int32, NDArray[np.intp]]:
     return np.concatenate(keys), np.concatenate(source)
 
 
-def _read_header(file: IO[bytes], path: Path) -> tuple[int, float]:
+def _read_header(file: IO[bytes]) -> tuple[int, float]:
     """Read the number of nodes and the cell size; leave the file just after the header."""
     first = file.readline(200).strip()
-    if first != FULL_TREE:
-        raise FormatError("not an .ot OctoMap file", where=path, got=first[:40])
+    if first != _FULL_TREE:
+        raise FormatError("not an .ot OctoMap file", got=first[:40])
     fields: dict[bytes, bytes] = {}
     for _ in range(_LONGEST_HEADER_LINES):
         name, _, value = file.readline(200).strip().partition(b" ")
@@ -240,43 +233,27 @@ def _read_header(file: IO[bytes], path: Path) -> tuple[int, float]:
     try:
         nodes, resolution_m = parse_integer(fields[b"size"]), parse_number(fields[b"res"])
     except (KeyError, ValueError) as error:
-        raise FormatError("the OctoMap is truncated or damaged", where=path) from error
-    if fields.get(b"id") != b"OcTree" or nodes < 0 or not 0 < resolution_m < np.inf:
-        raise FormatError(
-            "the file has no occupancy octree", where=path, got=fields.get(b"id", b"")[:40]
-        )
+        raise FormatError(_DAMAGED) from error
+    kind = fields.get(b"id", b"")
+    if kind != b"OcTree" or nodes < 0 or not 0 < resolution_m < np.inf:
+        raise FormatError("the file has no occupancy octree", got=kind[:40])
     return nodes, resolution_m
 
 
 @dataclass(frozen=True)
 class Branch:
-    """A node with everything below it.
+    """A node with everything below it."""
 
-    Attributes:
-        full: Its bytes in an ``.ot`` file.
-        binary: Its bytes in a ``.bt`` file; empty for a leaf, which is stored in its parent.
-        value: Its log-odds: the maximum of the leaves below it.
-        kind: 1 = free, 2 = occupied, 3 = has children, in the pruned tree of the ``.bt``.
-        nodes: Number of nodes in the ``.ot``, including itself.
-        pruned_nodes: Number of nodes in the ``.bt``, including itself.
-    """
-
-    full: bytes
-    binary: bytes
-    value: float
-    kind: int
-    nodes: int
-    pruned_nodes: int
+    full: bytes  # its bytes in an ``.ot`` file
+    binary: bytes  # its bytes in a ``.bt`` file; empty for a leaf, which is stored in its parent
+    value: float  # its log-odds: the maximum of the leaves below it
+    kind: int  # 1 = free, 2 = occupied, 3 = has children, in the pruned tree of the ``.bt``
+    nodes: int  # number of nodes in the ``.ot``, including itself
+    pruned_nodes: int  # number of nodes in the ``.bt``, including itself
 
 
 def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
-    """Encode the branch of a cube of cells.
-
-    Args:
-        keys: int32 (N, 3), N ≥ 1, distinct cells of one cube with a side of ``2^depth``.
-        log_odds: float32 (N,); 0 and above = occupied.
-        depth: At least 1.
-    """
+    """Encode the branch of a cube of cells (N, 3), N ≥ 1, distinct; log-odds from 0 = occupied."""
     code = _morton(keys.astype(np.int64) & ((1 << depth) - 1), depth)
     order = np.argsort(code)
     levels = [code[order] >> (3 * up) for up in range(depth + 1)]
@@ -302,10 +279,9 @@ def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
 
 
 def join_branches(children: dict[int, Branch]) -> Branch:
-    """Return the parent node of some branches: its own bytes only; theirs follow in order.
+    """Return the parent node of branches by their index 0 to 7: its own bytes; theirs follow.
 
-    Args:
-        children: Branches by their index, 0 to 7: bit 0 is x, bit 1 y, bit 2 z.
+    Bit 0 of the index is x, bit 1 y, bit 2 z.
     """
     value = max(child.value for child in children.values())
     kinds = {child.kind for child in children.values()}
@@ -381,18 +357,3 @@ def _morton(cells: NDArray[np.int64], depth: int) -> _Index:
         for axis in range(3):
             code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return code
-
-
-def file_header(*, binary: bool, nodes: int, resolution_m: float) -> bytes:
-    """Return the header of a file."""
-    kind = "# Octomap OcTree binary file" if binary else "# Octomap OcTree file"
-    lines = [
-        kind,
-        "# (feel free to add / change comments, but leave the first line as it is!)",
-        "#",
-        "id OcTree",
-        f"size {nodes}",
-        f"res {resolution_m:g}",
-        "data",
-    ]
-    return ("\n".join(lines) + "\n").encode()

@@ -17,11 +17,7 @@ from recon.io.files import StrPath
 
 
 def write_mesh(path: StrPath, mesh: TriangleMesh) -> None:
-    """Write OBJ or STL, chosen by the suffix.
-
-    Raises:
-        OutputError: Open3D could not write the file.
-    """
+    """Write OBJ or STL, chosen by the suffix."""
     with _quiet():
         written = o3d.io.write_triangle_mesh(Path(path), _legacy(mesh))
     if not written:
@@ -29,11 +25,7 @@ def write_mesh(path: StrPath, mesh: TriangleMesh) -> None:
 
 
 def read_mesh(path: StrPath) -> TriangleMesh:
-    """Read OBJ, STL, GLB or another format that Open3D knows, chosen by the suffix.
-
-    Raises:
-        FormatError: Open3D found no triangles in the file.
-    """
+    """Read OBJ, STL, GLB or another format that Open3D knows, chosen by the suffix."""
     with _quiet():
         mesh = o3d.io.read_triangle_mesh(Path(path))
     if not mesh.has_triangles():
@@ -49,12 +41,7 @@ def read_mesh(path: StrPath) -> TriangleMesh:
 def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32, Int32]:
     """Label the connected components of a mesh.
 
-    Args:
-        vertices: (V, 3).
-        faces: int (F, 3).
-
-    Returns:
-        int32 (F,), component of each face, and int32 (C,), number of faces of each component.
+    The result is int32 (F,), component of each face, and int32 (C,), faces of each component.
     """
     with _quiet():
         labels, sizes, _ = _surface(vertices, faces).cluster_connected_triangles()

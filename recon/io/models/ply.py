@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Final
 
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.values import Frame, PointCloud
 from recon.core.values.arrays import Float32, UInt8
-from recon.io.files import StrPath, reader, reading
+from recon.io.files import StrPath, reader
 from recon.io.models.ply_tables import (
     PlyHeader,
     Table,
-    read_table_pieces,
     read_tables,
     write_table_stream,
     write_tables,
@@ -33,7 +32,6 @@ _SCALARS: Final = (
     ("count", "count", "<i4"),
 )
 _FRAME: Final = "frame "
-_PIECE_POINTS: Final = 1 << 19
 # Less than any stereo camera or laser scanner measures.
 _LARGEST_ROUNDING_M: Final = 0.005
 _FRAMES: Final[tuple[Frame, ...]] = ("camera", "world", "map")
@@ -67,13 +65,8 @@ def write_ply(
 def write_ply_tiles(path: StrPath, clouds: Iterable[PointCloud], *, frame: Frame) -> int:
     """Write several clouds into one file, in the format of `write_ply`.
 
-    Args:
-        path: The file, written atomically.
-        clouds: Clouds in the same frame and with the same fields; one is in memory at a time.
-        frame: Their frame.
-
-    Returns:
-        The number of points.
+    The clouds, of which one is in memory at a time, have that frame and the same fields. The
+    number of points is returned.
     """
     nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
     return write_table_stream(path, "vertex", map(_table, clouds), [_FRAME + frame], nothing)
@@ -94,38 +87,23 @@ def read_ply(path: StrPath) -> PointCloud:
             which is finite, or doubles that float32 would move by millimetres.
     """
     header, tables = read_tables(path, ["vertex"])
-    vertex = _vertices(tables.get("vertex"), path)
-    cloud = replace(
-        _shape(vertex, header),
-        confidence=_confidence(vertex),
+    vertex = tables.get("vertex", np.zeros(0))
+    xyz = positions_of(vertex)
+    _check_precision(vertex)
+    cloud = PointCloud(
+        xyz=xyz,
+        rgb=colours_of(vertex),
+        normals=normals_of(vertex),
         sigma_m=_scalar(vertex, "sigma", np.float32),
+        confidence=_confidence(vertex),
         weight=_scalar(vertex, "weight", np.float32),
         count=_scalar(vertex, "count", np.int32),
+        frame=_frame(header),
     )
-    kept = _finite(cloud)
-    _check_kept(len(cloud), len(kept), path)
-    return kept
-
-
-def read_ply_pieces(
-    path: StrPath, points_each: int = _PIECE_POINTS, *, sigma: bool = False
-) -> Iterator[PointCloud]:
-    """Read positions, normals, colours and perhaps sigma like `read_ply`, one piece at a time.
-
-    Other fields are left out, as the meaning of ``quality`` depends on all its values.
-    """
-    vertex: Table | None = None
-    points, kept = 0, 0
-    for header, vertex in read_table_pieces(path, "vertex", points_each):
-        with reading(path):
-            piece = _shape(_vertices(vertex, path), header)
-            if sigma:
-                piece = replace(piece, sigma_m=_scalar(vertex, "sigma", np.float32))
-            piece = _finite(piece)
-        points, kept = points + len(vertex), kept + len(piece)
-        yield piece
-    _vertices(vertex, path)
-    _check_kept(points, kept, path)
+    finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
+    if len(cloud) and not finite.any():
+        raise FormatError("no point of the PLY file is finite")
+    return cloud if finite.all() else cloud.select(finite)
 
 
 def vertex_dtype(*, normals: bool, colours: bool) -> list[tuple[str, str]]:
@@ -142,6 +120,13 @@ def fill_vertices(
         if values is not None:
             for column, name in enumerate(names):
                 table[name] = values[:, column]
+
+
+def positions_of(vertex: Table) -> Float32:
+    """Return float32 (N, 3), the positions of a vertex table, which must have them."""
+    if not _has(vertex, _XYZ):
+        raise FormatError("the PLY file has no vertices with x, y and z")
+    return _stacked(vertex, _XYZ, np.float32)
 
 
 def normals_of(vertex: Table) -> NDArray[np.float32] | None:
@@ -169,15 +154,7 @@ def _table(cloud: PointCloud) -> Table:
     return table
 
 
-def _vertices(vertex: Table | None, path: StrPath) -> Table:
-    """Check that the vertex table exists and has positions."""
-    if vertex is None or not _has(vertex, _XYZ):
-        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
-    _check_precision(vertex, path)
-    return vertex
-
-
-def _check_precision(vertex: Table, path: StrPath) -> None:
+def _check_precision(vertex: Table) -> None:
     """Reject coordinates that float32 would round too far, such as UTM: by up to half a metre."""
     for name in _XYZ:
         exact = vertex[name]
@@ -189,31 +166,10 @@ def _check_precision(vertex: Table, path: StrPath) -> None:
         if moved_m > _LARGEST_ROUNDING_M:
             raise FormatError(
                 "coordinates are too large to be kept in single precision",
-                where=path,
                 got=f"{name} up to {np.abs(exact).max():.10g}, rounded by {moved_m:.2g} m",
                 expected=f"rounded by at most {_LARGEST_ROUNDING_M:g} m",
                 hint="subtract an offset, such as the first point, from all coordinates",
             )
-
-
-def _shape(vertex: Table, header: PlyHeader) -> PointCloud:
-    """Return positions, normals and colours of vertices."""
-    return PointCloud(
-        xyz=_stacked(vertex, _XYZ, np.float32),
-        rgb=colours_of(vertex),
-        normals=normals_of(vertex),
-        frame=_frame(header),
-    )
-
-
-def _finite(cloud: PointCloud) -> PointCloud:
-    finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
-    return cloud if finite.all() else cloud.select(finite)
-
-
-def _check_kept(points: int, kept: int, path: StrPath) -> None:
-    if points and not kept:
-        raise FormatError("no point of the PLY file is finite", where=path)
 
 
 def _has(table: Table, names: tuple[str, ...]) -> bool:
@@ -237,8 +193,5 @@ def _confidence(vertex: Table) -> NDArray[np.float32] | None:
 
 
 def _frame(header: PlyHeader) -> Frame:
-    for comment in header.comments:
-        for frame in _FRAMES:
-            if comment == _FRAME + frame:
-                return frame
-    return "camera"
+    named = (f for comment in header.comments for f in _FRAMES if comment == _FRAME + f)
+    return next(named, "camera")

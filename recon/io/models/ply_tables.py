@@ -5,7 +5,7 @@ Ref: G. Turk, "The PLY polygon file format", 1994.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import SEEK_END
 from pathlib import Path
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.text import counted, parse_numbers
 from recon.io.atomic import atomic_path
-from recon.io.files import StrPath, reader, reading
+from recon.io.files import StrPath, reader
 
 #: A structured array with one field per property. Lists are supported only with three entries, as
 #: a field of shape (3,) that follows a field with the length (`list_length`).
@@ -37,17 +37,11 @@ _LONGEST_NUMBER: Final = 20
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The header of a PLY file.
+    """The header of a PLY file."""
 
-    Attributes:
-        encoding: ``ascii``, ``binary_little_endian`` or ``binary_big_endian``.
-        elements: Name, number of rows and dtype of each element, in the order of the file.
-        comments: The comment lines, without the keyword.
-    """
-
-    encoding: str
-    elements: tuple[tuple[str, int, np.dtype[Any]], ...]
-    comments: tuple[str, ...]
+    encoding: str  # a key of _ORDERS
+    elements: tuple[tuple[str, int, np.dtype[Any]], ...]  # name, number of rows, type of a row
+    comments: tuple[str, ...]  # without the keyword
 
 
 def list_length(name: str) -> str:
@@ -57,38 +51,20 @@ def list_length(name: str) -> str:
 
 @reader
 def read_tables(path: StrPath, wanted: Sequence[str]) -> tuple[PlyHeader, dict[str, Table]]:
-    """Read the wanted elements of a PLY file.
+    """Read the header and those of the wanted elements that the file has.
 
-    Args:
-        path: The file.
-        wanted: Names of the elements; whatever follows the last of them is not read.
-
-    Returns:
-        The header, and a table for each wanted element that the file has.
+    Whatever follows the last of them is not read.
     """
     with Path(path).open("rb") as stream:
-        header = _read_header(stream, path)
-        return header, _read_body(stream, header, wanted, path)
-
-
-def read_table_pieces(
-    path: StrPath, wanted: str, rows_each: int
-) -> Iterator[tuple[PlyHeader, Table]]:
-    """Read an element of a PLY file piece by piece, each with the header.
-
-    Args:
-        path: The file.
-        wanted: Name of the element; nothing is yielded if the file lacks it.
-        rows_each: Largest number of rows per piece.
-    """
-    with reading(path), Path(path).open("rb") as stream:
-        header = _read_header(stream, path)
-        for element in header.elements:
-            for table in _pieces(stream, header, element, rows_each, path):
-                if element[0] == wanted:
-                    yield header, table
-            if element[0] == wanted:
-                return
+        header = _read_header(stream)
+        tables: dict[str, Table] = {}
+        missing = {name for name, _, _ in header.elements} & set(wanted)
+        for name, count, dtype in header.elements:
+            if not missing:
+                break
+            tables[name] = _read_element(stream, header.encoding, name, count, dtype)
+            missing.discard(name)
+        return header, {name: table for name, table in tables.items() if name in wanted}
 
 
 def write_tables(
@@ -112,10 +88,8 @@ def write_tables(
 def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[Table]]]) -> None:
     """Write elements whose rows arrive in parts, binary little endian, atomically.
 
-    Args:
-        path: The file.
-        elements: For each element the total number of rows, and its tables, all of one dtype;
-            one is held at a time. The first of each is taken before the header is written.
+    Each element has its total number of rows, and tables of one dtype; one is held at a time, but
+    the first of each is taken before the header is written.
     """
     begun = {name: iter(tables) for name, (_, tables) in elements.items()}
     first = {name: next(tables) for name, tables in begun.items()}
@@ -133,15 +107,8 @@ def write_table_stream(
 ) -> int:
     """Write one element whose rows arrive in parts, binary little endian, atomically.
 
-    Args:
-        path: The file.
-        name: The element.
-        tables: Its rows; one table is held at a time, and all get the dtype of the first.
-        comments: Comment lines.
-        empty: What is written if there is no table.
-
-    Returns:
-        The number of rows, which is filled into the header at the end.
+    One table is held at a time, and all get the dtype of the first; ``empty`` is written if there
+    is none. The number of rows, which is returned, is filled into the header at the end.
     """
     dtype: np.dtype[Any] | None = None
     rows = 0
@@ -169,7 +136,6 @@ def _header(
     comments: Sequence[str] = (),
     encoding: str = _BINARY,
 ) -> bytes:
-    """Return the header of elements, each with its name, number of rows and dtype."""
     lines = ["ply", f"format {encoding} 1.0", *(f"comment {comment}" for comment in comments)]
     for name, rows, dtype in elements:
         lines += [f"element {name} {rows}", *_property_lines(dtype)]
@@ -188,7 +154,6 @@ def _property_lines(dtype: np.dtype[Any]) -> list[str]:
 
 
 def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
-    """Return names and dtypes of the fields of a table."""
     return [(name, dtype[name]) for name in dtype.names or ()]
 
 
@@ -202,10 +167,10 @@ def _write_rows(stream: IO[bytes], table: Table) -> None:
     np.savetxt(stream, np.concatenate(columns, axis=1), fmt=formats)
 
 
-def _read_header(stream: IO[bytes], path: StrPath) -> PlyHeader:
+def _read_header(stream: IO[bytes]) -> PlyHeader:
     """Parse the header and leave the stream just after it."""
     if stream.readline(8).strip() != b"ply":
-        raise FormatError("not a PLY file: it does not start with 'ply'", where=path)
+        raise FormatError("not a PLY file: it does not start with 'ply'")
     encoding, comments = "", []
     elements: list[tuple[str, int, list[tuple[Any, ...]]]] = []
     for _ in range(_LONGEST_HEADER_LINES):
@@ -222,15 +187,15 @@ def _read_header(stream: IO[bytes], path: StrPath) -> PlyHeader:
             case ["property", *words] if elements and _is_property(words):
                 elements[-1][2].extend(_property_fields(words, _ORDERS.get(encoding, "<")))
             case _:
-                raise FormatError("cannot read the PLY header", where=path, got=repr(line[:60]))
+                raise FormatError("cannot read the PLY header", got=repr(line[:60]))
     else:
-        raise FormatError("the PLY header does not end", where=path)
+        raise FormatError("the PLY header does not end")
     if not encoding:
-        raise FormatError("the PLY header has no format line", where=path)
+        raise FormatError("the PLY header has no format line")
     try:
         typed = tuple((name, count, np.dtype(fields)) for name, count, fields in elements)
     except ValueError as error:
-        raise FormatError("the PLY header names a property twice", where=path) from error
+        raise FormatError("the PLY header names a property twice") from error
     return PlyHeader(encoding, typed, tuple(comments))
 
 
@@ -241,7 +206,6 @@ def _is_property(words: list[str]) -> bool:
 
 
 def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
-    """Return the fields of one property line."""
     name = words[-1]
     if words[0] == "list":
         length, entry = (order + _TYPES[word] for word in words[1:-1])
@@ -249,45 +213,18 @@ def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
     return [(name, order + _TYPES[words[0]])]
 
 
-def _read_body(
-    stream: IO[bytes], header: PlyHeader, wanted: Sequence[str], path: StrPath
-) -> dict[str, Table]:
-    """Read element by element until all wanted ones are found."""
-    tables: dict[str, Table] = {}
-    missing = {name for name, _, _ in header.elements} & set(wanted)
-    for name, count, dtype in header.elements:
-        if not missing:
-            break
-        [tables[name]] = _pieces(stream, header, (name, count, dtype), count, path)
-        missing.discard(name)
-    return {name: table for name, table in tables.items() if name in wanted}
-
-
-def _pieces(
-    stream: IO[bytes],
-    header: PlyHeader,
-    element: tuple[str, int, np.dtype[Any]],
-    rows_each: int,
-    path: StrPath,
-) -> Iterator[Table]:
-    """Yield the rows of an element in pieces; at least one table."""
-    name, count, dtype = element
-    read = _read_text if header.encoding == "ascii" else _read_binary
-    rows = 0
-    while True:
-        expected = min(rows + rows_each, count)
-        table = _checked_lists(read(stream, expected - rows, dtype), path)
-        rows += len(table)
-        if rows < expected:
-            raise FormatError(
-                f"the file is truncated in its element {name!r}",
-                where=path,
-                got=counted(rows, "row"),
-                expected=f"{count}",
-            )
-        yield table
-        if rows == count:
-            return
+def _read_element(
+    stream: IO[bytes], encoding: str, name: str, count: int, dtype: np.dtype[Any]
+) -> Table:
+    read = _read_text if encoding == "ascii" else _read_binary
+    table = read(stream, count, dtype)
+    for field_name, field in _fields(dtype):
+        if field.shape and (table[list_length(field_name)] != 3).any():
+            raise FormatError("a face is not a triangle", hint="triangulate the mesh first")
+    if len(table) < count:
+        what, got = f"the file is truncated in its element {name!r}", counted(len(table), "row")
+        raise FormatError(what, got=got, expected=f"{count}")
+    return table
 
 
 def _read_binary(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
@@ -302,33 +239,19 @@ def _read_binary(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
 
 def _read_text(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
     """Read rows of text up to the first that is missing or malformed."""
-    width = sum(int(np.prod(field.shape)) for _, field in _fields(dtype))
-    rows = []
-    for _ in range(count):
-        line = stream.readline()
-        if not line:
-            break
+    widths = [int(np.prod(field.shape)) for _, field in _fields(dtype)]
+    rows: list[list[float]] = []
+    while len(rows) < count and (line := stream.readline()):
         try:
             numbers = parse_numbers(line.split())
         except ValueError:
             break
-        if len(numbers) != width:
+        if len(numbers) != sum(widths):
             break
         rows.append(numbers)
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), sum(widths))
     table = np.zeros(len(rows), dtype)
-    start = 0
-    for name, field in _fields(dtype):
-        stop = start + int(np.prod(field.shape))
-        table[name] = values[:, start:stop].reshape(len(rows), *field.shape)
-        start = stop
-    return table
-
-
-def _checked_lists(table: Table, path: StrPath) -> Table:
-    for name, field in _fields(table.dtype):
-        if field.shape and (table[list_length(name)] != 3).any():
-            raise FormatError(
-                "a face is not a triangle", where=path, hint="triangulate the mesh first"
-            )
+    columns = np.split(values, np.cumsum(widths), axis=1)
+    for (name, field), part in zip(_fields(dtype), columns, strict=False):
+        table[name] = part.reshape(len(rows), *field.shape)
     return table

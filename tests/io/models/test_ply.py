@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from recon.core.errors import FormatError, OutputError
 from recon.core.values import PointCloud
-from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
+from recon.io.models.ply import read_ply, write_ply
 
 FIELDS = ("rgb", "normals", "confidence", "sigma_m", "weight", "count")
 NUMBERS = st.floats(-1e6, 1e6, width=32)
@@ -225,71 +222,28 @@ def test_an_unwritable_place_is_reported_and_leaves_nothing(tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.parametrize("ascii", [False, True])
-@pytest.mark.parametrize("points_each", [1, 7, 20, 1000])
-def test_a_cloud_is_read_in_pieces(tmp_path: Path, ascii: bool, points_each: int) -> None:  # noqa: A002
-    cloud = replace(example_cloud(20), frame="map")
-    write_ply(tmp_path / "cloud.ply", cloud, ascii=ascii)
-    pieces = list(read_ply_pieces(tmp_path / "cloud.ply", points_each))
-    assert [len(piece) for piece in pieces[:-1]] == [points_each] * (len(pieces) - 1)
-    assert {piece.frame for piece in pieces} == {"map"}
-    for name in ("xyz", "rgb", "normals"):
-        joined = np.concatenate([getattr(piece, name) for piece in pieces])
-        np.testing.assert_array_equal(joined, getattr(cloud, name))
-
-
-def test_pieces_without_a_finite_point_are_empty(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "a.ply", XYZ, b"1 2 3\nnan 2 3\n4 5 inf\n7 8 9\n", 4)
-    assert [len(piece) for piece in read_ply_pieces(path, 1)] == [1, 0, 0, 1]
-
-
-def test_a_piece_takes_memory_for_its_points_alone(tmp_path: Path) -> None:
-    points = 200_000
-    write_ply(tmp_path / "cloud.ply", example_cloud(points))
-    tracemalloc.start()
-    read = sum(len(piece) for piece in read_ply_pieces(tmp_path / "cloud.ply", 1000))
-    peak_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert read == points
-    # A point is 27 bytes as arrays and 43 in the file: the whole would be 14 MB.
-    assert peak_bytes < 1e6
-
-
-@pytest.mark.parametrize("points_each", [1, 3, 1000])
 @pytest.mark.parametrize(
-    ("body", "complaint"),
+    "content",
     [
-        (b"1 2 3\n4 5 6\n7 8 9\n", r"truncated in its element 'vertex' \(got 3 rows, expected 4"),
-        (b"nan 2 3\n" * 4, "no point of the PLY file is finite"),
+        b"element vertex 1\nproperty float x\nend_header\n1\n",
+        b"element vertex 1\nend_header\n\n",
+        b"end_header\n",
     ],
 )
-def test_a_damaged_cloud_is_refused_in_pieces_too(
-    tmp_path: Path, body: bytes, complaint: str, points_each: int
-) -> None:
-    path = write_raw(tmp_path / "a.ply", XYZ, body, 4)
-    with pytest.raises(FormatError, match=complaint):
-        list(read_ply_pieces(path, points_each))
+def test_a_file_without_places_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"ply\nformat ascii 1.0\n" + content)
+    with pytest.raises(FormatError, match=r"a\.ply: .*no vertices with x, y and z"):
+        read_ply(path)
 
 
-def test_a_file_without_places_has_no_pieces(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "a.ply", "property float x", b"1\n", 1)
-    with pytest.raises(FormatError, match="no vertices with x, y and z"):
-        list(read_ply_pieces(path))
-    path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(FormatError, match="no vertices with x, y and z"):
-        list(read_ply_pieces(path))
-
-
-@pytest.mark.parametrize("read", [read_ply, lambda path: list(read_ply_pieces(path))])
-def test_survey_coordinates_that_would_become_steps_are_refused(
-    tmp_path: Path, read: Callable[[Path], object]
-) -> None:
+def test_survey_coordinates_that_would_become_steps_are_refused(tmp_path: Path) -> None:
     xyz = np.array([4.5e5, 5.4e6, 300]) + np.random.default_rng(0).uniform(0, 10, (100, 3))
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 100\nproperty double x\n"
     header += "property double y\nproperty double z\nend_header\n"
     path = tmp_path / "utm.ply"
     path.write_bytes(header.encode() + xyz.astype("<f8").tobytes())
     with pytest.raises(FormatError, match=r"utm\.ply: .* \(got x up to 4500.*subtract an offset"):
-        read(path)
+        read_ply(path)
     path.write_bytes(header.encode() + (xyz - xyz[0]).astype("<f8").tobytes())
-    read(path)
+    read_ply(path)
