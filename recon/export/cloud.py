@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -23,33 +22,17 @@ _MUCH: Final = 0.02
 """Share of the points that can be left out without a word; a busy street has less."""
 
 
-@dataclass(frozen=True, eq=False)
-class WrittenCloud:
-    """What is kept in memory of a cloud that is written.
-
-    Attributes:
-        points: Number of its points.
-        removed: Number of points that were left out since they moved.
-        sample: Even sample of it; all points of a small one. Frame ``map``.
-        warnings: What the user should know of the points that were left out.
-    """
-
-    points: int
-    removed: int
-    sample: PointCloud
-    warnings: list[str]
-
-
 def cloud_product(order: Order) -> Made:
     """Write ``map/cloud.ply``, and ``map/removed.ply`` with what moved."""
     files = [order.run.path(f"map/{name}.ply") for name in ("cloud", "removed")]
-    written = export_cloud(order.placed.tiles, *files)
-    figures = {"points": written.points, "points_removed": written.removed}
-    return Made(figures, written.warnings, written.sample)
+    return export_cloud(order.placed.tiles, *files)
 
 
-def export_cloud(tiles: Tiles, path: Path, removed: Path | None) -> WrittenCloud:
-    """Write the points of all tiles into a PLY file, and perhaps what was removed into another."""
+def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
+    """Write the points of all tiles into a PLY file, and perhaps what was removed into another.
+
+    A report shows an even sample of the cloud; all points of a small one. Frame ``map``.
+    """
     sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
 
     def clouds() -> Iterator[PointCloud]:
@@ -64,7 +47,8 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None) -> WrittenCloud
     if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
         left_out = write_ply_tiles(removed, (cloud for cloud in moved if len(cloud)), frame="map")
-    return WrittenCloud(points, left_out, sample.cloud(), _doubts(tiles, points, left_out))
+    figures = {"points": points, "points_removed": left_out}
+    return Made(figures, _doubts(tiles, points, left_out), sample.cloud())
 
 
 def _doubts(tiles: Tiles, points: int, removed: int) -> list[str]:
@@ -80,12 +64,7 @@ def _doubts(tiles: Tiles, points: int, removed: int) -> list[str]:
 
 
 class CloudSample:
-    """Keeps the first point of each grid cell; cells grow as points are added.
-
-    Args:
-        limit: Largest number of points kept; up to it, all are kept.
-        cell_m: Cell size when the limit is first reached.
-    """
+    """Keeps the first point of each cell, at most ``limit`` points: cells grow with the cloud."""
 
     def __init__(self, limit: int, cell_m: float) -> None:
         self._limit = limit

@@ -32,12 +32,7 @@ OF_A_PAIR: Final = ("cloud", "mesh")
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """What is left in memory of products whose files are written.
-
-    Attributes:
-        made: By name, those that could be made.
-        warnings: What could not be written, and what their users should know.
-    """
+    """What is left in memory of products whose files are written, by name; and warnings."""
 
     made: Mapping[str, Made]
     warnings: tuple[str, ...]
@@ -72,13 +67,9 @@ class Products:
 
 
 def make(order: Order, products: Sequence[str] = USUAL) -> Products:
-    """Make products of a map, and write them into the folder of a run.
+    """Make any of `PRODUCTS` of a map, and write them into the folder of a run.
 
     A surface that cannot be made is a warning where something else is asked for.
-
-    Args:
-        order: The map.
-        products: Any of `PRODUCTS`.
     """
     made: dict[str, Made] = {}
     warnings: list[str] = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Final
@@ -42,37 +41,24 @@ _MARGIN_M: Final = 5.0
 """Least distance from the path to the edge of the grid: a footprint must fit in at the start."""
 
 
-@dataclass(frozen=True, eq=False)
-class WrittenGrid:
-    """The grid of a drive, and what was found out for it.
-
-    Attributes:
-        grid: The grid.
-        camera_height_m: Height above the ground at which something carried the camera; None =
-            unknown, or not at one height.
-        warnings: What a user of the grid should know.
-    """
-
-    grid: OccupancyGrid
-    camera_height_m: float | None
-    warnings: tuple[str, ...]
+WrittenGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
 
 
 def grid_product(order: Order) -> Made:
     """Write ``map/grid.*``."""
     placed, stem = order.placed, order.run.path("map/grid")
-    written = export_grid(placed.tiles, placed.path_m, placed.trusted, stem)
-    (rows, columns), height_m = written.grid.cells.shape, written.camera_height_m
+    grid, height_m, warnings = export_grid(placed.tiles, placed.path_m, placed.trusted, stem)
+    rows, columns = grid.cells.shape
     figures = {
-        "resolution_m": written.grid.resolution_m,
+        "resolution_m": grid.resolution_m,
         "rows": rows,
         "columns": columns,
-        "occupied_cells": int((written.grid.cells == OCCUPIED).sum()),
-        "free_cells": int((written.grid.cells == FREE).sum()),
+        "occupied_cells": int((grid.cells == OCCUPIED).sum()),
+        "free_cells": int((grid.cells == FREE).sum()),
         "camera_height_m": height_m,
         "T_base_camera": base_axes(order.map.first.T_map_world, height_m).tolist(),
     }
-    return Made(figures, written.warnings, written.grid)
+    return Made(figures, warnings, grid)
 
 
 def export_grid(tiles: Tiles, path_m: Float64, trusted: Bool, stem: Path) -> WrittenGrid:
@@ -83,11 +69,15 @@ def export_grid(tiles: Tiles, path_m: Float64, trusted: Bool, stem: Path) -> Wri
         path_m: float64 (N, 3), camera positions in map axes; a row of NaN between two drives.
         trusted: bool (N,), which of them are to be trusted.
         stem: The common path without suffix.
+
+    Returns:
+        The grid, the height at which something carried the camera above the ground (None = unknown,
+        or not at one height), and what a user of the grid should know.
     """
     if tiles.extent[0] == tiles.extent[1]:
         raise MappingError("nothing was observed: there is no map to flatten")
     written = _Flattening(tiles, path_m, trusted).grid()
-    write_nav2(stem, written.grid)
+    write_nav2(stem, written[0])
     return written
 
 
@@ -125,7 +115,7 @@ class _Flattening:
         grid = OccupancyGrid(cells, self._resolution_m, origin_m)
         height_m = settings.camera_height_m
         warnings = (*_warnings(height_m, driven), *self._band_warnings())
-        return WrittenGrid(grid, height_m if driven else None, warnings)
+        return grid, height_m if driven else None, warnings
 
     def _band_warnings(self) -> Iterator[str]:
         """Yield what is wrong with a height band that is too low or too thin for the cells."""
@@ -251,22 +241,14 @@ def _paste(
 
 
 def octomap_product(order: Order) -> Made:
-    """Write ``map/octomap.bt`` and ``.ot``."""
-    voxels, warnings = export_octomap(order.placed.tiles, order.run.path("map/octomap"))
-    return Made({"voxels": voxels}, warnings)
+    """Write ``map/octomap.bt`` and ``.ot`` with the voxels that are occupied or free.
 
-
-def export_octomap(tiles: Tiles, stem: Path) -> tuple[int, list[str]]:
-    """Write ``stem.bt`` and ``stem.ot`` with the voxels that are occupied or free.
-
-    Returns:
-        The number of observed voxels, undecided ones included, and warnings: a map may be too large
-        for an OctoMap.
+    The figure is the number of observed voxels, undecided ones included. A map may be too large.
     """
+    tiles, stem, warnings = order.placed.tiles, order.run.path("map/octomap"), []
     known = (drop_undecided(tile.voxels, tiles.config.grid) for tile in tiles)
-    warnings = []
     try:
         write_octomap_tiles(stem, known, tiles.edge_cells.bit_length() - 1, tiles.resolution_m)
     except MappingError as error:
         warnings.append(f"no OctoMap: {error}")
-    return sum(len(tile.voxels) for tile in tiles), warnings
+    return Made({"voxels": sum(len(tile.voxels) for tile in tiles)}, warnings)

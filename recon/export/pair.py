@@ -45,11 +45,7 @@ def mesh_frame(
 
 
 def write_disparity_files(disparity: Disparity, run: RunDirectory) -> float:
-    """Write disparity, confidence and reasons below ``disparity/``.
-
-    Returns:
-        Grey levels per pixel of disparity in ``disparity.png``.
-    """
+    """Write disparity, confidence, reasons; return grey levels per pixel in ``disparity.png``."""
     path, scale = run.path, fitting_scale(disparity.values)
     write_pfm(path("disparity/disparity.pfm"), disparity.values)
     write_disparity_png(path("disparity/disparity.png"), disparity.values, scale=scale)
@@ -88,11 +84,7 @@ def mesh_cloud(
     run: Run,
     formats: Sequence[str] = ("ply",),
 ) -> dict[str, Any]:
-    """Mesh a cloud file in one piece, as its camera saw it if it is that of a pair.
-
-    Returns:
-        The figures of the mesh.
-    """
+    """Mesh a cloud file in one piece, as its camera saw it if it is that of a pair; its figures."""
     with run.stage("read"):
         cloud = read_ply(path)
         write_ply(run.path(LAYER), cloud)
@@ -123,18 +115,7 @@ def copy_file(file: Path, target: Path) -> None:
 def export_pair(
     source: Path, settings: MeshSettings, products: Sequence[str], run: Run, formats: Sequence[str]
 ) -> dict[str, Any]:
-    """Write products of a run of `recon pair`: its cloud, and a mesh of it.
-
-    Args:
-        source: Folder of that run.
-        settings: Settings of the mesh.
-        products: Which of ``cloud`` and ``mesh``.
-        run: The run that makes them.
-        formats: Formats of the mesh.
-
-    Returns:
-        The figures of ``summary.json``.
-    """
+    """Write cloud and mesh of a run of `recon pair`, or one of them; the figures of the summary."""
     cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
     figures: dict[str, Any] = {"run": str(source), "warnings": []}
     if "cloud" in products:

@@ -15,11 +15,9 @@ from recon.run.run import Run
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """A map, and how its products are wanted.
+    """A map with its drives in tiles, and how its products are wanted.
 
     Attributes:
-        map: The map.
-        placed: Its drives, cut into tiles.
         run: The run, whose folder they go to.
         mesh: Settings of the mesh.
         formats: Formats of the mesh.
@@ -36,13 +34,7 @@ class Order:
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What is left in memory of a product whose files are written.
-
-    Attributes:
-        figures: Its figures for ``summary.json``.
-        warnings: What a user of it should know.
-        value: What a report shows of it, if anything.
-    """
+    """What is left of a written product: figures of the summary, warnings, what a report shows."""
 
     figures: dict[str, Any]
     warnings: Sequence[str] = ()
@@ -51,12 +43,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Product:
-    """A kind of file, or of files, that are made from a map.
-
-    Attributes:
-        write: Writes them.
-        needs_occupancy: Whether they are made of what is free and occupied.
-    """
+    """A kind of file: what writes it, and whether it is made of what is free and occupied."""
 
     write: Callable[[Order], Made]
     needs_occupancy: bool = False

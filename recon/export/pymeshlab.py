@@ -35,11 +35,11 @@ def screened_poisson(
     samples_per_node: float,
     point_weight: float,
 ) -> tuple[Float32, Int32, Float32]:
-    """Return the closed surface through oriented points.
+    """Return the closed surface through oriented points (N, 3) with unit normals, all finite.
 
     Args:
-        xyz: (N, 3), metres, finite.
-        normals: (N, 3), unit, finite, outwards.
+        xyz: Metres.
+        normals: Outwards.
         depth: Depth of the octree: its edge has 2^depth cells.
         scale: Edge of the octree, as a multiple of the longest side of the cloud.
         samples_per_node: Minimum number of points per octree cell; larger for noisy points.

@@ -33,13 +33,7 @@ HEADER: Final = (
 
 
 def export_paths(session: Session, camera_height_m: float | None, run: RunDirectory) -> None:
-    """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed.
-
-    Args:
-        session: The drive.
-        camera_height_m: Height of the camera above the ground; None = unknown.
-        run: The run.
-    """
+    """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed."""
     path = session.trajectory
     write_kitti_poses(run.path("trajectory_kitti.txt"), path)
     write_tum(run.path("trajectory_tum.txt"), path)
@@ -72,13 +66,7 @@ def export_sessions(map_: MapFile, run: RunDirectory) -> None:
 def export_localized(
     drive: LocalizedDrive, camera_height_m: float | None, run: RunDirectory
 ) -> None:
-    """Write ``trajectory_tum.txt``, ``trajectory_map_base_tum.txt`` and ``states.csv``.
-
-    Args:
-        drive: The drive in the map.
-        camera_height_m: Height of the map's camera above the ground; None = unknown.
-        run: The run.
-    """
+    """Write ``trajectory_tum.txt``, ``trajectory_map_base_tum.txt`` and ``states.csv``."""
     path, T_map_world = drive.trajectory, drive.T_map_world
     write_tum(run.path("trajectory_tum.txt"), path)
     based = _of_base(path, T_map_world, camera_height_m)

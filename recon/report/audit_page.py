@@ -32,14 +32,12 @@ def write_audit_page(
     write_page(
         "audit",
         run,
+        audit.summary,
         source=source,
         lines=audit_lines(audit.summary),
-        found=audit.figures,
         frames=frames_figure(audit.looks) if audit.looks else None,
         pairs=[_pair(look, look.pair, matcher) for look in audit.looks if look.pair is not None],
         warnings=[finding.text for finding in audit.findings],
-        verdict=audit.verdict,
-        sound=audit.verdict == "good",
     )
 
 

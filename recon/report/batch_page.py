@@ -41,7 +41,7 @@ def write_batch_page(
     write_page(
         "batch",
         run,
-        found=summary,
+        summary,
         tables=batch_tables(first),
         pages=pages,
         sweep=sweep,

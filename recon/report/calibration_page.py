@@ -37,16 +37,7 @@ def write_calibration_page(result: CalibrationRun, run: RunDirectory) -> None:
     }
     for name, png in figures.items():
         write_bytes(run.path(f"pictures/{name}.png"), png)
-    found = result.summary
-    write_page(
-        "calibration",
-        run,
-        found=found,
-        figures=figures,
-        warnings=found["warnings"],
-        verdict=found["verdict"],
-        sound=found["verdict"] == "good",
-    )
+    write_page("calibration", run, result.summary, figures=figures)
 
 
 def _epipolar_pictures(result: CalibrationRun) -> dict[str, bytes]:

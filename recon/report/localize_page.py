@@ -19,7 +19,7 @@ _SHADES: Final = {State.SEARCHING: style.FAINT, State.COASTING: style.TRUTH, Sta
 def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a drive in a map."""
     figures = {"path": _path(result), "certainty": certainty_figure(result.drive)}
-    write_page("localize", run, run=result, figures=figures, warnings=result.summary["warnings"])
+    write_page("localize", run, result.summary, result=result, figures=figures)
 
 
 def _path(result: LocalizeRun) -> bytes | None:

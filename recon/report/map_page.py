@@ -43,11 +43,11 @@ def write_map_page(
     run: RunDirectory,
 ) -> None:
     """Write ``report.html`` of a map of one drive, with a frame of it in full."""
-    write_page("map", run, **map_content(map_, made, errors, sample, summary))
+    write_page("map", run, summary, **map_content(map_, made, errors, sample))
 
 
 def map_content(
-    map_: MapFile, made: Products, errors: DriveErrors, sample: ReconstructedFrame, summary: Json
+    map_: MapFile, made: Products, errors: DriveErrors, sample: ReconstructedFrame
 ) -> Json:
     """Return what the page of a drive shows: map and path first, then the data behind them."""
     session, truth = map_.first, errors.true_path
@@ -56,7 +56,7 @@ def map_content(
     radius_share = 0.0 if drift is None else drift.radius_share
     true_path = {} if truth is None else {"true path": truth}
     return {
-        **_map_content(made, {"path": path}, true_path, T_map_world, summary),
+        **_map_content(made, {"path": path}, true_path, T_map_world),
         "path": path,
         "health": health,
         "metrics": errors.path,
@@ -74,7 +74,7 @@ def map_content(
 def write_joined_page(map_: MapFile, made: Products, summary: Json, run: RunDirectory) -> None:
     """Write ``report.html`` of a map of several drives: all paths on one grid."""
     paths = {f"session {number}": path for number, path in map_.paths.items()}
-    write_page("joined", run, **_map_content(made, paths, {}, map_.first.T_map_world, summary))
+    write_page("joined", run, summary, **_map_content(made, paths, {}, map_.first.T_map_world))
 
 
 def _map_content(
@@ -82,7 +82,6 @@ def _map_content(
     paths: dict[str, Trajectory],
     only_in_3d: dict[str, Trajectory],
     T_map_world: Float64,
-    summary: Json,
 ) -> Json:
     """Return what the pages of all maps show: paths on the grid, and with others in 3-D."""
     from_above = {name: seen_from_above(path, T_map_world) for name, path in paths.items()}
@@ -90,8 +89,6 @@ def _map_content(
         (name, apply(T_map_world, path.positions_m)) for name, path in (paths | only_in_3d).items()
     ]
     return {
-        "found": summary,
-        "warnings": summary["warnings"],
         "grid": grid_figure(made.grid, from_above),
         "resolution_m": made.grid.resolution_m,
         "view": plot_scene(Scene(np.eye(4), made.cloud, made.mesh, ways)),

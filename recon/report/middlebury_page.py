@@ -30,10 +30,9 @@ _LEAST_SHARE: Final = 0.001
 
 
 def draw_result(result: SceneResult, run: RunDirectory) -> None:
-    """Write the disparity and the error of a result as colour images.
+    """Write disparity, in colours of the range of the truth, and error of a result as images.
 
-    In the error, blue is correct, red is wrong by `ERROR_LIMIT_PX` full-size pixels or more, and
-    dark is unknown ground truth; holes are filled. Disparity colours span the range of the truth.
+    Blue is correct, red is wrong by `ERROR_LIMIT_PX` full-size pixels or more; holes are filled.
     """
     scene, values = result.scene, result.values
     scale = round(4 * values.shape[1] / scene.truth.values.shape[1]) / 4
@@ -56,25 +55,19 @@ def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None
     write_page(
         "middlebury",
         run,
-        found=summary,
+        summary,
         tables=tables,
         reliability=reliability_figure(rated) if rated else None,
         sparsification=sparsification_figure(rated) if rated else None,
         scenes=[_scene(name, summary, run) for name in scene_names(summary["matchers"])],
-        warnings=summary["warnings"],
     )
 
 
 @style.styled
 def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
-    """Draw the fraction of correct pixels by confidence (reliability diagram).
-
-    Bins with less than a thousandth of the pixels are left out; the bars show the distribution of
-    the pixels over the bins.
-    """
-    figure, (upper, lower) = style.subplots(
-        style.HALF_IN, 5.0, 2, sharex=True, height_ratios=(4, 1)
-    )
+    """Draw the share of correct pixels by confidence; below, the share of pixels in each bin."""
+    ratios: dict[str, Any] = {"sharex": True, "height_ratios": (4, 1)}
+    figure, (upper, lower) = style.subplots(style.HALF_IN, 5.0, 2, **ratios)
     upper.plot((0, 1), (0, 1), color=style.FAINT, linestyle="--", linewidth=1, label="calibrated")
     for n, (name, curves) in enumerate(matchers.items()):
         bins, colour = curves["reliability"], f"C{n}"
@@ -179,8 +172,7 @@ def csv_table(summary: Figures) -> str:
 
     Figures of the confidence are in the rows they refer to: all pixels that have a value.
     """
-    depths = [f"depth_{name}" for name in _DEPTHS]
-    named = [*_columns("", ""), *depths, *_CONFIDENCE]
+    named = [*_columns("", ""), *(f"depth_{name}" for name in _DEPTHS), *_CONFIDENCE]
     rows = [["matcher", "scene", "mask", "holes", *named, "seconds"]]
     for matcher, found in summary["matchers"].items():
         for scene, figures in [*found["scenes"].items(), ("weighted", found["weighted"])]:

@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from matplotlib.figure import Figure
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
@@ -31,30 +30,29 @@ _WEBP_QUALITY: Final = 80
 _NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
 
 
-def write_page(name: str, run: RunDirectory, /, **content: Any) -> None:
+def write_page(name: str, run: RunDirectory, found: Mapping[str, Any], /, **content: Any) -> None:
     """Write ``report.html`` of a run, with its command, ``config.yaml`` and versions.
 
-    Args:
-        name: The template, such as ``map``.
-        run: The run.
-        content: What the template shows, see `render_page`.
+    Warnings and verdict are those of the summary, ``found``, unless ``content`` has others.
     """
-    path = run.path("config.yaml")
-    config = path.read_text(encoding="utf-8") if path.is_file() else ""
-    origin = {"command": command_line(), "config": config, "versions": versions()}
-    write_text(run.path("report.html"), render_page(name, **origin, **content))
+    path, verdict = run.path("config.yaml"), found.get("verdict", "")
+    page = {
+        "found": found,
+        "warnings": found.get("warnings", ()),
+        "verdict": verdict,
+        "sound": verdict == "good",
+        "command": command_line(),
+        "config": path.read_text(encoding="utf-8") if path.is_file() else "",
+        "versions": versions(),
+    }
+    write_text(run.path("report.html"), render_page(name, **{**page, **content}))
 
 
 def render_page(name: str, **content: Any) -> str:
-    """Render a page as one HTML document without any external resource.
+    """Render a page as one HTML document without any external resource; all text is escaped.
 
-    All text is escaped. plotly.js is included once, and only if there is a 3-D view.
-
-    Args:
-        name: The template, such as ``map``.
-        content: What it shows. All pages know ``warnings``, ``verdict`` (heading of the warnings;
-            "" counts them), ``sound`` (whether they are shown in green, as remarks on a good
-            result), ``command``, ``config`` and ``versions``.
+    All templates know ``warnings``, ``verdict`` (heading of the warnings; "" counts them),
+    ``sound`` (they are remarks on a good result, in green), ``command``, ``config``, ``versions``.
     """
     return page_environment().get_template(f"{name}.html.j2").render(content)
 
@@ -85,11 +83,9 @@ def page_environment() -> Environment:
 def command_line() -> str:
     """Return the command line of this process, or "" if it is not one of recon."""
     program = Path(sys.argv[0] if sys.argv else "")
-    started = program.name in {"recon", "recon.exe"} or program.parts[-2:] == (
-        "recon",
-        "__main__.py",
-    )
-    return shlex.join(["recon", *sys.argv[1:]]) if started else ""
+    module = program.parts[-2:] == ("recon", "__main__.py")
+    ours = module or program.name in {"recon", "recon.exe"}
+    return shlex.join(["recon", *sys.argv[1:]]) if ours else ""
 
 
 def summary_rows(summary: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -104,13 +100,9 @@ def summary_rows(summary: Mapping[Any, Any], prefix: str = "") -> list[tuple[str
             rows += summary_rows(dict(enumerate(value)), f"{prefix}{key}.")
         else:
             name, text = f"{prefix}{key}", _text(value)
-            rows.append((name, text if _is_text(value) else with_unit(text, name)))
+            unitless = value is None or isinstance(value, str | bool) or value == []
+            rows.append((name, text if unitless else with_unit(text, name)))
     return rows
-
-
-def _is_text(value: Any) -> bool:
-    """Return whether a value of a summary has no unit: it is unknown, a text, or yes or no."""
-    return value is None or isinstance(value, str | bool) or value == []
 
 
 def _known(value: Any, form: str) -> str:
@@ -161,8 +153,7 @@ def _words(name: str) -> list[str]:
 @style.styled
 def timing_figure(stages: Mapping[str, float]) -> bytes:
     """Draw time and share of each stage, in the order of the mapping."""
-    figure = Figure((style.HALF_IN, max(1.6, 0.42 * len(stages) + 0.9)))
-    axes = figure.subplots()
+    figure, axes = style.subplots(style.HALF_IN, max(1.6, 0.42 * len(stages) + 0.9))
     seconds = np.asarray(list(stages.values()), dtype=np.float64)
     total = max(float(seconds.sum()), 1e-12)
     bars = axes.barh(list(stages), seconds, height=0.62)

@@ -27,7 +27,7 @@ from recon.stereo.frame import PairRun
 def write_pair_page(result: PairRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a pair, and its results as colour images."""
     write_disparity_images(result, run)
-    write_page("pair", run, **pair_content(result))
+    write_page("pair", run, result.summary, **pair_content(result))
 
 
 def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
@@ -49,7 +49,6 @@ def pair_content(result: PairRun) -> Json:
         error = error_figure(np.abs(result.disparity.values - result.truth.values))
     return {
         "run": result,
-        "warnings": result.warnings,
         "result": stereo_figures(result.pair, result.disparity),
         "error": error,
         "limit_px": ERROR_LIMIT_PX,

@@ -59,9 +59,9 @@ def write_paper_page(
     write_page(
         "paper",
         run,
+        summary,
         folder=folder.name or folder,
         titles=TITLES,
-        summary=summary,
         drawn=[
             {
                 "experiment": one,
@@ -76,7 +76,6 @@ def write_paper_page(
         bad_px=BAD_PX,
         # Experiments have their own sections.
         of_the_run={k: v for k, v in summary.items() if k not in {"experiments", "table_1"}},
-        warnings=summary["warnings"],
     )
 
 

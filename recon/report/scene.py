@@ -1,7 +1,6 @@
-"""A cloud, a mesh and paths in 3-D, as plain data for plotly.js.
+"""A cloud, a mesh and paths in 3-D, as plain data for plotly.js, thinned for display.
 
-The colour of a point is one byte: its index in a palette of at most 256 colours. A list of
-``rgb()`` strings would be ten times the size.
+The colour of a point is its index in a palette: ``rgb()`` strings would be ten times the size.
 """
 
 from __future__ import annotations
@@ -66,14 +65,10 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The content of a 3-D view, all in one frame.
+    """The content of a 3-D view, all in one frame, which ``T_view_frame`` turns to x forward, z up.
 
-    Attributes:
-        T_view_frame: float64 (4, 4), rotates that frame to x forward and z up.
-        cloud: Points, or None.
-        mesh: A surface, or None.
-        paths: Named camera paths, float64 (N, 3).
-        eye_m: Initial viewpoint, view axes; None = above, from where the content fills the view.
+    Paths of cameras, float64 (N, 3), have names. ``eye_m`` is the first viewpoint in view axes;
+    None = above, from where the content fills the view.
     """
 
     T_view_frame: Float64
@@ -84,17 +79,11 @@ class Scene:
 
 
 def plot_scene(scene: Scene, max_points: int = MAX_POINTS) -> Json | None:
-    """Return the ``data`` and ``layout`` that plotly.js draws, as plain JSON values.
+    """Return the ``data`` and ``layout`` that plotly.js draws; None without point and triangle.
 
+    The cloud is thinned evenly; the mesh is simplified, and hidden at first if there is a cloud.
     ``layout.meta`` lists the colourings of the cloud, the first trace: a ``label``, and the
     ``marker`` that it gets when that one is chosen.
-
-    Args:
-        scene: What to draw. The mesh is simplified, and initially hidden if there is a cloud.
-        max_points: The cloud is thinned evenly to at most this number.
-
-    Returns:
-        The plot; None if there is neither a point nor a triangle.
     """
     T = scene.T_view_frame
     cloud = None if scene.cloud is None else _without_outliers(scene.cloud)
@@ -117,11 +106,7 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS) -> Json | None:
 
 
 def quantise_colours(rgb: UInt8) -> tuple[UInt8, UInt8]:
-    """Reduce colours uint8 (N, 3) to a palette.
-
-    Returns:
-        The palette, uint8 (P, 3) with 1 <= P <= 256, and uint8 (N,) indices into it.
-    """
+    """Return a palette of colours (N, 3): uint8 (P, 3), P <= 256, and uint8 (N,) indices in it."""
     if not len(rgb):
         return np.zeros((1, 3), dtype=np.uint8), np.zeros(0, dtype=np.uint8)
     image = Image.fromarray(rgb[None]).quantize(256, Image.Quantize.MEDIANCUT)
@@ -174,7 +159,7 @@ def _xyz(points: NDArray[Any]) -> Json:
 
 
 def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
-    """Return colours by the image if the points have them, and by height."""
+    """Return colourings of a cloud: by the image if it has colours, and by height."""
     low, high = style.value_range(xyz[:, 2])
     height = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
     scale = {"color": height, "colorscale": _TURBO, "cmin": 0, "cmax": 255}
@@ -205,11 +190,11 @@ def _without_outliers(cloud: PointCloud) -> PointCloud:
 
 def _visible_points(cloud: PointCloud | None, scene: Scene) -> Float64:
     """Return float64 (N, 3): the initially visible points, view axes."""
-    parts = [np.zeros((0, 3)), *(path for _, path in scene.paths)]
+    parts: list[NDArray[Any]] = [np.zeros((0, 3)), *(path for _, path in scene.paths)]
     if cloud is not None and len(cloud):
-        parts.append(cloud.xyz.astype(np.float64))
+        parts.append(cloud.xyz)
     elif scene.mesh is not None:
-        parts.append(scene.mesh.vertices.astype(np.float64))
+        parts.append(scene.mesh.vertices)
     return np.asarray(apply(scene.T_view_frame, np.concatenate(parts)))
 
 
@@ -247,14 +232,7 @@ def _bounding_box(seen: Float64) -> Float64:
 
 
 def _whole_view(seen: Float64) -> tuple[Float64, Float64]:
-    """Return the viewpoint that sees all points, and in which they fill most of the view.
-
-    Args:
-        seen: float64 (N, 3), in units of plotly relative to the centre of the box.
-
-    Returns:
-        float64 (3,) twice: the viewpoint, and the point that it looks at.
-    """
+    """Return viewpoint and look-at point, (3,) each, so that all points (N, 3) fill the view."""
     points = seen[:: max(1, len(seen) // _TRIED_POINTS)] if len(seen) else np.zeros((1, 3))
     tried = [_view_from(points, turn, above) for turn in _TURNS_RAD for above in _ABOVE_RAD]
     _, eye, look_at = max(tried, key=lambda view: view[0])
@@ -294,10 +272,7 @@ def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:
 
 
 def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
-    """Return at most about ``limit`` triangles, by merging vertices that share a cell.
-
-    Degenerate triangles are removed. For display, not for measurement.
-    """
+    """Return at most about ``limit`` triangles for display, by merging vertices in cells."""
     # Open3D's quadric decimation takes nine times as long (1.6 s instead of 0.18 s of processor
     # time, 168,579 to 80,000 triangles), and drops the colours.
     cell_m, thinned = 0.0, mesh

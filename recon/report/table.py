@@ -21,14 +21,9 @@ _LATEX: Final = str.maketrans({
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table with a head; the first cell of a row names it.
 
-    Attributes:
-        title: What it shows.
-        head: Titles of the columns.
-        rows: The cells; the first of a row names it.
-        best: Where the best, that is the smallest, number is looked for: in each column, in each
-            row, or nowhere.
+    ``best`` says where the best, that is the smallest, number is looked for.
     """
 
     title: str
@@ -55,17 +50,18 @@ class Table:
 
     def latex(self) -> str:
         """Write the table as a ``tabular`` of plain LaTeX, the best of several numbers in bold."""
-        best = self.best_cells()
-        head, *body = [
-            " & ".join(_latex_cell(cell, bold=(r, c) in best) for c, cell in enumerate(row))
-            + r" \\"
-            for r, row in enumerate([self.head, *self.rows], start=-1)
-        ]
+        best = self._best_cells()
+        lines = []
+        for r, row in enumerate([self.head, *self.rows], start=-1):
+            cells = [cell.translate(_LATEX) for cell in row]
+            bold = (rf"\textbf{{{x}}}" if (r, c) in best else x for c, x in enumerate(cells))
+            lines.append(" & ".join(bold) + r" \\")
+        head, *body = lines
         begin = rf"\begin{{tabular}}{{l{'r' * (len(self.head) - 1)}}}"
         lines = [f"% {self.title}", begin, r"\hline", head, r"\hline", *body, r"\hline"]
         return "\n".join([*lines, r"\end{tabular}"])
 
-    def best_cells(self) -> set[tuple[int, int]]:
+    def _best_cells(self) -> set[tuple[int, int]]:
         """Return row and column of the smallest number, as it is shown, of each line of several."""
         lines: dict[int, dict[tuple[int, int], float]] = {}
         for r, row in enumerate(self.rows if self.best != "nowhere" else ()):
@@ -97,8 +93,3 @@ def csv_text(rows: Iterable[Sequence[Any]]) -> str:
 def number(value: float | None, digits: int = 2) -> str:
     """Write a number with fixed digits, or `NOT_KNOWN`."""
     return NOT_KNOWN if value is None else f"{value:.{digits}f}"
-
-
-def _latex_cell(text: str, *, bold: bool) -> str:
-    escaped = text.translate(_LATEX)
-    return rf"\textbf{{{escaped}}}" if bold else escaped

@@ -23,8 +23,7 @@ def write_trajectory_page(result: TrajectoryRun, run: RunDirectory) -> None:
     }
     for name, png in figures.items():
         write_bytes(run.path(f"{name}.png"), png)
-    warnings = result.summary["warnings"]
-    write_page("trajectory", run, run=result, figures=figures, warnings=warnings)
+    write_page("trajectory", run, result.summary, result=result, figures=figures)
 
 
 def compared_paths_figure(comparison: TrajectoryComparison) -> bytes:

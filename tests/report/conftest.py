@@ -150,6 +150,6 @@ def view(pair: RectifiedPair, disparity: Disparity, cloud: PointCloud) -> Simple
         mesh=None,
         truth=DisparityTruth(disparity.values + 1, disparity.valid),
         metrics=DisparityMetrics({2.0: 10.0}, 25.0, 1.0, 1.0, 1440),
-        summary={"points": 2000},
+        summary={"points": 2000, "warnings": ["a warning"]},
         warnings=("a warning",),
     )

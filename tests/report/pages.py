@@ -74,8 +74,9 @@ def rows(block: str) -> list[tuple[str, ...]]:
 
 
 def map_html(run: SimpleNamespace) -> str:
-    return render_page("map", **map_content(**vars(run)))
+    content = map_content(run.map_, run.made, run.errors, run.sample)
+    return render_page("map", found=run.summary, warnings=run.summary["warnings"], **content)
 
 
 def pair_html(run: SimpleNamespace) -> str:
-    return render_page("pair", **pair_content(run))  # type: ignore[arg-type]
+    return render_page("pair", found=run.summary, warnings=run.warnings, **pair_content(run))  # type: ignore[arg-type]

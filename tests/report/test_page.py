@@ -228,7 +228,7 @@ def test_page_of_a_run_shows_its_configuration(tmp_path: Path) -> None:
     with RunDirectory(tmp_path / "run") as directory:
         directory.path("config.yaml").write_text("rectification: <b>\n")
         found = {"baseline_m": 0.5, "row_error_rms_px": None, "depth_error_m": None}
-        write_page("audit", directory, **content, found=found, frames=None, pairs=[])
+        write_page("audit", directory, found, **content, frames=None, pairs=[])
         directory.write_json("run.json", {})
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "<pre>rectification: &lt;b&gt;\n</pre>" in page

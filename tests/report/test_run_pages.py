@@ -74,7 +74,7 @@ def test_a_map_compared_with_the_truth_is_tabulated(drive: SimpleNamespace) -> N
 
 
 def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> None:
-    plot: dict[str, Any] = map_content(**vars(drive))["view"]
+    plot: dict[str, Any] = map_content(drive.map_, drive.made, drive.errors, drive.sample)["view"]
     assert [trace["name"] for trace in plot["data"]][-2:] == ["path", "true path"]
     low, high = plot["layout"]["scene"]["xaxis"]["range"]
     # Both run from 0 to 10 m forward in map axes.

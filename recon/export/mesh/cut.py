@@ -17,12 +17,7 @@ from recon.stereo.cloud import open3d_clouds
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane perpendicular to an axis.
-
-    Attributes:
-        axis: 0 = x, 1 = y, 2 = z.
-        at_m: Coordinate on that axis.
-    """
+    """A plane perpendicular to an axis (0 = x), at a coordinate on it."""
 
     axis: int
     at_m: float
@@ -33,18 +28,15 @@ class Plane:
 
 
 def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleMesh:
-    """Return the part of a mesh on one side of a plane; triangles that cross it are split.
+    """Return the part of a mesh on one side of a plane, perhaps none; what crosses it is split.
 
-    Two meshes of one surface, cut along the same plane, meet there without overlap.
+    Two meshes of one surface, cut along the same plane, meet there without overlap: new vertices
+    lie exactly in the plane. Their normals and colours are interpolated.
 
     Args:
         mesh: Any mesh.
         plane: Where to cut.
         keep_above: Keep the side of larger coordinates, else that of smaller ones.
-
-    Returns:
-        The part; it may be empty. New vertices lie exactly in the plane; their normals and
-        colours are interpolated along the cut edges.
     """
     away = mesh.vertices[:, plane.axis] - np.float32(plane.at_m)
     away = away if keep_above else -away
@@ -69,13 +61,9 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
 
 
 def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64) -> TriangleMesh:
-    """Add vertices on edges of a mesh; no face uses them yet.
+    """Add vertices (N, 3), which no face uses yet, on edges (N, 2), at shares from 0 to 1 of them.
 
-    Args:
-        mesh: Any mesh.
-        new: float32 (N, 3), the vertices.
-        edges: int32 (N, 2), the edge of each vertex; normals and colours are interpolated on it.
-        share: float64 (N,), position along the edge, from 0 to 1.
+    Normals and colours are interpolated along the edges.
     """
     normals, rgb = mesh.normals, mesh.rgb
     if normals is not None:
@@ -131,13 +119,9 @@ _SAME_M: Final = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class OnEdges:
-    """Projections of points onto line segments.
+    """Projections of points onto line segments: the segments, and positions on them, from 0 to 1.
 
-    Attributes:
-        edge: int64 (N,), index of the segment.
-        share: float64 (N,), position along it, from 0 to 1.
-        feet: float64 (N, 3), the projected points.
-        distance_m: float64 (N,), distance of each point to its projection.
+    ``feet`` are the projected points, float64 (N, 3), at ``distance_m`` from the points.
     """
 
     edge: np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -161,7 +145,7 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
         mesh: The mesh.
         plane: The plane of the cut.
         border: float32 (E, 2, 3), the neighbour's `open_edges`.
-        reach_m: Vertices farther from the other mesh stay, since it has no surface there.
+        reach_m: Widest gap that is closed.
     """
     rows = np.flatnonzero(plane.holds(mesh.vertices))
     if not len(rows) or not len(border):
@@ -175,12 +159,7 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
 
 
 def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
-    """Return the nearest points on line segments, among those with the nearest midpoints.
-
-    Args:
-        points: float32 (N, 3).
-        edges: float32 (E, 2, 3), E ≥ 1.
-    """
+    """Return the nearest points on edges (E, 2, 3), among those with the nearest midpoints."""
     middles = edges.mean(axis=1)
     candidates = open3d_clouds.nearest(points, middles, min(_CANDIDATES, len(edges)))[0]
     begin = edges[candidates, 0].astype(np.float64)
@@ -225,11 +204,7 @@ def _split_faces(
 ) -> Int32:
     """Split faces with new vertices on a boundary edge into fans around the opposite corner.
 
-    Args:
-        faces: int32 (F, 3).
-        corners: Boundary edges from `_open_corners`.
-        edge: int64 (N,), row of ``corners`` of each new vertex, ascending.
-        new: int32 (N,), indices of the new vertices, in order along each edge.
+    ``edge`` is the row of ``corners`` (`_open_corners`) of each new vertex, ascending.
     """
     kept = np.ones(len(faces), dtype=bool)
     fans = [faces[:0]]
@@ -259,16 +234,7 @@ def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
 
 
 def keep_vertices(vertices: Float32, faces: Int32, keep: Bool) -> tuple[Float32, Int32]:
-    """Return the part of a mesh whose faces have all three vertices in ``keep``.
-
-    Args:
-        vertices: float32 (V, 3).
-        faces: int32 (F, 3).
-        keep: bool (V,).
-
-    Returns:
-        The remaining vertices that a face uses, and the faces, renumbered.
-    """
+    """Return vertices and faces of the part whose faces have all vertices in ``keep``."""
     return _without_loose(vertices, faces[keep[faces].all(axis=1)])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -46,44 +46,12 @@ _BULGE_M: Final = 2.0
 PieceKey = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class MeshPiece:
-    """A piece whose mesh is written.
-
-    Attributes:
-        path: Its PLY file.
-        vertices: Number of vertices.
-        faces: Number of faces.
-    """
+class MeshPiece(NamedTuple):
+    """The PLY file of a piece, and numbers of its vertices and faces."""
 
     path: Path
     vertices: int
     faces: int
-
-
-@dataclass(frozen=True, eq=False)
-class WrittenMesh:
-    """A mesh whose files are written.
-
-    Attributes:
-        points: Number of points of the map.
-        pieces: Its pieces.
-        warnings: Parts that could not be meshed.
-    """
-
-    points: int
-    pieces: tuple[MeshPiece, ...]
-    warnings: tuple[str, ...]
-
-    @property
-    def faces(self) -> int:
-        """Number of triangles."""
-        return sum(piece.faces for piece in self.pieces)
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices."""
-        return sum(piece.vertices for piece in self.pieces)
 
 
 def mesh_product(order: Order) -> Made:
@@ -91,17 +59,16 @@ def mesh_product(order: Order) -> Made:
     tiles, run, cloud = order.placed.tiles, order.run, order.run.path("map/cloud.ply")
     if not cloud.is_file():
         cloud = run.path(LAYER)
-        export_cloud(tiles, cloud, None)
+        export_cloud(tiles, cloud)
     # Each piece being meshed takes memory of its own.
     at_once = run.threads if tiles.config.memory.limit_mb is None else 1
-    written = export_mesh(tiles, order.mesh, run, cloud, at_once)
+    made = export_mesh(tiles, order.mesh, run, cloud, at_once)
     in_other_formats(run, order.formats, "map")
-    figures = {"vertices": written.vertices, "faces": written.faces, "tiles": len(written.pieces)}
-    whole, warnings = run.path(WHOLE), [*written.warnings]
+    warnings = [*made.warnings]
     if order.mesh.free_space and not has_occupancy(order.map):
         warnings.append("the map kept no rays: which faces lie in free space is not known")
-    shown = read_mesh(whole) if written.faces <= SAMPLE_FACES else None
-    return Made({"points": written.points, **figures}, warnings, shown)
+    shown = read_mesh(run.path(WHOLE)) if made.figures["faces"] <= SAMPLE_FACES else None
+    return Made(made.figures, warnings, shown)
 
 
 def in_other_formats(run: RunDirectory, formats: Sequence[str], frame: Frame | None) -> None:
@@ -117,7 +84,7 @@ def export_mesh(
     run: RunDirectory,
     cloud: Path,
     threads: int | None = None,
-) -> WrittenMesh:
+) -> Made:
     """Write ``mesh/mesh.ply``, its pieces if there are several, and ``mesh/mesh.mlp``.
 
     Args:
@@ -125,23 +92,25 @@ def export_mesh(
         settings: Settings of the mesh; ``target_faces`` is the total over all pieces.
         run: The run.
         cloud: A PLY file in it, for the MeshLab project.
-        threads: Pieces reconstructed at a time, each in its own process, but at most four, since
-            each needs memory; None = one per core. Does not change results.
+        threads: Pieces reconstructed at a time, at most four, since each needs memory; None = one
+            per core. Does not change results.
     """
     at_once = min(threads or available_cores(), _MOST_AT_ONCE)
-    found = _Mesher(tiles, settings, run, at_once, _count(tiles, settings)).written()
-    if not found.pieces:
-        raise MeshingError(
-            "no part of the map gives a surface", got="; ".join(found.warnings) or "no point"
-        )
+    points = _count(tiles, settings)
+    pieces, warnings = _Mesher(tiles, settings, run, at_once, points).written()
+    if not pieces:
+        got = "; ".join(warnings) or "no point"
+        raise MeshingError("no part of the map gives a surface", got=got)
     whole = run.path(WHOLE)
-    join_meshes(whole, [(piece.path, piece.vertices, piece.faces) for piece in found.pieces])
-    layers = {piece.path.stem: piece.path for piece in found.pieces}
-    if len(found.pieces) == 1:
-        found.pieces[0].path.unlink()
+    join_meshes(whole, pieces)
+    layers = {piece.path.stem: piece.path for piece in pieces}
+    if len(pieces) == 1:
+        pieces[0].path.unlink()
         layers = {"mesh": whole}
     write_mlp(run.path("mesh/mesh.mlp"), {**layers, "cloud": cloud}, "map")
-    return found
+    vertices, faces = (sum(numbers) for numbers in [*zip(*pieces, strict=True)][1:])
+    figures = {"points": points.total(), "vertices": vertices, "faces": faces}
+    return Made({**figures, "tiles": len(pieces)}, warnings)
 
 
 def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:
@@ -169,7 +138,8 @@ class _Mesher:
     points: Counter[PieceKey]
     borders: dict[tuple[PieceKey, Plane], Float32] = field(default_factory=dict)
 
-    def written(self) -> WrittenMesh:
+    def written(self) -> tuple[list[MeshPiece], list[str]]:
+        """Return the pieces whose files are written, and what could not be meshed."""
         pieces: list[MeshPiece] = []
         failed: dict[PieceKey, MeshingError] = {}
         keys = sorted(self.points)
@@ -183,16 +153,16 @@ class _Mesher:
                 path = self.run.path(f"mesh/tiles/tile_{key[0]}_{key[1]}.ply")
                 write_mesh(path, mesh)
                 pieces.append(MeshPiece(path, len(mesh.vertices), len(mesh.faces)))
-        return WrittenMesh(self.points.total(), tuple(pieces), self._warnings(failed))
+        return pieces, self._warnings(failed)
 
-    def _warnings(self, failed: dict[PieceKey, MeshingError]) -> tuple[str, ...]:
+    def _warnings(self, failed: dict[PieceKey, MeshingError]) -> list[str]:
         """Return a line about the pieces without a surface, naming the one with the most points."""
         if not failed:
-            return ()
+            return []
         worst = max(failed, key=self.points.__getitem__)
         share = sum(self.points[key] for key in failed) / self.points.total()
         tiles = f"{len(failed)} of {counted(len(self.points), 'tile')}"
-        return (f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})",)
+        return [f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})"]
 
     def _surface(self, key: PieceKey) -> TriangleMesh | MeshingError:
         """Return the surface of a piece, or the error why there is none, raised at its turn."""
@@ -209,11 +179,8 @@ class _Mesher:
         if self.settings.free_space:
             voxels = self.tiles.voxels_in(wide.wider(_BULGE_M))
             wrong = partial(looked_through, voxels=voxels) if len(voxels) else None
-        mesh = reconstruct_mesh(
-            cloud,
-            self.settings.model_copy(update={"target_faces": self._target(len(cloud))}),
-            wrong=wrong,
-        )
+        settings = self.settings.model_copy(update={"target_faces": self._target(len(cloud))})
+        mesh = reconstruct_mesh(cloud, settings, wrong=wrong)
         for axis, far in _SIDES:
             mesh = cut_mesh(mesh, self._plane(key, axis, far), keep_above=not far)
         return mesh

@@ -145,12 +145,7 @@ def reconstruct_mesh(
 
 @dataclass(frozen=True)
 class Octree:
-    """The grid that a surface is computed on.
-
-    Attributes:
-        depth: Its edge has 2^depth cells.
-        scale: Its edge, as a multiple of the longest side of the cloud.
-    """
+    """The grid of a surface: 2^depth cells, ``scale`` times the longest side of the cloud."""
 
     depth: int
     scale: float = OCTREE_SCALE
@@ -162,13 +157,10 @@ def trimmed_surface(
     octree: Octree,
     wrong: Callable[[Float32], Bool] | None = None,
 ) -> TriangleMesh:
-    """Return the Poisson surface of a cloud with normals, without what no points support.
+    """Return the Poisson surface of a cloud with unit normals, without what no points support.
 
-    Args:
-        cloud: Finite points with unit normals, in coordinates that are equally precise everywhere.
-        settings: Settings of the reconstruction.
-        octree: Resolution of the surface.
-        wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
+    Coordinates are equally precise everywhere. ``wrong`` says which vertices (V, 3) cannot be on a
+    surface.
     """
     vertices, faces, density = screened_poisson(
         cloud.xyz,

@@ -45,16 +45,11 @@ _COVERAGE_SAMPLES: Final = 100_000
 def reconstruct_view(
     cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
 ) -> TriangleMesh:
-    """Reconstruct the surface that one stereo pair sees.
-
-    Args:
-        cloud: The points of the pair in camera axes, with normals if possible.
-        camera: The rectified camera that measured them.
-        settings: Settings of the reconstruction. Spacings are pixels here.
+    """Reconstruct the surface that one stereo pair sees; spacings of ``settings`` are pixels here.
 
     Returns:
-        The mesh in camera axes, with unit normals towards the camera, and colours if the cloud
-        has any.
+        The mesh in camera axes, as the cloud, with unit normals towards the camera, and colours if
+        the cloud has any.
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
@@ -77,9 +72,7 @@ def reconstruct_view(
 def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
     """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
 
-    Args:
-        mesh: The mesh in camera axes, with at least one face.
-        cloud: The points in camera axes, at least one; of more than 100,000, every n-th is used.
+    Of more than 100,000 points, every n-th is used.
     """
     xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
     distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
@@ -87,11 +80,7 @@ def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
 
 
 def check_coverage(coverage: float) -> tuple[str, ...]:
-    """Return a warning if the mesh of a pair leaves out much of its cloud.
-
-    Args:
-        coverage: Share of the points that are on the mesh, see `mesh_coverage`.
-    """
+    """Return a warning if the mesh of a pair leaves out much of its cloud."""
     if coverage >= LEAST_COVERAGE:
         return ()
     tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
@@ -104,10 +93,6 @@ class _ImageSpace:
     """Column, row and negative disparity from the principal point and infinity, in pixels.
 
     The mapping is projective, so planes stay planes, and it preserves orientation.
-
-    Attributes:
-        focal_px: Focal length.
-        baseline_m: Distance between the camera centres.
     """
 
     focal_px: float

@@ -55,7 +55,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, list[T
     with pytest.MonkeyPatch.context() as patch:
         overlap_less(patch)
         whole, tiles, warnings = written(filled(), folder / "out", threads=1)
-    assert warnings == ()
+    assert warnings == []
     return whole, tiles
 
 
@@ -75,15 +75,15 @@ def filled() -> Tiles:
 
 def written(
     store: Tiles, folder: Path, settings: MeshSettings = SETTINGS, threads: int | None = None
-) -> tuple[TriangleMesh, list[TriangleMesh], tuple[str, ...]]:
+) -> tuple[TriangleMesh, list[TriangleMesh], list[str]]:
     """The whole mesh, that of each tile, and the warnings."""
     with RunDirectory(folder) as directory:
         layer = directory.path("mesh/cloud.ply")
         write_ply(layer, street())
         found = export_mesh(store, settings, directory, layer, threads)
         directory.write_json("run.json", {"files": directory.files()})
-    tiles = [read_mesh(folder / "mesh" / "tiles" / piece.path.name) for piece in found.pieces]
-    return read_mesh(folder / "mesh" / "mesh.ply"), tiles, found.warnings
+    tiles = [read_mesh(path) for path in sorted((folder / "mesh" / "tiles").glob("*.ply"))]
+    return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)
 
 
 def test_tiles_lie_on_the_surface_and_are_the_whole(
