@@ -35,8 +35,7 @@ from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import usual_ndisp
-from recon.stereo.rectify.grey import to_grey
-from recon.stereo.rectify.rectifier import Rectifier
+from recon.stereo.rectify.rectifier import Rectifier, to_grey
 
 # Scene of each experiment, identified by Table 1: docs/paper.md.
 EXPERIMENTS: Final[Mapping[int, str]] = MappingProxyType({2: "ArtL", 3: "Jadeplant", 4: "Pipes"})

@@ -24,9 +24,8 @@ from recon.run.run import plain
 from recon.sources.image_names import ImagePairs
 from recon.sources.one_pair import read_pair
 from recon.stereo.rectify.features import match_exactly
-from recon.stereo.rectify.grey import to_grey
 from recon.stereo.rectify.lens import epipolar_curves, epipolar_lines
-from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, plan_turns
+from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, plan_turns, to_grey
 
 # Pairs of a folder whose features are matched where there is no calibration: in other pairs of a
 # flown room rows are 0.44 to 0.52 px apart by 8 of them, 0.41 to 0.43 by 16, and 0.41 by 74.

@@ -157,7 +157,6 @@ class StereoSettings(Settings):
         """Return the settings with another matcher, by name or as an object; None = unchanged.
 
         ``config.yaml`` has the name of an object only, so such a run is repeated from Python.
-        `map_sequence` and `run_map` call it from one thread, one pair after the other.
         """
         if matcher is None:
             return self

@@ -126,7 +126,6 @@ def _leaf(door: Float64, paint: Paint) -> TriangleSoup:
 
 
 def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
-    """Return glass behind frames with a mullion and a transom; each window is an object."""
     parts = rng.integers(1, 2**30, len(holes))
     x0, z0, x1, z1 = holes.T
     w, h, f = x1 - x0, z1 - z0, np.full(len(holes), _FRAME_M)
@@ -153,7 +152,6 @@ def _upright(rectangles: Float64, y: float, paint: Paint, parts: NDArray[Any]) -
 
 
 def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
-    """Return the four inner sides of each hole."""
     x0, z0, x1, z1 = holes.T
     zero = np.zeros(len(holes))
     inwards = [0.0, _REVEAL_M, 0.0]
@@ -165,7 +163,6 @@ def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
 
 
 def _ledges(plan: HousePlan, holes: Float64) -> TriangleSoup:
-    """Return a string course per floor, a cornice, and a sill under each opening."""
     w = plan.width
     levels = 0.4 + plan.storey * np.arange(1, plan.floors)
     bands = [(plan.eaves - 0.25, plan.eaves + 0.1, 0.3)]
@@ -186,7 +183,6 @@ def _blind_walls(plan: HousePlan) -> TriangleSoup:
 
 
 def _gable(plan: HousePlan) -> TriangleSoup:
-    """Return two slopes with their ridge along the street, and the triangles below them."""
     w, d, h, out = plan.width, plan.depth, plan.eaves + 0.05, 0.35
     rise = 0.42 * d
     slope = rise / (d / 2)

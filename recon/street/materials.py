@@ -16,8 +16,7 @@ from recon.core.values.arrays import Float64, Int32
 from recon.street.kernels.surface import SurfaceHits, fractal_noise, lattice_values
 from recon.street.shapes import Material, TriangleSoup
 
-GAMMA: Final = 2.2
-"""Exponent from display values to linear light."""
+GAMMA: Final = 2.2  # exponent from display values to linear light
 _OCTAVES: Final = 7
 _ROUGHNESS: Final = 0.92  # amplitude of each octave relative to the next coarser one
 ROAD_HALF_M: Final = 5.2
@@ -114,7 +113,6 @@ def _asphalt(p: Patch) -> Float64:
 
 
 def _paving(p: Patch) -> Float64:
-    """Return slabs in running bond, with a row of darker setts along the kerb."""
     tile = (0.6, 0.4)
     tone = tile_tone(p.uv, tile, p.spread, np.zeros(len(p.uv), dtype=int), bond=0.5)
     rgb = p.rgb * (1.0 + 0.16 * tone)[:, None]
@@ -122,14 +120,12 @@ def _paving(p: Patch) -> Float64:
 
 
 def _kerb(p: Patch) -> Float64:
-    """Return stones one metre long."""
     tone = tile_tone(p.uv, (1.0, 1.0), p.spread, np.zeros(len(p.uv), dtype=int))
     rgb = p.rgb * (1.0 + 0.12 * tone)[:, None]
     return _blend(rgb, (0.2, 0.2, 0.2), 0.8 * stripes(p.u, 1.0, 0.02, p.spread[:, 0]))
 
 
 def _weather(p: Patch) -> Float64:
-    """Return splash marks at the foot of walls, and vertical rain streaks."""
     foot = np.exp(-np.maximum(p.height_m, 0.0) / 0.5)
     cell = np.stack([p.u, np.zeros_like(p.u)], axis=1)
     narrow = np.stack([p.spread[:, 0], np.zeros_like(p.u)], axis=1)
@@ -142,7 +138,6 @@ def _plaster(p: Patch) -> Float64:
 
 
 def _brick(p: Patch) -> Float64:
-    """Return bricks of 24 × 7.5 cm, in areas of slightly different colour."""
     tile = (0.25, 0.083)
     tone = 0.28 * tile_tone(p.uv, tile, p.spread, p.part, bond=0.5)
     tone += 0.07 * tile_tone(p.uv, (0.9, 0.4), p.spread, p.part + 1)
@@ -151,7 +146,6 @@ def _brick(p: Patch) -> Float64:
 
 
 def _glass(p: Patch) -> Float64:
-    """Return the dark rooms, painted sky reflections, and some curtains."""
     rgb = p.rgb * np.clip(1.0 + 0.5 * (p.v - 0.7), 0.5, 2.5)[:, None]
     curtain = (_variation(p, 1) > 0.1) * stripe(p.u % 1.1, 0.0, 0.36, p.spread[:, 0])
     folds = 0.5 + 0.25 * np.sin(p.u * 42.0) * np.exp(-((p.spread[:, 0] / 0.06) ** 2))
@@ -162,7 +156,6 @@ def _glass(p: Patch) -> Float64:
 
 
 def _door(p: Patch) -> Float64:
-    """Return two columns of panels and a letter box."""
     u, v = p.u % 1.1, p.v
     frame = 1.0 - stripe(np.abs(u - 0.55), 0.08, 0.45, p.spread[:, 0]) * (
         1.0 - stripes(v, 0.75, 0.14, p.spread[:, 1])
@@ -173,14 +166,12 @@ def _door(p: Patch) -> Float64:
 
 
 def _roof(p: Patch) -> Float64:
-    """Return rows of tiles, each casting a line of shadow."""
     tone = tile_tone(p.uv, (0.3, 0.35), p.spread, p.part, bond=0.5)
     rgb = p.rgb * (1.0 + 0.2 * tone)[:, None]
     return _blend(rgb, (0.1, 0.08, 0.07), 0.6 * stripes(p.v, 0.35, 0.05, p.spread[:, 1]))
 
 
 def _car_paint(p: Patch) -> Float64:
-    """Return door gaps, a trim strip, and road dirt at the bottom."""
     gaps = both(
         stripe(np.abs(p.u + 0.25), 0.0, 0.012, p.spread[:, 0]),
         stripe(np.abs(p.u - 0.80), 0.0, 0.012, p.spread[:, 0]),
@@ -192,7 +183,6 @@ def _car_paint(p: Patch) -> Float64:
 
 
 def _car_glass(p: Patch) -> Float64:
-    """Return the dark panes between pillars in the colour of the body."""
     pillars = stripe(np.abs(p.u + 0.25), 0.0, 0.05, p.spread[:, 0])
     pillars = both(pillars, stripe(p.v, 1.36, 9.0, p.spread[:, 1]))
     cover = pillars[:, None]
@@ -202,19 +192,16 @@ def _car_glass(p: Patch) -> Float64:
 
 
 def _leaves(p: Patch) -> Float64:
-    """Return leaves; sunlit ones are yellower than those deep in the crown."""
     tint = np.clip(0.5 + 0.6 * p.grain, 0.0, 1.0)[:, None]
     return np.asarray(p.rgb * (tint * [1.25, 1.1, 0.7] + (1.0 - tint) * [0.7, 0.85, 0.9]))
 
 
 def _metal(p: Patch) -> Float64:
-    """Return seams, so that poles have some texture."""
     seams = stripes(p.v, 0.9, 0.05, p.spread[:, 1])
     return _blend(p.rgb, (0.75, 0.74, 0.7), 0.5 * seams)
 
 
 def _poster(p: Patch) -> Float64:
-    """Return strongly coloured areas within a white border, and lines of text."""
     zero = np.zeros(len(p.uv), dtype=np.int64)
     tones = [tile_tone(p.uv, (0.23, 0.31), p.spread, p.part + k) for k in (0, 1, 2)]
     rgb = p.rgb * (1.0 + 0.3 * tones[0][:, None] + 0.3 * np.stack(tones, axis=1))

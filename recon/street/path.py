@@ -79,7 +79,6 @@ def centre_line(settings: StreetScene, length_m: float) -> CentreLine:
 
 
 def _walk(along_m: Float64, heading_rad: Float64) -> Float64:
-    """Integrate directions along a line to points (N, 2)."""
     middle = 0.5 * (heading_rad[:-1] + heading_rad[1:])
     steps = np.diff(along_m)[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1)
     return np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])

@@ -51,7 +51,6 @@ def car(rng: np.random.Generator) -> TriangleSoup:
 
 
 def _body(length: float, width: float, paint: Paint, van: bool) -> TriangleSoup:
-    """Return the lower body with sills, bumpers, bonnet and boot."""
     a = length / 2
     boot = [(-a + 0.06, 0.92)] if van else [(-a + 0.55, 0.97), (-a + 0.08, 0.9)]
     profile = [(-a + 0.05, 0.24), (a - 0.1, 0.2), (a, 0.36), (a - 0.03, 0.62), (a - 0.25, 0.76)]
@@ -60,7 +59,6 @@ def _body(length: float, width: float, paint: Paint, van: bool) -> TriangleSoup:
 
 
 def _cabin(length: float, width: float, height: float, paint: Paint, van: bool) -> TriangleSoup:
-    """Return windows that slant inwards, and a roof."""
     a, side, front = length / 2, 0.14, 0.75
     back = 0.12 if van else 0.4
     low = np.array([-a + (0.06 if van else 0.35), -width / 2 + 0.03, 0.9])
@@ -86,7 +84,6 @@ def _wheel(x: float, y: float, part: int) -> TriangleSoup:
 
 
 def _lamps(length: float, width: float, part: int) -> list[TriangleSoup]:
-    """Return head and tail lamps and number plates, 1 cm proud of the bumpers."""
     white = Paint(Material.PLAIN, (0.85, 0.85, 0.80), part + 3)
     red = Paint(Material.PLAIN, (0.55, 0.06, 0.05), part + 4)
     plate = Paint(Material.POSTER, (0.80, 0.80, 0.72), part + 5)
@@ -227,19 +224,16 @@ SECTIONS: Final = (picket_fence, railing, hedge, wires, shop_window)
 
 
 def _row(step_m: float, size_m: tuple[float, float, float], paint: Paint) -> TriangleSoup:
-    """Return upright bars of one size in a row."""
     x = np.arange(0.0, SECTION_M, step_m)
     low = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
     return boxes(low, low + size_m, paint)
 
 
 def _rails(heights_m: tuple[float, ...], thick_m: float, paint: Paint) -> TriangleSoup:
-    """Return bars along the section."""
     low = np.array([[0.0, 0.02, height] for height in heights_m])
     return boxes(low, low + np.array([SECTION_M, thick_m, thick_m]), paint)
 
 
 def _posts(step_m: float, height_m: float) -> TriangleSoup:
-    """Return posts that carry a fence."""
     grey = Paint(Material.PLAIN, (0.60, 0.59, 0.56), 1)
     return _row(step_m, (0.12, 0.12, height_m), grey)

@@ -103,7 +103,6 @@ class StreetCamera:
         return stereo_views(self.world.camera, self.world.T_street_camera[index])
 
     def _truth(self, index: int, depth_m: Float32) -> DisparityTruth:
-        """Return the disparity, and whether the right camera sees each point."""
         camera = self.world.camera
         left, right = self.views(index)
         known = np.flatnonzero(np.isfinite(depth_m))
@@ -115,7 +114,6 @@ class StreetCamera:
         return DisparityTruth(disparity_from_depth(depth_m, camera), nonocc.reshape(depth_m.shape))
 
     def _record(self, image: Float64, index: int, side: int) -> UInt8:
-        """Apply the sensor model of one camera to an image."""
         settings = self.world.settings
         return record(
             image,
@@ -158,7 +156,6 @@ def _expose(light: Float64) -> Float64:
 
 
 def _four_rays(stage: Stage, view: View, pixels: Float64) -> Float64:
-    """Return the mean radiance (N, 3) over the four quarters of pixels (N, 2)."""
     quarters = (pixels[:, None, :] + np.array(_QUARTERS)).reshape(-1, 2)
     sample = stage.look(view.origin, view.directions(quarters), 0.5 / view.focal_px)
     return np.asarray(_expose(sample.rgb).reshape(-1, 4, 3).mean(axis=1))

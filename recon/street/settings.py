@@ -9,8 +9,7 @@ from typing_extensions import Self
 
 from recon.core.settings import Settings
 
-CORNER_M: Final = 16.0
-"""Radius of the corners of a block."""
+CORNER_M: Final = 16.0  # radius of the corners of a block
 
 _LEAST_SIDE_M: Final = 2 * CORNER_M + 28.0  # two rows of houses, back to back
 _SideM = Annotated[float, Field(ge=_LEAST_SIDE_M, le=2000.0)]

@@ -103,7 +103,6 @@ def build_street(settings: StreetSettings) -> StreetWorld:
 
 
 def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> TriangleSoup:
-    """Repeat one period of a straight street, beginning behind the start."""
     shifts = repeat_m * np.arange(-math.ceil(BEHIND_M / repeat_m), math.ceil(length_m / repeat_m))
     along = [np.array([shift, 0.0, 0.0]) for shift in shifts]
     return merge([move(period, se3.make_transform(np.eye(3), offset)) for offset in along])
@@ -126,7 +125,6 @@ def _sun(seed: int) -> Float64:
 
 
 def _ground(road: CentreLine) -> TriangleSoup:
-    """Return road, kerbs and pavements in strips of one metre, and the ground beside them."""
     a, top = ROAD_HALF_M, KERB_M
     grey = Paint(Material.ASPHALT, (0.40, 0.40, 0.41))
     strips = [_strip(road, ((-a, 0.0), (a, 0.0)), grey)]
@@ -178,7 +176,6 @@ def _yard(road: CentreLine, lateral_m: float, paint: Paint) -> TriangleSoup:
 
 
 def _inside(road: CentreLine, side: float) -> bool:
-    """Return whether a side of the road is the inside of a block."""
     return road.loop_m is not None and side > 0
 
 
@@ -190,7 +187,6 @@ def _band(near: Float64, far: Float64) -> Float64:
 
 
 def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Yield a row of houses with setbacks and occasional gaps for side streets."""
     at, end = road.span_m
     while at < end:
         width = float(rng.uniform(8.0, 15.0))
@@ -202,7 +198,6 @@ def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator
 
 
 def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Return houses behind the first row, visible through its gaps."""
     at, end = road.span_m
     end += 30.0 * (at < 0.0)
     while at < end:
@@ -238,7 +233,6 @@ def _stand(
 
 
 def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Return parked cars in about half of the bays, most facing in the direction of their lane."""
     first, end = road.span_m
     for bay in np.arange(max(first, -18.0), end, 6.0):
         if rng.random() < 0.45:
@@ -251,7 +245,6 @@ def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Ite
 
 
 def _fences(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Return what one looks through along the inner half of the pavement, in random order."""
     first, end = road.span_m
     for at in np.arange(max(first, -18.0), end, SECTION_M + 0.6):
         section = SECTIONS[int(rng.integers(len(SECTIONS)))](rng)
@@ -261,7 +254,6 @@ def _fences(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator
 
 
 def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Return trees along the kerb, copied from a few models, and a row at the far end."""
     seedlings = [props.tree(rng) for _ in range(_SEEDLINGS)]
 
     def grow(at_m: float, lateral_m: float) -> TriangleSoup:
@@ -279,7 +271,6 @@ def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[
 
 
 def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Return lamp posts at regular distances; signs, bollards, bins and pillars at random."""
     kerb = side * (ROAD_HALF_M + 0.45)
     # Separate random streams, as the number of posts must not change the objects between them.
     lamps, rng = rng.spawn(2)

@@ -100,7 +100,6 @@ def _raster(
 
 
 def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64:
-    """Return points (N, 3) of one depth map, left camera axes."""
     depth = camera.depth(index).astype(np.float64).ravel()
     rig = camera.world.camera
     near = np.flatnonzero(depth <= range_m)
@@ -110,15 +109,12 @@ def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64
 
 
 def _thin(xyz: Float32, voxel_m: float) -> Float32:
-    """Return the first point in each voxel, in the order given."""
     keys = pack_keys(np.floor(xyz / voxel_m).astype(np.int64))
     first = np.unique(keys, return_index=True)[1]
     return np.asarray(xyz[np.sort(first)])
 
 
 class _Counter:
-    """Counts the frames in which each cell appears."""
-
     def __init__(self) -> None:
         self._keys = np.zeros(0, np.int64)
         self._frames = np.zeros(0, np.int64)
@@ -190,7 +186,6 @@ def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
 
 
 def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
-    """Return points (M, 3) on segments, at most ``step_m`` apart, including the ends."""
     pieces = np.ceil(np.linalg.norm(end - start, axis=1) / step_m).astype(int) + 1
     segment = np.repeat(np.arange(len(start)), pieces + 1)
     first = np.cumsum(pieces + 1) - (pieces + 1)

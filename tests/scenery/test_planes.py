@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.core.errors import SettingsError
 from recon.core.values import RectifiedCamera
-from tests.scenery.planes import Plane, fronto_parallel_pair, plane_pair, slanted_pair, step_pair
+from tests.scenery.planes import fronto_parallel_pair, slanted_pair, step_pair
 
 CAMERA = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)
 
@@ -21,11 +20,6 @@ def _warp_error(scene) -> np.ndarray:
     fetched = cv2.remap(scene.pair.right.astype(np.float32), x, v, cv2.INTER_LANCZOS4)
     mask &= (x >= 4) & (x <= d.shape[1] - 5)
     return np.abs(fetched - scene.pair.left)[mask]
-
-
-def test_disparity_of_a_fronto_parallel_plane_is_constant():
-    scene = fronto_parallel_pair(CAMERA, 8.0)
-    assert np.allclose(scene.truth.values, 200.0 * 0.5 / 8.0, rtol=1e-6)
 
 
 def test_doffs_shifts_the_disparity():
@@ -41,11 +35,6 @@ def test_disparity_of_a_slanted_plane_is_linear_in_the_image():
     x, y = (u - 99.5) / 200, (v - 49.5) / 200
     # Z = 10 + 0.5 X - 0.2 Y along a ray: Z·(1 - 0.5 x + 0.2 y) = 10.
     assert np.allclose(d, 100.0 * (1 - 0.5 * x + 0.2 * y) / 10.0, rtol=1e-6)
-
-
-def test_an_integer_disparity_shifts_the_image_by_whole_pixels():
-    scene = fronto_parallel_pair(CAMERA, 100.0 / 20.0)
-    assert np.array_equal(scene.pair.left[:, 20:], scene.pair.right[:, :-20])
 
 
 @pytest.mark.parametrize(
@@ -76,26 +65,3 @@ def test_the_occluded_strip_is_as_wide_as_the_step_in_disparity():
     expected[square[0] - 10 : square[0]] = False
     assert len(square) == 60
     assert np.array_equal(row, expected)
-
-
-def test_pixels_without_a_plane_have_no_disparity():
-    scene = plane_pair(CAMERA, [Plane((0.0, 1.0, 0.0), 1.5)])
-    assert np.isnan(scene.truth.values[:50]).all()
-    assert np.isfinite(scene.truth.values[50:]).all()
-    assert not scene.truth.nonocc[:50].any()
-
-
-def test_noise_has_the_strength_that_was_asked_for_and_is_repeatable():
-    clean, noisy, again = (
-        fronto_parallel_pair(CAMERA, 8.0, seed=4, noise_dn=n).pair.left for n in (0.0, 5.0, 5.0)
-    )
-    difference = noisy.astype(float) - clean
-    assert 4.5 < difference.std() < 5.5
-    assert np.array_equal(noisy, again)
-
-
-def test_no_plane_is_refused():
-    with pytest.raises(SettingsError):
-        plane_pair(CAMERA, [])
-    with pytest.raises(SettingsError):
-        fronto_parallel_pair(CAMERA, -3.0)

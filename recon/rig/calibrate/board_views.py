@@ -28,7 +28,7 @@ from recon.rig.calibrate.detect import (
 from recon.sources.image_names import ImagePairs
 from recon.sources.settings import SourceSettings
 from recon.sources.video import frames_of, open_videos, split_views, view_size
-from recon.stereo.rectify.grey import to_grey
+from recon.stereo.rectify.rectifier import to_grey
 
 # Looks at a video per second: a hand holds a board still for longer than that.
 _LOOKS_HZ: Final = 10.0

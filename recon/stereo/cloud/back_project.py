@@ -15,8 +15,7 @@ from recon.core.values import Disparity, PointCloud, Reason, RectifiedCamera, Re
 from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.kernels import points
 
-_NORMALS_RADIUS_PX: Final = 3
-"""Half width of the window that gives a point its normal."""
+_NORMALS_RADIUS_PX: Final = 3  # half width of the window that gives a point its normal
 
 
 class CloudSettings(Settings):
@@ -76,7 +75,14 @@ def back_project(
             got=f"disparity {disparity.values.shape}",
             expected=f"{pair.left.shape}",
         )
-    found = points.make_points(_maps(disparity, pair), _rules(pair.camera, settings, normals))
+    maps = points.Maps(
+        values=disparity.values,
+        confidence=disparity.confidence,
+        sigma=disparity.sigma_px,
+        colours=pair.left[:, :, None] if pair.left_rgb is None else pair.left_rgb,
+        usable=np.zeros((0, 0), np.bool_) if pair.valid is None else pair.valid,
+    )
+    found = points.make_points(maps, _rules(pair.camera, settings, normals))
     return PointCloud(
         xyz=found.xyz,
         rgb=found.colours,
@@ -84,16 +90,6 @@ def back_project(
         sigma_m=found.sigma,
         confidence=found.confidence,
         frame="camera",
-    )
-
-
-def _maps(disparity: Disparity, pair: RectifiedPair) -> points.Maps:
-    return points.Maps(
-        values=disparity.values,
-        confidence=disparity.confidence,
-        sigma=disparity.sigma_px,
-        colours=pair.left[:, :, None] if pair.left_rgb is None else pair.left_rgb,
-        usable=np.zeros((0, 0), np.bool_) if pair.valid is None else pair.valid,
     )
 
 
@@ -118,17 +114,10 @@ def _or_infinity(limit: float | None) -> float:
     return sys.float_info.max if limit is None else limit
 
 
-_RADIUS_PX: Final = 2
-"""Half width of the window."""
-
-_MAX_GRADIENT: Final = 1.0
-"""Largest disparity gradient of a matchable surface, pixels per pixel."""
-
-_TOLERANCE_PX: Final = 0.5
-"""Matching noise allowed on top of the gradient."""
-
-_MIN_SUPPORT: Final = 0.36
-"""Share of the window that must lie on the surface of its centre."""
+_RADIUS_PX: Final = 2  # half width of the window
+_MAX_GRADIENT: Final = 1.0  # largest disparity gradient of a matchable surface, pixels per pixel
+_TOLERANCE_PX: Final = 0.5  # matching noise allowed on top of the gradient
+_MIN_SUPPORT: Final = 0.36  # share of the window that must lie on the surface of its centre
 
 
 def remove_flying_edges(disparity: Disparity) -> Disparity:
@@ -154,7 +143,8 @@ def _support(values: Float32) -> UInt8:
     padded = cv2.copyMakeBorder(values, r, r, r, r, cv2.BORDER_REFLECT_101)
     count = np.zeros(padded.shape, dtype=np.uint8)
     # Support is mutual, so each pair of pixels is compared once, over half of the window.
-    for dy, dx in _half_window(r):
+    window = range(-r, r + 1)
+    for dy, dx in ((dy, dx) for dy in window for dx in window if (dy, dx) > (0, 0)):
         limit = _TOLERANCE_PX + _MAX_GRADIENT * float(np.hypot(dy, dx))
         ahead = (slice(dy, None), slice(max(dx, 0), min(dx, 0) or None))
         here = (slice(None, -dy or None), slice(max(-dx, 0), min(-dx, 0) or None))
@@ -162,9 +152,3 @@ def _support(values: Float32) -> UInt8:
         cv2.add(count[here], near, dst=count[here])
         cv2.add(count[ahead], near, dst=count[ahead])
     return np.asarray(count[r : r + height, r : r + width] + np.uint8(1))
-
-
-def _half_window(radius_px: int) -> list[tuple[int, int]]:
-    """Return offsets (dy, dx) of one half of a window; the other half is its negative."""
-    r = range(-radius_px, radius_px + 1)
-    return [(dy, dx) for dy in r for dx in r if dy > 0 or (dy == 0 and dx > 0)]

@@ -44,7 +44,9 @@ def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bo
         return np.ones(len(xyz), dtype=bool)
     with _quiet():
         _, index = _legacy(xyz).remove_statistical_outlier(neighbours, sigmas)
-    return _mask(index, len(xyz))
+    mask = np.zeros(len(xyz), dtype=bool)
+    mask[np.asarray(index, dtype=np.intp)] = True
+    return mask
 
 
 def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
@@ -114,7 +116,8 @@ def nearest(
             got=f"{farthest_m:.3g} m",
             expected=f"at most {_SEARCHABLE_M:.0e} m",
         )
-    near_origin, points = (_tensor(xyz) for xyz in moved)
+    tensor = o3d.core.Tensor.from_numpy
+    near_origin, points = (tensor(np.array(xyz, dtype=np.float32)) for xyz in moved)
     with _quiet():
         search = o3d.core.nns.NearestNeighborSearch(near_origin)
         search.knn_index()
@@ -144,18 +147,8 @@ def _finite(xyz: NDArray[Any]) -> Float64:
     return points
 
 
-def _tensor(xyz: NDArray[Any]) -> Any:
-    return o3d.core.Tensor.from_numpy(np.array(xyz, dtype=np.float32))
-
-
 def _array(vectors: Any) -> Float32:
     return np.asarray(vectors).astype(np.float32)
-
-
-def _mask(index: Any, length: int) -> Bool:
-    mask = np.zeros(length, dtype=bool)
-    mask[np.asarray(index, dtype=np.intp)] = True
-    return mask
 
 
 def _quiet() -> Any:

@@ -22,8 +22,6 @@ class _Runs(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """The runs of a row."""
-
     runs: Int32  # (W,), the run of each pixel that has a value
     breaks: UInt8  # (W,), 1 where a pixel does not belong to the run of the one before
 
@@ -32,12 +30,12 @@ class _Row(NamedTuple):
 def find_speckles(values: Float32, largest_step: float, smallest_size: int) -> Bool:
     """Return bool (H, W), the pixels of connected regions of fewer than ``smallest_size``.
 
-    Two neighbours (left, right, above, below) belong to one region when both have a value (not
-    NaN) and the values differ by ``largest_step`` or less.
+    Neighbours (left, right, above, below) belong to one region when both have a value (not NaN) and
+    the values differ by ``largest_step`` or less.
 
     Ref: union-find with path halving, R. Sedgewick, K. Wayne, "Algorithms", 4th ed., 1.5; runs as
-    nodes, L. He, Y. Chao, K. Suzuki, "A run-based two-scan labeling algorithm", IEEE Transactions
-    on Image Processing 17, 2008.
+    nodes, L. He et al., "A run-based two-scan labeling algorithm", IEEE Trans. Image Processing 17,
+    2008.
     """
     height, width = values.shape
     block = np.empty((values.size, 4), np.int32)
@@ -103,7 +101,6 @@ def _join_rows(touches: UInt8, parents: Int32, above: _Row, here: _Row, joins: U
 
 @kernel
 def _mark_small(runs: _Runs, count: int, smallest_size: int, small: Bool) -> None:
-    """Mark the runs of regions of fewer pixels."""
     parents = runs.parents
     for run in range(count):
         # A parent comes before its child: it points to its root already.
@@ -116,7 +113,6 @@ def _mark_small(runs: _Runs, count: int, smallest_size: int, small: Bool) -> Non
 
 @kernel
 def _join(parents: Int32, one: int, other: int) -> None:
-    """Give two regions one root: the smaller index."""
     a, b = _root(parents, one), _root(parents, other)
     if a < b:
         parents[b] = a
@@ -140,11 +136,10 @@ def average_opposite(
     """Average each pixel of some rows with the pairs of opposite neighbours that are near it.
 
     A pair is a neighbour and its mirror image about the pixel; it counts where both are within
-    the square of half width ``radius`` and within the image, have a value, and differ from the
-    pixel's by ``largest_step`` or less. On a plane the mean of a pair is the pixel's own value, so
-    slopes are preserved even beside holes and steps, where a mean over all neighbours would be
-    biased. Only the fields of a chessboard that have the pixel's colour are used: the noise of
-    neighbours is correlated, so the others would add little for twice the time.
+    ``radius`` columns and rows and within the image, have a value, and differ from the pixel's by
+    ``largest_step`` or less. On a plane the mean of a pair is the pixel's own value, so slopes
+    stay, even beside holes and steps. Only the fields of a chessboard that have the pixel's colour
+    are used: the noise of neighbours is correlated, so the others would add little.
     """
     height, width = values.shape
     step = np.float32(largest_step)

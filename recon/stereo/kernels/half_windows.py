@@ -2,13 +2,11 @@
 
 A window consists of an upper and a lower half that share the middle row. The lower half of a row is
 the upper half of a row further down, so it is summed once and kept in a ring of rows. Column sums
-are updated from row to row, one pixel in and one out; sums over the width are put together from
-sums of two and of four columns.
+are updated from row to row; sums over the width are put together from sums of two and of four.
 
 Sums are stored place by place, with the columns of a block side by side. Place ``n`` is candidate
 ``n - abs(slant)``, so that a slanted half finds candidates before the first and after the last.
-Only the places of offered candidates are summed. Where one is offered again, its sums start early
-enough for the first window that needs them.
+Only the places of offered candidates are summed, early enough for the first window that needs them.
 """
 
 from __future__ import annotations
@@ -34,11 +32,8 @@ from recon.stereo.kernels.tiles import GROUP, Offer
 _CACHE_BYTES: Final = 1024 * 1024
 """Size of the ring of half windows: what a core's own (L2) cache commonly holds."""
 
-_CHUNK: Final = 16
-"""Candidates whose columns are summed at a time: their sums stay in the L1 cache."""
-
-BLOCK: Final = 1024
-"""Most columns of a block."""
+_CHUNK: Final = 16  # candidates whose columns are summed at a time: their sums stay in the L1 cache
+BLOCK: Final = 1024  # most columns of a block
 
 
 class Search(NamedTuple):
@@ -228,7 +223,6 @@ def _begin(views: Views, search: Search, y: int, x0: int, scratch: Scratch) -> N
 
 @kernel
 def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, scratch: Scratch) -> None:
-    """Add the costs of the pixels of row ``y`` to the column sums of place ``n``."""
     sums, left, right = scratch.columns, views.left[y], views.right[y]
     cap, shift = splat(np.uint8(cost_cap)), x0 + scratch.alive.size - 1 - n
     for c in range(0, scratch.stride, LANES):

@@ -1,11 +1,9 @@
 """Matching costs of all candidates of a row: gradients and census over a window, in uint8.
 
-A row of costs is an array (candidates, W). The pixels of a candidate lie side by side, in the left
-view as in the right, so vector registers are filled along the row and only its end needs padding.
-Sums over the window's width are kept for as many rows as the window is high.
-
-The census, one bit per neighbour that is darker, is invariant under any change of brightness that
-keeps the order of grey levels.
+A row of costs is an array (candidates, W): the pixels of a candidate lie side by side, so vector
+registers are filled along the row and only its end needs padding. Sums over the window's width are
+kept for as many rows as the window is high. The census, one bit per neighbour that is darker, is
+invariant under any change of brightness that keeps the order of grey levels.
 
 Ref: R. Zabih, J. Woodfill, "Non-parametric local transforms for computing visual
 correspondence", ECCV 1994.
@@ -34,20 +32,11 @@ from recon.stereo.kernels.simd.vectors import (
     widen,
 )
 
-GRADIENT_CAP: Final = 127
-"""Horizontal gradients (Sobel units) are clipped to plus or minus this."""
-
-CENSUS_RADIUS: Final = 2
-"""Half the square of the census, in pixels: its 24 bits fill three planes."""
-
-PLANES: Final = 4
-"""One of gradients, and three of bits."""
-
-ALIGNMENT: Final = 64
-"""Bytes of a cache line."""
-
-BLOCK: Final = 16
-"""Candidates done at a time: their rows of the window stay in the cache."""
+GRADIENT_CAP: Final = 127  # horizontal gradients (Sobel units) are clipped to plus or minus this
+CENSUS_RADIUS: Final = 2  # half the square of the census, in pixels: its 24 bits fill three planes
+PLANES: Final = 4  # one of gradients, and three of bits
+ALIGNMENT: Final = 64  # bytes of a cache line
+BLOCK: Final = 16  # candidates done at a time: their rows of the window stay in the cache
 
 
 class Views(NamedTuple):
@@ -230,7 +219,6 @@ def _compare(
 
 @kernel
 def _sum_across(pixels: UInt8, n: int, x: int, radius: int) -> Vector:
-    """Sum the costs over the window's width; the sums fit into uint8."""
     total = load_row(pixels, n, x)
     for d in range(x + 1, x + 2 * radius + 1):
         total = total + load_row(pixels, n, d)
@@ -290,7 +278,6 @@ def write_planes(grey: UInt8, place: int, first: int, end: int, planes: UInt8) -
 
 @kernel
 def _write_gradient(around: UInt8, y: int, gradient: UInt8) -> None:
-    """Write the clipped Sobel gradient of a row."""
     rows, radius, most = around.shape[0], CENSUS_RADIUS, np.int16(GRADIENT_CAP)
     above, same, below = around[(y - 1) % rows], around[y % rows], around[(y + 1) % rows]
     above_left, above_right = above[radius - 1 :], above[radius + 1 :]
@@ -306,7 +293,6 @@ def _write_gradient(around: UInt8, y: int, gradient: UInt8) -> None:
 
 @kernel
 def _write_census(around: UInt8, y: int, width: int, planes: UInt8) -> None:
-    """Write the bits of a row."""
     rows, none, first = around.shape[0], splat(np.uint8(0)), splat(np.uint8(1))
     for x in range(0, width, LANES):
         middle = load_row(around, y % rows, CENSUS_RADIUS + x)

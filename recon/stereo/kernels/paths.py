@@ -1,15 +1,14 @@
 """Costs along the paths of semi-global matching.
 
-The vertical and the diagonal paths of a sweep come from the row before, so every pixel of a row is
-a lane of its own and no pixel waits for its neighbour. A row is updated in place: the path from the
-left goes through it from right to left, and the one from the right from left to right, so that each
-reads its predecessor before it is overwritten.
+Vertical and diagonal paths come from the row before, so every pixel of a row is a lane of its own
+and none waits for its neighbour. A row is updated in place: the path from the left goes through it
+from right to left, the one from the right from left to right, so that each reads its predecessor
+before it is overwritten.
 
-On a horizontal path each pixel needs the path cost of its neighbour, so lanes are candidates there:
-the costs of a row are transposed, block by block, and the result is transposed back. Both paths are
-followed in one loop, so that the processor works on one while it waits for the other. In the first
-half of its way a path leaves its costs behind; in the second half it averages its own with those of
-the other.
+On a horizontal path each pixel needs the path cost of its neighbour, so lanes are candidates: the
+costs of a row are transposed, block by block, and the result is transposed back. Both paths are
+followed in one loop, so that the processor works on one while it waits for the other. In its first
+half a path leaves its costs behind; in the second it averages its own with those of the other.
 
 Paths are averaged instead of summed: a mean of two, rounded up, is one instruction and fits into a
 byte. By the order of the means the vertical path weighs twice a diagonal one, and a horizontal path
@@ -218,8 +217,7 @@ def _advance_others(
         store_row(now, STRAIGHT, here, fresh_0)
 
 
-RIGHTWARD, LEFTWARD = range(2)
-"""The two paths."""
+RIGHTWARD, LEFTWARD = range(2)  # the two paths
 
 
 class RowScratch(NamedTuple):
@@ -276,7 +274,6 @@ def follow_row(costs: UInt8, grey: UInt8, paths: Paths, scratch: RowScratch) -> 
 
 @kernel
 def _transpose_costs(costs: UInt8, scratch: RowScratch) -> None:
-    """Write the costs column by column."""
     ndisp, columns = costs.shape
     whole = ndisp // LANES * LANES
     for k in range(0, whole, LANES):
@@ -303,7 +300,6 @@ def _set_steps(grey: UInt8, paths: Paths, steps: UInt8) -> None:
 
 @kernel
 def _follow(width: int, p1: np.uint8, scratch: RowScratch) -> None:
-    """Follow both paths from end to end."""
     right = left = splat(np.uint8(0))
     step_p1, half = splat(p1), width // 2
     for x in range(half):

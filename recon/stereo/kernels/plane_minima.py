@@ -17,15 +17,9 @@ from recon.stereo.kernels.simd.vectors import LANES, load_row, smaller, splat, s
 NONE: Final = 255
 """Stands for the cost of a candidate that does not exist; real costs stay below it."""
 
-MARGIN: Final = LANES
-"""Columns on each side of a row of costs, where no candidate exists."""
-
-BLOCK: Final = 256
-"""Candidates that a byte can number."""
-
-PARTS: Final = 8
-"""Units of `Minima.costs` per unit of these costs."""
-
+MARGIN: Final = LANES  # columns on each side of a row of costs, where no candidate exists
+BLOCK: Final = 256  # candidates that a byte can number
+PARTS: Final = 8  # units of `Minima.costs` per unit of these costs
 LOWEST, WHICH, BEFORE, AFTER, SECOND, LAST, PRIOR, EARLIER = range(8)
 """Rows of what is known of a column.
 

@@ -170,7 +170,6 @@ def _sum_windows(columns: Float32, radius: int, sums: Float32) -> None:
 def _fit_normals(
     sums: Float32, values: Float32, v: int, rules: tuple[Any, ...], normal: Float32
 ) -> None:
-    """Unit normals of the least-squares planes of a row of windows."""
     focal, cx, cy, doffs = rules[0], rules[1], rules[2], rules[4]
     for u in range(len(values)):
         n = np.float64(sums[0, u])

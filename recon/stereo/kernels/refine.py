@@ -12,9 +12,7 @@ from recon.stereo.kernels.minima import NO_COST, Minima
 VALID, LOW_TEXTURE, AMBIGUOUS, LEFT_RIGHT, OCCLUDED, OUT_OF_RANGE, BORDER = range(7)
 """The codes of `recon.core.values.Reason`; a test holds them equal."""
 
-SIGMA_LARGEST_PX: Final = 2.0
-"""Standard deviation at a flat minimum; none is larger."""
-
+SIGMA_LARGEST_PX: Final = 2.0  # standard deviation at a flat minimum; none is larger
 WRONG_PX: Final = 1.0
 """Error from which a disparity counts as wrong; the least error of a wrong one."""
 
@@ -45,8 +43,7 @@ class Refined(NamedTuple):
     reason: UInt8  # uint8
 
 
-REFINED_BYTES: Final = 13
-"""What a pixel of `Refined` takes."""
+REFINED_BYTES: Final = 13  # what a pixel of `Refined` takes
 
 
 def refined_in(memory: UInt8, height: int, width: int) -> Refined:

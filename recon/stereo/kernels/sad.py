@@ -87,7 +87,6 @@ def sad_minima(
 def _choose(
     halves: Halves, search: Search, scratch: Scratch, y: int, x0: int, x1: int, minima: Minima
 ) -> None:
-    """Choose among the candidates of columns ``x0`` to ``x1 - 1`` of row ``y``."""
     winner, best, second = minima.winner[y], minima.costs[0, y], minima.costs[3, y]
     before, after = minima.costs[1, y], minima.costs[2, y]
     for x in range(x0, x1, LANES):

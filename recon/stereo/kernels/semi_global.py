@@ -46,9 +46,7 @@ from recon.stereo.kernels.paths import (
 from recon.stereo.kernels.plane_minima import MARGIN, NONE, Band, Best, choose_row, empty_best
 from recon.stereo.kernels.simd.vectors import LANES
 
-ROWS: Final = 32
-"""Rows of a block: many, compared with the overlap below it that is swept in vain."""
-
+ROWS: Final = 32  # rows of a block: many, compared with the overlap below it that is swept in vain
 SCRATCH_BYTES: Final = 4 << 20
 """Most memory of what passes from one sweep to the other, so that it stays in the cache."""
 
@@ -100,7 +98,6 @@ def _shapes(columns: int, paths: Paths) -> list[tuple[int, ...]]:
 
 
 def _band_scratch(scratch: Scratch, columns: int, paths: Paths) -> BandScratch:
-    """Divide the memory among the arrays for a band."""
     arrays, start = [], 0
     for shape in _shapes(columns, paths):
         size = int(np.prod(shape))
@@ -161,7 +158,6 @@ def _search_band(
     best: Best,
     minima: Minima,
 ) -> None:
-    """Find the best candidates of a strip within a band, block by block."""
     known = top = max(strip.start - paths.overlap, 0)
     begin(paths, buffers.above)
     for first in range(top, strip.stop, ROWS):
@@ -181,7 +177,6 @@ def _search_band(
 def _sweep_down(
     grey: UInt8, paths: Paths, band: Band, first: int, end: int, buffers: BandScratch
 ) -> None:
-    """Follow the paths from above through a block, and write their means."""
     for y in range(first, end):
         costs, means = buffers.costs[y % buffers.costs.shape[0]], buffers.means[y % ROWS]
         here, before = grey[y, band.start : band.end], grey[max(y - 1, 0), band.start : band.end]

@@ -11,11 +11,8 @@ import numpy as np
 
 from recon.core.kernels.compiled import Bool, Float32, Int64, kernel
 
-GROUP: Final = 8
-"""Candidates that are offered or left out together."""
-
-Offer = Bool
-"""bool (G,), which groups of candidates are offered."""
+GROUP: Final = 8  # candidates that are offered or left out together
+Offer = Bool  # bool (G,), which groups of candidates are offered
 
 
 class Tiles(NamedTuple):

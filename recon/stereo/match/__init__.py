@@ -6,9 +6,9 @@
 - `range.py`: a range where none is known, and rough disparities.
 
 `sad.py` compares gradients in windows: the cost is in `kernels/half_windows.py`, the best candidate
-in `kernels/sad.py`, and `kernels/tiles.py` says which candidates are tried. `sgm.py` adds census and
-paths: the cost is in `kernels/path_costs.py`, the paths are in `kernels/semi_global.py`. Of both,
-`kernels/refine.py` checks what was found, and says why a pixel has no disparity.
+in `kernels/sad.py`, and `kernels/tiles.py` says which candidates are tried. `sgm.py` adds census
+and paths: the cost is in `kernels/path_costs.py`, the paths are in `kernels/semi_global.py`. Of
+both, `kernels/refine.py` checks what was found, and says why a pixel has no disparity.
 
 Other matchers: `opencv.py` and `onnx.py`.
 """

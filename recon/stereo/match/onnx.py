@@ -137,7 +137,6 @@ def _size(declared: tuple[int | None, ...], s: OnnxSettings) -> tuple[int, int] 
 
 
 def _fitted(image: UInt8, size: tuple[int, int] | None) -> UInt8:
-    """Return the image at the size that the network takes."""
     if size is not None:
         way = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
         return np.asarray(cv2.resize(image, size, interpolation=way))
@@ -146,7 +145,6 @@ def _fitted(image: UInt8, size: tuple[int, int] | None) -> UInt8:
 
 
 def _unfitted(values: Float32, shape: tuple[int, ...], size: tuple[int, int] | None) -> Float32:
-    """Return the disparity at the size of the image, in its pixels."""
     height, width = shape
     inner = (height, width) if size else tuple(n + -n % _MULTIPLE_PX for n in shape)
     if values.shape != inner:
@@ -157,7 +155,6 @@ def _unfitted(values: Float32, shape: tuple[int, ...], size: tuple[int, int] | N
 
 
 def _tensor(image: UInt8, channels: int, s: OnnxSettings) -> Float32:
-    """Return float32 (1, C, H, W), normalised."""
     if max(len(s.mean), len(s.std)) > channels:
         raise SettingsError(
             "mean and std have more numbers than the network has channels",

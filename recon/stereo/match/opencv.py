@@ -7,43 +7,30 @@ widens the images.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.core.errors import MatchingError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
-from recon.core.values.arrays import UInt8
 from recon.stereo.match.protocol import unrated_disparity
 from recon.stereo.match.search import LEFT_RIGHT_PX, OddInt, SearchSettings
 
-_STEPS: Final = 16
-"""OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities."""
-
-_LIMIT_PX: Final = 2**15 // _STEPS - 1
-"""16ths of a pixel are counted in 16 bits."""
-
-_SGBM_MODE: Final = cv2.STEREO_SGBM_MODE_HH
-"""Eight paths over the whole image, its most accurate."""
-
+_STEPS: Final = 16  # OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities
+_LIMIT_PX: Final = 2**15 // _STEPS - 1  # 16ths of a pixel are counted in 16 bits
+_SGBM_MODE: Final = cv2.STEREO_SGBM_MODE_HH  # eight paths over the whole image, its most accurate
 _BM_PREFILTER_CAP: Final = 31
 _BM_TEXTURE_THRESHOLD: Final = 10
 """Least sum of prefiltered values in the window; OpenCV's default, as the cap."""
 
 _SGBM_PREFILTER_CAP: Final = 63
-_P1, _P2 = 8, 32
-"""P1 and P2 per pixel of the block, as OpenCV's documentation suggests."""
-
+_P1, _P2 = 8, 32  # P1 and P2 per pixel of the block, as OpenCV's documentation suggests
 _UNIQUENESS_PERCENT: Final = 5
 """By how much the second best cost must exceed the best; OpenCV suggests 5 to 15."""
 
-_SPECKLE_PX: Final = 50
-"""Regions of at most so many pixels are removed, as of our matchers."""
-
+_SPECKLE_PX: Final = 50  # regions of at most so many pixels are removed, as of our matchers
 _SPECKLE_STEP_PX: Final = 1
 
 
@@ -85,7 +72,7 @@ class OpencvMatcher:
         s, ndisp = self._settings, _range(self._settings, pair.camera)
         block_px = s.block_px or (_SGBM_BLOCK_PX if self._semi_global else _BM_BLOCK_PX)
         make = _semi_global_engine if self._semi_global else _block_engine
-        return _match(pair, make(s, ndisp, block_px), s, _Margins.around(s, block_px, ndisp))
+        return _match(pair, make(s, ndisp, block_px), s, _sides(s, block_px, ndisp))
 
 
 def _block_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.StereoBM:
@@ -113,48 +100,33 @@ def _semi_global_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.Ste
     )
 
 
-@dataclass(frozen=True)
-class _Margins:
-    """Pixels added to each side of both images."""
-
-    rows: int
-    left: int
-    right: int
-
-    @classmethod
-    def around(cls, settings: OpencvSettings, block_px: int, ndisp: int) -> _Margins:
-        """Return as many as OpenCV leaves out, half a window and the range, or none."""
-        if not settings.pad:
-            return cls(0, 0, 0)
-        margin = block_px // 2 + 1
-        low, high = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
-        return cls(margin, margin + max(0, high), margin + max(0, -low))
-
-    def widen(self, image: UInt8) -> UInt8:
-        """Return the image with its edges repeated."""
-        sides = (self.rows, self.rows, self.left, self.right)
-        return np.asarray(cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE))
-
-    def crop(self, image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
-        """Return what `widen` made of an image of that shape, without the edges."""
-        height, width = shape
-        rows, columns = slice(self.rows, self.rows + height), slice(self.left, self.left + width)
-        return image[rows, columns]
+def _sides(s: OpencvSettings, block_px: int, ndisp: int) -> tuple[int, int, int, int]:
+    """Return pixels to add above, below, left and right: what OpenCV leaves out, or none."""
+    if not s.pad:
+        return 0, 0, 0, 0
+    margin, low, high = block_px // 2 + 1, s.min_disparity_px, s.min_disparity_px + ndisp - 1
+    return margin, margin, margin + max(0, high), margin + max(0, -low)
 
 
-def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margins) -> Disparity:
+def _match(
+    pair: RectifiedPair, engine: Any, s: OpencvSettings, sides: tuple[int, int, int, int]
+) -> Disparity:
     """Let OpenCV match; pixels without a value are AMBIGUOUS.
 
     OpenCV does not report which of its checks (texture, uniqueness, left against right) failed.
     """
     try:
-        raw = engine.compute(margins.widen(pair.left), margins.widen(pair.right))
+        wide = (
+            cv2.copyMakeBorder(v, *sides, cv2.BORDER_REPLICATE) for v in (pair.left, pair.right)
+        )
+        raw = engine.compute(*wide)
     except cv2.error as error:
         raise MatchingError(
             "OpenCV cannot match this pair with these settings",
             got=f"{pair.camera.width_px}x{pair.camera.height_px}: {error.err[:200]}",
         ) from error
-    fixed = np.ascontiguousarray(margins.crop(raw, pair.left.shape))
+    (top, _, left, _), (height, width) = sides, pair.left.shape
+    fixed = np.ascontiguousarray(raw[top : top + height, left : left + width])
     unknown = (s.min_disparity_px - 1) * _STEPS
     values = fixed / np.float32(_STEPS)
     reason = np.where(fixed > unknown, Reason.VALID, Reason.AMBIGUOUS).astype(np.uint8)
@@ -165,7 +137,6 @@ def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margin
 
 
 def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
-    """Return the number of disparities, a multiple of 16."""
     ndisp = settings.ndisp_for(camera)
     ndisp = _STEPS * -(-ndisp // _STEPS)
     first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1

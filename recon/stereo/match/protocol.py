@@ -48,8 +48,7 @@ def unrated_disparity(values: Float32, reason: UInt8, pair: RectifiedPair) -> Di
     )
 
 
-GROUP: Final = "recon.matchers"
-"""The entry point group in which a package registers its matchers."""
+GROUP: Final = "recon.matchers"  # the entry point group in which a package registers its matchers
 
 
 class CheckedMatcher:

@@ -30,8 +30,7 @@ class AutoRangeMatcher:
     """Chooses the range of another matcher for each pair; a `Matcher`.
 
     The range is a function of the pair alone, never of the frames before it, so that a resumed run
-    gives the same result. It is never narrower than `usual_ndisp`, so from frame to frame it
-    changes only where something is nearer than that allows.
+    gives the same result.
     """
 
     def __init__(self, matcher: Matcher, minimum_px: int = 0) -> None:
@@ -49,10 +48,9 @@ class AutoRangeMatcher:
 def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     """Return the number of disparities that a pair needs, a multiple of 16.
 
-    The pair is matched at a small size, searched up to half its width. Its trusted disparities show
-    how near the scene is; a tenth and one pixel of the small pair are added, because small objects
-    may be nearer. It is at least `usual_ndisp`, also where too little can be trusted, and at most
-    the image's width (rounded up).
+    The pair is matched at a small size. Its trusted disparities show how near the scene is; a tenth
+    and one small pixel are added, because small objects may be nearer. It is at least
+    `usual_ndisp`, also where too little can be trusted, and at most the image's width (rounded up).
     """
     height, width = pair.left.shape
     factor = max(1, width // _COARSE_WIDTH_PX)
@@ -68,7 +66,6 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
 
 
 def _smaller(pair: RectifiedPair, factor: int) -> RectifiedPair:
-    """Return the pair, ``factor`` times smaller, with a range of half its width; without rims."""
     width, height = pair.left.shape[1] // factor, pair.left.shape[0] // factor
     camera = replace(pair.camera.resized(width, height), ndisp=width // 2)
     left, right = (_shrunk(image, factor, (width, height)) for image in (pair.left, pair.right))
@@ -81,7 +78,6 @@ def _shrunk(image: UInt8, factor: int, size: tuple[int, int]) -> UInt8:
 
 
 def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    """Return disparities (N,) in pixels of the small pair."""
     settings = SadSettings(window_px=7, uniqueness_percent=10)
     found = SadMatcher(settings, threads=1, average=False).match(small)
     return found.values[found.valid & (found.confidence >= _CONFIDENCE)]
@@ -89,8 +85,7 @@ def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtyp
 
 Number = TypeVar("Number", np.float32, np.uint8)
 
-_WINDOW_PX: Final = 7
-"""Edge of the window at half size: nearly that of `sad` at full size."""
+_WINDOW_PX: Final = 7  # edge of the window at half size: nearly that of `sad` at full size
 
 
 class HalfSizeMatcher:
@@ -123,7 +118,6 @@ def _half(pair: RectifiedPair) -> RectifiedPair:
 
 
 def _enlarged(found: Disparity, shape: tuple[int, ...]) -> Disparity:
-    """Return a disparity of half size at full size: four pixels have the value of one."""
     return replace(
         found,
         values=_repeated(2 * found.values, shape),

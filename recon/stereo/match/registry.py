@@ -64,8 +64,7 @@ def make_matcher(
     if not isinstance(matcher, str) or matcher not in MATCHERS:
         check_matcher(matcher)
         made = load_registered(matcher) if isinstance(matcher, str) else matcher
-        checked = CheckedMatcher(made, name_of(matcher))
-        return AutoRangeMatcher(checked)
+        return AutoRangeMatcher(CheckedMatcher(made, name_of(matcher)))
     own = getattr(settings, field_of(matcher))
     made = MATCHERS[matcher](own, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.

@@ -58,15 +58,10 @@ RADIUS_PX: Final = 3
 """Half the window at half size: smaller than at full size, or thin things are lost."""
 
 UNIQUENESS_PERCENT: Final = 5
-LEFT_RIGHT_PX: Final = 1
 
-LEAST_NDISP: Final = 32
-"""With fewer candidates a search at half size takes longer than it saves."""
-
+LEAST_NDISP: Final = 32  # with fewer candidates a search at half size takes longer than it saves
 TILE_HEIGHT_PX: Final = 16
-_TILE_COLUMNS: Final = 160
-"""Columns of a tile together with those that its windows reach over."""
-
+_TILE_COLUMNS: Final = 160  # columns of a tile together with those that its windows reach over
 SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0.03, least=4)
 """How much support at half size offers candidates to a tile."""
 
@@ -100,8 +95,8 @@ class SadMatcher:
     """Compares windows of gradients and checks what it finds; a `Matcher`.
 
     Every pixel is searched, those at the left border as far as the right image reaches.
-    ``threads`` strips of rows are worked on at once (None = all cores), without effect on the
-    result; ``average`` = disparities are averaged with their neighbours.
+    ``threads`` (None = all cores) has no effect on the result; ``average`` = disparities are
+    averaged with their neighbours.
     """
 
     def __init__(
@@ -126,7 +121,6 @@ class SadMatcher:
             return finish(refined, s, pool, self._threads, average=self._average)
 
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
-        """Return which candidates are offered where."""
         if not self._settings.half_size_first or search.ndisp < LEAST_NDISP:
             return undivided(search, pair.left.shape)
         halved = half_search(search)
@@ -216,16 +210,8 @@ def half_search(search: Search) -> Search:
 
 def half_rules(search: Search) -> Rules:
     """Return what makes a match of a search at half size reliable."""
-    return Rules(
-        ndisp=search.ndisp,
-        minimum=search.minimum,
-        fit=False,
-        texture=0.0,
-        uniqueness=UNIQUENESS_PERCENT,
-        left_right=LEFT_RIGHT_PX,
-        window_pixels=(2 * RADIUS_PX + 1) ** 2,
-        sigma_floor_px=0.1,
-    )
+    asked = SadSettings(min_disparity_px=search.minimum, uniqueness_percent=UNIQUENESS_PERCENT)
+    return rules_of(asked, search.ndisp, (2 * RADIUS_PX + 1) ** 2)._replace(fit=False)
 
 
 def undivided(search: Search, shape: tuple[int, int]) -> Tiles:

@@ -27,9 +27,7 @@ LEFT_RIGHT_PX: Final = 1
 _SIGMA_FLOOR_PX: Final = 0.1
 """Smallest standard deviation that a disparity is given: noise is not all that makes it wrong."""
 
-_SPECKLE_STEP_PX: Final = 1.0
-"""Largest step of disparity between neighbours of one region."""
-
+_SPECKLE_STEP_PX: Final = 1.0  # largest step of disparity between neighbours of one region
 _AVERAGE_PX: Final = 7
 """Each disparity becomes the mean of the pairs of opposite neighbours, in a square of this width,
 that lie on its surface."""
@@ -232,8 +230,7 @@ class _Lent:
 _GRADIENT_CAP: Final = 31
 """Gradients (Sobel units) are clipped to plus or minus this before windows compare them."""
 
-_GAIN_OF_SOBEL: Final = 8.0
-"""A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
+_GAIN_OF_SOBEL: Final = 8.0  # a 3×3 Sobel filter answers a slope of one grey level per pixel with 8
 
 
 def clipped_gradients(image: UInt8, rows: range) -> UInt8:
@@ -276,7 +273,6 @@ def _where_seen(mean: Float32, valid: Bool | None, rows: range) -> Float32:
 
 
 def _around(rows: range, reach: int, height: int) -> range:
-    """Return rows, and those around them that the image has."""
     return range(max(rows.start - reach, 0), min(rows.stop + reach, height))
 
 

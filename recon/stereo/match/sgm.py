@@ -39,9 +39,7 @@ from recon.stereo.match.search import (
     rules_of,
 )
 
-_LEVELS: Final = 250
-"""Largest path cost before rounding, which needs the rest of a byte."""
-
+_LEVELS: Final = 250  # largest path cost before rounding, which needs the rest of a byte
 _ODDS: Final = 2.4
 """`Rules.odds` of this matcher, fitted on MiddEval3; 2003, 2005 and 2006 were held out."""
 
@@ -51,18 +49,14 @@ _SIDE_OVERLAP: Final = 16
 """Columns that neighbouring bands share: horizontal and diagonal paths start there."""
 
 
-_COST_CAP: Final = 14
-"""Largest difference of gradients that counts at one pixel."""
-
+_COST_CAP: Final = 14  # largest difference of gradients that counts at one pixel
 _LARGEST_COST: Final = _COST_CAP + (2 * CENSUS_RADIUS + 1) ** 2 - 1
 """Largest cost of one pixel: of its gradient and of all bits of the census."""
 
 _EDGE_GREY_LEVELS: Final = 12
 """Where the image changes by more along a path, large steps are cheaper: surfaces end there."""
 
-_EDGE_P2_SHARE: Final = 0.25
-"""Share of P2 that is left there."""
-
+_EDGE_P2_SHARE: Final = 0.25  # share of P2 that is left there
 _OVERLAP_ROWS: Final = 4
 """Rows that each strip of an image shares with its neighbours, for vertical paths to start in."""
 
@@ -113,8 +107,7 @@ class SgmMatcher:
     """Aggregates costs along paths through the image, and checks the result; a `Matcher`.
 
     Every pixel is searched, those at the left border as far as the right image reaches.
-    ``threads`` strips of rows are worked on at once (None = all cores), without effect on the
-    result.
+    ``threads`` (None = all cores) has no effect on the result.
     """
 
     def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
@@ -157,7 +150,6 @@ class SgmMatcher:
             return finish(refined, s, pool, at_once)
 
     def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
-        """Return the strips of an image, and how many may be worked on at once."""
         height = camera.height_px
         # An even number of strips keeps two cores busy to the end.
         rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))

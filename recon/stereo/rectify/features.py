@@ -29,11 +29,8 @@ _BLOCK: Final = 1024  # descriptors compared with all others at once
 _ROUGH_PX: Final = 3.0
 """Features of coarse pyramid levels are a few pixels off; larger shifts are wrong matches."""
 
-_ROWS_APART: Final = 12.0
-"""Row error that the initial homographies may leave."""
-
-MOST_FEATURES: Final = 8000
-"""Maximum number of features per image, where a caller does not say."""
+_ROWS_APART: Final = 12.0  # row error that the initial homographies may leave
+MOST_FEATURES: Final = 8000  # maximum number of features per image, where a caller does not say
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +145,6 @@ def _describe(detector: cv2.Feature2D, image: UInt8) -> tuple[Float32, NDArray[A
 
 
 def _distinct(candidates: Sequence[Sequence[cv2.DMatch]]) -> dict[int, int]:
-    """Return best matches that pass the ratio test."""
     return {
         best.queryIdx: best.trainIdx
         for best, second in candidates
@@ -205,15 +201,9 @@ _OUTLIER_PX: Final = 3.0
 """A feature whose row error differs from that of the others by more than this is a wrong match."""
 
 
-_FEATURES: Final = 1000
-"""Maximum number of features per image."""
-
-_MIN_FEATURES: Final = 40
-"""With fewer matched features there is no verdict."""
-
-_WARN_ROW_PX: Final = 1.0
-"""Median row error that gives a warning, in pixels."""
-
+_FEATURES: Final = 1000  # maximum number of features per image
+_MIN_FEATURES: Final = 40  # with fewer matched features there is no verdict
+_WARN_ROW_PX: Final = 1.0  # median row error that gives a warning, in pixels
 _SWAPPED_SHARE: Final = 0.8
 """Share of near features with negative disparity from which the cameras count as swapped."""
 
@@ -267,18 +257,15 @@ def check_inspection(inspection: PairInspection, where: str | None = None) -> tu
             hint="give the left camera's images first (or un-mirror the images)",
         )
     if abs(inspection.row_error_px) >= _WARN_ROW_PX:
+        side = "low" if inspection.row_error_px > 0 else "high"
         line = (
             "rows of left and right are not aligned: the right image is "
-            f"{abs(inspection.row_error_px):.0f} px too {_side(inspection.row_error_px)} (expected "
+            f"{abs(inspection.row_error_px):.0f} px too {side} (expected "
             f"under {_WARN_ROW_PX:g} px); depth will be poor or wrong: rectify the "
             "images, or recalibrate the cameras"
         )
         return (line,)
     return ()
-
-
-def _side(row_error_px: float) -> str:
-    return "low" if row_error_px > 0 else "high"
 
 
 def _agreeing(row_shift: Float32) -> Bool:

@@ -13,8 +13,7 @@ from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.arrays import Float32, Float64
 
 _ORIGIN: Final = np.zeros(3)
-_LARGEST_MISS_PX: Final = 0.01
-"""Largest reprojection error of a correctly inverted ray."""
+_LARGEST_MISS_PX: Final = 0.01  # largest reprojection error of a correctly inverted ray
 
 # OpenCV inverts a lens model iteratively, and stops early by default (five iterations, 0.01).
 _EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
@@ -73,10 +72,8 @@ def rays_of(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
     if not len(points):
         return np.zeros((0, 3))
-    if camera.model == "fisheye":
-        plane = cv2.fisheye.undistortPoints(points, matrix, distortion, criteria=_EXACT)
-    else:
-        plane = cv2.undistortPoints(points, matrix, distortion, criteria=_EXACT)
+    model: Any = cv2.fisheye if camera.model == "fisheye" else cv2
+    plane = model.undistortPoints(points, matrix, distortion, criteria=_EXACT)
     rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
     # OpenCV marks some failures of the fisheye model with -1e6; of other failures, and of rays at
     # more than 90 degrees, it returns the ray of another pixel.
@@ -92,11 +89,15 @@ def sees_all(camera: CameraIntrinsics) -> bool:
 
     Distortion polynomials are fitted where points were seen; farther out they may fold back.
     """
+    return bool(np.isfinite(rays_of(camera, np.concatenate(border_of(camera)))).all())
+
+
+def border_of(camera: CameraIntrinsics) -> list[Float64]:
+    """Return pixels (65, 2) along the left, right, upper and lower side of the image."""
     w, h = camera.width_px - 1.0, camera.height_px - 1.0
     t = np.linspace(0, 1, 65)
     sides = [(0 * t, h * t), (w + 0 * t, h * t), (w * t, 0 * t), (w * t, h + 0 * t)]
-    border = np.concatenate([np.stack(side, axis=1) for side in sides])
-    return bool(np.isfinite(rays_of(camera, border)).all())
+    return [np.stack(side, axis=1) for side in sides]
 
 
 def rectifying_maps(
@@ -109,19 +110,9 @@ def rectifying_maps(
     """
     if camera.model != "fisheye" and not sees_all(camera):
         return _without_folds(camera, rotation, matrix, size)
-    make = (
-        cv2.fisheye.initUndistortRectifyMap
-        if camera.model == "fisheye"
-        else cv2.initUndistortRectifyMap
-    )
-    maps = make(
-        np.array(camera.matrix),
-        np.array(camera.distortion),
-        rotation,
-        np.array(matrix[:, :3]),
-        size,
-        cv2.CV_32FC1,
-    )
+    model: Any = cv2.fisheye if camera.model == "fisheye" else cv2
+    raw, distortion, K = (np.array(a) for a in (camera.matrix, camera.distortion, matrix[:, :3]))
+    maps = model.initUndistortRectifyMap(raw, distortion, rotation, K, size, cv2.CV_32FC1)
     return np.asarray(maps[0]), np.asarray(maps[1])
 
 

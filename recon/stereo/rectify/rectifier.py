@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal
 
 import cv2
 import numpy as np
@@ -22,9 +23,8 @@ from recon.core.values import (
     StereoPair,
     check_size,
 )
-from recon.core.values.arrays import Bool, Float32, Float64, UInt8
-from recon.stereo.rectify.grey import to_grey
-from recon.stereo.rectify.lens import rays_of, rectifying_maps, sees_all
+from recon.core.values.arrays import Bool, Float32, Float64, UInt8, frozen_array
+from recon.stereo.rectify.lens import border_of, rays_of, rectifying_maps, sees_all
 
 # Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
 _BORDER_TOLERANCE_PX: Final = 1e-3
@@ -65,13 +65,8 @@ class RemapTables:
     def inside(self) -> Bool:
         """bool (H, W), True where the source is inside the raw image."""
         height, width = self.map_x.shape
-        low, e = -_BORDER_TOLERANCE_PX, _BORDER_TOLERANCE_PX
-        return np.asarray(
-            (self.map_x >= low)
-            & (self.map_y >= low)
-            & (self.map_x <= width - 1 + e)
-            & (self.map_y <= height - 1 + e)
-        )
+        x, y, e = self.map_x, self.map_y, _BORDER_TOLERANCE_PX
+        return np.asarray((x >= -e) & (y >= -e) & (x <= width - 1 + e) & (y <= height - 1 + e))
 
     def warp(self, image: UInt8) -> UInt8:
         """Rectify one raw image; pixels without a source are black."""
@@ -161,7 +156,8 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
         if "fisheye" in (left.model, right.model) or not (sees_all(left) and sees_all(right)):
             R1, R2, P1, P2 = plan_wide_view(calibration, settings.alpha)
         else:
-            R1, R2, P1, P2 = _plan_pinholes(calibration, size, settings.alpha)
+            alpha = -1 if settings.alpha is None else settings.alpha
+            R1, R2, P1, P2 = _bouguet(calibration, left.distortion, right.distortion, alpha)
     except cv2.error as error:
         raise CalibrationError("cameras cannot be rectified", got=error.err) from error
     camera = RectifiedCamera.from_matrices(P1, P2, -P2[0, 3] / P2[0, 0], *size)
@@ -186,22 +182,16 @@ def plan_rectification(
     return turns.camera, (left, right)
 
 
-def _plan_pinholes(
-    calibration: StereoCalibration, size: tuple[int, int], alpha: float | None
-) -> tuple[Float64, Float64, Float64, Float64]:
-    left, right = calibration.left, calibration.right
-    R1, R2, P1, P2, *_ = cv2.stereoRectify(
-        left.matrix,
-        left.distortion,
-        right.matrix,
-        right.distortion,
-        size,
-        calibration.T_right_left[:3, :3],
-        calibration.T_right_left[:3, 3:],
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=-1 if alpha is None else alpha,
-    )
-    return R1, R2, P1, P2
+def _bouguet(
+    calibration: StereoCalibration, left: Float64 | None, right: Float64 | None, alpha: float
+) -> Sequence[Float64]:
+    """Return R_left, R_right (3, 3) and P_left, P_right (3, 4), for the distortions given."""
+    cameras, T = (calibration.left, calibration.right), calibration.T_right_left
+    size = (cameras[0].width_px, cameras[0].height_px)
+    K_left, K_right = (camera.matrix for camera in cameras)
+    return cv2.stereoRectify(K_left, left, K_right, right, size, T[:3, :3], T[:3, 3:], alpha=alpha)[
+        :4
+    ]
 
 
 def _with_field(camera: RectifiedCamera, field_of_view_deg: float | None) -> RectifiedCamera:
@@ -264,14 +254,11 @@ def _check_rig(calibration: StereoCalibration) -> None:
 
 # A planar image stretches by 1 / cos²: fourfold at 60 degrees from the optical axis.
 _WIDEST: Final = math.tan(math.radians(60))
-_BORDER_POINTS: Final = 65
 
 Box = tuple[Float64, Float64]
 
 
-def plan_wide_view(
-    calibration: StereoCalibration, alpha: float | None
-) -> tuple[Float64, Float64, Float64, Float64]:
+def plan_wide_view(calibration: StereoCalibration, alpha: float | None) -> Sequence[Float64]:
     """Return R_left, R_right, P_left, P_right of wide views, as ``stereoRectify`` of pinholes.
 
     The centre of the views keeps the resolution of the lens, so they show less than a wide lens
@@ -281,20 +268,11 @@ def plan_wide_view(
     """
     left, right = calibration.left, calibration.right
     size = (left.width_px, left.height_px)
-    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-        left.matrix,
-        None,
-        right.matrix,
-        None,
-        size,
-        calibration.T_right_left[:3, :3],
-        calibration.T_right_left[:3, 3:],
-        alpha=-1,
-    )
-    boxes = [_boxes(left, R_left), _boxes(right, R_right)]
-    inner, outer = (_common([pair[kind] for pair in boxes]) for kind in (0, 1))
+    R_left, R_right, P_left, P_right = _bouguet(calibration, None, None, -1)
+    boxes = np.array([_boxes(left, R_left), _boxes(right, R_right)])
+    inner, outer = zip(boxes[:, :, 0].max(axis=0), boxes[:, :, 1].min(axis=0), strict=True)
     focal = _focal(inner, outer, size, alpha, float(left.matrix[0, 0]))
-    x, y = _middle(inner)
+    x, y = (inner[0] + inner[1]) / 2
     for P in (P_left, P_right):
         P[0, 0] = P[1, 1] = focal
         P[0, 2] = (size[0] - 1) / 2 - focal * x
@@ -305,18 +283,13 @@ def plan_wide_view(
 
 def _boxes(camera: CameraIntrinsics, rotation: Float64) -> tuple[Box, Box]:
     """Return the largest box inside the rotated image border, and the smallest box around it."""
-    w, h = camera.width_px - 1.0, camera.height_px - 1.0
-    t, zero = np.linspace(0, 1, _BORDER_POINTS), np.zeros(_BORDER_POINTS)
-    sides = {
-        "left": (zero, h * t), "right": (zero + w, h * t),
-        "top": (w * t, zero), "bottom": (w * t, zero + h),
-    }  # fmt: skip
-    flat = {name: _flat(camera, rotation, np.stack(xy, axis=1)) for name, xy in sides.items()}
+    sides = [_flat(camera, rotation, side) for side in border_of(camera)]
+    left, right, top, bottom = sides
     inner = (
-        np.array([flat["left"][:, 0].max(), flat["top"][:, 1].max()]),
-        np.array([flat["right"][:, 0].min(), flat["bottom"][:, 1].min()]),
+        np.array([left[:, 0].max(), top[:, 1].max()]),
+        np.array([right[:, 0].min(), bottom[:, 1].min()]),
     )
-    every = np.concatenate(list(flat.values()))
+    every = np.concatenate(sides)
     return inner, (every.min(axis=0), every.max(axis=0))
 
 
@@ -331,15 +304,6 @@ def _flat(camera: CameraIntrinsics, rotation: Float64, pixels: Float64) -> Float
     return np.asarray(np.clip(turned[:, :2] / z, -_WIDEST, _WIDEST))
 
 
-def _common(boxes: list[Box]) -> Box:
-    low, high = zip(*boxes, strict=True)
-    return np.max(low, axis=0), np.min(high, axis=0)
-
-
-def _middle(box: Box) -> Float64:
-    return np.asarray((box[0] + box[1]) / 2)
-
-
 def _focal(
     inner: Box, outer: Box, size: tuple[int, int], alpha: float | None, raw_px: float
 ) -> float:
@@ -349,3 +313,28 @@ def _focal(
     zoomed = max(raw_px, float((pixels / np.maximum(inner[1] - inner[0], 1e-6)).max()))
     whole = float((pixels / np.maximum(outer[1] - outer[0], 1e-6)).min())
     return zoomed * (1 - alpha) + whole * alpha
+
+
+GreyMode = Literal["bt601", "mean", "paper"]
+
+_PAPER_WEIGHTS: Final = np.array([0.299, 0.587, 0.144])
+
+
+def to_grey(image: UInt8, mode: GreyMode = "bt601") -> UInt8:
+    """Convert an image, uint8 (H, W, 3) RGB, to grey; a grey image is returned unchanged.
+
+    ``bt601`` weights red, green and blue by 0.299, 0.587 and 0.114, ``mean`` equally. ``paper`` is
+    Eq. 6 of the seed paper as printed: its weight of blue, 0.144, is a misprint of 0.114, so the
+    weights sum to 1.03 and bright pixels are clipped at 255.
+
+    Ref: ITU-R BT.601, section 2.5.1.
+    """
+    if isinstance(image, np.ndarray) and image.ndim == 2:
+        return frozen_array("image", image, np.uint8, (None, None))
+    frozen_array("image", image, np.uint8, (None, None, 3))
+    if mode == "bt601":
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    if mode == "mean":
+        # An integer is never halfway between two multiples of 3, so + 1 rounds to nearest.
+        return np.asarray((image.sum(axis=2, dtype=np.uint16) + 1) // 3, dtype=np.uint8)
+    return np.asarray(np.clip(np.rint(image @ _PAPER_WEIGHTS), 0, 255), dtype=np.uint8)

@@ -13,8 +13,8 @@ from recon.core.geometry.se3 import exp_so3
 from recon.io.middlebury import read_middlebury_scene
 from recon.rig.uncalibrated import rectify_features, rectify_images
 from recon.stereo.rectify.features import PairFeatures, match_again, match_exactly
-from recon.stereo.rectify.grey import to_grey
 from recon.stereo.rectify.lens import epipolar_lines
+from recon.stereo.rectify.rectifier import to_grey
 
 SIZE = (640, 480)
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])

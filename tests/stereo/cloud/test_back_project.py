@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import recon
 from recon.core.errors import ShapeError
 from recon.core.geometry.projection import project
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
-from recon.stereo.cloud.back_project import CloudSettings, back_project
+from recon.stereo.cloud.back_project import CloudSettings, back_project, remove_flying_edges
 
 CAMERA = RectifiedCamera(
     focal_px=100.0,
@@ -112,15 +113,6 @@ def test_range_confidence_and_sigma_decide_what_is_kept() -> None:
     assert len(back_project(disparity, make_pair(), CloudSettings(min_confidence=0.8))) == 0
 
 
-def test_points_at_or_beyond_infinity_are_not_made() -> None:
-    values = np.full((40, 64), -CAMERA.doffs_px)
-    values[:, :10] = -CAMERA.doffs_px - 3
-    values[:, 60:] = 6.0
-    cloud = back_project(as_disparity(values), make_pair(), ALL)
-    assert len(cloud) == 40 * 4
-    assert np.isfinite(cloud.xyz).all()
-
-
 def test_points_carry_the_colours_of_their_pixels() -> None:
     values = np.full((40, 64), np.nan)
     values[7, 11] = 6.0
@@ -137,14 +129,6 @@ def test_pixels_without_a_source_in_the_raw_image_make_no_point() -> None:
     valid[:, 5:] = False
     pair = replace(make_pair(), valid=valid)
     assert len(back_project(as_disparity(np.full((40, 64), 6.0)), pair, ALL)) == 40 * 5
-
-
-def test_stride_takes_every_nth_row_and_column() -> None:
-    disparity = as_disparity(np.full((40, 64), 6.0))
-    whole = back_project(disparity, make_pair(), ALL)
-    thin = back_project(disparity, make_pair(), ALL.model_copy(update={"stride": 3}))
-    grid = np.arange(40 * 64).reshape(40, 64)[::3, ::3].ravel()
-    np.testing.assert_array_equal(thin.xyz, whole.xyz[grid])
 
 
 @pytest.mark.parametrize(
@@ -173,15 +157,79 @@ def test_a_lone_pixel_has_a_normal_towards_the_camera() -> None:
     assert cloud.normals[0, 2] < -0.99
 
 
-def test_normals_can_be_left_out() -> None:
-    disparity = as_disparity(np.full((40, 64), 6.0))
-    assert back_project(disparity, make_pair(), ALL, normals=False).normals is None
-
-
-def test_no_disparity_gives_an_empty_cloud() -> None:
-    assert len(back_project(as_disparity(np.full((40, 64), np.nan)), make_pair(), ALL)) == 0
-
-
 def test_another_size_is_refused() -> None:
     with pytest.raises(ShapeError, match="differ in size"):
         back_project(as_disparity(np.full((40, 63), 6.0)), make_pair(), ALL)
+
+
+def smeared_step(width: int) -> np.ndarray:
+    """A foreground of 40 px before a background of 10 px, with a linear ramp between them."""
+    row = np.full(60, 10.0)
+    row[30:] = 40.0
+    row[30 : 30 + width] = np.linspace(10, 40, width + 2)[1:-1]
+    return np.tile(row, (40, 1))
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_a_step_loses_exactly_its_mixed_pixels(width: int) -> None:
+    result = remove_flying_edges(as_disparity(smeared_step(width)))
+    mixed = np.zeros((40, 60), dtype=bool)
+    mixed[:, 30 : 30 + width] = True
+    np.testing.assert_array_equal(result.reason == Reason.EDGE, mixed)
+
+
+def test_a_clean_step_loses_nothing() -> None:
+    result = remove_flying_edges(as_disparity(smeared_step(0)))
+    assert result.valid.all()
+
+
+def test_a_mixed_column_beside_an_occlusion_goes_too() -> None:
+    values = smeared_step(1)
+    values[:, 20:30] = np.nan
+    result = remove_flying_edges(as_disparity(values))
+    assert (result.reason[:, 30] == Reason.EDGE).all()
+    assert result.valid[:, 32:].all()
+    assert (result.reason[:, 20:30] == Reason.AMBIGUOUS).all()
+
+
+@given(across=st.floats(-0.7, 0.7), down=st.floats(-0.7, 0.7), noise_seed=st.integers(0, 2**16))
+def test_every_slant_below_the_gradient_limit_survives(
+    across: float, down: float, noise_seed: int
+) -> None:
+    # 0.7 along each axis is a gradient of 1 at most; noise of ±0.25 differs by 0.5 at most.
+    v, u = np.mgrid[:24, :30]
+    noise = np.random.default_rng(noise_seed).uniform(-0.25, 0.25, u.shape)
+    result = remove_flying_edges(as_disparity(60 + across * u + down * v + noise))
+    assert result.valid.all()
+
+
+def test_a_pole_two_pixels_wide_survives_and_a_lone_pixel_does_not() -> None:
+    values = np.full((30, 40), 10.0)
+    values[:, 20:22] = 50.0
+    values[15, 8] = 30.0
+    result = remove_flying_edges(as_disparity(values))
+    expected = np.zeros(values.shape, dtype=bool)
+    expected[15, 8] = True
+    np.testing.assert_array_equal(result.reason == Reason.EDGE, expected)
+
+
+class Smeared:
+    """A matcher that finds a smeared step in every pair."""
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        assert pair.left.shape == (40, 60)
+        return Disparity.from_values(smeared_step(2))
+
+
+@pytest.mark.parametrize("removed", [True, False])
+def test_it_can_be_turned_off(removed: bool) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (40, 60), dtype=np.uint8)
+    camera = RectifiedCamera(100.0, 30.0, 20.0, 30.0, 0.1, 60, 40)
+    config = recon.load_config(overrides=[f"cloud.remove_flying_edges={removed}"])
+    found = recon.reconstruct(image, image, camera, config, matcher=Smeared()).disparity
+    assert (Reason.EDGE in found.reason) == removed
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (3, 200), (200, 4)])
+def test_images_as_small_as_the_window_pass(shape: tuple[int, int]) -> None:
+    assert remove_flying_edges(as_disparity(np.full(shape, 5.0))).valid.all()

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
 
 from recon.core.values import Reason
 from recon.stereo.kernels import refine
 from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.refine import (
+    AMBIGUOUS,
+    BORDER,
+    LEFT_RIGHT,
+    LOW_TEXTURE,
+    OCCLUDED,
+    OUT_OF_RANGE,
     REFINED_BYTES,
+    SIGMA_LARGEST_PX,
+    VALID,
     WRONG_PX,
     Refined,
     Rules,
@@ -22,7 +32,6 @@ from recon.stereo.kernels.refine import (
     refined_in,
     reject,
 )
-from tests.stereo.kernels.refine_reference import refine_minima_reference
 
 RULES = Rules(8, 0, 0.0, 0, left_right=1, window_pixels=25, sigma_floor_px=0.1)
 
@@ -150,18 +159,6 @@ def test_pixel_is_occluded_where_no_pixel_of_the_right_view_has_its_match(
     assert refine_one(minima)[3] == reason
 
 
-def test_second_best_within_the_margin_is_ambiguous() -> None:
-    rules = RULES._replace(uniqueness=10)
-    assert refine_one(one_pixel((20, 60, 40, 22)), rules)[3] == Reason.AMBIGUOUS
-    assert refine_one(one_pixel((20, 60, 40, 23)), rules)[3] == Reason.VALID
-
-
-def test_confidence_grows_with_the_margin_and_is_zero_without_a_second_best() -> None:
-    close, far = (refine_one(one_pixel((20, 60, 40, n)))[1] for n in (30, 100))
-    assert 0 < close < far < 1
-    assert refine_one(one_pixel((20, 60, 40, NO_COST)))[1] == 0
-
-
 def test_confidence_is_the_odds_of_margin_and_noise() -> None:
     _, confidence, _, _ = refine_one(one_pixel((20, 60, 40, 100)), RULES._replace(odds=3.0))
     margin = (100 - 20) / (25 + 20)
@@ -191,10 +188,6 @@ def test_sigma_is_the_limit_without_slope_and_the_floor_without_noise_or_doubt(
     assert refine_one(one_pixel(costs), sure)[2] == pytest.approx(sigma_px, abs=1e-4)
 
 
-def test_sigma_of_a_pixel_without_a_second_best_is_that_of_a_wrong_one() -> None:
-    assert refine_one(one_pixel((20, 60, 40, NO_COST)))[2] == refine.WRONG_PX
-
-
 def test_rejected_pixels_have_nothing_left_but_a_reason() -> None:
     refined = refine_all(one_pixel((2, 6, 6, 20)), np.ones((1, 8), np.float32), RULES)
     mask = np.arange(8)[None] >= 6
@@ -204,3 +197,77 @@ def test_rejected_pixels_have_nothing_left_but_a_reason() -> None:
     assert np.isnan(refined.sigma_px[mask]).all()
     assert (refined.confidence[mask] == 0).all()
     assert np.isfinite(refined.values[0, 5])
+
+
+def refine_minima_reference(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> Refined:
+    """Return all rows of `recon.stereo.kernels.refine.refine_minima`."""
+    reason = _reasons(minima, texture, rules)
+    keep = reason == VALID
+    best, before, after, second = minima.costs.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = rules.minimum + minima.winner.astype(np.float64)
+        values += _offsets(best, before, after, rules.fit)
+        sigma = _sigmas(best, before, after, rules)
+        margin = (second - best) / (rules.window_pixels + best)
+        odds = rules.odds * np.sqrt(margin / (sigma * sigma * sigma))
+        confidence = np.where(second < NO_COST, odds / (odds + 1.0), 0.0)
+        if_wrong = np.maximum(sigma, WRONG_PX)
+        mixed = np.sqrt(confidence * sigma**2 + (1.0 - confidence) * if_wrong**2)
+    return Refined(
+        values=np.where(keep, values, np.nan).astype(np.float32),
+        confidence=np.where(keep, confidence, 0.0).astype(np.float32),
+        sigma_px=np.where(keep, mixed, np.nan).astype(np.float32),
+        reason=reason,
+    )
+
+
+def _reasons(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> NDArray[np.uint8]:
+    k = minima.winner.astype(np.int64)
+    best, before, after, second = minima.costs.astype(np.int64)
+    width = k.shape[1]
+    right = np.arange(width) - rules.minimum - k
+    place = np.clip(right, 0, width - 1)
+    other = np.take_along_axis(minima.right_winner.astype(np.int64), place, axis=1)
+    differs = (rules.left_right >= 0) & (np.abs(other - k) > rules.left_right)
+    inside = (right > 0) & (right < width - 1)
+    chosen = _chosen_beside(minima.right_winner, rules)
+    ends = np.maximum(before, after) == NO_COST
+    close = 100 * second <= best * (100 + rules.uniqueness)
+    cases = [
+        ((k == rules.ndisp) | np.isnan(texture), BORDER),
+        (texture < rules.texture, LOW_TEXTURE),
+        (ends & ((k == 0) | (k == rules.ndisp - 1) | inside), OUT_OF_RANGE),
+        (ends, BORDER),
+        (differs & chosen, LEFT_RIGHT),
+        (differs, OCCLUDED),
+        ((rules.uniqueness > 0) & close, AMBIGUOUS),
+    ]
+    conditions, codes = zip(*cases, strict=True)
+    return np.asarray(np.select(conditions, codes, VALID), dtype=np.uint8)
+
+
+def _chosen_beside(right_winner: NDArray[np.uint16], rules: Rules) -> NDArray[np.bool_]:
+    height, width = right_winner.shape
+    x = np.arange(width) + rules.minimum + right_winner.astype(np.int64)
+    chosen = np.zeros((height, width), np.bool_)
+    for aside in (-1, 0, 1):
+        seen = (right_winner != rules.ndisp) & (x + aside >= 0) & (x + aside < width)
+        chosen[np.nonzero(seen)[0], (x + aside)[seen]] = True
+    return chosen
+
+
+def _offsets(
+    best: NDArray[Any], before: NDArray[Any], after: NDArray[Any], fit: bool
+) -> NDArray[np.float64]:
+    slope = np.maximum(before, after) - best
+    return np.where(fit & (slope > 0), 0.5 * (before - after) / slope, 0.0)
+
+
+def _sigmas(
+    best: NDArray[Any], before: NDArray[Any], after: NDArray[Any], rules: Rules
+) -> NDArray[np.float64]:
+    slope = np.maximum(before, after) - best
+    vertex = np.maximum(best - 0.5 * np.abs(before - after), 0.0)
+    noise = 0.5 * np.pi * vertex / (slope * np.sqrt(rules.window_pixels))
+    sigma = np.sqrt(rules.sigma_floor_px**2 + noise * noise)
+    return np.where(slope > 0, np.minimum(sigma, SIGMA_LARGEST_PX), SIGMA_LARGEST_PX)

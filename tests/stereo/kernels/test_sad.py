@@ -22,7 +22,7 @@ from recon.stereo.kernels.minima import NO_COST, Minima, empty_minima
 from recon.stereo.kernels.sad import sad_minima
 from recon.stereo.kernels.simd.vectors import LANES
 from recon.stereo.kernels.tiles import Tiles, make_tiles
-from tests.stereo.kernels.sad_reference import sad_minima_reference
+from tests.stereo.kernels.references import sad_minima_reference
 
 Image = NDArray[np.uint8]
 
@@ -96,13 +96,6 @@ def test_what_is_not_offered_is_as_if_it_did_not_exist(
     assert_equal(found, sad_minima_reference(*pair, search, tiles))
 
 
-@given(pairs(), searches, st.integers(2, 4))
-def test_strips_do_not_change_the_result(
-    pair: tuple[Image, Image], search: Search, strips: int
-) -> None:
-    assert_equal(search_all(*pair, search, None, strips), search_all(*pair, search))
-
-
 @pytest.mark.parametrize("slant", [0, 1, -2])
 @pytest.mark.parametrize(("ndisp", "minimum"), [(64, 0), (65, -40), (33, 20), (100, 60)])
 def test_wide_images_are_searched_in_vectors(ndisp: int, minimum: int, slant: int) -> None:
@@ -116,24 +109,6 @@ def test_wide_images_are_searched_in_vectors(ndisp: int, minimum: int, slant: in
     assert_equal(search_all(left, right, search), expected)
 
 
-@given(pairs(), searches, st.integers(1, 12))
-def test_blocks_do_not_change_the_result(
-    pair: tuple[Image, Image], search: Search, block: int
-) -> None:
-    shape = pair[0].shape
-    narrow = make_tiles(shape, (shape[0], block), search.ndisp)
-    assert_equal(search_all(*pair, search, narrow), search_all(*pair, search))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
-def test_images_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
-    grey = np.zeros(shape, np.uint8)
-    search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, slant=0)
-    minima = search_all(grey, grey, search)
-    assert_equal(minima, sad_minima_reference(grey, grey, search, everything(shape, search)))
-    assert (minima.winner == 0).all()
-
-
 # One row: the sums over a column fit into bytes, those over two do not.
 @pytest.mark.parametrize(("radius", "rows_radius"), [(7, 7), (1, 0), (4, 0)])
 def test_largest_costs_do_not_overflow(radius: int, rows_radius: int) -> None:
@@ -142,13 +117,3 @@ def test_largest_costs_do_not_overflow(radius: int, rows_radius: int) -> None:
     costs = search_all(left, right, search).costs[0]
     assert (costs == (2 * radius + 1) * 2 * (rows_radius + 1) * 255).all()
     assert costs.max() < NO_COST
-
-
-def test_pixels_without_a_candidate_have_no_winner() -> None:
-    grey = np.zeros((2, 8), np.uint8)
-    search = Search(ndisp=3, minimum=5, radius=1, rows_radius=1, cost_cap=31, slant=0)
-    minima = search_all(grey, grey, search)
-    # Disparity 5 needs a right pixel at x - 5.
-    assert (minima.winner[:, :5] == 3).all()
-    assert (minima.winner[:, 5:] == 0).all()
-    assert (minima.costs[:, :, :5] == NO_COST).all()

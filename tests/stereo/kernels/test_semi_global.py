@@ -29,7 +29,7 @@ from recon.stereo.kernels.semi_global import (
     scratch_bytes,
     semi_global_minima,
 )
-from tests.stereo.kernels.semi_global_reference import semi_global_minima_reference
+from tests.stereo.kernels.references import semi_global_minima_reference
 
 Image = NDArray[np.uint8]
 
@@ -100,26 +100,6 @@ def test_search_equals_the_reference(
     views = make_views(*pair, window, paths)
     expected = semi_global_minima_reference(views, window, paths)
     assert_equal(search(views, window, paths), expected)
-
-
-@settings(max_examples=30)
-@given(pairs(), windows(), st.integers(2, 4))
-def test_strips_that_overlap_wholly_do_not_change_the_result(
-    pair: tuple[Image, Image], rules: tuple[Window, Paths], strips: int
-) -> None:
-    window, paths = rules
-    views = make_views(*pair, window, paths)
-    assert_equal(search(views, window, paths, strips), search(views, window, paths))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
-def test_images_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
-    grey = np.zeros(shape, np.uint8)
-    paths = Paths(4, 0, 10, 50, 20, 12, overlap=4, side_overlap=4)
-    window = scaled_window(2, 2, 16, 40, 3.0)
-    minima = search(make_views(grey, grey, window, paths), window, paths)
-    assert (minima.winner == 0).all()
-    assert (minima.right_winner == 0).all()
 
 
 def test_few_rows_of_overlap_change_little() -> None:

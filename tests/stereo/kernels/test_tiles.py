@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 
 from recon.core.values.arrays import Float32
 from recon.stereo.kernels.tiles import GROUP, Support, Tiles, make_tiles, offer_supported
-from tests.stereo.kernels.tiles_reference import offer_supported_reference, offered_reference
+from tests.stereo.kernels.references import offer_supported_reference, offered_reference
 
 NDISP = 40
 LENIENT = Support(margin_x=0, margin_y=0, margin=0, matched=0.0, share=0.0, least=1)
@@ -56,23 +56,9 @@ def test_only_the_group_of_a_match_is_offered_and_only_to_its_tile() -> None:
     assert candidates.any(axis=2).nonzero()[0].min() == 8
 
 
-def test_neighbours_of_a_match_are_offered_within_the_margin() -> None:
-    halved = np.full((4, 8), 8, np.float32)
-    offered_to = [offered(halved, LENIENT._replace(margin=m)).offered[0, 0] for m in (0, 1)]
-    assert offered_to[0].nonzero()[0].tolist() == [2]
-    assert offered_to[1].nonzero()[0].tolist() == [1, 2]
-
-
 def test_a_tile_with_too_few_matches_is_offered_everything() -> None:
     halved = np.full((8, 8), np.nan, np.float32)
     halved[:4, :7], halved[4:, :3] = 3, 3
     tiles = offered(halved, LENIENT._replace(matched=0.5))
     assert tiles.offered[0, 0].tolist() == [True, False, False, False, False]
     assert tiles.offered[1, 0].all()
-
-
-def test_lonely_matches_support_nothing() -> None:
-    halved = np.full((4, 8), 4, np.float32)
-    halved[2, 3:6] = 15
-    assert offered(halved, LENIENT._replace(share=0.1)).offered[0, 0].nonzero()[0].tolist() == [1]
-    assert offered(halved, LENIENT._replace(share=0.05)).offered[0, 0, 3]

@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.values import RectifiedPair
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.match.search import clipped_gradients, texture
+from recon.stereo.match.search import ResultPool, clipped_gradients, texture
 
 HEIGHT, WIDTH = 23, 17
 ALL = range(HEIGHT)
@@ -41,3 +41,26 @@ def test_texture_of_a_ramp_is_its_slope() -> None:
     found = texture(pair, 5, range(4, 9))
     # Away from the border, where the gradient of a continued image is half as large.
     np.testing.assert_allclose(found[:, 3:-3], 3.0, rtol=1e-6)
+
+
+def test_unreferenced_memory_is_lent_again() -> None:
+    pool = ResultPool(2)
+    block = pool.lend(4096)
+    address = block.ctypes.data
+    del block
+    assert pool.lend(4096).ctypes.data == address
+
+
+def test_memory_stays_lent_while_a_view_of_it_is_referenced() -> None:
+    pool = ResultPool(2)
+    view = pool.lend(4096)[:4000].view(np.float32).reshape(10, 100)[2:]
+    view[:] = 7
+    pool.lend(4096)[:] = 0
+    pool.lend(4096)[:] = 0
+    assert (view == 7).all()
+
+
+def test_memory_of_another_size_is_given_up() -> None:
+    pool = ResultPool(2)
+    pool.lend(4096)
+    assert pool.lend(100).shape == (100,)

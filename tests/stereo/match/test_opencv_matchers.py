@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.core.errors import MatchingError, SettingsError
+from recon.core.errors import MatchingError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
@@ -98,9 +98,3 @@ def test_a_refusal_of_opencv_is_an_error_of_ours() -> None:
 def test_a_range_beyond_16_bits_is_refused(range_px: dict[str, int]) -> None:
     with pytest.raises(MatchingError, match="exceed the range of OpenCV"):
         match("opencv-sgbm", shifted_pair(0), **range_px)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_an_even_window_is_refused(name: str) -> None:
-    with pytest.raises(SettingsError, match="odd"):
-        OpencvSettings.parse({"block_px": 6})

@@ -1,8 +1,7 @@
 """How vectors compile: each function of `vectors` as the LLVM instructions that stand for it.
 
-A vector is a numba type whose values are LLVM vectors, so that it stays in a register. Vectors
-exist in compiled code alone: no function that Python calls takes or returns one. What this relies
-on in numba and llvmlite, and what breaks it, is in ``docs/simd.md``.
+A vector is a numba type whose values are LLVM vectors, so that it stays in a register. What this
+relies on in numba and llvmlite, and what breaks it, is in ``docs/simd.md``.
 
 Ref: LLVM Language Reference Manual, "Vector Operations"; numba manual, "Low-level extension API".
 """
@@ -59,7 +58,6 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _llvm_type(bits: int, lanes: int = LANES) -> ir.VectorType:
-    """Return LLVM's type of a vector of so many bits a lane."""
     return ir.VectorType(ir.IntType(bits), lanes)
 
 
@@ -73,7 +71,6 @@ def _compiled_as(function: Callable[..., Any], typer: Callable[..., Any]) -> Cal
 
 
 def _binary(function: Callable[..., Any], write: Callable[..., Any]) -> None:
-    """Register a function of two vectors of one kind."""
 
     def typer(a: Any, b: Any) -> Any:
         return a if isinstance(a, _Vector) and a == b else None
@@ -86,7 +83,6 @@ def _binary(function: Callable[..., Any], write: Callable[..., Any]) -> None:
 
 
 def _intrinsic(name: str) -> Callable[..., Any]:
-    """Emits a call of one of LLVM's intrinsic functions of two vectors."""
 
     def write(builder: Any, a: Any, b: Any) -> Any:
         kind = ir.FunctionType(a.type, [a.type, a.type])
@@ -133,13 +129,11 @@ def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
 
 
 def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
-    """Return address, as of some type, of an element: arguments are the array and the index."""
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
     return builder.bitcast(builder.gep(array.data, [arguments[1]]), kind.as_pointer())
 
 
 def _address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
-    """Address, as of some type, of an element: arguments are the array, the row and the column."""
     rows = context.make_array(signature.args[0])(context, builder, arguments[0])
     n, at = (
         context.cast(builder, value, given, types.intp)
@@ -150,7 +144,6 @@ def _address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, 
 
 
 def _type_in_row(rows: Any, n: Any, at: Any) -> Any:
-    """Return the type of a vector in an array of rows; None = the array does not fit."""
     # The address is computed for a C-ordered array.
     fits = isinstance(rows, types.Array) and rows.ndim == 1 + 1 and rows.layout == "C"
     return _Vector(rows.dtype) if fits else None
@@ -273,7 +266,6 @@ def _transpose(context: Any, builder: Any, signature: Any, arguments: Any) -> An
 
 
 def _write_transposed(builder: Any, block: list[Any]) -> list[Any]:
-    """Transpose a square of bytes."""
     # First the quarters of the square change places. Then the halves of all vectors are interleaved
     # lane by lane, each half by itself: no instruction has to move lanes between halves.
     half = LANES // 2

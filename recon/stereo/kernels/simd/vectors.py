@@ -14,8 +14,7 @@ LANES: Final = 32
 """Values of a vector. In 16 bits they fill a register of 512 bits; where registers are smaller, the
 compiler uses several."""
 
-Vector: TypeAlias = NDArray[Any]
-"""uint8 or uint16 (LANES,)."""
+Vector: TypeAlias = NDArray[Any]  # uint8 or uint16 (LANES,)
 
 
 def load(array: NDArray[Any], at: int) -> Vector:
