@@ -21,6 +21,7 @@ from recon.stereo.match.registry import (
 )
 from recon.stereo.match.sad import SadSettings
 from recon.stereo.match.search import usual_ndisp
+from recon.stereo.match.sgm import SgmSettings
 from recon.stereo.rectify.rectifier import to_grey
 from tests.stereo.match.images import HEIGHT, WIDTH, inner, warped_pair
 
@@ -84,7 +85,7 @@ def test_range_of_settings_or_calibration_is_kept() -> None:
     known = replace(pair, camera=replace(pair.camera, ndisp=32))
     assert near_share(make_matcher("sad").match(known), 100) < 0.1
     assert searched(narrow) is narrow.sad
-    assert searched(MatchingSettings(matcher="sgm")).speckle_size_px == 50
+    assert searched(MatchingSettings(matcher="sgm")) == SgmSettings()
     assert searched(MatchingSettings(matcher="onnx")) == SadSettings()
 
 
