@@ -25,7 +25,7 @@ from recon.core.settings import Settings
 from recon.core.values.arrays import UInt8, size_text
 from recon.io.images.image import write_image
 from recon.io.trajectory import FRAMES, HEADER, CapturedFrame
-from recon.sources.opencv_camera import Camera, OpenCvCamera
+from recon.sources.opencv_camera import Camera
 from recon.sources.settings import SourceSettings
 from recon.sources.video import split_views
 
@@ -107,7 +107,7 @@ def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[
     with ExitStack() as stack:
         cameras: list[Camera] = []
         for device in devices:
-            cameras.append(OpenCvCamera(device, size, settings.rate_hz))
+            cameras.append(Camera(device, size, settings.rate_hz))
             stack.callback(cameras[-1].close)
         yield tuple(cameras)
 

@@ -5,6 +5,6 @@
   `synthetic.py`: one kind each, or two alike;
 - `images.py`: drives in image files, which `image_names.py` and `times.py` pair;
 - `frame_list.py`: which frames are pairs, and which of them are used; `calibration.py`;
-- `live.py`: a drive that arrives in its own time; `opencv_camera.py`; `prior.py`;
+- `live.py`: a drive that arrives in its own time; `opencv_camera.py`; `bag_prior.py`;
 - `datasets.py`: public data sets and how they are fetched.
 """

@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import CalibrationError, FormatError, SourceError
+from recon.core.errors import CalibrationError, SourceError
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.cameras.ros import ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
 from recon.io.files import reading, resolved
-from recon.io.images.image import decode_image, pixels_of_ros_image
 from recon.sources.bag_prior import read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
-from recon.sources.frame_list import check_most, pair_frames
+from recon.sources.frame_list import pair_frames
 from recon.sources.image_names import find_partners, partner_names
 from recon.sources.one_pair import join_pair
 from recon.sources.rosbags import (
@@ -30,14 +28,16 @@ from recon.sources.rosbags import (
     POSES,
     Bag,
     BagCameraInfo,
-    BagImage,
 )
 from recon.sources.settings import SourceSettings
 from recon.sources.source import ReadPrior, Recording
-from recon.sources.times import check_increasing, pair_stamps, pairs_in_time
+from recon.sources.times import check_increasing, pair_stamps
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
 _S: Final = 1e-9
+_IMAGES: Final = (IMAGE, COMPRESSED)
+_LISTED: Final = 20
+"""Most topics in a description."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -45,7 +45,6 @@ class BagSource(Recording):
     """A drive in a bag, which does not say which poses are true; messages are read one at a time.
 
     Attributes:
-        bag: The recording.
         topics: Left and right image topic.
         pairs: Indices of the left and the right message of each pair.
         left_s: float64 (M,), timestamps of all left messages.
@@ -95,19 +94,9 @@ class BagSource(Recording):
 
     def _images(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
         """Yield the wanted images of one camera, given by their indices in order."""
-        times, topic = self.recorded_ns[side], self.topics[side]
-        start_ns = int(times[wanted[0]])
-        position = int(np.searchsorted(times, start_ns))
-        messages = self.bag.images(topic, start_ns)
-        for target in wanted:
-            message = next(islice(messages, target - position, None), None)
-            if message is None:
-                raise FormatError(
-                    "recording ends early", where=self.bag.paths[0], got=f"{target} of {topic}"
-                )
-            position = target + 1
-            where = f"{self.bag.paths[0]}: {topic}, message {target}"
-            image = decode_message(message, where)
+        images = self.bag.images(self.topics[side], wanted, self.recorded_ns[side])
+        for target, image in zip(wanted, images, strict=True):
+            where = f"{self.bag.paths[0]}: {self.topics[side]}, message {target}"
             check_size(self.calibration, image.shape[1], image.shape[0], where)
             yield image
 
@@ -115,14 +104,19 @@ class BagSource(Recording):
 def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     """Open a recording, and read all its timestamps to pair the messages."""
     bag = Bag(_find_files(path))
-    topics, also = choose_topics(bag, settings)
+    topics, also = _choose_topics(bag, settings)
     times = bag.scan(topics)
     stamps, clock = _stamps(times, topics, path)
-    found = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
-    check_most(len(found.left), min(map(len, stamps)), path)
-    pairs, listing = pair_frames(pairs_in_time(stamps, found), settings, path)
-    rig, texts, source = _read_rig(bag, topics, pairs[0][0], settings, path)
-    also += list_others(bag, topics)
+    frames = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, path)
+    pairs, listing = pair_frames(frames, settings, path)
+    recorded_ns = (times[topics[0]][:, 0], times[topics[1]][:, 0])
+    if settings.has_camera:
+        first = next(bag.images(topics[0], [pairs[0][0]], recorded_ns[0]))
+        rig, texts = read_rig(settings, path, (first.shape[1], first.shape[0]))
+        source = f"calibration {settings.calibration or 'in numbers'}"
+    else:
+        rig, texts, source = _rig_of_infos(bag, topics, path), (), "its CameraInfo"
+    also += _list_others(bag, topics)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
         name=resolved(path).name,
@@ -134,7 +128,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         pairs=pairs,
         listing=listing,
         left_s=stamps[0],
-        recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),
+        recorded_ns=recorded_ns,
         texts=texts,
         stamped=not clock,
     )
@@ -147,20 +141,6 @@ def find_bags(folder: Path) -> list[Path]:
     parts = sorted(folder.glob("*.bag"))
     single = [path for path in sorted(folder.iterdir()) if path.suffix in {".mcap", ".db3"}]
     return parts or (single if len(single) == 1 else [])
-
-
-def decode_message(message: BagImage, where: str) -> UInt8:
-    """Decode an image message."""
-    if not message.step:
-        return decode_image(message.data.tobytes(), where)
-    return pixels_of_ros_image(
-        message.data,
-        message.encoding,
-        (message.height_px, message.width_px),
-        message.step,
-        big_endian=message.big_endian,
-        where=where,
-    )
 
 
 def _find_files(path: Path) -> list[Path]:
@@ -192,20 +172,9 @@ def _stamps(
     return (left, right), "" if stamped else ", recording times as the headers have none"
 
 
-def _read_rig(
-    bag: Bag,
-    topics: tuple[str, str],
-    first: int,
-    settings: SourceSettings,
-    path: Path,
-) -> tuple[Rig, tuple[Path, ...], str]:
-    """Return the calibration, the files it was read from, and a note on its origin."""
-    infos = [camera_info_topic(bag, topic) for topic in topics]
-    if settings.has_camera:
-        message = next(islice(bag.images(topics[0]), first, None))
-        image = decode_message(message, f"{path}: {topics[0]}")
-        rig, texts = read_rig(settings, path, (image.shape[1], image.shape[0]))
-        return rig, texts, f"calibration {settings.calibration or 'in numbers'}"
+def _rig_of_infos(bag: Bag, topics: tuple[str, str], path: Path) -> Rig:
+    """Return the rig that the CameraInfo messages of two image topics describe."""
+    infos = [_info_topic(bag, topic) for topic in topics]
     if None in infos:
         raise SourceError(
             "recording has no calibration of both cameras",
@@ -214,21 +183,13 @@ def _read_rig(
             hint=CALIBRATE,
         )
     left, right = (bag.camera_info(topic) for topic in infos if topic is not None)
-    rectified = all(map(names_rectified, topics))
-    return as_rectified(rig_of_messages(left, right, path, rectified)), (), "its CameraInfo"
+    return as_rectified(rig_of_messages(left, right, path, all(map(_is_rectified, topics))))
 
 
-_IMAGES = (IMAGE, COMPRESSED)
-_LISTED = 20
-
-
-def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
-    """Return the left and right image topic: from the settings, else guessed from the topic names.
+def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
+    """Return the left and right image topic, by the settings or by name, and a note on others.
 
     Of several pairs, rectified ones are preferred, then uncompressed ones, then alphabetical order.
-
-    Returns:
-        The topics, and a note on other candidate pairs.
     """
     if settings.left or settings.right:
         return _named(bag, settings), ""
@@ -249,21 +210,21 @@ def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], 
             got=bag.list_topics(_IMAGES) or "no image topic",
             hint="name them with --left and --right",
         )
-    best, *others = sorted(pairs, key=lambda pair: _rank(bag, pair[0]))
+    ranked = sorted(
+        (not _is_rectified(left), bag.topics[left].kind == COMPRESSED, left, right)
+        for left, right in pairs
+    )
+    best, *others = [(left, right) for *_, left, right in ranked]
     also = ", ".join(left for left, _ in others)
     return best, f" (also there: {also}; choose with --left)" if also else ""
 
 
-def list_others(bag: Bag, used: Sequence[str]) -> str:
-    """Return a note on the topics that are not used, and on those that `--prior` takes.
-
-    Other pairs of image topics are not among them; see `choose_topics`.
-    """
-    images = [topic.name for topic in bag.topics.values() if topic.kind in _IMAGES]
+def _list_others(bag: Bag, used: Sequence[str]) -> str:
+    """Return a note on unused topics, but for those of images, and on which `--prior` takes."""
+    images = [name for name, topic in bag.topics.items() if topic.kind in _IMAGES]
     named = {*used, *(name for pair in find_partners(images) for name in pair)}
-    others = sorted(
-        t.name for t in bag.topics.values() if t.kind != CAMERA_INFO and t.name not in named
-    )
+    unused = {name for name, topic in bag.topics.items() if topic.kind != CAMERA_INFO} - named
+    others = sorted(unused)
     if not others:
         return ""
     poses = [name for name in others if bag.topics[name].kind in POSES and "static" not in name]
@@ -271,7 +232,7 @@ def list_others(bag: Bag, used: Sequence[str]) -> str:
     return f", not used: {listed}" + (f" (for --prior: {', '.join(poses)})" if poses else "")
 
 
-def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
+def _info_topic(bag: Bag, image_topic: str) -> str | None:
     """Return the CameraInfo topic of an image topic: at the same level, or one level up."""
     place = PurePosixPath(image_topic.removesuffix("/compressed")).parent
     for candidate in (place / "camera_info", place.parent / "camera_info"):
@@ -281,7 +242,7 @@ def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
     return None
 
 
-def names_rectified(image_topic: str) -> bool:
+def _is_rectified(image_topic: str) -> bool:
     """Return whether a topic has rectified images, according to ROS naming conventions."""
     return "rect" in image_topic.removesuffix("/compressed").rsplit("/", 1)[-1]
 
@@ -303,19 +264,8 @@ def _named(bag: Bag, settings: SourceSettings) -> tuple[str, str]:
     return str(left), str(right)
 
 
-def _rank(bag: Bag, topic: str) -> tuple[bool, bool, str]:
-    return not names_rectified(topic), bag.topics[topic].kind == COMPRESSED, topic
-
-
 def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rectified: bool) -> Rig:
-    """Build a rig from two CameraInfo messages.
-
-    Args:
-        left: Message of the left camera.
-        right: Message of the right camera.
-        where: The recording, for error messages.
-        rectified: Whether the images are rectified, so that only ``P`` is used.
-    """
+    """Return the rig of two CameraInfo messages; of rectified images only ``P`` is used."""
     for info in (left, right):
         if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:
             raise CalibrationError(

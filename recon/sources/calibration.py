@@ -36,16 +36,10 @@ def read_rig(
     size: tuple[int, int],
     cameras: tuple[int, int] | None = None,
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """Return the calibration that the settings name or give in numbers, else that in a folder.
+    """Return the calibration that the settings name or give in numbers, else that of a folder.
 
-    Args:
-        settings: May name a file, or give the numbers of rectified cameras.
-        folder: The folder to search otherwise.
-        size: Image width and height.
-        cameras: Left and right camera of a KITTI file; None = grey if it has that pair.
-
-    Returns:
-        The calibration, and the files it was read from.
+    Also the files it was read from. ``size`` is image width and height; ``cameras`` are those to
+    take from a KITTI file, else grey if it has that pair.
     """
     check_given_once(settings.calibration, settings)
     if settings.numbers:
@@ -76,12 +70,9 @@ def check_given_once(calibration: object, settings: SourceSettings) -> None:
 def camera_of_numbers(
     settings: SourceSettings, size: tuple[int, int], **instead: float
 ) -> RectifiedCamera:
-    """Return the camera of rectified images of which the settings give the numbers.
+    """Return the camera of rectified images (width, height) by the numbers in the settings.
 
-    Args:
-        settings: Focal length and baseline; the principal point is else the middle.
-        size: Image width and height.
-        instead: Numbers to use where the settings have none.
+    Where they have none, those of ``instead`` count; the principal point is else the middle.
     """
     numbers = {**instead, **settings.numbers}
     focal_px, baseline_m = numbers.get("focal_px"), numbers.get("baseline_m")

@@ -13,9 +13,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -37,6 +36,7 @@ from recon.sources.images import (
     list_images,
     pair_listed,
     pair_named,
+    stamps_of,
 )
 from recon.sources.settings import SourceSettings
 from recon.sources.times import (
@@ -51,11 +51,9 @@ _TIMES: Final = "times.txt"
 _INSIDE: Final = ("", "data", "images", "image", "img")
 
 _Frames = list[tuple[Path | None, Path | None]]
-"""Left and right image of each frame; None = missing."""
 
 
-@dataclass(frozen=True)
-class _Pairing:
+class _Pairing(NamedTuple):
     """Pairs in order; ``stamps_s`` is None if their times are unknown."""
 
     pairs: list[tuple[Path, Path]]
@@ -76,10 +74,7 @@ def open_folders(folder: Path, settings: SourceSettings) -> ImageSource:
         name=resolved(folder).name,
         description=f"plain folders, {found.how}{found.listing}{clock}{note}",
         calibration=rig,
-        images=[
-            ImageFrame(left, right, float(stamp))
-            for (left, right), stamp in zip(found.pairs, stamps_s, strict=True)
-        ],
+        images=[ImageFrame(*both, float(t)) for both, t in zip(found.pairs, stamps_s, strict=True)],
         listing=found.listing,
         truth=truth,
         texts=(*texts, *found.texts),
@@ -129,9 +124,8 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     by = settings.pair_by
     timed = () if settings.rate_hz else (folder, views[0])
     listed = next((p / _TIMES for p in timed if (p / _TIMES).is_file()), None)
-    stamps = _stamps(left, right) if by in {"auto", "stamp"} else None
-    if stamps is not None:
-        found = _pair_by_stamp(left, right, stamps, settings, folder)
+    found = _pair_by_stamp(left, right, settings, folder) if by in {"auto", "stamp"} else None
+    if found is not None:
         return found if listed is None else _with_times(found, listed)
     if by == "stamp":
         raise SourceError("names of the images are not timestamps", where=left[0])
@@ -166,29 +160,21 @@ def _pair_as_listed(folder: Path, settings: SourceSettings) -> _Pairing:
     return _Pairing(pairs, listing, stamps_s, how, (folder / FRAMES,))
 
 
-def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:
-    """Return the timestamps in the file names, or None unless all names are timestamps."""
-    first, second = (stamps_of_names([path.stem for path in paths]) for paths in (left, right))
-    return None if first is None or second is None else (first, second)
-
-
 def _pair_by_stamp(
-    left: list[Path],
-    right: list[Path],
-    stamps: tuple[Float64, Float64],
-    settings: SourceSettings,
-    folder: Path,
-) -> _Pairing:
-    for series, paths in zip(stamps, (left, right), strict=True):
-        check_increasing(series, str(paths[0].parent))
-    lists = [
-        list(zip(series.tolist(), paths, strict=True))
-        for series, paths in zip(stamps, (left, right), strict=True)
-    ]
+    left: list[Path], right: list[Path], settings: SourceSettings, folder: Path
+) -> _Pairing | None:
+    """Return pairs by the times in the file names; None unless all names are times."""
+    lists = []
+    for paths in (left, right):
+        stamps_s = stamps_of_names([path.stem for path in paths])
+        if stamps_s is None:
+            return None
+        lists.append(list(zip(stamps_s.tolist(), paths, strict=True)))
+    for one in lists:
+        check_increasing(np.array([stamp for stamp, _ in one]), str(one[0][1].parent))
     frames, listing = pair_listed(lists, settings, folder)
     pairs = [(frame.left, frame.right) for frame in frames]
-    stamps_s = np.array([frame.timestamp_s for frame in frames])
-    return _Pairing(pairs, listing, stamps_s, "paired by stamps")
+    return _Pairing(pairs, listing, stamps_of(frames), "paired by stamps")
 
 
 def _by_name(left: list[Path], right: list[Path]) -> _Frames | None:
@@ -232,7 +218,8 @@ def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Fr
 def _with_times(found: _Pairing, path: Path) -> _Pairing:
     """Return the pairs with the times of a file, which win over those in names."""
     stamps_s = read_times_of_pairs(path, found.listing)
-    return replace(found, stamps_s=stamps_s, how=f"{found.how}, times of {_TIMES}", texts=(path,))
+    how = f"{found.how}, times of {_TIMES}"
+    return found._replace(stamps_s=stamps_s, how=how, texts=(path,))
 
 
 def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:

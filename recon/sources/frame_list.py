@@ -59,7 +59,7 @@ class FrameList:
         return list(of_pairs) if self.chosen is None else [of_pairs[k] for k in self.chosen]
 
     def choose(self, settings: SourceSettings, where: Path) -> FrameList:
-        """Return the same recording, of which the frames from ``start`` to ``end`` are used."""
+        """Return the same recording, of which the frames that the settings choose are used."""
         if (settings.start, settings.end, settings.stride) == (0, None, 1):
             return self
         chosen = range(len(self.paired))[settings.start : settings.end : settings.stride]
@@ -74,14 +74,13 @@ class FrameList:
         return replace(self, chosen=chosen)
 
     def lines(self, count: int) -> list[int] | None:
-        """Return the line of each pair in a file with one line per frame, such as ``times.txt``.
+        """Return the line of each pair, from 0, in a file of one line per frame (``times.txt``).
 
         One line per pair fits at once, whether of all pairs or of those used. Else names that are
         counters give the line, so that it stays the right one where images are missing; else the
         position does, and further lines are ignored.
 
-        Returns:
-            Indices from 0; None = the file has too few lines.
+        None = the file has too few lines.
         """
         of_pairs = self._lines_of_all(count)
         if of_pairs is None:
@@ -104,14 +103,10 @@ def pair_frames(
     where: Path,
     names: Sequence[str] | None = None,
 ) -> tuple[list[tuple[Left, Right]], FrameList]:
-    """Return the pairs that are used, among frames of which an image may be missing.
+    """Return the pairs that are used, of frames in order with a left and right image (or None).
 
-    Args:
-        frames: What stands for the left and for the right image of each frame, in order; None =
-            missing.
-        settings: By how many frames the right images were taken later, and the frames to use.
-        where: The source, for the error message.
-        names: Names of the frames without suffix; None = they have none.
+    The settings say by how many frames the right images were taken later. ``names`` are those of
+    the frames without suffix.
     """
     alone_right = sum(left is None and right is not None for left, right in frames)
     # A listed frame without any image counts as one, on the left.
@@ -154,13 +149,7 @@ def _shift_right(
 
 
 def check_most(pairs: int, images: int, where: Path) -> None:
-    """Refuse a recording of which most is missing.
-
-    Args:
-        pairs: Number of pairs.
-        images: Number of images of one camera, found or listed.
-        where: The source, for the error message.
-    """
+    """Refuse a recording of which most is missing; ``images`` of one camera, found or listed."""
     if 2 * pairs < images:
         raise SourceError(
             "most images have no partner",

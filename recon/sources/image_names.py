@@ -101,12 +101,9 @@ Key = tuple[object, ...]
 
 @dataclass(frozen=True)
 class ImagePairs:
-    """Images of two cameras, paired.
+    """Left and right images, in natural order; ``by_order`` = paired so, as names gave no clue.
 
-    Attributes:
-        pairs: Left and right file of each pair, in natural order.
-        by_order: Whether files were paired by order, as their names gave no clue.
-        lonely: Files that were left out since they have no partner.
+    ``lonely`` files are left out, as they have no partner.
     """
 
     pairs: tuple[tuple[Path, Path], ...]
@@ -115,16 +112,11 @@ class ImagePairs:
 
 
 def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
-    """Find the images of two cameras and pair them.
+    """Pair the images of two cameras; each is a folder, an image or a pattern (``*?[]**``).
 
     Names match if they are equal apart from words and constant numbers of each side, such as
     ``left01.jpg`` and ``right01.jpg`` or ``cam0/17.png`` and ``cam1/17.png``. If no names match
-    and both sides have as many images, they are paired by order. Files without a partner are left
-    out.
-
-    Args:
-        left: A folder, an image, or a pattern with ``*``, ``?``, ``[]`` or ``**``.
-        right: The same for the right camera.
+    and both sides have as many images, they are paired by order.
     """
     sides = (find_images(left), find_images(right))
     both = set(sides[0]) & set(sides[1])

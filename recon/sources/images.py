@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -23,21 +23,14 @@ from recon.sources.image_names import IMAGES, natural_key
 from recon.sources.one_pair import join_pair
 from recon.sources.settings import SourceSettings
 from recon.sources.source import Recording
-from recon.sources.times import pair_stamps, pairs_in_time
+from recon.sources.times import pair_stamps
 
 _WHITE_SAMPLE: Final = 8
 """Frames, spread over a drive of 16-bit images, that its white is taken from."""
 
 
-@dataclass(frozen=True)
-class ImageFrame:
-    """The two files of one frame.
-
-    Attributes:
-        left: Left image.
-        right: Right image.
-        timestamp_s: Exposure time stamp of the left image.
-    """
+class ImageFrame(NamedTuple):
+    """The two files of one frame, and the exposure time of the left one."""
 
     left: Path
     right: Path
@@ -59,7 +52,7 @@ class ImageSource(Recording):
     @cached_property
     def stamps_s(self) -> Float64:
         """float64 (N,), times of the left images."""
-        return np.array([frame.timestamp_s for frame in self.images])
+        return stamps_of(self.images)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Read the pairs from number ``start`` on."""
@@ -82,7 +75,7 @@ class ImageSource(Recording):
 
     @property
     def _most_megapixels(self) -> float:
-        """Largest image to read; a calibration was accepted for images of its size."""
+        # A calibration was accepted for images of its size.
         rig = self.calibration
         camera = rig if isinstance(rig, RectifiedCamera) else rig.left
         return max(MAX_MEGAPIXELS, camera.width_px * camera.height_px / 1e6)
@@ -93,25 +86,23 @@ class ImageSource(Recording):
         return image
 
 
+def stamps_of(frames: Sequence[ImageFrame]) -> Float64:
+    """Return float64 (N,), the times of some frames."""
+    return np.array([frame.timestamp_s for frame in frames])
+
+
 def pair_listed(
     lists: Sequence[Sequence[tuple[float, Path]]], settings: SourceSettings, where: Path
 ) -> tuple[list[ImageFrame], FrameList]:
-    """Pair two lists of images by time; a listed image that is missing has no partner.
+    """Pair two lists of images by time; returns the frames that the settings choose.
 
-    Only the frames that the settings choose are returned.
-
-    Args:
-        lists: Time stamp and file of the left images, and of the right ones, in order of time.
-        settings: Largest difference within a pair, and the frames to use.
-        where: The source, for error messages.
+    Each list has time and file of the images of a camera, in order of time. A listed image that is
+    missing has no partner.
     """
     for one in lists:
         check_most(sum(path.is_file() for _, path in one), len(one), where)
     stamps = [np.array([stamp for stamp, _ in one]) for one in lists]
-    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(where))
-    # Of two cameras with different rates, the slower one decides what is missing.
-    check_most(len(pairs.left), min(map(len, lists)), where)
-    found = pairs_in_time(stamps, pairs)
+    found = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, where)
     frames = [
         (
             None if i is None or existing(lists[0][i][1]) is None else lists[0][i],
@@ -127,13 +118,7 @@ def pair_listed(
 def pair_named(
     frames: Sequence[tuple[Path | None, Path | None]], settings: SourceSettings, where: Path
 ) -> tuple[list[tuple[Path, Path]], FrameList]:
-    """Return the pairs that are used, among frames of which an image may be missing.
-
-    Args:
-        frames: Left and right image of each frame in order; None = missing.
-        settings: The frames to use.
-        where: The source, for the error message.
-    """
+    """Return the pairs that are used; of ``frames`` in order, an image may be missing (None)."""
     whole = sum(None not in frame for frame in frames)
     alone_right = sum(left is None and right is not None for left, right in frames)
     alone = max(len(frames) - whole - alone_right, alone_right)

@@ -1,15 +1,20 @@
-"""Drives in the layout of the KITTI odometry benchmark.
+"""Drives of KITTI: of the odometry benchmark, and raw, rectified (``_sync``) or not (``_extract``).
 
 ::
 
-    folder/
-      image_0/ image_1/     left and right image of each frame, same names (or image_2, image_3)
-      calib.txt             P0 P1 (or P2 P3)
-      times.txt             seconds, one line per frame
-      poses.txt             optional: T_world_camera0, 12 numbers per frame
+    folder/                    odometry
+      image_0/ image_1/        left and right image of each frame, same names (or image_2, image_3)
+      calib.txt                P0 P1 (or P2 P3)
+      times.txt                seconds, one line per frame
+      poses.txt                optional: T_world_camera0, 12 numbers per frame
+                               (or poses/06.txt beside sequences/06, as in KITTI's own download)
 
-KITTI's own download has the poses in a separate folder, ``poses/06.txt`` for ``sequences/06``;
-they are found there too.
+    2011_09_26/                raw
+      calib_cam_to_cam.txt     (or in the drive's folder)
+      2011_09_26_drive_0013_sync/
+        image_00/ image_01/    (or image_02, image_03)
+          data/0000000000.png
+          timestamps.txt       date and time, one line per image
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ from recon.core.text import counted, is_count
 from recon.core.values import RectifiedCamera, Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
-from recon.io.files import StrPath, resolved
+from recon.io.files import resolved
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.frame_list import FrameList
@@ -34,7 +39,6 @@ from recon.sources.images import (
     ImageFrame,
     ImageSource,
     image_size,
-    is_image,
     list_images,
     pair_listed,
     pair_named,
@@ -42,47 +46,36 @@ from recon.sources.images import (
 from recon.sources.settings import SourceSettings
 from recon.sources.times import check_increasing, read_dates, read_times_of_pairs
 
+_RAW_CALIBRATION: Final = "calib_cam_to_cam.txt"
 
-def open_kitti(
-    folder: StrPath,
-    settings: SourceSettings | None = None,
-    cameras: tuple[int, int] | None = None,
-) -> ImageSource:
-    """Open a drive in KITTI's odometry layout.
 
-    File names, calibration, times and poses are read and checked at once; the images are read
-    while iterating. Images may be deleted: those without a partner are left out, and the lines of
-    times.txt and poses.txt are found by the numbers in the names.
+def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSource:
+    """Open a drive of the odometry benchmark, the grey images if it has both kinds.
 
-    Args:
-        folder: The folder of the drive.
-        settings: May name another calibration, or a frame rate in place of times.
-        cameras: (0, 1) for the grey pair, (2, 3) for the colour pair; None = grey if present.
+    Images may be deleted: those without a partner are left out, and the lines of times.txt and
+    poses.txt are found by the numbers in the names.
     """
-    path = Path(folder)
-    if not path.is_dir():
-        raise SourceError("folder does not exist", where=path)
-    pair = cameras or choose_cameras(path, "image_{}")
+    if not folder.is_dir():
+        raise SourceError("folder does not exist", where=folder)
+    pair = _choose_cameras(folder, "image_{}")
     settings = settings or SourceSettings()
-    images, listing = _list_pairs(*(path / f"image_{camera}" for camera in pair), settings=settings)
-    times, time_files = _read_times(path, listing, settings)
-    rig, calibration_files = _read_rig(path, settings, pair, images[0][0])
-    texts = (*calibration_files, *time_files, _find_poses(path))
+    views = [folder / f"image_{camera}" for camera in pair]
+    images, listing = _list_pairs(views[0], views[1], settings)
+    times, time_files = _read_times(folder, listing, settings)
+    rig, calibration_files = _read_rig(folder, settings, pair, image_size(images[0][0], settings))
+    texts = (*calibration_files, *time_files, _find_poses(folder))
     return ImageSource(
-        name=resolved(path).name,
+        name=resolved(folder).name,
         description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}{listing}",
         calibration=rig,
-        images=[
-            ImageFrame(left, right, float(time_s))
-            for (left, right), time_s in zip(images, times, strict=True)
-        ],
+        images=[ImageFrame(*both, float(t)) for both, t in zip(images, times, strict=True)],
         listing=listing,
-        truth=_read_truth(path, times, listing, pair[0]),
+        truth=_read_truth(folder, times, listing, pair[0]),
         texts=tuple(text for text in texts if text is not None),
     )
 
 
-def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
+def _choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
     """Return the grey pair of cameras, or the colour pair if only that is complete."""
     pairs = (GREY_CAMERAS, COLOUR_CAMERAS)
     for pair in pairs:
@@ -106,24 +99,15 @@ def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
 
 
 def _list_pairs(
-    left: Path, right: Path, *, settings: SourceSettings
+    left: Path, right: Path, settings: SourceSettings
 ) -> tuple[list[tuple[Path, Path]], FrameList]:
     """Return the left and right image of each frame, paired by equal names."""
-    names = [_names(folder) for folder in (left, right)]
-    for folder, found in zip((left, right), names, strict=True):
-        if not found:
-            raise SourceError("folder contains no images", where=folder)
+    names = [{path.name for path in list_images(folder)} for folder in (left, right)]
     frames = [
         (left / name if name in names[0] else None, right / name if name in names[1] else None)
         for name in sorted(names[0] | names[1], key=natural_key)
     ]
     return pair_named(frames, settings, left.parent)
-
-
-def _names(folder: Path) -> set[str]:
-    if not folder.is_dir():
-        raise SourceError("folder does not exist", where=folder)
-    return {path.name for path in folder.iterdir() if is_image(path)}
 
 
 def _read_times(
@@ -144,10 +128,9 @@ def _read_times(
 
 
 def _read_rig(
-    folder: Path, settings: SourceSettings, cameras: tuple[int, int], image: Path
+    folder: Path, settings: SourceSettings, cameras: tuple[int, int], size: tuple[int, int]
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """Read the calibration; its file need not contain the image size."""
-    path, size = folder / "calib.txt", image_size(image, settings)
+    path = folder / "calib.txt"
     if settings.has_camera:
         return read_rig(settings, folder, size, cameras)
     if not path.exists():
@@ -183,17 +166,13 @@ def _find_poses(folder: Path) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-_RAW_CALIBRATION: Final = "calib_cam_to_cam.txt"
-
-
 def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open a raw drive; its images are paired by timestamp."""
-    cameras = choose_cameras(folder, "image_{:02d}")
+    cameras = _choose_cameras(folder, "image_{:02d}")
     views = [folder / f"image_{camera:02d}" for camera in cameras]
     frames, listing = pair_listed([_read_dated(v) for v in views], settings, folder)
-    rig, calibration_files = _read_raw_rig(
-        folder, settings, cameras, image_size(frames[0].left, settings)
-    )
+    size = image_size(frames[0].left, settings)
+    rig, calibration_files = _read_raw_rig(folder, settings, cameras, size)
     rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
     return ImageSource(
         name=resolved(folder).name,

@@ -1,12 +1,20 @@
-"""Drives with lists of images and their times, as in the TUM benchmarks.
+"""Drives with a list of images and times for each camera: of TUM and of EuRoC (ASL, TUM VI).
 
 ::
 
-    folder/
-      left.txt right.txt        time [s] and file, one line per image (or cam0.txt cam1.txt …)
+    folder/                            TUM
+      left.txt right.txt               time [s] and file per line (or cam0.txt cam1.txt …)
       left/1305031102.175304.png …
-      groundtruth.txt           optional: t tx ty tz qx qy qz qw of the left camera
-      calib.txt                 or any other supported calibration file
+      groundtruth.txt                  optional: t tx ty tz qx qy qz qw of the left camera
+      calib.txt                        or any other supported calibration file
+
+    folder/mav0/                       EuRoC (or its content directly)
+      cam0/ cam1/
+        data.csv                       time [ns], file name
+        data/1403636579763555584.png
+        sensor.yaml                    lens, size, T_BS (or a camchain for both cameras)
+      state_groundtruth_estimate0/     optional: ground truth trajectory of the body
+        data.csv
 """
 
 from __future__ import annotations
@@ -24,7 +32,7 @@ from recon.io.cameras.ros import NS, read_euroc_camera, read_euroc_truth
 from recon.io.files import resolved
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.image_names import find_partners
-from recon.sources.images import ImageSource, image_size, is_image, pair_listed
+from recon.sources.images import ImageSource, image_size, is_image, pair_listed, stamps_of
 from recon.sources.settings import SourceSettings
 from recon.sources.times import (
     check_increasing,
@@ -34,14 +42,15 @@ from recon.sources.times import (
     truth_at,
 )
 
+_TRUTH: Final = "state_groundtruth_estimate0"
+
 
 def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open a drive with two lists; its images are paired by timestamp."""
-    paths = _find_tum_lists(folder, settings)
-    lists = [_read_tum_list(path) for path in paths]
-    frames, listing = pair_listed(lists, settings, folder)
+    paths = _find_lists(folder, settings)
+    frames, listing = pair_listed([_read_tum_list(path) for path in paths], settings, folder)
     rig, texts = read_rig(settings, folder, image_size(frames[0].left, settings))
-    truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
+    truth, note = read_tum_truth(folder, stamps_of(frames))
     return ImageSource(
         name=resolved(folder).name,
         description=f"TUM drive, {paths[0].name} and {paths[1].name}, "
@@ -67,7 +76,7 @@ def _lists(path: Path) -> bool:
     return len(words) >= 2 and is_image(Path(words[1]))
 
 
-def _find_tum_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
+def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
     if settings.left and settings.right:
         return folder / settings.left, folder / settings.right
     found = list_files(folder)
@@ -89,7 +98,13 @@ def _read_tum_list(path: Path) -> list[tuple[float, Path]]:
     return listed
 
 
-_TRUTH: Final = "state_groundtruth_estimate0"
+def is_euroc(folder: Path) -> bool:
+    """Return whether a folder has the list of EuRoC's left camera."""
+    return (_root(folder) / "cam0" / "data.csv").is_file()
+
+
+def _root(folder: Path) -> Path:
+    return folder / "mav0" if (folder / "mav0").is_dir() else folder
 
 
 def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
@@ -97,12 +112,11 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
 
     The ground truth is interpolated to the timestamps; it is used only if it covers every frame.
     """
-    root = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    root = _root(folder)
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
-    lists = [_read_list(view) for view in views]
-    frames, listing = pair_listed(lists, settings, root)
-    rig, calibration_files = _read_rig(root, settings, views, image_size(frames[0].left, settings))
-    truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
+    frames, listing = pair_listed([_read_euroc_list(view) for view in views], settings, root)
+    rig, texts = _read_euroc_rig(root, settings, views, image_size(frames[0].left, settings))
+    truth, note = _read_euroc_truth(root, views[0], stamps_of(frames))
     return ImageSource(
         name=resolved(folder).name,
         description=f"EuRoC drive, {views[0].name} and {views[1].name}, paired by stamps{listing}"
@@ -111,11 +125,11 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
         images=frames,
         listing=listing,
         truth=truth,
-        texts=(*calibration_files, *(view / "data.csv" for view in views)),
+        texts=(*texts, *(view / "data.csv" for view in views)),
     )
 
 
-def _read_list(view: Path) -> list[tuple[float, Path]]:
+def _read_euroc_list(view: Path) -> list[tuple[float, Path]]:
     if not view.is_dir():
         raise SourceError("folder of a camera is missing", where=view)
     path = view / "data.csv"
@@ -124,30 +138,25 @@ def _read_list(view: Path) -> list[tuple[float, Path]]:
     return [(stamp, view / "data" / name) for stamp, name in entries]
 
 
-def _read_rig(
+def _read_euroc_rig(
     root: Path, settings: SourceSettings, views: list[Path], size: tuple[int, int]
 ) -> tuple[Rig, tuple[Path, ...]]:
-    if settings.has_camera:
-        return read_rig(settings, root, size)
     paths = [view / "sensor.yaml" for view in views]
-    if not paths[0].is_file():
-        # TUM VI has one file for both cameras instead, beside mav0 or in another folder there.
-        return read_rig(settings, _with_calibration(root), size)
+    if settings.has_camera or not paths[0].is_file():
+        # TUM VI has one file for both cameras, beside mav0 or in another folder there.
+        places = (root, root.parent, root.parent / "dso")
+        return read_rig(settings, next(filter(find_calibration, places), root), size)
     (left, T_body_left), (right, T_body_right) = (read_euroc_camera(path) for path in paths)
     rig = StereoCalibration(left, right, invert(T_body_right) @ T_body_left)
     check_size(rig, *size, paths[0])
     return as_rectified(rig), tuple(paths)
 
 
-def _with_calibration(root: Path) -> Path:
-    places = (root, root.parent, root.parent / "dso")
-    return next((place for place in places if find_calibration(place)), root)
-
-
-def _read_truth(root: Path, left: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
+def _read_euroc_truth(
+    root: Path, left: Path, stamps_s: Float64
+) -> tuple[SequenceTruth | None, str]:
     """Return the truth at the times of the frames, and a note if it does not cover them all."""
     path, sensor = root / _TRUTH / "data.csv", left / "sensor.yaml"
     if not (path.is_file() and sensor.is_file()):
         return None, ""
-    _, T_body_camera = read_euroc_camera(sensor)
-    return truth_at(read_euroc_truth(path), stamps_s, T_body_camera)
+    return truth_at(read_euroc_truth(path), stamps_s, read_euroc_camera(sensor)[1])

@@ -116,7 +116,7 @@ class PairInput:
         pair: The images.
         calibration: Calibration of the two cameras.
         files: Files that the pair was read from.
-        truth: True disparity of the rectified left view, or None.
+        truth: True disparity of the rectified left view, if known.
         notes: What the camera was taken from, where there is no calibration file; for warnings.
         up_to_scale: True if the baseline is unknown and counts as 1 m.
     """
@@ -190,12 +190,7 @@ def _with_camera(given: PairInput, known: SourceSettings) -> PairInput:
 
 
 def with_truth(given: PairInput, path: Path | None) -> PairInput:
-    """Return the pair with ground truth from a file, of which every known pixel counts.
-
-    Args:
-        given: The pair.
-        path: True disparity of the rectified left image, PFM or 16-bit PNG; None = none.
-    """
+    """Return the pair with the true disparity of its rectified left image: PFM or 16-bit PNG."""
     if path is None:
         return given
     values, shape = read_disparity(path), given.pair.left.shape[:2]

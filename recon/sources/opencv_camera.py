@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import cv2
 import numpy as np
@@ -20,45 +20,10 @@ _HEAD_BYTES: Final = 4096
 _MANUAL: Final = 1
 
 
-class Camera(Protocol):
-    """Interface of a camera for capture."""
+class Camera:
+    """A device by number or path (``0``, ``/dev/video0``), or a video file, which is not ``live``.
 
-    name: str
-    live: bool
-
-    @property
-    def rate_hz(self) -> float:
-        """Frames per second; NaN if the driver does not report it."""
-        ...
-
-    def grab(self) -> float | None:
-        """Grab the next frame without decoding it; its time in seconds, None = end."""
-        ...
-
-    def retrieve(self) -> UInt8:
-        """Decode the grabbed frame: uint8 (H, W, 3) RGB."""
-        ...
-
-    def lock(self, exposure: float | None) -> float | None:
-        """Fix exposure and white balance; the exposure, None = not supported by the driver."""
-        ...
-
-    def close(self) -> None:
-        """Release the device."""
-        ...
-
-
-class OpenCvCamera:
-    """A device by number or path, or a video file.
-
-    Args:
-        device: ``0``, ``/dev/video0`` or a file.
-        size: Width and height to request; None = unchanged.
-        rate_hz: Frames per second to request; None = unchanged.
-
-    Attributes:
-        name: The device as given.
-        live: False for a file.
+    Width, height and frames per second are requested of a device; None = unchanged.
     """
 
     def __init__(
@@ -90,11 +55,9 @@ class OpenCvCamera:
         return float(rate) if rate > 0 else float("nan")
 
     def grab(self) -> float | None:
-        """Grab the next frame without decoding it.
+        """Grab the next frame without decoding it; returns its time in seconds, None = the end.
 
-        Returns:
-            Time of the frame according to the driver, in seconds of the machine's monotonic clock;
-            for a file, its position. None = end of the stream.
+        That of the driver, on the machine's monotonic clock; of a file, its position.
         """
         if not self._capture.grab():
             return None
@@ -112,13 +75,9 @@ class OpenCvCamera:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def lock(self, exposure: float | None) -> float | None:
-        """Fix exposure and white balance.
+        """Fix white balance and exposure, in the driver's unit; None = keep the current one.
 
-        Args:
-            exposure: Exposure of the other camera, in the driver's unit; None = keep the current.
-
-        Returns:
-            The fixed exposure; None = not supported by the driver.
+        Returns the fixed exposure; None = not supported by the driver.
         """
         if not self.live:
             return None

@@ -1,10 +1,10 @@
-"""The kinds of source, and how the kind of a path is recognised."""
+"""The kinds of source: one row each, in the order in which the kind of a path is recognised."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from recon.core.errors import SourceError
 from recon.io.files import StrPath, reading
@@ -14,26 +14,43 @@ from recon.io.trajectory import FRAMES
 from recon.sources.bag import BAGS, find_bags, open_bag
 from recon.sources.folders import find_views, open_folders
 from recon.sources.kitti import open_kitti, open_kitti_raw
-from recon.sources.listed import list_files, open_euroc, open_tum
+from recon.sources.listed import is_euroc, list_files, open_euroc, open_tum
 from recon.sources.one_pair import open_middlebury
 from recon.sources.settings import SourceSettings
 from recon.sources.source import StereoSource
 from recon.sources.video import list_videos, open_video_source
 
-SOURCES: Final[dict[str, Callable[[Path, SourceSettings], StereoSource]]] = {
-    "kitti": open_kitti,
-    "kitti-raw": open_kitti_raw,
-    "euroc": open_euroc,
-    "tum": open_tum,
-    "folders": open_folders,
-    "video": open_video_source,
-    "bag": open_bag,
-    "middlebury": open_middlebury,
-}
-EXPECTED: Final = (
-    "a KITTI drive (odometry or raw), an EuRoC or TUM folder, left and right folders, videos, "
-    "a ROS bag or MCAP file, or a Middlebury scene"
+
+class Kind(NamedTuple):
+    """A kind of source: what it is called, how it is opened, and how it is recognised."""
+
+    name: str
+    what: str
+    open: Callable[[Path, SourceSettings], StereoSource]
+    fits: Callable[[Path, SourceSettings], object]
+    """Whether a folder looks like it."""
+    suffixes: frozenset[str] = frozenset()
+
+
+_KITTI, _PLAIN = "a KITTI drive (odometry or raw)", "left and right folders"
+KINDS: Final = (
+    Kind("bag", "a ROS bag or MCAP file", open_bag, lambda at, _: find_bags(at), BAGS),
+    Kind("euroc", "an EuRoC folder", open_euroc, lambda at, _: is_euroc(at)),
+    Kind(
+        "kitti-raw",
+        _KITTI,
+        open_kitti_raw,
+        lambda at, _: any(at.glob("image_0[0-3]/data")),
+    ),
+    Kind("folders", _PLAIN, open_folders, lambda at, _: (at / FRAMES).is_file()),
+    Kind("middlebury", "a Middlebury scene", open_middlebury, lambda at, _: find_layout(at)),
+    Kind("kitti", _KITTI, open_kitti, lambda at, _: any(at.glob("image_[0-3]"))),
+    Kind("tum", "a TUM folder", open_tum, lambda at, _: list_files(at)),
+    Kind("video", "videos", open_video_source, lambda at, _: list_videos(at), VIDEOS),
+    Kind("folders", _PLAIN, open_folders, find_views),
 )
+"""The most distinctive first: what `recon capture` wrote is listed in a file, and may look like
+others."""
 
 
 def open_source(
@@ -43,7 +60,7 @@ def open_source(
 
     Args:
         path: The folder or file.
-        kind: A key of `SOURCES`; None = recognise it by its files.
+        kind: A name of `KINDS`; None = recognise it by its files.
         settings: What cannot be derived from its files.
 
     Raises:
@@ -56,46 +73,25 @@ def open_source(
     with reading(path):
         if kind is None:
             kind = recognise_source(path, settings)
-        if kind not in SOURCES:
-            raise SourceError("unknown kind of source", got=kind, expected=", ".join(SOURCES))
-        return SOURCES[kind](Path(path), settings)
+        opening = {row.name: row.open for row in KINDS}
+        if kind not in opening:
+            raise SourceError("unknown kind of source", got=kind, expected=", ".join(opening))
+        return opening[kind](Path(path), settings)
 
 
 def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> str:
-    """Recognise the kind of source (a key of `SOURCES`) of a path by its files."""
+    """Return the kind (a name of `KINDS`) that a folder or file looks like."""
     place = Path(path)
-    if place.is_file():
-        return _recognise_file(place)
-    if not place.is_dir():
+    is_file, settings = place.is_file(), settings or SourceSettings()
+    if not is_file and not place.is_dir():
         raise SourceError("folder does not exist", where=path)
-    if not any(place.iterdir()):
+    if not is_file and not any(place.iterdir()):
         raise SourceError("folder is empty", where=path)
-    kind = next((kind for kind, fits in _signs(place, settings or SourceSettings()) if fits), None)
-    if kind is None:
-        raise SourceError("folder is not a source of stereo pairs", where=path, expected=EXPECTED)
-    return kind
-
-
-def _recognise_file(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix in VIDEOS:
-        return "video"
-    if suffix in BAGS:
-        return "bag"
-    raise SourceError("file is not a source of stereo pairs", where=path, expected=EXPECTED)
-
-
-def _signs(folder: Path, settings: SourceSettings) -> tuple[tuple[str, bool], ...]:
-    """Return kinds and whether a folder looks like them, most distinctive first."""
-    views = range(4)
-    return (
-        ("bag", bool(find_bags(folder))),
-        ("euroc", any((f / "cam0" / "data.csv").is_file() for f in (folder / "mav0", folder))),
-        ("kitti-raw", any((folder / f"image_{n:02d}" / "data").is_dir() for n in views)),
-        ("folders", (folder / FRAMES).is_file()),
-        ("middlebury", find_layout(folder) is not None),
-        ("kitti", any((folder / f"image_{n}").exists() for n in views)),
-        ("tum", bool(list_files(folder))),
-        ("video", bool(list_videos(folder))),
-        ("folders", find_views(folder, settings) is not None),
+    for kind in KINDS:
+        if place.suffix.lower() in kind.suffixes if is_file else kind.fits(place, settings):
+            return kind.name
+    raise SourceError(
+        f"{'file' if is_file else 'folder'} is not a source of stereo pairs",
+        where=path,
+        expected=", ".join(dict.fromkeys(kind.what for kind in KINDS)),
     )

@@ -10,16 +10,17 @@ import heapq
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, ReconError, require
 from recon.core.text import counted
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float64, UInt8
+from recon.io.images.image import decode_image, pixels_of_ros_image
 
 IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
@@ -36,55 +37,16 @@ _EXTRA: Final = "ros"
 _NS_PER_S: Final = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class BagTopic:
-    """One topic.
-
-    Attributes:
-        name: Name of the topic.
-        kind: Message type, such as `IMAGE`, `COMPRESSED`, `CAMERA_INFO` or one of `POSES`.
-        messages: Number of messages.
-    """
+class BagTopic(NamedTuple):
+    """A topic: its name, message type and number of messages."""
 
     name: str
     kind: str
     messages: int
 
 
-@dataclass(frozen=True, eq=False)
-class BagImage:
-    """An image as recorded; a compressed image has only ``encoding`` and ``data``.
-
-    Attributes:
-        encoding: ROS's encoding, such as ``mono8`` or ``bgr8``; ``format`` of a compressed image.
-        data: The bytes.
-        width_px: Width; 0 if compressed.
-        height_px: Height; 0 if compressed.
-        step: Bytes per row; 0 if compressed.
-        big_endian: Whether 16-bit pixels are big-endian.
-    """
-
-    encoding: str
-    data: NDArray[np.uint8]
-    width_px: int = 0
-    height_px: int = 0
-    step: int = 0
-    big_endian: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class BagCameraInfo:
-    """``sensor_msgs/CameraInfo``.
-
-    Attributes:
-        width_px: Width of the images.
-        height_px: Height of the images.
-        model: Name of the lens model.
-        D: float64 (N,), distortion.
-        K: float64 (3, 3), the raw camera.
-        R: float64 (3, 3), rotation of the rectification.
-        P: float64 (3, 4), the rectified camera.
-    """
+class BagCameraInfo(NamedTuple):
+    """``sensor_msgs/CameraInfo``: float64 D (N,), K (3, 3) raw, R (3, 3), P (3, 4) rectified."""
 
     width_px: int
     height_px: int
@@ -95,21 +57,12 @@ class BagCameraInfo:
     P: Float64
 
 
-@dataclass(frozen=True, eq=False)
-class BagPose:
-    """The pose of one frame in another, from any of the `POSES`.
-
-    Attributes:
-        recorded_ns: Time of recording.
-        stamp_ns: Header stamp; 0 = none.
-        parent: The frame the pose is given in.
-        child: The frame whose pose it is; empty if the message does not say.
-        xyz_m: float64 (3,), position.
-        xyzw: float64 (4,), quaternion.
-    """
+class BagPose(NamedTuple):
+    """The pose of frame ``child`` (empty = the message does not say) in frame ``parent``."""
 
     recorded_ns: int
     stamp_ns: int
+    """Header stamp; 0 = none."""
     parent: str
     child: str
     xyz_m: Float64
@@ -149,12 +102,7 @@ class Bag:
         )
 
     def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Read only the times of all messages of some topics.
-
-        Returns:
-            For each topic int64 (N, 2), nanoseconds: time of recording and header stamp, in the
-            order of recording.
-        """
+        """Return of each topic int64 (N, 2), ns: time of recording, in order, and header stamp."""
         times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
         for topic, recorded_ns, content in self._messages(topics):
             times[topic].append((recorded_ns, self._stamp_ns(content, topic)))
@@ -162,27 +110,25 @@ class Bag:
             topic: np.array(found, dtype=np.int64).reshape(-1, 2) for topic, found in times.items()
         }
 
-    def images(self, topic: str, start_ns: int | None = None) -> Iterator[BagImage]:
-        """Yield the images of a topic in the order of recording.
+    def images(
+        self, topic: str, wanted: Sequence[int], recorded_ns: NDArray[np.int64]
+    ) -> Iterator[UInt8]:
+        """Decode the messages of a topic with these increasing numbers.
 
-        Args:
-            topic: An image topic.
-            start_ns: Skip messages recorded before this time.
+        ``recorded_ns`` is when all of its messages were recorded: reading begins at the first one.
         """
-        compressed = self.topics[topic].kind == COMPRESSED
-        for _, _, content in self._messages([topic], start_ns):
-            message = self._parse(content, topic)
-            if compressed:
-                yield BagImage(message.format, message.data)
-            else:
-                yield BagImage(
-                    message.encoding,
-                    message.data,
-                    message.width,
-                    message.height,
-                    message.step,
-                    bool(message.is_bigendian),
+        start_ns = int(recorded_ns[wanted[0]])
+        position = int(np.searchsorted(recorded_ns, start_ns))
+        messages = self._messages([topic], start_ns)
+        for target in wanted:
+            found = next(islice(messages, target - position, None), None)
+            if found is None:
+                raise FormatError(
+                    "recording ends early", where=self.paths[0], got=f"{target} of {topic}"
                 )
+            position = target + 1
+            where = f"{self.paths[0]}: {topic}, message {target}"
+            yield _decode(self._parse(found[2], topic), where)
 
     def camera_info(self, topic: str) -> BagCameraInfo:
         """Read the first message of a ``CameraInfo`` topic."""
@@ -194,13 +140,13 @@ class Bag:
                 for name in "DKRP"
             }
             return BagCameraInfo(
-                width_px=int(message.width),
-                height_px=int(message.height),
-                model=str(message.distortion_model),
-                D=matrix["D"].astype(np.float64),
-                K=matrix["K"].reshape(3, 3),
-                R=matrix["R"].reshape(3, 3),
-                P=matrix["P"].reshape(3, 4),
+                int(message.width),
+                int(message.height),
+                str(message.distortion_model),
+                matrix["D"].astype(np.float64),
+                matrix["K"].reshape(3, 3),
+                matrix["R"].reshape(3, 3),
+                matrix["P"].reshape(3, 4),
             )
         raise FormatError("topic has no message", where=self.paths[0], got=topic)
 
@@ -283,6 +229,20 @@ class Bag:
                 hint="it may be truncated; copy it again, or repair it with rosbag reindex, "
                 "ros2 bag reindex or mcap recover",
             ) from error
+
+
+def _decode(message: Any, where: str) -> UInt8:
+    """Decode an image message, raw or compressed."""
+    if hasattr(message, "format"):
+        return decode_image(message.data.tobytes(), where)
+    return pixels_of_ros_image(
+        message.data,
+        message.encoding,
+        (message.height, message.width),
+        message.step,
+        big_endian=bool(message.is_bigendian),
+        where=where,
+    )
 
 
 def _pose_of(message: Any, recorded_ns: int) -> BagPose:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final
@@ -19,26 +18,27 @@ from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.files import read_table, read_text, reader
 from recon.io.trajectory import read_tum
-from recon.sources.frame_list import FrameList
+from recon.sources.frame_list import FrameList, check_most
+
+_STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+", re.ASCII)
+_SECONDS_DIGITS: Final = 10
+"""Digits of a time in seconds since 1970, from 2001 to 2286."""
+_LONGEST_STEP_S: Final = 60.0
+"""Longest usual time between two frames of a drive."""
+_CLOCK_STEPS: Final = 10
+"""Least step of padded numbers that are a clock: 10 ms, or less in finer units."""
 
 
 @reader
 def read_times(path: Path, frames: int) -> Float64:
-    """Read ``times.txt`` of the first frames, see `read_times_of_pairs`.
-
-    Returns:
-        float64 (frames,), increasing.
-    """
+    """Return float64 (frames,), the times of the first frames; see `read_times_of_pairs`."""
     return read_times_of_pairs(path, FrameList([""] * frames, range(frames)))
 
 
 def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
-    """Read ``times.txt`` for the frames that are pairs; see `FrameList.lines`.
+    """Return float64 (N,), the increasing times of pairs in a ``times.txt``; see `FrameList.lines`.
 
     A line per frame has its time in seconds, or, as for DSO, its number, time and exposure.
-
-    Returns:
-        float64, one time per pair, increasing.
     """
     if not path.exists():
         raise SourceError("file does not exist", where=path)
@@ -65,11 +65,8 @@ def read_dates(path: Path) -> Float64:
     Returns:
         float64 (N,), seconds since 1970, which a double resolves to 0.2 µs.
     """
-    stamps = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if line.strip():
-            stamps.append(_parse_date(line.strip(), f"{path}:{number}"))
-    return np.array(stamps)
+    lines = enumerate(read_text(path).splitlines(), start=1)
+    return np.array([_parse_date(s.strip(), f"{path}:{n}") for n, s in lines if s.strip()])
 
 
 def _parse_date(text: str, where: str) -> float:
@@ -87,14 +84,9 @@ def _parse_date(text: str, where: str) -> float:
 
 @reader
 def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, str]]:
-    """Read a list of images: timestamp and file name per line, separated by spaces or a comma.
+    """Read time in seconds and file name of each line of TUM's ``rgb.txt`` or EuRoC's ``data.csv``.
 
-    Args:
-        path: TUM's ``rgb.txt`` or EuRoC's ``data.csv``; ``#`` starts a comment.
-        unit_s: Unit of the timestamps: 1e-9 for EuRoC.
-
-    Returns:
-        (seconds, name) of each line.
+    Spaces or a comma separate the two; ``#`` starts a comment. EuRoC's ``unit_s`` is 1e-9.
     """
     entries = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -119,15 +111,10 @@ def _parse_entry(words: list[str], unit_s: float, where: str) -> tuple[float, st
 def truth_at(
     path: Trajectory, stamps_s: Float64, T_body_camera: Float64 | None = None
 ) -> tuple[SequenceTruth | None, str]:
-    """Return the true pose of the left camera in each frame; the first one is the identity.
+    """Return the true pose of the left camera at some times; the first one is the identity.
 
-    Args:
-        path: ``T_world_body`` at the times of the measuring instrument.
-        stamps_s: float64 (N,), times of the frames.
-        T_body_camera: float64 (4, 4), pose of the left camera in the body; None = identity.
-
-    Returns:
-        The ground truth and an empty note, or None and a note if it does not cover every frame.
+    The path is ``T_world_body``; no ``T_body_camera`` = the identity. If it does not cover all
+    times, there is no truth, and a note that says so.
     """
     covered = (stamps_s >= path.timestamps_s[0]) & (stamps_s <= path.timestamps_s[-1])
     if not covered.all():
@@ -147,37 +134,8 @@ def read_tum_truth(folder: Path, stamps_s: Float64) -> tuple[SequenceTruth | Non
     return truth_at(read_tum(path), np.asarray(stamps_s))
 
 
-_STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+", re.ASCII)
-
-_SECONDS_DIGITS: Final = 10
-"""Digits of a time in seconds since 1970, from 2001 to 2286."""
-_LONGEST_STEP_S: Final = 60.0
-"""Longest usual time between two frames of a drive."""
-_CLOCK_STEPS: Final = 10
-"""Least step of padded numbers that are a clock: 10 ms, or less in finer units."""
-
-
-@dataclass(frozen=True, eq=False)
-class StampPairs:
-    """Pairs of entries of two series of timestamps.
-
-    Attributes:
-        left: Indices into the left series, increasing.
-        right: Indices of their partners in the right series, increasing.
-        alone: Numbers of entries (left, right) without a partner.
-    """
-
-    left: Sequence[int]
-    right: Sequence[int]
-    alone: tuple[int, int]
-
-
 def stamp_of_name(stem: str) -> float | None:
-    """Return timestamp in a file name: seconds, or an integer number of ms, µs or ns since 1970.
-
-    Returns:
-        Seconds, or None if the name is not a timestamp.
-    """
+    """Return seconds in a file name, if any: as such, or an integer of ms, µs or ns since 1970."""
     if _STAMP.fullmatch(stem) is None:
         return None
     if "." in stem or len(stem) == _SECONDS_DIGITS:
@@ -186,11 +144,9 @@ def stamp_of_name(stem: str) -> float | None:
 
 
 def stamps_of_names(stems: Sequence[str]) -> Float64 | None:
-    """Return timestamps in the file names of one camera.
+    """Return float64 (N,), the seconds in all file names of a camera; None = a name has none.
 
-    Returns:
-        float64 (N,), seconds; None unless all names are timestamps, or if they are counters, such
-        as KITTI's ``0000000123``.
+    Counters, such as KITTI's ``0000000123``, are no times.
     """
     stamps = [stamp_of_name(stem) for stem in stems]
     if any(stamp is None for stamp in stamps) or _are_counters(stems):
@@ -211,13 +167,7 @@ def _are_counters(stems: Sequence[str]) -> bool:
 
 
 def check_increasing(stamps_s: Float64, where: str, lines: Sequence[int] | None = None) -> None:
-    """Check that timestamps are strictly increasing.
-
-    Args:
-        stamps_s: float64 (N,), in the order of the frames.
-        where: Their file or folder.
-        lines: The line of each in the file; None = they are numbered.
-    """
+    """Refuse times that do not increase; ``lines`` are those of the file that they are in."""
     backwards = np.flatnonzero(np.diff(stamps_s) <= 0)
     if backwards.size:
         at = int(backwards[0]) + 1
@@ -231,12 +181,7 @@ def check_increasing(stamps_s: Float64, where: str, lines: Sequence[int] | None 
 
 
 def check_seconds(stamps_s: Float64, where: str | Path) -> None:
-    """Check that timestamps can be seconds of a drive, not milliseconds or all the same.
-
-    Args:
-        stamps_s: float64 (N,), in the order of the frames.
-        where: Their file.
-    """
+    """Refuse times that cannot be seconds of a drive: milliseconds, or all the same."""
     step_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 1.0
     if not 0.0 < step_s <= _LONGEST_STEP_S:
         raise SourceError(
@@ -248,20 +193,19 @@ def check_seconds(stamps_s: Float64, where: str | Path) -> None:
         )
 
 
-def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: str) -> StampPairs:
-    """Pair two series of timestamps that are mutual nearest neighbours.
+def pair_stamps(
+    left_s: Float64, right_s: Float64, tolerance_s: float, where: Path
+) -> list[tuple[int | None, int | None]]:
+    """Return frames in order of time: the indices of left and right image, None = missing.
 
-    Args:
-        left_s: float64 (N,), seconds, increasing.
-        right_s: float64 (M,), seconds, increasing.
-        tolerance_s: Largest difference within a pair.
-        where: The source, for the error message.
+    Images of two increasing series are a pair if each is the nearest of the other, within the
+    tolerance. A recording of which most has no partner is refused.
     """
     to_right, to_left = nearest_sorted(left_s, right_s), nearest_sorted(right_s, left_s)
     mutual = to_left[to_right] == np.arange(len(left_s))
     apart_s = np.abs(right_s[to_right] - left_s)
-    chosen = np.flatnonzero(mutual & (apart_s <= tolerance_s))
-    if not chosen.size:
+    paired = mutual & (apart_s <= tolerance_s)
+    if not paired.any():
         raise SourceError(
             "no left and right images were taken at the same time",
             where=where,
@@ -269,25 +213,14 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
             expected=f"at most {tolerance_s:g} s",
             hint="raise --set source.tolerance_s= if that is the true skew of the cameras",
         )
-    alone = (len(left_s) - len(chosen), len(right_s) - len(chosen))
-    return StampPairs(chosen.tolist(), to_right[chosen].tolist(), alone)
-
-
-def pairs_in_time(
-    stamps_s: Sequence[Float64], pairs: StampPairs
-) -> list[tuple[int | None, int | None]]:
-    """Return all frames in order of time: indices of their left and right image, None = missing.
-
-    Args:
-        stamps_s: float64 (N,) and (M,), the two series.
-        pairs: Which of their entries are pairs.
-    """
-    partner = dict(zip(pairs.left, pairs.right, strict=True))
-    taken = set(pairs.right)
-    frames: list[tuple[float, int | None, int | None]] = [
-        (stamp_s, k, partner.get(k)) for k, stamp_s in enumerate(stamps_s[0].tolist())
+    # Of two cameras with different rates, the slower one decides what is missing.
+    check_most(int(paired.sum()), min(len(left_s), len(right_s)), where)
+    rights = [
+        right if pair else None for right, pair in zip(to_right.tolist(), paired, strict=True)
     ]
-    frames += [
-        (stamp_s, None, k) for k, stamp_s in enumerate(stamps_s[1].tolist()) if k not in taken
+    alone = set(range(len(right_s))).difference(to_right[paired].tolist())
+    frames: list[tuple[float, int | None, int | None]] = [
+        *zip(left_s.tolist(), range(len(left_s)), rights, strict=True),
+        *((float(right_s[k]), None, k) for k in sorted(alone)),
     ]
     return [frame[1:] for frame in sorted(frames, key=lambda frame: frame[0])]

@@ -29,13 +29,7 @@ _LONGER: Final = 0.05
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class VideoSource(Recording):
-    """A drive in one or two video files.
-
-    Attributes:
-        videos: One file with both views, or left and right.
-        settings: Arrangement of the views, and the frame rate if that of the file is overridden.
-        numbers: Frame of the left and of the right view of each pair.
-    """
+    """A drive in one video with both views, or in two; ``numbers`` are the frames of each pair."""
 
     videos: tuple[VideoFile, ...]
     settings: SourceSettings
@@ -95,7 +89,7 @@ class VideoSource(Recording):
 
 
 def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
-    """Open a file with both views, a left file (``settings.right`` is the other), or a folder."""
+    """Open one video, a left one (``settings.right`` is the other), or those of a folder."""
     videos = open_videos(_find_videos(path, settings))
     frames = zip_longest(range(videos[0].frames), range(videos[-1].frames))
     numbers, listing = pair_frames(list(frames), settings, path)
@@ -122,11 +116,6 @@ def open_videos(files: Sequence[Path]) -> tuple[VideoFile, ...]:
     if len(videos) == 2:
         _check_alike(*videos)
     return videos
-
-
-def frames_of(videos: Sequence[VideoFile]) -> int:
-    """Return the number of frames that all the videos have."""
-    return min(video.frames for video in videos)
 
 
 def list_videos(folder: Path) -> list[str]:

@@ -142,7 +142,7 @@ def test_what_is_no_source_is_one_clear_line(tmp_path: Path, make: type, message
 
 
 def test_an_unknown_kind_gets_the_choices(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"got rosbag, expected kitti, kitti-raw, euroc, "):
+    with pytest.raises(SourceError, match=r"got rosbag, expected bag, euroc, kitti-raw, "):
         open_source(tmp_path, "rosbag")
 
 

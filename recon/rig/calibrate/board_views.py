@@ -27,7 +27,7 @@ from recon.rig.calibrate.detect import (
 )
 from recon.sources.image_names import ImagePairs
 from recon.sources.settings import SourceSettings
-from recon.sources.video import frames_of, open_videos, split_views, view_size
+from recon.sources.video import open_videos, split_views, view_size
 from recon.stereo.rectify.rectifier import to_grey
 
 # Looks at a video per second: a hand holds a board still for longer than that.
@@ -153,7 +153,7 @@ def pick_views(
     if len(videos) == 1:
         view_size(videos[0], settings)  # checks that the frames can be halved
     every = max(1, round(videos[0].rate_hz / _LOOKS_HZ))
-    looks = range(0, frames_of(videos), every)
+    looks = range(0, min(video.frames for video in videos), every)
     small = np.stack([_shrunk(both) for both in _frames(videos, looks, settings)])
     chosen = [looks[number] for number in _choose(small)]
     if not chosen:
