@@ -13,101 +13,47 @@ from recon.io.images.image import MAX_MEGAPIXELS
 class SourceSettings(Settings):
     """How cameras, pairs and times are found in a source, where its layout leaves that open."""
 
-    left: str | None = Field(
-        default=None,
-        description="Left camera: a folder in the source, or a topic. none = found by name.",
-    )
-    right: str | None = Field(
-        default=None,
-        description="Right camera: a folder or topic, or the path of the right folder or video if "
-        "the source is the left one. none = found by name.",
-    )
-    calibration: str | None = Field(
-        default=None,
-        description="Calibration file to use instead of that of the source. none = its own.",
-    )
-    focal_px: float | None = Field(
-        default=None,
-        ge=1.0,
-        le=1e6,
-        description="Focal length of images that are rectified already, with `source.baseline_m` "
-        "in place of a calibration file. none = that of the calibration.",
-    )
-    baseline_m: float | None = Field(
-        default=None,
-        ge=1e-6,
-        le=1e6,
-        description="Distance between their cameras. none = see there.",
-    )
-    cx_px: float | None = Field(
-        default=None,
-        ge=-1e6,
-        le=1e6,
-        description="Column of their principal points. none = the middle.",
-    )
-    cy_px: float | None = Field(
-        default=None, ge=-1e6, le=1e6, description="Row of it. none = the middle."
-    )
-    max_megapixels: float = Field(
-        default=MAX_MEGAPIXELS,
-        ge=1e-4,
-        le=10_000.0,
-        description="Largest image that is read, in 10⁶ pixels; larger ones are refused before "
-        "they are decoded.",
-    )
-    metres_per_unit: float = Field(
-        default=1.0,
-        ge=1e-6,
-        le=1e6,
-        description="Unit of the translation in an OpenCV calibration file: 0.001 for mm.",
-    )
-    pair_by: Literal["auto", "stamp", "name", "index"] = Field(
-        default="auto",
-        description="How images of plain folders are paired. auto = by timestamps if the names "
-        "have them, else by names if most have a partner, else by order.",
-    )
-    tolerance_s: float = Field(
-        default=0.01,
-        ge=1e-9,
-        le=1e6,
-        description="Largest difference between the timestamps of a pair.",
-    )
-    rate_hz: float | None = Field(
-        default=None,
-        ge=1e-3,
-        le=1e6,
-        description="Frame rate of a KITTI drive, plain folders or videos, in place of their "
-        "times. none = their times, or 10 Hz for plain folders without times.",
-    )
-    start: int = Field(
-        default=0,
-        ge=0,
-        le=1_000_000_000,
-        description="First frame used; earlier ones are not read.",
-    )
-    end: int | None = Field(
-        default=None,
-        ge=1,
-        le=1_000_000_000,
-        description="Frame at which to stop, itself not used. none = the last.",
-    )
-    stride: int = Field(
-        default=1,
-        ge=1,
-        le=1_000_000_000,
-        description="Use every so many frames; the others are not read.",
-    )
-    shift_frames: int = Field(
-        default=0,
-        ge=-1_000_000_000,
-        le=1_000_000_000,
-        description="By how many frames the right camera is late: the left image of a frame is "
-        "paired with the right one of so many frames later. Times, ground truth and known poses "
-        "stay those of the left images. Negative = the left camera is late.",
-    )
-    side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
-        default="left-right", description="Arrangement of the two views in the frames of one video."
-    )
+    left: str | None = None
+    """Left camera: a folder in the source, or a topic. none = found by name."""
+    right: str | None = None
+    """Right camera: a folder or topic, or the path of the right folder or video if the source is
+    the left one. none = found by name."""
+    calibration: str | None = None
+    """Calibration file to use instead of that of the source. none = its own."""
+    focal_px: float | None = Field(None, ge=1.0, le=1e6)
+    """Focal length of images that are rectified already, with `source.baseline_m` in place of a
+    calibration file. none = that of the calibration."""
+    baseline_m: float | None = Field(None, ge=1e-6, le=1e6)
+    """Distance between their cameras. none = see there."""
+    cx_px: float | None = Field(None, ge=-1e6, le=1e6)
+    """Column of their principal points. none = the middle."""
+    cy_px: float | None = Field(None, ge=-1e6, le=1e6)
+    """Row of it. none = the middle."""
+    max_megapixels: float = Field(MAX_MEGAPIXELS, ge=1e-4, le=10_000.0)
+    """Largest image that is read, in 10⁶ pixels; larger ones are refused before they are
+    decoded."""
+    metres_per_unit: float = Field(1.0, ge=1e-6, le=1e6)
+    """Unit of the translation in an OpenCV calibration file: 0.001 for mm."""
+    pair_by: Literal["auto", "stamp", "name", "index"] = "auto"
+    """How images of plain folders are paired. auto = by timestamps if the names have them, else by
+    names if most have a partner, else by order."""
+    tolerance_s: float = Field(0.01, ge=1e-9, le=1e6)
+    """Largest difference between the timestamps of a pair."""
+    rate_hz: float | None = Field(None, ge=1e-3, le=1e6)
+    """Frame rate of a KITTI drive, plain folders or videos, in place of their times. none = their
+    times, or 10 Hz for plain folders without times."""
+    start: int = Field(0, ge=0, le=1_000_000_000)
+    """First frame used; earlier ones are not read."""
+    end: int | None = Field(None, ge=1, le=1_000_000_000)
+    """Frame at which to stop, itself not used. none = the last."""
+    stride: int = Field(1, ge=1, le=1_000_000_000)
+    """Use every so many frames; the others are not read."""
+    shift_frames: int = Field(0, ge=-1_000_000_000, le=1_000_000_000)
+    """By how many frames the right camera is late: the left image of a frame is paired with the
+    right one of so many frames later. Times, ground truth and known poses stay those of the left
+    images. Negative = the left camera is late."""
+    side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = "left-right"
+    """Arrangement of the two views in the frames of one video."""
 
     @property
     def numbers(self) -> dict[str, float]:
