@@ -21,14 +21,7 @@ from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.frame_list import pair_frames
 from recon.sources.image_names import find_partners, partner_names
 from recon.sources.one_pair import join_pair
-from recon.sources.rosbags import (
-    CAMERA_INFO,
-    COMPRESSED,
-    IMAGE,
-    POSES,
-    Bag,
-    BagCameraInfo,
-)
+from recon.sources.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag, BagCameraInfo
 from recon.sources.settings import SourceSettings
 from recon.sources.source import ReadPrior, Recording
 from recon.sources.times import check_increasing, pair_stamps

@@ -11,11 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.core.errors import SourceError
-from recon.core.values import (
-    RectifiedCamera,
-    StereoPair,
-    check_size,
-)
+from recon.core.values import RectifiedCamera, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
 from recon.sources.frame_list import FrameList, check_most, pair_frames

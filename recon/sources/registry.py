@@ -36,12 +36,7 @@ _KITTI, _PLAIN = "a KITTI drive (odometry or raw)", "left and right folders"
 KINDS: Final = (
     Kind("bag", "a ROS bag or MCAP file", open_bag, lambda at, _: find_bags(at), BAGS),
     Kind("euroc", "an EuRoC folder", open_euroc, lambda at, _: is_euroc(at)),
-    Kind(
-        "kitti-raw",
-        _KITTI,
-        open_kitti_raw,
-        lambda at, _: any(at.glob("image_0[0-3]/data")),
-    ),
+    Kind("kitti-raw", _KITTI, open_kitti_raw, lambda at, _: any(at.glob("image_0[0-3]/data"))),
     Kind("folders", _PLAIN, open_folders, lambda at, _: (at / FRAMES).is_file()),
     Kind("middlebury", "a Middlebury scene", open_middlebury, lambda at, _: find_layout(at)),
     Kind("kitti", _KITTI, open_kitti, lambda at, _: any(at.glob("image_[0-3]"))),

@@ -98,11 +98,7 @@ class LoopWatch:
     """
 
     def __init__(
-        self,
-        keyframes: Keyframes,
-        stopwatch: Stopwatch | None = None,
-        *,
-        search: bool = True,
+        self, keyframes: Keyframes, stopwatch: Stopwatch | None = None, *, search: bool = True
     ) -> None:
         self.searching = search
         self._stage = (stopwatch or Stopwatch()).stage

@@ -15,13 +15,7 @@ import pytest
 
 from recon.core.errors import FormatError, OutputError
 from recon.core.geometry import se3
-from recon.core.values import (
-    Disparity,
-    PointCloud,
-    RectifiedCamera,
-    RectifiedPair,
-    Trajectory,
-)
+from recon.core.values import Disparity, PointCloud, RectifiedCamera, RectifiedPair, Trajectory
 from recon.map.drive import drive_loops
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.store.records import Store
