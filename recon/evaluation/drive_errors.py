@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from recon.core.errors import EvaluationError
 from recon.core.values import (
@@ -25,6 +26,7 @@ from recon.sources.source import StereoSource
 
 # Distance to the true surface below which a map point counts as correct.
 SURFACE_THRESHOLD_M: Final = 0.2
+_Errors = TypeVar("_Errors", TrajectoryMetrics, MapMetrics, OccupancyMetrics)
 LEAST_FRAMES: Final = 3  # number of frames that must have seen a cell for it to be compared
 
 
@@ -42,60 +44,34 @@ class DriveErrors:
 def compare_with_truth(
     source: StereoSource, mapped: MappedSequence, grid: OccupancyGrid, *, poses_given: bool
 ) -> DriveErrors:
-    """Compare a drive with the truth that its source knows.
+    """Compare a mapped drive and its grid with the truth that its source knows.
 
-    Args:
-        source: The source.
-        mapped: The mapped drive.
-        grid: Its grid.
-        poses_given: Whether its poses were given: they are no estimate, and 0 % drift would
-            mislead.
+    Poses that were given are no estimate, and 0 % drift would mislead: the paths are not compared.
     """
     warnings: list[str] = []
-    truth = source.truth
-    path = None if poses_given else _compare_paths(mapped.trajectory, truth, warnings)
-    surface = _compare_surfaces(mapped, truth, warnings)
-    occupancy = _compare_occupancy(source, mapped, grid, warnings)
-    true_path = None if truth is None else truth.trajectory
-    return DriveErrors(path, surface, occupancy, tuple(warnings), true_path)
 
+    def attempt(what: str, compare: Callable[[], _Errors]) -> _Errors | None:
+        try:
+            return compare()
+        except EvaluationError as error:
+            warnings.append(f"not compared with the true {what}: {error}")
+            return None
 
-def _compare_paths(
-    trajectory: Trajectory, truth: SequenceTruth | None, warnings: list[str]
-) -> TrajectoryMetrics | None:
-    if truth is None or truth.trajectory is None:
-        return None
-    try:
-        return evaluate_trajectory(trajectory, truth.trajectory)
-    except EvaluationError as error:
-        warnings.append(f"not compared with the true path: {error}")
-        return None
-
-
-def _compare_surfaces(
-    mapped: MappedSequence, truth: SequenceTruth | None, warnings: list[str]
-) -> MapMetrics | None:
-    if truth is None or truth.surface is None:
-        return None
-    try:
+    truth = source.truth or SequenceTruth()
+    true_path, true_surface = truth.trajectory, truth.surface
+    path = surface = occupancy = None
+    if true_path is not None and not poses_given:
+        path = attempt("path", lambda: evaluate_trajectory(mapped.trajectory, true_path))
+    if true_surface is not None:
         # Loads the whole cloud, but only where the whole true surface is in memory as well.
-        return evaluate_map(mapped.cloud, truth.surface, SURFACE_THRESHOLD_M)
-    except EvaluationError as error:
-        warnings.append(f"not compared with the true surface: {error}")
-        return None
-
-
-def _compare_occupancy(
-    source: StereoSource, mapped: MappedSequence, grid: OccupancyGrid, warnings: list[str]
-) -> OccupancyMetrics | None:
-    truth = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
-    if truth is None:
-        return None
-    try:
-        return evaluate_occupancy(drop_undecided(mapped.voxels, mapped.config.grid), grid, truth)
-    except EvaluationError as error:
-        warnings.append(f"not compared with the true occupancy: {error}")
-        return None
+        surface = attempt(
+            "surface", lambda: evaluate_map(mapped.cloud, true_surface, SURFACE_THRESHOLD_M)
+        )
+    known = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
+    if known is not None:
+        voxels = drop_undecided(mapped.voxels, mapped.config.grid)
+        occupancy = attempt("occupancy", lambda: evaluate_occupancy(voxels, grid, known))
+    return DriveErrors(path, surface, occupancy, tuple(warnings), true_path)
 
 
 def occupancy_view(

@@ -122,6 +122,10 @@ class PrintedMatcher:
 
     A pixel has no value only where no patch lies within both images. Every other pixel keeps
     its minimum, however doubtful: confidence 1 says that nothing was asked, not that it is right.
+    ``signed`` sums the differences with their signs, as Eq. 9-10 are printed; else their absolute
+    values, which is what SAD means.
+
+    Ref: Eq. 9-10 of the seed paper, see docs/paper.md.
     """
 
     patch_px: int  # edge of the patch; odd
@@ -221,13 +225,9 @@ def apply_method(
 ) -> MethodResult:
     """Reconstruct one experiment by one method.
 
-    Args:
-        method: ``corrected`` is our matcher with the scene's calibration. ``absolute`` and
-            ``as_printed`` find integer disparities in Eq. 6 grey images, without and with the
-            misprint of Eq. 9-10, and both use Table 1's focal length as printed.
-        experiment: The scene.
-        config: Settings of the stages, and of the experiments.
-        threads: Threads for our matcher; None = all cores.
+    ``corrected`` is our matcher with the scene's calibration. ``absolute`` and ``as_printed`` find
+    integer disparities in Eq. 6 grey images, without and with the misprint of Eq. 9-10, and both
+    use Table 1's focal length as printed.
     """
     if method == CORRECTED:
         rebuilt = FrameReconstructor(experiment.camera, config, threads=threads)
@@ -272,16 +272,10 @@ def try_patches(
 def compare_depth(
     depth_m: Float32, truth: DisparityTruth, camera: RectifiedCamera
 ) -> dict[str, float] | None:
-    """Compare depths with the truth at pixels seen by both cameras; None = no pixel has both.
+    """Compare depths (H, W) with the truth at pixels seen by both cameras; None = none has both.
 
-    Args:
-        depth_m: float32 (H, W), metres; NaN = unknown.
-        truth: True disparity.
-        camera: The true geometry.
-
-    Returns:
-        Medians: of the depth, of the true depth of these pixels, of the absolute error in per cent
-        of it, and of estimated ÷ true depth; the number of pixels.
+    Returns medians of the depth, of the true depth of these pixels, of the absolute error in per
+    cent of it, and of estimated ÷ true depth; and the number of pixels.
     """
     true_m = depth_from_disparity(truth.values, camera)
     both = np.isfinite(depth_m) & np.isfinite(true_m) & truth.nonocc

@@ -206,19 +206,15 @@ def motion_errors(
 def _by_length(
     segments: Segments, percent: Float64, deg_per_100m: Float64
 ) -> tuple[LengthErrors, ...]:
-    """Return the mean errors of the segments of each length."""
-    found = []
-    for length_m in np.unique(segments.length_m):
-        of_length = segments.length_m == length_m
-        found.append(
-            LengthErrors(
-                length_m=float(length_m),
-                t_rel_percent=float(np.mean(percent[of_length])),
-                r_rel_deg_per_100m=float(np.mean(deg_per_100m[of_length])),
-                segments=int(of_length.sum()),
-            )
+    return tuple(
+        LengthErrors(
+            length_m=float(length_m),
+            t_rel_percent=float(np.mean(percent[segments.length_m == length_m])),
+            r_rel_deg_per_100m=float(np.mean(deg_per_100m[segments.length_m == length_m])),
+            segments=int((segments.length_m == length_m).sum()),
         )
-    return tuple(found)
+        for length_m in np.unique(segments.length_m)
+    )
 
 
 def _rms(values: Float64) -> float:

@@ -12,7 +12,7 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import fit_points, fit_upright
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import SequenceTruth, Trajectory
-from recon.evaluation.segments import KITTI_LENGTHS_M, choose_segments, segments_of
+from recon.evaluation.segments import KITTI_LENGTHS_M, segments_of
 from recon.evaluation.trajectory import TrajectoryRules, compare_paths, evaluate_trajectory
 from recon.io.trajectory import write_tum
 
@@ -50,15 +50,11 @@ def test_upright_keeps_a_map_upright_where_gnss_leaves_its_roll_open() -> None:
     # The pitch by 0.3 m of noise in 60 points over 60 m: 0.3 / 17 / sqrt(60), 0.13 degrees.
     assert np.degrees(np.arccos(found[2, 2])) < 0.5
     assert np.degrees(np.arccos(loose[2, 2])) > 20
-
-
-def test_upright_finds_the_tilt_of_a_path_with_turns() -> None:
     path = trajectory(bend(200, 0.03)).positions_m[:, [2, 0, 1]]  # a circle in the plane z = 0
     T_survey_map = make_transform(exp_so3(np.array([0.02, -0.03, 1.2])), np.array([4e5, 5e6, 90.0]))
-    found = fit_upright(path, apply(T_survey_map, path)).T_to_from
-    off_rad = angle_rad(found @ invert(T_survey_map))
+    tilted = fit_upright(path, apply(T_survey_map, path)).T_to_from
     # Three metres upwards count 9 m² beside half of the squared radius of 33 m: of 0.036 rad.
-    assert off_rad < 0.036 * 9 / (33**2 / 2)
+    assert angle_rad(tilted @ invert(T_survey_map)) < 0.036 * 9 / (33**2 / 2)
 
 
 @given(scale=st.floats(0.5, 1.5))
@@ -84,44 +80,61 @@ def test_a_yaw_drift_is_the_relative_rotation_error() -> None:
     assert metrics.rpe_deg == pytest.approx(0.01, rel=1e-6)
 
 
-def test_the_absolute_error_does_not_see_where_the_world_begins() -> None:
-    poses = bend(120, 0.01)
+@pytest.mark.parametrize(
+    ("alignment", "ate_m", "scale"),
+    [("none", 3.0, 1.0), ("origin", 1.0, 1.0), ("se3", 1.0, 1.0), ("sim3", 0.0, 1 / 1.1)],
+)
+def test_an_alignment_takes_away_what_it_may(alignment: str, ate_m: float, scale: float) -> None:
+    """An estimate of another scale that begins elsewhere; what remains is at least ``ate_m``."""
+    poses = bend(201, 0.01)
     moved = make_transform(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([5.0, -3.0, 2.0])) @ poses
-    metrics = evaluate_trajectory(trajectory(moved), trajectory(poses))
-    assert metrics.ate_m < 1e-9
-    assert metrics.t_rel_percent < 1e-9
-
-
-def test_the_absolute_error_does_see_the_scale() -> None:
-    poses = straight(101)
-    estimate = poses.copy()
-    estimate[:, :3, 3] *= 1.1
-    metrics = evaluate_trajectory(trajectory(estimate), trajectory(poses))
-    # Centred, position s is off by 0.1·s, s evenly in ±50 m: rms = 0.1·sqrt(50·51/3).
-    assert metrics.ate_m == pytest.approx(0.1 * math.sqrt(50 * 51 / 3), rel=1e-9)
-
-
-def test_a_mirrored_path_is_not_aligned_by_a_reflection() -> None:
-    rng = np.random.default_rng(1)
-    poses = np.tile(np.eye(4), (60, 1, 1))
-    poses[:, :3, 3] = np.cumsum(rng.normal(size=(60, 3)), axis=0)
+    rules = TrajectoryRules(alignment=alignment)
+    same = evaluate_trajectory(trajectory(moved), trajectory(poses), rules)
+    assert (same.ate_m < 1e-9) == (alignment != "none")
+    assert same.t_rel_percent < 1e-9
+    moved[:, :3, 3] *= 1.1
+    found = evaluate_trajectory(trajectory(moved), trajectory(poses), rules)
+    assert found.scale == pytest.approx(scale)
+    assert found.ate_m > ate_m if ate_m else found.ate_m < 1e-9
+    poses[:, 1, 3] += 9 * np.sin(np.arange(201))  # no plane, in which a mirror is a rotation
     mirrored = poses.copy()
     mirrored[:, 0, 3] *= -1
-    assert evaluate_trajectory(trajectory(mirrored), trajectory(poses)).ate_m > 0.5
+    assert evaluate_trajectory(trajectory(mirrored), trajectory(poses), rules).ate_m > 0.5
 
 
-def test_a_long_drive_has_the_benchmarks_segments_at_every_tenth_frame() -> None:
-    segments = choose_segments(np.arange(1000, dtype=np.float64))
-    assert set(segments.length_m) == set(KITTI_LENGTHS_M)
-    assert set(np.unique(segments.first) % 10) == {0}
+def test_the_absolute_error_of_a_scale_is_that_of_centred_positions() -> None:
+    estimate = straight(101)
+    estimate[:, :3, 3] *= 1.1
+    metrics = evaluate_trajectory(trajectory(estimate), trajectory(straight(101)))
+    # Centred, position s is off by 0.1·s, s evenly in ±50 m: rms = 0.1·sqrt(50·51/3).
+    assert metrics.ate_m == pytest.approx(0.1 * math.sqrt(50 * 51 / 3), rel=1e-9)
+    assert metrics.ate_max_m == pytest.approx(5.0)
+    assert metrics.ate_median_m == pytest.approx(2.5)
 
 
-def test_a_drive_of_a_few_hundred_metres_has_those_of_the_benchmark_that_fit() -> None:
-    metrics = evaluate_trajectory(trajectory(straight(331)), trajectory(straight(331)))
-    assert metrics.segment_lengths_m == (100.0, 200.0, 300.0)
-    # From frame 0, 10, …; a segment ends one frame beyond its length, at frame 330 at the latest.
-    assert [one.segments for one in metrics.by_length] == [23, 13, 3]
-    assert metrics.segments == 39
+@pytest.mark.parametrize(
+    ("frames", "by_length"),
+    [
+        # From every tenth frame; a segment ends one frame beyond its length.
+        (331, {100.0: 23, 200.0: 13, 300.0: 3}),
+        (1000, {n: 99 - int(n) // 10 + (1 if n < 900 else 0) for n in KITTI_LENGTHS_M}),
+        (171, {50.0: 120, 100.0: 70}),
+        (31, {15.0: 15}),
+    ],
+)
+def test_segments_are_those_for_which_a_drive_has_room(
+    frames: int, by_length: dict[float, int]
+) -> None:
+    truth = trajectory(bend(frames, 0.01))
+    metrics = evaluate_trajectory(trajectory(bend(frames, 0.0101)), trajectory(straight(frames)))
+    assert {one.length_m: one.segments for one in metrics.by_length} == by_length
+    assert metrics.segment_lengths_m == tuple(by_length)
+    assert metrics.segments == sum(by_length.values())
+    metrics = evaluate_trajectory(trajectory(bend(frames, 0.0101)), truth)
+    weights = [one.segments for one in metrics.by_length]
+    for name in ("t_rel_percent", "r_rel_deg_per_100m"):
+        mean = np.average([getattr(one, name) for one in metrics.by_length], weights=weights)
+        assert getattr(metrics, name) == pytest.approx(mean, rel=1e-12)
 
 
 def test_lengths_and_steps_can_be_asked_for() -> None:
@@ -132,32 +145,6 @@ def test_lengths_and_steps_can_be_asked_for() -> None:
         evaluate_trajectory(
             trajectory(straight(50)), trajectory(straight(50)), TrajectoryRules(lengths_m=(60.0,))
         )
-
-
-def test_the_mean_over_lengths_is_weighted_by_their_segments() -> None:
-    truth = trajectory(bend(400, 0.01))
-    metrics = evaluate_trajectory(trajectory(bend(400, 0.0101)), truth)
-    weights = [one.segments for one in metrics.by_length]
-    for name in ("t_rel_percent", "r_rel_deg_per_100m"):
-        mean = np.average([getattr(one, name) for one in metrics.by_length], weights=weights)
-        assert getattr(metrics, name) == pytest.approx(mean, rel=1e-12)
-
-
-def test_a_wrong_scale_vanishes_with_sim3_alone() -> None:
-    poses = bend(201, 0.01)
-    estimate = poses.copy()
-    estimate[:, :3, 3] *= 1.1
-    found = {
-        name: evaluate_trajectory(
-            trajectory(estimate), trajectory(poses), TrajectoryRules(alignment=name)
-        )
-        for name in ("none", "se3", "sim3")
-    }
-    assert found["sim3"].scale == pytest.approx(1 / 1.1)
-    assert found["sim3"].ate_m < 1e-9
-    assert found["sim3"].t_rel_percent < 1e-9
-    assert found["none"].ate_m > found["se3"].ate_m > 1
-    assert found["none"].t_rel_percent == pytest.approx(found["se3"].t_rel_percent)
 
 
 def test_a_path_is_taken_from_a_file_and_from_the_truth_of_a_source(tmp_path: Path) -> None:
@@ -185,26 +172,6 @@ def test_a_truth_in_another_unit_is_refused_unless_scales_are_aligned(unit: floa
         evaluate_trajectory(*pair)
     scaled = evaluate_trajectory(*pair, TrajectoryRules(alignment="sim3"))
     assert scaled.scale == pytest.approx(unit)
-
-
-def test_an_estimate_that_starts_elsewhere_is_right_from_its_origin() -> None:
-    poses = bend(120, 0.01)
-    moved = make_transform(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([5.0, -3.0, 2.0])) @ poses
-    pair = (trajectory(moved), trajectory(poses))
-    assert evaluate_trajectory(*pair, TrajectoryRules(alignment="origin")).ate_m < 1e-9
-    assert evaluate_trajectory(*pair, TrajectoryRules(alignment="none")).ate_m > 3
-
-
-def test_a_short_drive_has_segments_of_50_and_100_m_at_every_frame() -> None:
-    metrics = evaluate_trajectory(trajectory(straight(171)), trajectory(straight(171)))
-    assert metrics.segment_lengths_m == (50.0, 100.0)
-    assert metrics.segments == 120 + 70
-
-
-def test_a_drive_under_50_m_has_segments_of_half_its_path() -> None:
-    metrics = evaluate_trajectory(trajectory(straight(31)), trajectory(straight(31)))
-    assert metrics.segment_lengths_m == (15.0,)
-    assert metrics.segments == 15
 
 
 @given(steps=st.lists(st.floats(0.0, 3.0), min_size=2, max_size=60).filter(lambda s: sum(s) >= 1.0))

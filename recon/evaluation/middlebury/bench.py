@@ -195,29 +195,22 @@ def summarise_scenes(
         raise SourceError(
             "there is no scene that all have a result for", where=folder, got=", ".join(names)
         )
-    without = [f"{name}: no truth, skipped" for name in skipped]
+    warnings = [f"{name}: no truth, skipped" for name in skipped]
+    for result in results:
+        lacking = [name for name in scenes if name not in result.files]
+        if lacking:
+            over = f"{len(common)} of {counted(len(scenes), 'scene')}"
+            missing = f"no result for {', '.join(lacking)}"
+            warnings.append(f"{result.name}: {missing}; means are over {over}, which all have")
     summary = {
         "matchers": {name: _of_matcher(scenes, name, common) for name in names},
         "folder": str(folder),
         "results": {result.name: str(result.folder) for result in results},
         "mean_over": common,
         "skipped": skipped,
-        "warnings": [*without, *_missing(scenes, results, common)],
+        "warnings": warnings,
     }
     return dict(plain(summary))
-
-
-def _missing(
-    scenes: Mapping[str, SceneFigures], results: Sequence[ResultFolder], common: Sequence[str]
-) -> Iterator[str]:
-    """Return a line for each folder of results that lacks scenes."""
-    for result in results:
-        lacking = [name for name in scenes if name not in result.files]
-        if lacking:
-            yield (
-                f"{result.name}: no result for {', '.join(lacking)}; means are over "
-                f"{len(common)} of {counted(len(scenes), 'scene')}, which all have"
-            )
 
 
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:

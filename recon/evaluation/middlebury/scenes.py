@@ -133,11 +133,8 @@ def find_results(
         present = {scene: file for scene, file in files.items() if file is not None}
         if not present:
             first = next(iter(scenes))
-            raise SourceError(
-                "folder has no result for any scene",
-                where=folder,
-                expected=f"{first}.pfm, or {first}/{_DISPARITY}*.pfm, and so on",
-            )
+            expected = f"{first}.pfm, or {first}/{_DISPARITY}*.pfm, and so on"
+            raise SourceError("folder has no result for any scene", where=folder, expected=expected)
         found.append(ResultFolder(name, folder, present))
     return found
 

@@ -43,48 +43,50 @@ def test_the_verdict_is_that_of_the_depth_error_at_the_working_distance(
 
 
 def test_the_depth_error_is_said_as_a_length_and_a_share() -> None:
-    _, found = judge(**error(0.06))
-    assert "depth at 4 m is expected to be wrong by 24 cm (6.0 %)" in found["depth"]
-    _, found = judge("chess:9x6", **error(0.06))
-    assert "depth at 4 squares is expected to be wrong by 0.24 squares" in found["depth"]
+    for board, said in (
+        ("chess:9x6:25mm", "at 4 m is expected to be wrong by 24 cm (6.0 %)"),
+        ("chess:9x6", "at 4 squares is expected to be wrong by 0.24 squares"),
+    ):
+        assert said in judge(board, **error(0.06))[1]["depth"]
 
 
 @pytest.mark.parametrize(
-    ("other", "code"),
+    ("other", "code", "figure"),
     [
-        ({"views_used": 8}, "views"),
-        ({"coverage_right": 0.4}, "coverage"),
-        ({"stereo_rms_px": 0.7}, "together"),
-        ({"epipolar_95_px": 1.4}, "rows"),
-        ({"baseline_m": 12.0}, "baseline"),
+        ({"views_used": 8}, "views", "8 different views"),
+        ({"coverage_right": 0.4}, "coverage", "40 % of the right"),
+        ({"stereo_rms_px": 0.7}, "together", "worse than alone"),
+        ({"epipolar_95_px": 1.4}, "rows", "1.40 px"),
+        ({"baseline_m": 12.0}, "baseline", "12 m: are the squares really 25 mm"),
     ],
 )
 def test_what_makes_the_forecast_doubtful_makes_it_usable_at_best(
-    other: dict[str, Any], code: str
+    other: dict[str, Any], code: str, figure: str
 ) -> None:
     verdict, found = judge(**other)
     assert verdict == "usable"
-    assert code in found
+    assert figure in found[code]
 
 
 @pytest.mark.parametrize(
-    ("other", "code"),
+    ("other", "code", "figure"),
     [
-        ({"coverage_left": 0.67}, "corners"),
-        ({"tilted_share": 0.2}, "tilt"),
-        ({"far_to_near": 1.2}, "distances"),
-        ({"focal_interval_px": [480.0, 520.0]}, "focal"),
-        ({"views_used": 13}, "more"),
-        ({"stereo_rms_px": 0.6, "left_rms_px": 0.6}, "sharpness"),
-        ({}, "more"),
+        ({"coverage_left": 0.67}, "corners", "67 % of the left"),
+        ({"tilted_share": 0.2}, "tilt", "20 degrees or more in 20 %"),
+        ({"far_to_near": 1.2}, "distances", "1.2 times"),
+        ({"focal_interval_px": [480.0, 520.0]}, "focal", "480.0 to 520.0 px"),
+        ({"views_used": 13}, "more", "13 different ones"),
+        ({"stereo_rms_px": 0.6, "left_rms_px": 0.6}, "sharpness", "0.60 px"),
+        ({}, "more", "lack nothing"),
     ],
 )
 def test_what_the_views_lack_is_said_when_depth_is_not_good(
-    other: dict[str, Any], code: str
+    other: dict[str, Any], code: str, figure: str
 ) -> None:
     verdict, found = judge(**error(0.04), **other)
     assert verdict == "usable"
     assert set(found) == {"depth", code}
+    assert figure in found[code]
     assert judge(**other) == ("good", {})
 
 
