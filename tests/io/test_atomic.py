@@ -34,15 +34,6 @@ def test_the_temporary_shares_folder_and_suffixes_with_the_target(tmp_path: Path
         temporary.write_bytes(b"x")
 
 
-def test_the_target_is_untouched_while_the_block_runs(tmp_path: Path) -> None:
-    target = tmp_path / "a.txt"
-    write_text(target, "old")
-    with atomic_path(target) as temporary:
-        temporary.write_text("new")
-        assert target.read_text() == "old"
-    assert target.read_text() == "new"
-
-
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, FormatError])
 def test_a_failing_block_keeps_the_old_file_and_leaves_no_temporary(
     tmp_path: Path, error: type[BaseException]
@@ -69,13 +60,6 @@ def test_a_file_in_place_of_a_folder_is_one_clear_line(tmp_path: Path) -> None:
         write_bytes(tmp_path / "file" / "a.txt", b"")
 
 
-def test_a_folder_in_place_of_the_file_is_one_clear_line(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").mkdir()
-    with pytest.raises(OutputError, match="got a folder"):
-        write_text(tmp_path / "a.txt", "text")
-    assert names(tmp_path) == ["a.txt"]
-
-
 def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "null").symlink_to(os.devnull)
@@ -97,12 +81,6 @@ def test_an_input_is_not_written_under_any_name(tmp_path: Path, link: str) -> No
     target = {"same": source, "by another way": tmp_path / ".." / tmp_path.name / "calib.txt"}
     with pytest.raises(SettingsError, match="would replace an input"):
         check_targets([tmp_path / "new", target.get(link, tmp_path / link)], [source])
-
-
-def test_a_new_file_and_one_that_is_not_read_may_be_written(tmp_path: Path) -> None:
-    for name in ("read", "other"):
-        (tmp_path / name).write_text("same content")
-    check_targets([tmp_path / "new", tmp_path / "other"], [tmp_path / "read", tmp_path / "gone"])
 
 
 def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:

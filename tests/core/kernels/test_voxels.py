@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from recon.core.kernels import voxels
+from recon.core.kernels.voxels import are_among, distinct_keys, find_keys
 from tests.core.kernels.voxels_reference import sum_points_reference
 
 # float32 sums of n ≤ 240 terms err by n · 2^-24 of the sum of their sizes: 1.4e-5 of the sum where
@@ -119,3 +121,20 @@ def test_a_row_is_found_where_it_was_entered_and_nowhere_else() -> None:
     voxels.enter_keys(table, keys)
     assert [voxels.find(table, key) for key in keys.tolist()] == [0, 1]
     assert voxels.find(table, voxels.pack_key(1, 2, 4)) == voxels.EMPTY
+
+
+ANY = st.integers(-(2**62), 2**62) | st.integers(0, 9)
+KEYS = hnp.arrays(np.int64, st.integers(0, 30), elements=ANY)
+
+
+@given(KEYS)
+def test_distinct_keys_are_sorted_and_each_there_once(keys: np.ndarray) -> None:
+    np.testing.assert_array_equal(distinct_keys(keys), np.unique(keys))
+
+
+@given(KEYS, KEYS)
+def test_keys_are_found_where_they_are(wanted: np.ndarray, keys: np.ndarray) -> None:
+    place, known = find_keys(wanted, np.sort(keys))
+    np.testing.assert_array_equal(known, np.isin(wanted, keys))
+    np.testing.assert_array_equal(np.sort(keys)[place[known]], wanted[known])
+    np.testing.assert_array_equal(are_among(wanted, keys), known)

@@ -82,8 +82,3 @@ def test_every_inner_corner_is_one_of_two_dark_squares(text: str) -> None:
         ]
         assert sum(touching) == 2
     assert len(board.corners_m) == board.inner[0] * board.inner[1]
-
-
-def test_a_board_says_itself_as_it_is_read() -> None:
-    for text in ("chess:9x6:25mm", "charuco:8x6:30mm:22mm:4x4_50"):
-        assert str(parse_board(text)) == text

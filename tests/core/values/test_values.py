@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import recon
 from recon.core.errors import CalibrationError, ShapeError
 from recon.core.values import (
     CameraIntrinsics,
@@ -15,6 +16,7 @@ from recon.core.values import (
     OccupancyGrid,
     OccupancyVoxels,
     PointCloud,
+    RayCloud,
     Reason,
     RectifiedCamera,
     RectifiedPair,
@@ -244,3 +246,139 @@ def test_a_pose_that_is_not_finite_is_named_by_its_number() -> None:
 
 def test_a_voxel_spans_from_its_key_to_the_next() -> None:
     np.testing.assert_allclose(voxels().centres_m, [[0.1, -0.1, 0.5]], atol=1e-12)
+
+
+GIVEN = np.array([[5.0, np.nan, np.inf], [0.0, -3.0, 7.5]])
+
+
+def test_a_disparity_is_made_of_values_alone() -> None:
+    made = Disparity.from_values(GIVEN)
+    assert made.values.dtype == np.float32
+    assert made.valid.tolist() == [[True, False, False], [False, False, True]]
+    assert made.values[made.valid].tolist() == [5, 7.5]
+    assert made.confidence.tolist() == np.float32([[0.9, 0, 0], [0, 0, 0.9]]).tolist()
+    assert set(made.sigma_px[made.valid].tolist()) == {0.25}
+    assert np.isnan(made.sigma_px[~made.valid]).all()
+    assert set(made.reason[~made.valid].tolist()) == {Reason.AMBIGUOUS}
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.uint8, np.int64])
+def test_any_dtype_of_real_numbers_is_taken(dtype: type) -> None:
+    made = Disparity.from_values(np.array([[0, 4], [6, 8]], dtype))
+    assert made.values[made.valid].tolist() == [4, 6, 8]
+
+
+def test_lists_and_masked_arrays_are_taken() -> None:
+    assert Disparity.from_values([[1, 2], [3, 4]]).valid.all()
+    masked = np.ma.masked_greater(np.arange(1.0, 7.0).reshape(2, 3), 4)
+    assert Disparity.from_values(masked).valid.sum() == 4
+
+
+def test_confidence_and_sigma_may_be_given_and_are_read_where_there_is_a_match() -> None:
+    sure = np.where(np.isfinite(GIVEN), 0.5, np.nan)
+    made = Disparity.from_values(GIVEN, confidence=sure, sigma_px=1)
+    assert made.confidence[made.valid].tolist() == [0.5, 0.5]
+    assert made.sigma_px[made.valid].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("values", "others", "words"),
+    [
+        (np.ones((2, 2, 1)), {}, "wrong shape"),
+        (np.ones((0, 3)), {}, "wrong shape"),
+        ("five", {}, "not an array of real numbers"),
+        (np.ones((2, 2), bool), {}, "not an array of real numbers.*bool"),
+        (np.ones((2, 2), complex), {}, "not an array of real numbers.*complex"),
+        ([[1, 2], [3]], {}, "not an array"),
+        (GIVEN, {"confidence": 1.5}, "confidence"),
+        (GIVEN, {"confidence": np.nan}, "confidence"),
+        (GIVEN, {"confidence": np.ones((3, 2))}, "confidence has the wrong shape"),
+        (GIVEN, {"sigma_px": 0}, "sigma_px"),
+        (GIVEN, {"sigma_px": np.inf}, "sigma_px"),
+    ],
+)
+def test_what_cannot_be_a_disparity_is_refused(
+    values: object, others: dict[str, object], words: str
+) -> None:
+    with pytest.raises(ShapeError, match=words):
+        Disparity.from_values(values, **others)  # type: ignore[arg-type]
+
+
+def test_a_truth_is_made_of_values_and_a_mask_of_middlebury() -> None:
+    levels = np.array([[255, 255, 255], [255, 255, 128]], np.uint8)
+    made = DisparityTruth.from_values(GIVEN, levels)
+    assert np.isfinite(made.values).tolist() == [[True, False, False], [False, False, True]]
+    assert made.nonocc.tolist() == [[True, False, False], [False, False, False]]
+    assert DisparityTruth.from_values(GIVEN, levels == 255).nonocc.sum() == 1
+    assert DisparityTruth.from_values(GIVEN).nonocc.sum() == 2
+
+
+@pytest.mark.parametrize("mask", [np.ones((2, 3), np.uint8), np.ones((3, 2), bool), 255])
+def test_a_mask_that_is_none_is_refused(mask: object) -> None:
+    with pytest.raises(ShapeError, match="no mask of the truth"):
+        DisparityTruth.from_values(GIVEN, mask)  # type: ignore[arg-type]
+
+
+ZEROS = np.zeros((500, 3), np.float32)
+POSES = np.tile(np.eye(4), (40, 1, 1))
+POSES[:, 2, 3] = np.arange(40) / 2
+TRAJECTORY = recon.Trajectory(POSES, np.arange(40) / 10)
+CELLS = np.full((30, 20), -1, np.int8)
+CELLS[:3], CELLS[3:6] = 0, 100
+SHARES = np.zeros(500, np.float16), np.zeros(500, np.uint8), np.zeros(500, np.uint8)
+SHOWN = {
+    recon.Disparity.from_values([[1, 2], [0, 5]]): "Disparity(2x2, 1 to 5 px, 75.0 % valid)",
+    recon.Disparity.from_values([[0, 0]]): "Disparity(2x1, 0 % valid)",
+    recon.DisparityTruth.from_values([[1, 2.5, np.inf, 0]], [[True, False, True, True]]): (
+        "DisparityTruth(4x1, 1 to 2.5 px, 50.0 % known, 25.0 % not occluded)"
+    ),
+    stereo_pair(name="im0.png", index=3): "StereoPair('im0.png', 6x4 grey, frame 3)",
+    rectified_pair(): "RectifiedPair(grey, frame 0, RectifiedCamera(focal_px=700.0, cx_px=3.0, "
+    "cy_px=2.0, cx_right_px=5.0, baseline_m=0.5, width_px=6, height_px=4, ndisp=33))",
+    calibration(): "StereoCalibration(baseline 0.5 m, "
+    + ", ".join(
+        2
+        * ["CameraIntrinsics(6x4, fx 500, fy 500, cx 0, cy 0 px, pinhole [0, 0, 0, 0, 0])"]
+    )
+    + ")",
+    recon.PointCloud(ZEROS, rgb=ZEROS.astype(np.uint8)): (
+        "PointCloud(500 points, x 0 to 0, y 0 to 0, z 0 to 0 m, camera axes, rgb)"
+    ),
+    recon.PointCloud(ZEROS[:0]): "PointCloud(0 points, empty, camera axes)",
+    TRAJECTORY: "Trajectory(40 poses, 19.5 m, 3.9 s)",
+    replace(TRAJECTORY, T_world_camera=POSES[:0], timestamps_s=np.zeros(0)): (
+        "Trajectory(0 poses, 0 m, 0 s)"
+    ),
+    recon.OccupancyVoxels(ZEROS.astype(np.int32), ZEROS[:, 0] + 1, 0.2): (
+        "OccupancyVoxels(500 voxels of 0.2 m, 500 occupied)"
+    ),
+    recon.OccupancyGrid(CELLS, 0.1, (-1.0, 2.0)): (
+        "OccupancyGrid(20x30 cells of 0.1 m, 10.0 % occupied, 10.0 % free, origin (-1.0, 2.0) m)"
+    ),
+    recon.TriangleMesh(ZEROS, ZEROS.astype(np.int32)): (
+        "TriangleMesh(500 faces, 500 vertices, x 0 to 0, y 0 to 0, z 0 to 0 m)"
+    ),
+    RayCloud(ZEROS.astype(np.int16), *SHARES, 0.01): "RayCloud(500 rays)",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("value", SHOWN, ids=lambda value: type(value).__name__)
+def test_a_value_is_shown_in_one_line(value: object) -> None:
+    assert repr(value) == SHOWN[value]
+
+
+def test_settings_show_what_differs_from_the_defaults() -> None:
+    assert repr(recon.load_config()) == "ReconConfig()"
+    config = recon.load_config(overrides=["matching.matcher=sgm", "matching.sad.window_px=7"])
+    assert repr(config) == (
+        "ReconConfig(matching=MatchingSettings(matcher='sgm', sad=SadSettings(window_px=7)))"
+    )
+
+
+def test_results_of_a_pair_show_their_parts() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (40, 80), dtype=np.uint8)
+    camera = replace(CAMERA, width_px=80, height_px=40, ndisp=16)
+    settings = recon.load_config(overrides=["matching.matcher=opencv-bm"])
+    frame = recon.reconstruct(noise[:, :80], noise[:, :80], camera, settings)
+    assert "\n" not in repr(frame)
+    assert len(repr(frame)) < 500

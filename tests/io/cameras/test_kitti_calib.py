@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.core.errors import CalibrationError, FormatError
 from recon.io.cameras.kitti import list_kitti_cameras, read_kitti_calib, read_kitti_offset
 
 SIZE = (1242, 375)
@@ -55,33 +54,6 @@ def test_cameras_of_the_raw_data_are_listed_too(tmp_path: Path) -> None:
     path = write(tmp_path, text)
     assert list_kitti_cameras(path) == {0, 1}
     assert read_kitti_calib(path, *SIZE).baseline_m == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize(
-    ("text", "error", "message"),
-    [
-        (row(0, 0), FormatError, r"calibration has no P1 \(got P0\); a stereo pair needs"),
-        ("Tr: 1 2 3\n", FormatError, r"calibration has no P0 \(got no projection matrix\)"),
-        ("", FormatError, "file is empty"),
-        (row(0, 0) + row(1, 0), CalibrationError, r"baseline is zero \(got 0 m, expected > 0 m"),
-        (row(0, 0) + row(1, 0.5), CalibrationError, "baseline is negative.*not swapped"),
-        (
-            row(0, 0) + "P1: 1 2 3\n",
-            FormatError,
-            r"'P1' is wrong \(got 3 numbers, expected 12 numbers",
-        ),
-        (row(0, 0) + "P1: " + "x " * 12, FormatError, "'P1' is wrong .*expected numbers"),
-        (row(0, 0) + "P1: " + "nan " * 12, FormatError, "'P1' is wrong .*expected finite numbers"),
-        (row(0, 0) + "P1: " + "0 " * 12, FormatError, "P1 is not the projection"),
-        (row(0, 0, focal=-7) + row(1, -1), CalibrationError, "focal length of P0 is not positive"),
-        (row(0, 0) + row(1, -1, focal=800), CalibrationError, "P0 and P1 have different focal"),
-    ],
-)
-def test_a_bad_calibration_is_one_clear_line_with_the_file(
-    tmp_path: Path, text: str, error: type[Exception], message: str
-) -> None:
-    with pytest.raises(error, match=rf"calib\.txt: .*{message}"):
-        read_kitti_calib(write(tmp_path, text), *SIZE)
 
 
 @pytest.mark.real

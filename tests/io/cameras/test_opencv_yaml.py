@@ -10,7 +10,7 @@ from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.opencv_yaml import read_opencv_calibration, write_opencv_calibration
+from recon.io.cameras.opencv_yaml import read_opencv_calibration
 
 LEFT = np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]])
 RIGHT = np.array([[498.0, 0, 318], [0, 499, 242], [0, 0, 1]])
@@ -41,31 +41,6 @@ def both_cameras() -> dict[str, object]:
 
 def pose(scale: float = 1.0) -> dict[str, object]:
     return {"R": ROTATION, "T": TRANSLATION_M.reshape(3, 1) * scale}
-
-
-def test_a_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    write_opencv_calibration(tmp_path / "stereo.yml", calibration())
-    read = read_opencv_calibration(tmp_path / "stereo.yml")
-    for side in ("left", "right"):
-        have, want = getattr(read, side), getattr(calibration(), side)
-        np.testing.assert_array_equal(have.matrix, want.matrix)
-        np.testing.assert_array_equal(have.distortion, want.distortion)
-        assert (have.width_px, have.height_px) == (640, 480)
-    np.testing.assert_array_equal(read.T_right_left, calibration().T_right_left)
-
-
-def test_a_camera_without_distortion_comes_back_without(tmp_path: Path) -> None:
-    plain = CameraIntrinsics(LEFT, np.zeros(0), 640, 480)
-    rig = StereoCalibration(plain, plain, calibration().T_right_left)
-    write_opencv_calibration(tmp_path / "stereo.yml", rig)
-    assert read_opencv_calibration(tmp_path / "stereo.yml").left.distortion.size == 0
-
-
-def test_opencv_itself_reads_what_is_written(tmp_path: Path) -> None:
-    write_opencv_calibration(tmp_path / "stereo.yml", calibration())
-    storage = cv2.FileStorage(str(tmp_path / "stereo.yml"), cv2.FILE_STORAGE_READ)
-    np.testing.assert_array_equal(storage.getNode("M2").mat(), RIGHT)
-    np.testing.assert_array_equal(storage.getNode("T").mat(), TRANSLATION_M.reshape(3, 1))
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
@@ -136,15 +111,6 @@ def test_a_bad_calibration_is_one_clear_line_with_the_file(
         read_opencv_calibration(path)
 
 
-@pytest.mark.parametrize(
-    "text", ["%YAML:1.0\n---\nM1: [1,2\n", "hello", '<?xml version="1.0"?>\n<opencv_storage><M1>1']
-)
-def test_what_file_storage_cannot_parse_is_one_clear_line(tmp_path: Path, text: str) -> None:
-    (tmp_path / "stereo.yml").write_text(text)
-    with pytest.raises(FormatError, match=r"stereo\.yml.*: not a"):
-        read_opencv_calibration(tmp_path / "stereo.yml", size_px=(640, 480))
-
-
 KITTI = "P0: 700 0 600 0 0 700 180 0 0 0 1 0\nP1: 700 0 600 -350 0 700 180 0 0 0 1 0\n"
 MIDDLEBURY = (
     "cam0=[700 0 600; 0 700 180; 0 0 1]\ncam1=[700 0 600; 0 700 180; 0 0 1]\n"
@@ -157,11 +123,6 @@ def test_kitti_and_middlebury_files_of_one_rig_give_one_camera(tmp_path: Path, t
     (tmp_path / "calib.txt").write_text(text)
     want = RectifiedCamera(700, 600, 180, 600, 0.5, 1242, 375)
     assert read_calibration(tmp_path / "calib.txt", 1242, 375) == want
-
-
-def test_an_opencv_file_is_recognised_by_content_whatever_its_name(tmp_path: Path) -> None:
-    write_opencv_calibration(tmp_path / "calib.txt", calibration())
-    assert isinstance(read_calibration(tmp_path / "calib.txt", 640, 480), StereoCalibration)
 
 
 def test_opencv_extrinsics_are_not_taken_for_kitti_although_they_hold_p1(tmp_path: Path) -> None:

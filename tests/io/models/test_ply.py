@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from recon.core.errors import FormatError, OutputError
+from recon.core.errors import FormatError
 from recon.core.values import PointCloud
 from recon.io.models.ply import read_ply, write_ply
 
@@ -143,43 +143,6 @@ def test_a_quality_that_is_no_confidence_is_left_out(tmp_path: Path) -> None:
     assert read_ply(path).confidence is None
 
 
-@pytest.mark.parametrize(
-    ("body", "complaint"),
-    [
-        (b"", "does not start with 'ply'"),
-        (b"junk\nmore\n", "does not start with 'ply'"),
-        (b"ply\nformat ascii 1.0\n", "PLY header"),
-        (b"ply\nformat binary_middle_endian 1.0\nend_header\n", "PLY header"),
-        (b"ply\nelement vertex 0\nend_header\n", "no format"),
-        (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "PLY header"),
-        (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "PLY header"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty\nend_header\n", "PLY header"),
-        (
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n1\n",
-            "PLY header",
-        ),
-        (
-            b"ply\nformat ascii 1.0\nelement v 1\nproperty int x\nproperty int x\nend_header\n",
-            "twice",
-        ),
-        (
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
-            "no vertices with x, y and z",
-        ),
-        (b"ply\nformat ascii 1.0\nend_header\n", "no vertices"),
-    ],
-)
-def test_a_file_that_is_no_cloud_is_refused_in_one_line(
-    tmp_path: Path, body: bytes, complaint: str
-) -> None:
-    path = tmp_path / "broken.ply"
-    path.write_bytes(body)
-    with pytest.raises(FormatError, match=complaint) as caught:
-        read_ply(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize("ascii", [False, True])
 def test_a_truncated_file_is_refused(tmp_path: Path, ascii: bool) -> None:  # noqa: A002
     path = tmp_path / "cloud.ply"
@@ -194,46 +157,6 @@ def test_a_truncated_file_is_refused(tmp_path: Path, ascii: bool) -> None:  # no
 def test_a_header_that_promises_more_than_memory_is_refused(tmp_path: Path) -> None:
     path = write_raw(tmp_path / "a.ply", XYZ, b"\0" * 24, 10**15, kind="binary_little_endian")
     with pytest.raises(FormatError, match="truncated"):
-        read_ply(path)
-
-
-def test_text_among_the_numbers_is_refused(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "a.ply", XYZ, b"1 2 3\n1 two 3\n", 2)
-    with pytest.raises(FormatError, match=r"element 'vertex'.*got 1 row, expected 2"):
-        read_ply(path)
-
-
-def test_a_cloud_of_nothing_but_nan_is_refused(tmp_path: Path) -> None:
-    path = write_raw(tmp_path / "a.ply", XYZ, b"nan nan nan\n" * 3, 3)
-    with pytest.raises(FormatError, match="no point of the PLY file is finite"):
-        read_ply(path)
-
-
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.ply", tmp_path):
-        with pytest.raises(FormatError, match=r"does not exist|cannot read the file"):
-            read_ply(path)
-
-
-def test_an_unwritable_place_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError):
-        write_ply(tmp_path / "file" / "cloud.ply", example_cloud())
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"element vertex 1\nproperty float x\nend_header\n1\n",
-        b"element vertex 1\nend_header\n\n",
-        b"end_header\n",
-    ],
-)
-def test_a_file_without_places_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a.ply"
-    path.write_bytes(b"ply\nformat ascii 1.0\n" + content)
-    with pytest.raises(FormatError, match=r"a\.ply: .*no vertices with x, y and z"):
         read_ply(path)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pyoctomap
 import pytest
 
-from recon.core.errors import FormatError, MappingError, OutputError
+from recon.core.errors import FormatError, MappingError
 from recon.core.values import OccupancyVoxels
 from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
 from tests.scenery.octomaps import write_octomap
@@ -53,39 +53,6 @@ def test_pyoctomap_finds_all_cells_of_a_bt_file_and_no_others(tmp_path: Path) ->
     # A leaf of a pruned tree stands for several cells.
     cells = [round(leaf.getSize() / 0.2) ** 3 for leaf in tree.begin_leafs()]
     assert sum(cells) == len(scene)
-
-
-def test_files_are_what_their_headers_say(tmp_path: Path) -> None:
-    binary, full = write_octomap(tmp_path / "octomap", _scene())
-    assert (binary.name, full.name) == ("octomap.bt", "octomap.ot")
-    assert binary.read_bytes().startswith(b"# Octomap OcTree binary file\n")
-    assert full.read_bytes().startswith(b"# Octomap OcTree file\n")
-
-
-def test_an_empty_map_is_written_and_read(tmp_path: Path) -> None:
-    empty = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), 0.5)
-    binary, full = write_octomap(tmp_path / "empty", empty)
-    assert len(read_octomap(full)) == 0
-    tree = pyoctomap.OcTree(0.1)
-    assert tree.readBinary(str(binary))
-    assert tree.size() == 0
-
-
-def test_writing_into_a_file_is_an_output_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError):
-        write_octomap(tmp_path / "file" / "octomap", _scene())
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"PLY", b"# Octomap OcTree", b"# Octomap OcTree binary file\n"]
-)
-def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "x.ot").write_bytes(content)
-    with pytest.raises(FormatError):
-        read_octomap(tmp_path / "x.ot")
-    with pytest.raises(FormatError):
-        read_octomap(tmp_path / "missing.ot")
 
 
 def _by_pyoctomap(voxels: OccupancyVoxels) -> tuple[bytes, bytes]:

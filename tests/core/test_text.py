@@ -10,7 +10,7 @@ import pytest
 from recon.cli.options import parse_numbers as parse_option
 from recon.commands.config import load_config
 from recon.core.errors import ReconError
-from recon.core.text import is_count, parse_integer, parse_number
+from recon.core.text import counted, is_count, parse_integer, parse_number, unit_of, with_unit
 from recon.io.cameras.opencv_yaml import read_file_storage
 from recon.io.fields import parse_yaml
 from recon.io.files import read_table
@@ -80,3 +80,48 @@ def test_settings_and_options_refuse_other_notations(text: str) -> None:
         parse_option(f"1,{text},3", "--antenna")
     with pytest.raises(ReconError):
         parse_size_mb(f"{text}M")
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [(0, "0 frames"), (1, "1 frame"), (2, "2 frames"), (-1, "-1 frame"), (1200, "1200 frames")],
+)
+def test_one_thing_is_no_plural(number: int, text: str) -> None:
+    assert counted(number, "frame") == text
+
+
+def test_a_number_may_be_written_in_another_form() -> None:
+    assert counted(1, "frame", form="+d") == "+1 frame"
+    assert counted(1200, "point", form=",") == "1,200 points"
+
+
+def test_some_words_have_a_plural_of_their_own() -> None:
+    assert [counted(n, "match", "matches") for n in (1, 2)] == ["1 match", "2 matches"]
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("path_length_m", "m"),
+        ("trajectory.r_rel_deg_per_100m", "°/100 m"),
+        ("trajectory.t_rel_percent at 100 m", "%"),
+        ("speed_m_per_s", "m/s"),
+        ("peak_memory_mb", "MB"),
+        ("fps", "frames/s"),
+        ("seconds", "s"),
+        ("seconds.match", "s"),
+        ("seconds_per_frame.p95", "s"),
+        ("live.latency_ms.p50", "ms"),
+        ("disparity.bad.0.5", "%"),
+        ("disparity.quantiles_px.50", "px"),
+        ("depth_error_cm.10.calibration", "cm"),
+        ("precision at 0.2 m", ""),
+        ("frames", ""),
+        ("frames_not_trusted", ""),
+        ("map.f_score", ""),
+        ("m", ""),
+    ],
+)
+def test_a_figure_has_the_unit_that_its_name_tells(name: str, unit: str) -> None:
+    assert unit_of(name) == unit
+    assert with_unit("3", name) == f"3 {unit}".strip()
