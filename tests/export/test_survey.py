@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,15 +56,39 @@ def positions(times_s: Float64) -> Float64:
     return np.column_stack([times_s, xyz])
 
 
-def write_positions(folder: Path, rows: Float64) -> Path:
-    np.savetxt(folder / "gnss.txt", rows, fmt="%.5f")
-    return folder / "gnss.txt"
+@pytest.fixture
+def place(tmp_path: Path) -> Callable[..., Georeference]:
+    """Places a map by rows of positions."""
+
+    def placed(
+        rows: Float64, map_: Map | None = None, antenna: tuple = ANTENNA, crs: str | None = None
+    ) -> Georeference:
+        np.savetxt(tmp_path / "gnss.txt", rows, fmt="%.5f")
+        return georeference(map_ or mapped(), Survey(tmp_path / "gnss.txt", antenna, crs))
+
+    return placed
 
 
-def test_antenna_and_times_between_frames_count(tmp_path: Path) -> None:
+Place = Callable[..., Georeference]
+
+
+def each_second() -> Float64:
+    return positions(FROM_S + np.arange(20))
+
+
+def often() -> Float64:
+    return positions(FROM_S + np.arange(0, 19.8, 0.2))
+
+
+def noisy(sigma_m: float, seed: int = 5) -> Float64:
+    rows = often()
+    rows[:, 1:] += np.random.default_rng(seed).normal(0, sigma_m, (len(rows), 3))
+    return rows
+
+
+def test_antenna_and_times_between_frames_count(place: Place) -> None:
     # Once a second and off the times of the frames; some before and after the drive.
-    file = write_positions(tmp_path, positions(FROM_S + 0.037 + np.arange(-3, 25)))
-    placed = georeference(mapped(), Survey(file, ANTENNA))
+    placed = place(positions(FROM_S + 0.037 + np.arange(-3, 25)))
     off = invert(T_SURVEY_MAP) @ placed.T_survey_map
     assert np.abs(off[:3, 3]).max() < 0.002
     assert np.degrees(angle_rad(off[None])[0]) < 0.01
@@ -73,67 +98,35 @@ def test_antenna_and_times_between_frames_count(tmp_path: Path) -> None:
     assert not placed.warnings()
 
 
-def test_without_the_antenna_the_map_is_off_by_it(tmp_path: Path) -> None:
-    file = write_positions(tmp_path, positions(FROM_S + np.arange(20)))
-    placed = georeference(mapped(), Survey(file))
+def test_without_the_antenna_the_map_is_off_by_it(place: Place) -> None:
+    placed = place(each_second(), antenna=(0.0, 0.0, 0.0))
     off = placed.T_survey_map[2, 3] - T_SURVEY_MAP[2, 3]
     assert off == pytest.approx(ANTENNA[2], abs=0.05)
 
 
-def test_frames_that_are_not_trusted_do_not_count(tmp_path: Path) -> None:
-    file = write_positions(tmp_path, positions(FROM_S + 0.05 + np.arange(0, 19.8, 0.1)))
-    map_ = mapped(untrusted=(50, 51, 52))
-    assert georeference(map_, Survey(file, ANTENNA)).rms_m < 0.01
+def test_frames_that_are_not_trusted_do_not_count(place: Place) -> None:
+    rows = positions(FROM_S + 0.05 + np.arange(0, 19.8, 0.1))
+    assert place(rows, mapped(untrusted=(50, 51, 52))).rms_m < 0.01
 
 
-def test_positions_may_be_a_tum_file_and_in_any_order(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(20))[::-1]
-    tum = np.column_stack([rows, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))])
-    placed = georeference(mapped(), Survey(write_positions(tmp_path, tum), ANTENNA))
+def test_positions_may_be_a_tum_file_and_in_any_order(place: Place) -> None:
+    rows = each_second()[::-1]
+    placed = place(np.column_stack([rows, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))]))
     np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
 
 
-def test_the_first_drive_of_a_merged_map_counts(tmp_path: Path) -> None:
+def test_the_first_drive_of_a_merged_map_counts(place: Place) -> None:
     map_ = mapped()
-    other = map_.begin(SessionInfo())
-    other.add_frame(np.eye(4), 0.0, OdometryHealth())
-    file = write_positions(tmp_path, positions(FROM_S + np.arange(20)))
-    placed = georeference(map_, Survey(file, ANTENNA))
+    map_.begin(SessionInfo()).add_frame(np.eye(4), 0.0, OdometryHealth())
+    placed = place(each_second(), map_)
     np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
 
 
-def test_positions_on_another_clock_are_warned_of(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(20))
-    rows[:, 0] += 1.5 * np.sin(np.arange(20))
-    placed = georeference(mapped(), Survey(write_positions(tmp_path, rows), ANTENNA))
-    assert placed.rms_m > 1.0
-    assert "another clock" in placed.warnings()[0]
-
-
-def test_positions_of_another_day_are_refused(tmp_path: Path) -> None:
-    file = write_positions(tmp_path, positions(FROM_S + np.arange(20)) + np.array([86400, 0, 0, 0]))
-    with pytest.raises(EvaluationError, match="no position was measured during the drive"):
-        georeference(mapped(), Survey(file))
-
-
-def test_positions_at_one_place_are_refused(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(20))
-    rows[:, 1:] = rows[0, 1:]
-    with pytest.raises(EvaluationError, match="do not say how the map is turned"):
-        georeference(mapped(), Survey(write_positions(tmp_path, rows)))
-
-
-def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "gnss.txt").write_text("$GPGGA,123519,4807.038,N\n")
-    with pytest.raises(FormatError, match=r"gnss\.txt:1"):
-        georeference(mapped(), Survey(tmp_path / "gnss.txt"))
-
-
-def test_positions_that_contradict_most_are_left_out_and_named(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(20))
+def test_positions_that_contradict_most_are_left_out_and_named(place: Place) -> None:
+    rows = each_second()
     rows[[3, 11], 1:3] += [[30.0, -12.0], [-8.0, 5.0]]
     rows[17, 1:] = 0.0  # no fix
-    placed = georeference(mapped(), Survey(write_positions(tmp_path, rows), ANTENNA))
+    placed = place(rows)
     np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
     assert placed.figures()["positions"] == 17
     assert placed.figures()["positions_left_out"] == 3
@@ -142,11 +135,20 @@ def test_positions_that_contradict_most_are_left_out_and_named(tmp_path: Path) -
     assert f"{FROM_S + 3:.3f} s" in warning
 
 
-def test_noise_alone_leaves_no_position_out(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(0, 19.8, 0.2))
-    rows[:, 1:] += np.random.default_rng(4).normal(0, 1.5, (len(rows), 3))
-    placed = georeference(mapped(), Survey(write_positions(tmp_path, rows), ANTENNA))
-    assert placed.figures()["positions_left_out"] == 0
+def test_the_noise_of_a_receiver_is_no_reason_to_refuse_or_leave_out(place: Place) -> None:
+    assert place(noisy(1.5, seed=4)).figures()["positions_left_out"] == 0
+    assert 10.0 < place(noisy(10.0)).rms_m < 20.0
+
+
+def test_what_may_be_wrong_with_the_positions_is_warned_of(place: Place) -> None:
+    rows = each_second()
+    rows[:, 0] += 1.5 * np.sin(np.arange(20))
+    placed = place(rows)
+    assert placed.rms_m > 1.0
+    assert "another clock" in placed.warnings()[0]
+    assert "1.10 times as far apart" in place(each_second() * [1, 1.1, 1.1, 1.1]).warnings()[0]
+    lines = place(each_second()[:, [0, 2, 1, 3]]).warnings()
+    assert [line for line in lines if "with easting and northing swapped" in line]
 
 
 NONSENSE = {
@@ -162,52 +164,48 @@ NONSENSE = {
 
 
 @pytest.mark.parametrize("nonsense", NONSENSE)
-def test_positions_that_nothing_explains_are_refused(tmp_path: Path, nonsense: str) -> None:
-    rows = positions(FROM_S + np.arange(0, 19.8, 0.2))
+def test_positions_that_nothing_explains_are_refused(place: Place, nonsense: str) -> None:
+    rows = often()
     rows[:, 1:] = NONSENSE[nonsense](rows[:, 1:])
     with pytest.raises(ReconError, match=r"gnss\.txt"):
-        georeference(mapped(), Survey(write_positions(tmp_path, rows), ANTENNA))
+        place(rows)
 
 
-def test_stretched_positions_are_warned_of_as_another_unit(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(20))
-    rows[:, 1:] *= 1.1
-    placed = georeference(mapped(), Survey(write_positions(tmp_path, rows), ANTENNA))
-    assert "1.10 times as far apart" in placed.warnings()[0]
+def test_positions_of_another_day_or_at_one_place_are_refused(place: Place) -> None:
+    rows = each_second()
+    with pytest.raises(EvaluationError, match="no position was measured during the drive"):
+        place(rows + np.array([86400, 0, 0, 0]))
+    rows[:, 1:] = rows[0, 1:]
+    with pytest.raises(EvaluationError, match="do not say how the map is turned"):
+        place(rows)
 
 
-def test_the_noise_of_a_receiver_is_no_reason_to_refuse(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(0, 19.8, 0.2))
-    rows[:, 1:] += np.random.default_rng(5).normal(0, 10.0, (len(rows), 3))
-    placed = georeference(mapped(), Survey(write_positions(tmp_path, rows), ANTENNA))
-    assert 10.0 < placed.rms_m < 20.0
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "gnss.txt").write_text("$GPGGA,123519,4807.038,N\n")
+    with pytest.raises(FormatError, match=r"gnss\.txt:1"):
+        georeference(mapped(), Survey(tmp_path / "gnss.txt"))
 
 
 @pytest.mark.parametrize("columns", [1, 3])
-def test_a_file_may_state_how_well_positions_were_measured(tmp_path: Path, columns: int) -> None:
-    rows = positions(FROM_S + np.arange(0, 19.8, 0.2))
-    rows[:, 1:] += np.random.default_rng(5).normal(0, 10.0, (len(rows), 3))
+def test_a_file_may_state_how_well_positions_were_measured(place: Place, columns: int) -> None:
+    def stated(sigma_m: float) -> Float64:
+        rows = noisy(10.0)
+        return np.column_stack([rows, np.full((len(rows), columns), sigma_m)])
 
-    def placed(sigma_m: float) -> Georeference:
-        stated = np.column_stack([rows, np.full((len(rows), columns), sigma_m)])
-        return georeference(mapped(), Survey(write_positions(tmp_path, stated), ANTENNA))
-
-    assert placed(10.0).rms_m > 10.0
+    assert place(stated(10.0)).rms_m > 10.0
     with pytest.raises(EvaluationError, match="neither drift nor noise explains"):
-        placed(0.1)
+        place(stated(0.1))
     with pytest.raises(FormatError, match="standard deviation"):
-        placed(0.0)
+        place(stated(0.0))
 
 
-def test_a_drift_that_the_run_states_explains_a_scale(tmp_path: Path) -> None:
-    rows = np.column_stack([positions(FROM_S + np.arange(20)), np.full(20, 0.02)])
-    rows[:, 1:4] *= 1.2
-    file = write_positions(tmp_path, rows)
+def test_a_drift_that_the_run_states_explains_a_scale(place: Place) -> None:
+    rows = np.column_stack([each_second() * [1, 1.2, 1.2, 1.2], np.full(20, 0.02)])
     with pytest.raises(EvaluationError, match=r"1\.2 times as far"):
-        georeference(mapped(), Survey(file, ANTENNA))
+        place(rows)
     # An error of all disparities by 0.1 px is 8 % of 1.3 px.
     far = mapped(health=OdometryHealth(sigma_m=1e-3, sigma_deg=1e-3, scale_px=1.3))
-    assert georeference(far, Survey(file, ANTENNA)).scale == pytest.approx(1.2, abs=0.01)
+    assert place(rows, far).scale == pytest.approx(1.2, abs=0.01)
 
 
 @pytest.mark.parametrize("far_m", [101.0, 1e5, 1e9, 1e300, float("nan")])
@@ -217,48 +215,30 @@ def test_an_antenna_that_is_on_no_vehicle_is_refused(far_m: float) -> None:
 
 
 @pytest.mark.parametrize("crs", ["+proj=noop", "+proj=pipeline +step +proj=noop"])
-def test_a_coordinate_system_whose_metres_are_none_is_refused(tmp_path: Path, crs: str) -> None:
+def test_a_coordinate_system_whose_metres_are_none_is_refused(place: Place, crs: str) -> None:
     pytest.importorskip("pyproj")
-    rows = positions(FROM_S + np.arange(20))
-    survey = Survey(write_positions(tmp_path, rows), ANTENNA, crs)
     with pytest.raises(EvaluationError, match="a metre of the coordinate system"):
-        georeference(mapped(), survey)
+        place(each_second(), crs=crs)
 
 
-def test_a_coordinate_system_of_ones_own_is_taken(tmp_path: Path) -> None:
+def test_coordinate_systems_of_ones_own_and_across_a_border_are_taken(place: Place) -> None:
     pytest.importorskip("pyproj")
-    file = write_positions(tmp_path, positions(FROM_S + np.arange(20)))
-    survey = Survey(file, ANTENNA, "+proj=utm +zone=32 +ellps=GRS80")
-    assert not georeference(mapped(), survey).warnings()
+    assert not place(each_second(), crs="+proj=utm +zone=32 +ellps=GRS80").warnings()
+    # 1.6 degrees west of zone 33.
+    assert not place(each_second() - [0, 300000.0, 0, 0], crs="EPSG:25833").warnings()
 
 
-@pytest.mark.parametrize("change", ["swapped", "local", "degrees"])
-def test_positions_outside_the_coordinate_system_are_refused(tmp_path: Path, change: str) -> None:
+OUTSIDE = {
+    "swapped": lambda rows: rows[:, [0, 2, 1, 3]],
+    "local": lambda rows: rows - [0, *rows[0, 1:3], 0],
+    "degrees": lambda rows: np.column_stack(
+        [rows[:, 0], np.tile([8.5, 49.0], (20, 1)), rows[:, 3]]
+    ),
+}
+
+
+@pytest.mark.parametrize("change", OUTSIDE)
+def test_positions_outside_the_coordinate_system_are_refused(place: Place, change: str) -> None:
     pytest.importorskip("pyproj")
-    rows = positions(FROM_S + np.arange(20))
-    if change == "swapped":
-        rows[:, 1:3] = rows[:, 2:0:-1]
-    elif change == "local":
-        rows[:, 1:3] -= rows[0, 1:3]
-    else:
-        rows[:, 1:3] = [8.5, 49.0]
-    survey = Survey(write_positions(tmp_path, rows), ANTENNA, "EPSG:25832")
     with pytest.raises(EvaluationError, match=r"outside the area|not degrees"):
-        georeference(mapped(), survey)
-
-
-def test_positions_just_across_the_border_of_a_zone_are_taken(tmp_path: Path) -> None:
-    pytest.importorskip("pyproj")
-    rows = positions(FROM_S + np.arange(20))
-    rows[:, 1] -= 300000.0  # 1.6 degrees west of zone 33
-    survey = Survey(write_positions(tmp_path, rows), ANTENNA, "EPSG:25833")
-    assert not georeference(mapped(), survey).warnings()
-
-
-def test_swapped_columns_are_recognised_by_the_bend_of_the_path(tmp_path: Path) -> None:
-    rows = positions(FROM_S + np.arange(20))
-    right = georeference(mapped(), Survey(write_positions(tmp_path, rows), ANTENNA))
-    assert not right.warnings()
-    swapped = write_positions(tmp_path, rows[:, [0, 2, 1, 3]])
-    lines = georeference(mapped(), Survey(swapped, ANTENNA)).warnings()
-    assert [line for line in lines if "with easting and northing swapped" in line]
+        place(OUTSIDE[change](each_second()), crs="EPSG:25832")

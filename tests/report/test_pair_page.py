@@ -1,20 +1,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.report.pair_page import (
-    confidence_figure,
-    depth_figure,
     depth_marks,
     disparity_figure,
     error_figure,
-    pair_figure,
-    reasons_figure,
+    is_wide,
+    stereo_figures,
 )
 
 
@@ -26,31 +26,18 @@ def decode(png: bytes) -> UInt8:
     return np.asarray(picture, dtype=np.uint8)
 
 
-def test_every_figure_of_a_pair_is_a_png(pair: RectifiedPair, disparity: Disparity) -> None:
-    decode(pair_figure(pair))
-    decode(disparity_figure(disparity, pair.camera))
-    decode(confidence_figure(disparity))
-    decode(reasons_figure(disparity))
-    decode(depth_figure(25.0 / disparity.values))
-    decode(error_figure(disparity.values - 2))
-
-
-def test_figures_without_any_value_are_drawn(pair: RectifiedPair, nothing_found: Disparity) -> None:
-    decode(disparity_figure(nothing_found, pair.camera))
-    decode(depth_figure(nothing_found.values))
-    decode(confidence_figure(nothing_found))
-    decode(reasons_figure(nothing_found))
-    decode(error_figure(nothing_found.values))
-
-
-def test_figure_of_a_disparity_below_zero_is_drawn(
-    pair: RectifiedPair, disparity: Disparity
+@pytest.mark.parametrize("which", ["disparity", "nothing_found", "below zero"])
+def test_every_figure_of_a_pair_is_a_png(
+    which: str, pair: RectifiedPair, disparity: Disparity, nothing_found: Disparity
 ) -> None:
     """With doffs, disparities may be negative; they have no depth here, where doffs is 0."""
-    below = Disparity(
-        disparity.values - 20, disparity.confidence, disparity.sigma_px, disparity.reason
-    )
-    decode(disparity_figure(below, pair.camera))
+    below = replace(disparity, values=disparity.values - 20)
+    shown = {"disparity": disparity, "nothing_found": nothing_found}.get(which, below)
+    figures = stereo_figures(pair, shown)
+    assert figures.pop("wide")
+    assert figures.pop("valid_percent") == 100 * shown.valid.mean()
+    for png in (*figures.values(), error_figure(shown.values)):
+        decode(png)
 
 
 def test_a_figure_shows_its_picture(pair: RectifiedPair, disparity: Disparity) -> None:
@@ -60,10 +47,12 @@ def test_a_figure_shows_its_picture(pair: RectifiedPair, disparity: Disparity) -
     assert right[2] > right[0] + 60  # near: red (OpenCV decodes to BGR)
 
 
+def test_images_of_twice_their_height_are_wide() -> None:
+    assert [is_wide((10, width, 3)) for width in (19, 20)] == [False, True]
+
+
 def test_shares_of_reasons_add_up_and_the_largest_comes_first(disparity: Disparity) -> None:
-    shares = disparity.reason_shares
-    assert shares == {Reason.VALID: 0.75, Reason.BORDER: 0.25}
-    assert list(shares) == [Reason.VALID, Reason.BORDER]
+    assert [*disparity.reason_shares.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
 
 
 def test_depth_marks_are_round_inside_the_range_and_apart() -> None:
@@ -73,3 +62,4 @@ def test_depth_marks_are_round_inside_the_range_and_apart() -> None:
     assert 3.3 <= min(marks) < max(marks) <= 80.0
     gaps = np.diff(np.log(marks)) / (limits[1] - limits[0])
     assert gaps.min() >= 0.1  # room for a label
+    assert len(marks) >= 7

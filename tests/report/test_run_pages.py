@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ from recon.core.values import (
 )
 from recon.evaluation.drive_errors import DriveErrors
 from recon.odometry.protocol import OdometryHealth
-from recon.report.map_page import map_content, write_map_page
+from recon.report.map_page import map_content, write_joined_page, write_map_page
 from recon.report.pair_page import write_pair_page
 from recon.run.directory import RunDirectory
 from tests.report.pages import blocks, key_figures, map_html, pair_html, rows
@@ -113,20 +114,41 @@ def test_truth_of_another_size_gives_no_error_map(view: SimpleNamespace) -> None
     assert "Disparity error" not in blocks(pair_html(view))
 
 
-def test_drive_leaves_its_page(drive: SimpleNamespace, tmp_path: Path) -> None:
-    with RunDirectory(tmp_path / "run") as directory:
-        write_map_page(**vars(drive), run=directory)
-        directory.write_json("run.json", {})
-    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "Map of drive &lt;1&gt;" in page
-    assert "Versions" in page
+def test_runs_leave_their_pages_and_images(
+    drive: SimpleNamespace, view: SimpleNamespace, tmp_path: Path
+) -> None:
+    for name, write in (
+        ("drive", lambda run: write_map_page(**vars(drive), run=run)),
+        ("pair", lambda run: write_pair_page(view, run)),
+    ):
+        with RunDirectory(tmp_path / name) as directory:
+            write(directory)
+            directory.write_json("run.json", {})
+    page = (tmp_path / "drive/report.html").read_text(encoding="utf-8")
+    assert re.search("Map of drive &lt;1&gt;(?s:.*)frame 5: lost(?s:.*)Versions", page)
+    page = (tmp_path / "pair/report.html").read_text(encoding="utf-8")
+    assert re.search("Stereo pair im0.png(?s:.*)a warning", page)
+    assert (tmp_path / "pair/disparity/disparity_colour.png").is_file()
 
 
-def test_pair_leaves_its_page_and_images_in_colour(view: SimpleNamespace, tmp_path: Path) -> None:
+def test_drives_of_a_merged_map_are_named_in_its_page(
+    drive: SimpleNamespace, trajectory: Trajectory, tmp_path: Path
+) -> None:
+    drive.map_.paths = {0: trajectory, 2: trajectory}
+    sessions = [
+        {"number": n, "name": f"drive {n}", "frames": 11, "frames_placed": 10, "length_m": 10.0,
+         "positions": 0, "linked": n != 1}
+        for n in range(3)
+    ]  # fmt: skip
+    summary = drive.summary | {"frames": 22, "path_length_m": 20.0, "sessions": sessions}
+    summary |= {"links": {"count": 4, "refused": 1, "pairs": {"0-2": 4}}, "points_removed": 3}
+    summary |= {"positions_misfit_rms_m": None, "seconds": 1.0, "peak_memory_mb": 9.0}
     with RunDirectory(tmp_path / "run") as directory:
-        write_pair_page(view, directory)  # type: ignore[arg-type]
+        write_joined_page(drive.map_, drive.made, summary, directory)
         directory.write_json("run.json", {})
-    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "Stereo pair im0.png" in page
-    assert "a warning" in page
-    assert (tmp_path / "run" / "disparity" / "disparity_colour.png").is_file()
+    page = (tmp_path / "run/report.html").read_text(encoding="utf-8")
+    assert "Map of 3 drives" in page
+    assert key_figures(page)["Drives in the map"] == "2 of 3"
+    assert rows(blocks(page)["Sessions"])[1] == ("1", "drive 1", "11", "10", "10.0", "0", "no")
+    assert "1 more contradict" in blocks(page)["Places that two drives saw"]
+    assert "session 2" in blocks(page)["In 3-D"]

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud, TriangleMesh
-from recon.report.drive_figures import thin_grid
+from recon.core.values import PointCloud, TriangleMesh
 from recon.report.scene import (
     T_UPRIGHT_CAMERA,
     Json,
@@ -80,16 +79,13 @@ def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(
     cloud: PointCloud, mesh: TriangleMesh
 ) -> None:
     both = plot(Scene(np.eye(4), cloud, mesh))["data"]
-    alone = plot(Scene(np.eye(4), None, mesh))["data"]
-    assert [trace["type"] for trace in both] == ["scatter3d", "mesh3d"]
-    assert both[1]["visible"] == "legendonly"
-    assert alone[0]["visible"] is True
-
-
-def test_mesh_without_colours_is_drawn(mesh: TriangleMesh) -> None:
     grey = TriangleMesh(mesh.vertices, mesh.faces)
-    trace = plot(Scene(np.eye(4), None, grey))["data"][0]
-    assert trace["color"].startswith("#")
+    (alone,) = plot(Scene(np.eye(4), None, grey))["data"]
+    assert [(trace["type"], trace["visible"]) for trace in (both[1], alone)] == [
+        ("mesh3d", "legendonly"),
+        ("mesh3d", True),
+    ]
+    assert (both[0]["type"], alone["color"]) == ("scatter3d", "#b8c4ce")
 
 
 def test_axes_have_true_proportion_and_the_longest_is_two(cloud: PointCloud) -> None:
@@ -101,21 +97,21 @@ def test_axes_have_true_proportion_and_the_longest_is_two(cloud: PointCloud) -> 
     assert aspect["y"] / aspect["x"] == pytest.approx(sides["y"] / sides["x"])
 
 
-def test_eye_in_metres_is_where_the_layout_looks_from() -> None:
-    corners = np.array([[0, 0, 0], [10, 10, 10]], dtype=np.float32)
-    scene = Scene(np.eye(4), PointCloud(corners), eye_m=(-5.0, 5.0, 5.0))
-    eye = plot(scene)["layout"]["scene"]["camera"]["eye"]
-    # 10 m before the middle of a box of 10.2 m, whose side is 2 units.
-    assert eye["x"] == pytest.approx(-2.0 / 1.02)
-    assert eye["y"] == pytest.approx(0.0)
-
-
-def test_what_is_far_off_is_looked_at_from_nearer_in_the_same_direction() -> None:
-    corners = np.array([[0, 0, 0], [1, 1, 1]], dtype=np.float32)
-    scene = Scene(np.eye(4), PointCloud(corners), eye_m=(-9.5, 0.5, 10.5))
-    eye = plot(scene)["layout"]["scene"]["camera"]["eye"]
-    assert eye["x"] == pytest.approx(-eye["z"])
-    assert np.hypot(eye["x"], eye["z"]) == pytest.approx(2.2)
+@pytest.mark.parametrize(
+    ("far_m", "eye_m", "expected"),
+    [
+        # 10 m before the middle of a box of 10.2 m, whose side is 2 units.
+        (10.0, (-5.0, 5.0, 5.0), (-2.0 / 1.02, 0.0, 0.0)),
+        # Looked at from nearer, in the same direction.
+        (1.0, (-9.5, 0.5, 10.5), (-2.2 / 2**0.5, 0.0, 2.2 / 2**0.5)),
+    ],
+)
+def test_eye_in_metres_is_where_the_layout_looks_from(
+    far_m: float, eye_m: tuple[float, float, float], expected: tuple[float, ...]
+) -> None:
+    corners = np.array([[0, 0, 0], [far_m] * 3], dtype=np.float32)
+    eye = plot(Scene(np.eye(4), PointCloud(corners), eye_m=eye_m))["layout"]["scene"]["camera"]
+    assert tuple(eye["eye"].values()) == pytest.approx(expected)
 
 
 def test_a_point_far_from_all_others_does_not_make_the_rest_small(cloud: PointCloud) -> None:
@@ -190,40 +186,26 @@ def test_thinned_cloud_is_a_part_of_the_cloud_within_the_limit(
     assert {tuple(p) for p in thinned.tolist()} <= {tuple(p) for p in xyz.tolist()}
 
 
-def test_cloud_of_one_place_is_thinned_to_one_point() -> None:
-    assert len(thin_cloud(PointCloud(np.ones((50, 3), dtype=np.float32)), 10)) == 1
-
-
 def test_thinned_cloud_keeps_its_extent_and_most_of_what_it_may(cloud: PointCloud) -> None:
     thinned = thin_cloud(cloud, 500)
     # A cell may not be much larger than needed, or detail would be lost for nothing.
     assert 250 <= len(thinned) <= 500
     assert np.ptp(thinned.xyz, axis=0) == pytest.approx(np.ptp(cloud.xyz, axis=0), abs=1.0)
     assert thinned.rgb is not None
-
-
-def test_thinning_is_deterministic(cloud: PointCloud) -> None:
-    np.testing.assert_array_equal(thin_cloud(cloud, 300).xyz, thin_cloud(cloud, 300).xyz)
+    np.testing.assert_array_equal(thinned.xyz, thin_cloud(cloud, 500).xyz)
+    assert len(thin_cloud(PointCloud(np.ones((50, 3), dtype=np.float32)), 10)) == 1
 
 
 def test_thinned_mesh_covers_the_same_place_with_fewer_triangles(mesh: TriangleMesh) -> None:
+    assert thin_mesh(mesh, 10_000) is mesh
     thinned = thin_mesh(mesh, 200)
     assert 20 < len(thinned.faces) <= 200
     assert thinned.faces.max() < len(thinned.vertices)
+    assert (np.diff(np.sort(thinned.faces, axis=1), axis=1) > 0).all()
     # The sheet is 19 m wide; cells of a few metres move its border by less than one cell.
     assert np.ptp(thinned.vertices, axis=0)[:2] == pytest.approx([19, 19], abs=4)
     assert thinned.rgb is not None
     assert len(thinned.rgb) == len(thinned.vertices)
-
-
-def test_small_mesh_stays_as_it_is(mesh: TriangleMesh) -> None:
-    assert thin_mesh(mesh, 10_000) is mesh
-
-
-def test_up_to_256_greys_are_kept_within_one_level() -> None:
-    grey = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
-    palette, index = quantise_colours(grey)
-    assert np.abs(palette[index].astype(int) - grey).max() <= 1
 
 
 @given(count=st.integers(0, 300), seed=st.integers(0, 99))
@@ -237,22 +219,13 @@ def test_palette_is_small_and_every_colour_is_near_its_entry(count: int, seed: i
         assert np.abs(palette[index].astype(int) - rgb).mean() < 16
 
 
-def test_two_colours_of_unequal_number_stay_two() -> None:
-    rgb = np.array([[0, 0, 0]] * 3 + [[200, 10, 10]] * 97, dtype=np.uint8)
-    palette, index = quantise_colours(rgb)
-    np.testing.assert_array_equal(palette[index], rgb)
-
-
-def test_a_thinned_grid_keeps_its_obstacles_and_its_place() -> None:
-    cells = np.full((7, 10), UNKNOWN, np.int8)
-    cells[:3] = FREE
-    cells[1, 9] = cells[6, 0] = OCCUPIED
-    thinned = thin_grid(OccupancyGrid(cells, 0.2, (-3.0, 4.0)), 4)
-    assert (thinned.resolution_m, thinned.origin_m) == (pytest.approx(0.6), (-3.0, 4.0))
-    expected = [[FREE, FREE, FREE, OCCUPIED], [UNKNOWN] * 4, [OCCUPIED, *[UNKNOWN] * 3]]
-    np.testing.assert_array_equal(thinned.cells, expected)
-
-
-def test_a_small_grid_stays_as_it_is() -> None:
-    grid = OccupancyGrid(np.zeros((3, 4), np.int8), 0.2, (0.0, 0.0))
-    assert thin_grid(grid, 4) is grid
+@pytest.mark.parametrize(
+    ("rgb", "off"),
+    [
+        (np.repeat(np.arange(256)[:, None], 3, axis=1), 1),
+        (np.array([[0, 0, 0]] * 3 + [[200, 10, 10]] * 97), 0),
+    ],
+)
+def test_greys_and_two_colours_of_unequal_number_stay(rgb: np.ndarray, off: int) -> None:
+    palette, index = quantise_colours(rgb.astype(np.uint8))
+    assert np.abs(palette[index].astype(int) - rgb).max() <= off
