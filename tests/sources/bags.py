@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recon.core.geometry.se3 import quaternion_from_rotation
 from recon.core.values import RectifiedCamera, StereoPair
-from tests.sources.drives import EPOCH_S, projections
+from tests.sources.drives import EPOCH_S, Writer, projections
 
 TOPICS = ("/stereo/left/image_rect", "/stereo/right/image_rect")
 
@@ -165,3 +165,8 @@ def write_bag(
             bag.write(how.topics[1], recorded, message)
     path = folder / how.name
     return next(path.glob("*.mcap")) if how.kind == "mcap" else path
+
+
+def bag(**how: Any) -> Writer:
+    """Return what writes bags in this way."""
+    return lambda pairs, camera, folder: write_bag(pairs, camera, folder, Recording(**how))

@@ -17,6 +17,10 @@ from recon.street.settings import StreetScene
 
 RATE_HZ = 10.0
 EPOCH_S = 1_600_000_000
+FRAMES = 11
+CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
+
+Writer = Callable[[list[StereoPair], RectifiedCamera, Path], Path]
 
 
 def rendered(frames: int, **settings: Any) -> tuple[list[StereoPair], RectifiedCamera]:
@@ -173,6 +177,3 @@ def write_lossy_videos(pairs: list[StereoPair], camera: RectifiedCamera, folder:
     write_video(folder / "left.mp4", [p.left for p in pairs], "mp4v")
     write_video(folder / "right.mp4", [p.right for p in pairs], "mp4v")
     return folder
-
-
-Writer = Callable[[list[StereoPair], RectifiedCamera, Path], Path]

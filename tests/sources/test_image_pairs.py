@@ -15,48 +15,33 @@ def touch(folder: Path, *names: str) -> None:
         path.write_bytes(b"x")
 
 
-def names(pairs: tuple[tuple[Path, Path], ...]) -> list[tuple[str, str]]:
-    return [(left.name, right.name) for left, right in pairs]
-
-
-def test_names_that_differ_in_side_are_paired_by_their_numbers(tmp_path: Path) -> None:
-    touch(tmp_path, "left1.png", "left02.png", "left10.png")
-    touch(tmp_path, "right10.png", "right01.png", "right2.png", "notes.txt")
-    found = pair_images(str(tmp_path / "left*"), str(tmp_path / "right*.png"))
-    assert not found.by_order
-    assert names(found.pairs) == [
-        ("left1.png", "right01.png"),
-        ("left02.png", "right2.png"),
-        ("left10.png", "right10.png"),
-    ]
-
-
-def test_a_number_of_the_camera_does_not_count(tmp_path: Path) -> None:
-    touch(tmp_path, "cam0_7.png", "cam0_8.png", "cam1_8.png", "cam1_7.png")
-    found = pair_images(str(tmp_path / "cam0*"), str(tmp_path / "cam1*"))
-    assert names(found.pairs) == [("cam0_7.png", "cam1_7.png"), ("cam0_8.png", "cam1_8.png")]
-
-
-def test_folders_are_paired_by_name_whatever_the_suffix(tmp_path: Path) -> None:
-    touch(tmp_path, "L/a.png", "L/b.png", "R/b.jpg", "R/a.jpg")
-    found = pair_images(tmp_path / "L", tmp_path / "R")
-    assert names(found.pairs) == [("a.png", "a.jpg"), ("b.png", "b.jpg")]
-
-
-def test_names_that_have_nothing_in_common_are_paired_by_order_and_that_is_reported(
-    tmp_path: Path,
+@pytest.mark.parametrize(
+    ("left", "right", "expected", "by_order"),
+    [
+        # By their numbers, where names differ in the side.
+        (["left1.png", "left02.png", "left10.png"],
+         ["right10.png", "right01.png", "right2.png", "right.txt"],
+         ["left1.png right01.png", "left02.png right2.png", "left10.png right10.png"], False),
+        # A number of the camera does not count.
+        (["left0_7.png", "left0_8.png"], ["right1_8.png", "right1_7.png"],
+         ["left0_7.png right1_7.png", "left0_8.png right1_8.png"], False),
+        # By name, whatever the suffix.
+        (["left/a.png", "left/b.png"], ["right/b.jpg", "right/a.jpg"],
+         ["a.png a.jpg", "b.png b.jpg"], False),
+        # By order, where names have nothing in common.
+        (["left/100.png", "left/200.png"], ["right/101.png", "right/202.png"],
+         ["100.png 101.png", "200.png 202.png"], True),
+        (["left_a.png"], ["right_b.png"], ["left_a.png right_b.png"], False),
+    ],
+)  # fmt: skip
+def test_images_are_paired_by_name_by_number_or_in_order(
+    tmp_path: Path, left: list[str], right: list[str], expected: list[str], by_order: bool
 ) -> None:
-    touch(tmp_path, "L/100.png", "L/200.png", "R/101.png", "R/202.png")
-    found = pair_images(tmp_path / "L", tmp_path / "R")
-    assert found.by_order
-    assert names(found.pairs) == [("100.png", "101.png"), ("200.png", "202.png")]
-
-
-def test_a_single_pair_needs_no_names_in_common(tmp_path: Path) -> None:
-    touch(tmp_path, "a.png", "b.png")
-    found = pair_images(tmp_path / "a.png", str(tmp_path / "b.png"))
-    assert names(found.pairs) == [("a.png", "b.png")]
-    assert not found.by_order
+    touch(tmp_path, *left, *right)
+    sides = ("left", "right") if "/" in left[0] else ("left*", "right*")
+    found = pair_images(*(str(tmp_path / side) for side in sides))
+    assert [f"{one.name} {other.name}" for one, other in found.pairs] == expected
+    assert found.by_order == by_order
 
 
 @pytest.mark.parametrize(

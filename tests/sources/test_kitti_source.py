@@ -11,7 +11,6 @@ from recon.io.images.image import write_image
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.kitti import open_kitti
 from recon.sources.settings import SourceSettings
-from recon.sources.source import StereoSource
 
 CALIB = {
     0: "700 0 16 0 0 700 8 0 0 0 1 0",
@@ -42,7 +41,6 @@ def make_drive(
 
 def test_a_drive_gives_its_pairs_in_order_with_times_and_names(tmp_path: Path) -> None:
     source = open_kitti(make_drive(tmp_path / "drive"))
-    assert isinstance(source, StereoSource)
     pairs = list(source)
     assert (source.name, len(source), len(pairs)) == ("drive", 3, 3)
     assert [pair.index for pair in pairs] == [0, 1, 2]
@@ -52,6 +50,7 @@ def test_a_drive_gives_its_pairs_in_order_with_times_and_names(tmp_path: Path) -
     assert (source.calibration.width_px, source.calibration.height_px) == (32, 16)
     assert source.calibration.baseline_m == 0.5
     assert source.truth is None
+    assert len(list(source)) == 3  # it can be read again
 
 
 def test_all_files_that_are_read_are_listed_and_exist(tmp_path: Path) -> None:
@@ -64,11 +63,6 @@ def test_all_files_that_are_read_are_listed_and_exist(tmp_path: Path) -> None:
     assert all((folder / name).is_file() for name in names)
 
 
-def test_a_source_can_be_iterated_again(tmp_path: Path) -> None:
-    source = open_kitti(make_drive(tmp_path))
-    assert len(list(source)) == len(list(source)) == 3
-
-
 def test_the_grey_pair_is_taken_unless_only_the_colour_pair_is_whole(tmp_path: Path) -> None:
     both = make_drive(tmp_path / "both", cameras=(0, 1, 2, 3))
     assert next(iter(open_kitti(both))).left.ndim == 2
@@ -76,38 +70,28 @@ def test_the_grey_pair_is_taken_unless_only_the_colour_pair_is_whole(tmp_path: P
     assert next(iter(open_kitti(colour))).left.ndim == 3
 
 
-def test_truth_starts_at_the_identity(tmp_path: Path) -> None:
-    truth = open_kitti(make_drive(tmp_path, 2, poses=TURNED + TURNED)).truth
-    assert truth is not None
-    assert truth.trajectory is not None
-    expected = np.stack([np.eye(4)] * 2)
-    np.testing.assert_allclose(truth.trajectory.T_world_camera, expected, atol=1e-12)
-    np.testing.assert_array_equal(truth.trajectory.timestamps_s, [0, 0.1])
-
-
-def test_truth_of_the_colour_pair_is_that_of_its_own_left_camera(tmp_path: Path) -> None:
-    folder = make_drive(tmp_path, 2, cameras=(2, 3), poses=IDENTITY + TURNED)
-    truth = open_kitti(folder).truth
-    assert truth is not None
-    assert truth.trajectory is not None
-    # Camera 2 sits at x = -0.1 m. Turned to the right about camera 0 it comes to z = 1 + 0.1 m.
-    np.testing.assert_allclose(truth.trajectory.positions_m, [[0, 0, 0], [0.1, 0, 1.1]], atol=1e-12)
-
-
-def test_poses_of_the_official_download_are_found_beside_the_sequences(tmp_path: Path) -> None:
-    folder = make_drive(tmp_path / "sequences" / "06")
+@pytest.mark.parametrize(
+    ("cameras", "poses", "expected"),
+    [
+        ((0, 1), TURNED + TURNED, [[0, 0, 0], [0, 0, 0]]),
+        # Camera 2 sits at x = -0.1 m. Turned to the right about camera 0 it comes to z = 1 + 0.1 m.
+        ((2, 3), IDENTITY + TURNED, [[0, 0, 0], [0.1, 0, 1.1]]),
+    ],
+)
+@pytest.mark.parametrize("place", ["poses.txt", "../../poses/06.txt"])  # KITTI's own download
+def test_truth_is_that_of_the_left_camera_and_starts_at_the_identity(
+    tmp_path: Path, cameras: tuple[int, ...], poses: str, expected: list[list[float]], place: str
+) -> None:
+    folder = make_drive(tmp_path / "sequences" / "06", 2, cameras)
     (tmp_path / "poses").mkdir()
-    (tmp_path / "poses" / "06.txt").write_text(IDENTITY * 3)
-    assert open_kitti(folder).truth is not None
-
-
-def test_lines_beyond_the_last_image_are_ignored(tmp_path: Path) -> None:
-    folder = make_drive(tmp_path, 3, poses=IDENTITY * 5)
-    (folder / "times.txt").write_text("0\n1\n2\n3\n4\n")
-    source = open_kitti(folder)
-    assert source.truth is not None
-    assert source.truth.trajectory is not None
-    assert len(source) == len(source.truth.trajectory) == 3
+    # Lines beyond the last image are ignored.
+    (folder / place).write_text(poses + IDENTITY)
+    with (folder / "times.txt").open("a") as times:
+        times.write("0.2\n")
+    truth = open_kitti(folder).truth.trajectory
+    np.testing.assert_allclose(truth.T_world_camera[0], np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(truth.positions_m, expected, atol=1e-12)
+    np.testing.assert_array_equal(truth.timestamps_s, [0, 0.1])
 
 
 def test_other_files_among_the_images_are_no_frames(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Details of single layouts: raw lenses, ground truth, names, encodings."""
+"""Details of single layouts: raw lenses, ground truth, names, times, encodings."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.errors import ReconError
+from recon.core.errors import FormatError, ReconError, SourceError
 from recon.core.geometry.se3 import make_transform
-from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
+from recon.core.values import CameraIntrinsics, StereoCalibration, StereoPair
 from recon.io.cameras.ros import write_kalibr
 from recon.io.images.image import pixels_of_ros_image, write_image
 from recon.sources.bag import rig_of_messages
@@ -21,23 +21,13 @@ from recon.sources.rosbags import BagCameraInfo
 from recon.sources.settings import SourceSettings
 from recon.sources.times import pair_stamps, stamp_of_name
 from tests.sources import drives
-
-CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
-
-
-@pytest.fixture(scope="module")
-def pairs() -> list[StereoPair]:
-    rng = np.random.default_rng(3)
-    return [
-        StereoPair(*rng.integers(0, 256, (2, 32, 64), dtype=np.uint8), 0.1 * index, index)
-        for index in range(12)
-    ]
+from tests.sources.drives import CAMERA
 
 
 def test_an_unrectified_kitti_drive_gets_its_raw_lenses(
-    pairs: list[StereoPair], tmp_path: Path
+    noise: list[StereoPair], tmp_path: Path
 ) -> None:
-    drive = drives.write_kitti_raw(pairs, CAMERA, tmp_path)
+    drive = drives.write_kitti_raw(noise, CAMERA, tmp_path)
     calib = tmp_path / "calib_cam_to_cam.txt"
     text = calib.read_text().replace("S_rect_00: 64 32", "S_rect_00: 60 30")
     calib.write_text(text.replace("S_00: 1392 512", "S_00: 64 32"))
@@ -55,9 +45,9 @@ def test_an_unrectified_kitti_drive_gets_its_raw_lenses(
 
 @pytest.mark.parametrize("tag", ["", "!!opencv-matrix"])
 def test_sensor_yaml_may_have_the_header_of_opencv(
-    pairs: list[StereoPair], tmp_path: Path, tag: str
+    noise: list[StereoPair], tmp_path: Path, tag: str
 ) -> None:
-    drives.write_euroc(pairs, CAMERA, tmp_path)
+    drives.write_euroc(noise, CAMERA, tmp_path)
     for path in tmp_path.rglob("sensor.yaml"):
         text = path.read_text().replace("T_BS:", f"T_BS: {tag}")
         path.write_text("%YAML:1.0\n---\n" + text)
@@ -65,10 +55,10 @@ def test_sensor_yaml_may_have_the_header_of_opencv(
 
 
 def test_a_euroc_drive_without_sensor_yaml_takes_the_camchain_beside_it(
-    pairs: list[StereoPair], tmp_path: Path
+    noise: list[StereoPair], tmp_path: Path
 ) -> None:
     """As TUM VI is published."""
-    drives.write_euroc(pairs, CAMERA, tmp_path)
+    drives.write_euroc(noise, CAMERA, tmp_path)
     left = CameraIntrinsics(CAMERA.matrix, np.zeros(4), 64, 32)
     T = make_transform(np.eye(3), np.array([-CAMERA.baseline_m, 0, 0]))
     (tmp_path / "dso").mkdir()
@@ -91,9 +81,9 @@ def test_messages_of_two_single_calibrations_have_no_baseline() -> None:
 
 
 def test_the_true_path_of_euroc_is_that_of_the_left_camera(
-    pairs: list[StereoPair], tmp_path: Path
+    noise: list[StereoPair], tmp_path: Path
 ) -> None:
-    drives.write_euroc(pairs, CAMERA, tmp_path)
+    drives.write_euroc(noise, CAMERA, tmp_path)
     # The body goes ahead along its x, 2 m/s, measured between the frames; it does not turn.
     rows = [
         f"{drives.EPOCH_S * 10**9 + k * 70_000_000 - 10_000_000},{0.14 * k},5,7,0.6,0,0,0.8"
@@ -117,26 +107,16 @@ def test_the_true_path_of_euroc_is_that_of_the_left_camera(
     assert "ground truth for only 10 of 12 frames: not used" in source.description
 
 
-def test_a_true_path_beside_plain_folders_is_read(pairs: list[StereoPair], tmp_path: Path) -> None:
-    drives.write_folders(pairs, CAMERA, tmp_path)
-    lines = [f"{0.1 * k:.3f} 0 0 {k} 0 0 0 1\n" for k in range(12)]
-    (tmp_path / "groundtruth.txt").write_text("".join(lines))
-    truth = open_source(tmp_path).truth
-    assert truth is not None
-    assert truth.trajectory is not None
-    assert truth.trajectory.path_length_m == pytest.approx(11, abs=1e-9)
-
-
 def test_both_cameras_in_one_folder_are_distinguished_by_name(
-    pairs: list[StereoPair], tmp_path: Path
+    noise: list[StereoPair], tmp_path: Path
 ) -> None:
-    for number, pair in enumerate(pairs, start=1):
+    for number, pair in enumerate(noise, start=1):
         write_image(tmp_path / f"left{number:02d}.png", pair.left)
         write_image(tmp_path / f"right{number:02d}.png", pair.right)
     drives.write_calib(tmp_path, CAMERA)
     read = list(open_source(tmp_path))
     assert len(read) == 12
-    np.testing.assert_array_equal(read[10].right, pairs[10].right)
+    np.testing.assert_array_equal(read[10].right, noise[10].right)
 
 
 @pytest.mark.real
@@ -148,9 +128,9 @@ def test_the_chessboard_images_of_opencv_are_pairs(recon_data: Path) -> None:
 
 
 def test_folders_of_any_name_and_place_can_be_named(
-    pairs: list[StereoPair], tmp_path: Path
+    noise: list[StereoPair], tmp_path: Path
 ) -> None:
-    for pair in pairs:
+    for pair in noise:
         write_image(tmp_path / "port" / f"{pair.index}.png", pair.left)
         write_image(tmp_path / "starboard" / f"{pair.index}.png", pair.right)
     calib = drives.write_calib(tmp_path / "papers", CAMERA)
@@ -158,7 +138,7 @@ def test_folders_of_any_name_and_place_can_be_named(
     beside = SourceSettings(right=str(tmp_path / "starboard"), calibration=str(calib))
     for path, settings in ((tmp_path, inside), (tmp_path / "port", beside)):
         np.testing.assert_array_equal(
-            list(open_source(path, "folders", settings))[11].right, pairs[11].right
+            list(open_source(path, "folders", settings))[11].right, noise[11].right
         )
 
 
@@ -168,14 +148,14 @@ def test_folders_of_any_name_and_place_can_be_named(
      ("bottom-top", True, np.vstack)],
 )  # fmt: skip
 def test_views_may_stand_in_any_order_in_one_video(
-    pairs: list[StereoPair], tmp_path: Path, layout: str, flip: bool, stack: object
+    noise: list[StereoPair], tmp_path: Path, layout: str, flip: bool, stack: object
 ) -> None:
-    images = [[p.left, p.right][:: -1 if flip else 1] for p in pairs]
+    images = [[p.left, p.right][:: -1 if flip else 1] for p in noise]
     drives.write_calib(tmp_path, CAMERA)
     path = drives.write_video(tmp_path / "both.avi", [stack(both) for both in images])  # type: ignore[operator]
     read = list(open_source(path, settings=SourceSettings(side_by_side=layout)))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(read[3].left[:, :, 0], pairs[3].left)
-    np.testing.assert_array_equal(read[3].right[:, :, 0], pairs[3].right)
+    np.testing.assert_array_equal(read[3].left[:, :, 0], noise[3].left)
+    np.testing.assert_array_equal(read[3].right[:, :, 0], noise[3].right)
 
 
 @pytest.mark.parametrize(
@@ -275,3 +255,65 @@ def test_a_message_with_too_few_bytes_is_refused() -> None:
         pixels_of_ros_image(np.zeros(9, np.uint8), "mono8", (2, 4), 6)
     # The last row needs no padding.
     assert pixels_of_ros_image(np.zeros(10, np.uint8), "mono8", (2, 4), 6).shape == (2, 4)
+
+
+def write_named(folder: Path, names: list[str]) -> Path:
+    """Pairs of equal names in two folders, the grey values counting the frames."""
+    for number, name in enumerate(names):
+        for side in ("left", "right"):
+            write_image(folder / side / f"{name}.png", np.full((32, 64), number, np.uint8))
+    drives.write_calib(folder, CAMERA)
+    return folder
+
+
+def times(folder: Path, **settings: object) -> list[float]:
+    source = open_source(folder, "folders", SourceSettings.model_validate(settings))
+    return source.stamps_s.tolist()
+
+
+@pytest.mark.parametrize("digits", [10, 13, 16, 19])
+@pytest.mark.parametrize("step", [1, 5])
+def test_padded_counters_are_no_times(tmp_path: Path, digits: int, step: int) -> None:
+    folder = write_named(tmp_path, [f"{100 + step * k:0{digits}d}" for k in range(4)])
+    assert times(folder) == [0.0, 0.1, 0.2, 0.3]
+    assert "no times: assumed 10 Hz" in open_source(folder).description
+
+
+def test_a_single_padded_counter_is_no_time(tmp_path: Path) -> None:
+    assert times(write_named(tmp_path, ["0000000123"])) == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["1600000000", "1600000001"], [1600000000, 1600000001]),
+        (["1600000000123", "1600000000156"], [1600000000.123, 1600000000.156]),
+        # Nanoseconds since a simulation began.
+        (["0000000000000000000", "0000000000050000000"], [0.0, 0.05]),
+    ],
+)
+def test_integer_times_stay_times(tmp_path: Path, names: list[str], expected: list[float]) -> None:
+    assert times(write_named(tmp_path, names)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_times_file_may_have_numbers_and_exposures(tmp_path: Path) -> None:
+    folder = write_named(tmp_path, [f"{k:05d}" for k in range(4)])
+    rows = [f"{k:05d} {7 + 0.25 * k:.6f} 1.5e-3\n" for k in range(4)]
+    (folder / "times.txt").write_text("".join(rows))
+    assert times(folder) == [7.0, 7.25, 7.5, 7.75]
+    (folder / "times.txt").write_text("".join([*rows[:2], rows[1], rows[3]]))
+    with pytest.raises(SourceError, match=r"times\.txt:3: two images have the same timestamp"):
+        times(folder)
+    (folder / "times.txt").write_text("1 2\n3 4\n")
+    with pytest.raises(FormatError, match="got 2, expected 1 or 3"):
+        times(folder)
+
+
+@pytest.mark.parametrize("name", ["{:010d}", "16000000{:02d}", "{}.5", "frame{}"])
+@pytest.mark.parametrize("place", [".", "left"])
+def test_a_times_file_wins_over_names(tmp_path: Path, name: str, place: str) -> None:
+    folder = write_named(tmp_path, [name.format(k) for k in range(4)])
+    (folder / place / "times.txt").write_text("7.0\n7.25\n7.5\n7.75\n")
+    assert times(folder) == [7.0, 7.25, 7.5, 7.75]
+    assert folder / place / "times.txt" in open_source(folder).files
+    assert times(folder, rate_hz=5.0) == pytest.approx([0, 0.2, 0.4, 0.6])

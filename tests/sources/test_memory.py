@@ -13,7 +13,7 @@ from recon.sources.registry import open_source
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")
-from tests.sources.bags import Recording, write_bag
+from tests.sources.bags import bag
 
 SHORT, LONG, WIDTH_PX, HEIGHT_PX = 50, 100, 320, 240
 PAIR_BYTES = 2 * WIDTH_PX * HEIGHT_PX
@@ -21,9 +21,9 @@ PAIR_BYTES = 2 * WIDTH_PX * HEIGHT_PX
 LAYOUTS: dict[str, drives.Writer] = {
     "kitti": drives.write_kitti,
     "two videos": drives.write_two_videos,
-    "ros1": lambda *drive: write_bag(*drive, Recording("ros1")),
-    "ros2": lambda *drive: write_bag(*drive, Recording("ros2")),
-    "mcap": lambda *drive: write_bag(*drive, Recording("mcap")),
+    "ros1": bag(kind="ros1"),
+    "ros2": bag(kind="ros2"),
+    "mcap": bag(kind="mcap"),
 }
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,21 +19,14 @@ from tests.hostile.refusals import assert_refused, run
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")
-from tests.sources.bags import TOPICS, Recording, recorder, write_bag
+from tests.sources.bags import TOPICS, Recording, bag, recorder
 
 Drive = tuple[list[StereoPair], RectifiedCamera]
 
 
-@pytest.fixture(scope="module")
-def drive() -> Drive:
-    """Noise, as the image content does not matter here."""
-    rng = np.random.default_rng(0)
-    camera = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
-    pairs = [
-        StereoPair(*rng.integers(0, 256, (2, 32, 64), dtype=np.uint8), 0.1 * index, index)
-        for index in range(12)
-    ]
-    return pairs, camera
+@pytest.fixture
+def drive(noise: list[StereoPair]) -> Drive:
+    return noise, drives.CAMERA
 
 
 def fails(path: Path, message: str, settings: SourceSettings | None = None) -> None:
@@ -53,7 +46,7 @@ def halve(path: Path, share: float = 0.5) -> Path:
 def test_a_cut_off_recording_is_one_line(
     drive: Drive, tmp_path: Path, kind: str, share: float
 ) -> None:
-    path = write_bag(*drive, tmp_path, Recording(kind))
+    path = bag(kind=kind)(*drive, tmp_path)
     halve(next(path.glob("*.db3")) if kind == "ros2" else path, share)
     fails(path, "recording cannot be read.*reindex")
 
@@ -62,7 +55,7 @@ def test_a_recording_cut_off_before_its_index_was_written_is_one_line(
     drive: Drive, tmp_path: Path
 ) -> None:
     # A recorder that was killed leaves the place of the index at 0.
-    path = write_bag(*drive, tmp_path, Recording("ros1"))
+    path = bag(kind="ros1")(*drive, tmp_path)
     content = path.read_bytes()
     at = content.index(b"index_pos=") + len(b"index_pos=")
     path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
@@ -75,41 +68,41 @@ def test_stamps_out_of_order_are_reported_with_topic_and_place(
 ) -> None:
     pairs, _ = drive
     mixed = [*pairs[:5], pairs[6], pairs[5], *pairs[7:]]
-    with recorder(tmp_path, Recording(kind)) as bag:
+    with recorder(tmp_path, Recording(kind)) as made:
         for number, pair in enumerate(mixed):
             stamp = round(pair.timestamp_s * 1e9) + 10**18
-            bag.write(TOPICS[0], number * 10**8, bag.image(stamp, pair.left))
-            bag.write(TOPICS[1], number * 10**8, bag.image(stamp, pair.right))
+            made.write(TOPICS[0], number * 10**8, made.image(stamp, pair.left))
+            made.write(TOPICS[1], number * 10**8, made.image(stamp, pair.right))
     path = next(p for p in tmp_path.rglob("*") if p.suffix in {".bag", ".mcap", ".db3"})
     fails(path, r"image_rect, image 6: timestamps are out of order")
 
 
-def test_a_missing_topic_is_reported_with_those_that_are_there(
-    drive: Drive, tmp_path: Path
+@pytest.mark.parametrize(
+    ("how", "settings", "message"),
+    [
+        ({}, {"left": "/front/image", "right": TOPICS[1]},
+         r"no such image topic \(got /front/image, expected .*image_rect \(12\)"),
+        ({"topics": ("/front/image", "/rear/image")}, {},
+         r"no image topics of a left and a right camera.*/front/image \(12\), /rear/image"),
+        ({"info": False}, {}, "no calibration of both cameras.*--calib"),
+        ({"encoding": "32FC1"}, {}, "message 0: image encoding is not supported.*got 32FC1"),
+    ],
+)  # fmt: skip
+def test_what_a_recording_lacks_is_said_with_what_it_has(
+    drive: Drive, tmp_path: Path, how: dict[str, Any], settings: dict[str, str], message: str
 ) -> None:
-    path = write_bag(*drive, tmp_path, Recording("ros1"))
-    settings = SourceSettings(left="/front/image", right=TOPICS[1])
-    fails(path, r"no such image topic \(got /front/image, expected .*image_rect \(12\)", settings)
+    path = bag(kind="ros1", **how)(*drive, tmp_path)
+    fails(path, message, SourceSettings(**settings))
 
 
-def test_topics_that_look_like_no_pair_are_listed(drive: Drive, tmp_path: Path) -> None:
-    path = write_bag(*drive, tmp_path, Recording("mcap", topics=("/front/image", "/rear/image")))
-    fails(path, r"no image topics of a left and a right camera.*/front/image \(12\), /rear/image")
-    settings = SourceSettings(left="/front/image", right="/rear/image")
-    assert len(open_source(path, settings=settings)) == 12
-
-
-def test_a_recording_without_calibration_asks_for_a_file(drive: Drive, tmp_path: Path) -> None:
-    path = write_bag(*drive, tmp_path, Recording("ros2", info=False))
-    fails(path, "no calibration of both cameras.*--calib")
-    calib = drives.write_calib(tmp_path / "calibration", drive[1])
-    source = open_source(path, settings=SourceSettings(calibration=str(calib)))
+def test_topics_and_calibration_can_be_named(drive: Drive, tmp_path: Path) -> None:
+    names = ("/front/image", "/rear/image")
+    path = bag(kind="mcap", topics=names, info=False)(*drive, tmp_path)
+    calib = str(drives.write_calib(tmp_path / "calibration", drive[1]))
+    settings = SourceSettings(left=names[0], right=names[1], calibration=calib)
+    source = open_source(path, settings=settings)
     assert len(list(source)) == 12
-
-
-def test_other_encodings_are_reported(drive: Drive, tmp_path: Path) -> None:
-    path = write_bag(*drive, tmp_path, Recording("ros1", encoding="32FC1"))
-    fails(path, "message 0: image encoding is not supported.*got 32FC1")
+    assert source.files[0] == Path(calib)
 
 
 def test_of_several_pairs_of_topics_the_rectified_one_is_taken_and_the_other_named(
@@ -117,14 +110,14 @@ def test_of_several_pairs_of_topics_the_rectified_one_is_taken_and_the_other_nam
 ) -> None:
     pairs, camera = drive
     raw = ("/stereo/left/image_raw", "/stereo/right/image_raw")
-    with recorder(tmp_path, Recording("ros1")) as bag:
+    with recorder(tmp_path, Recording("ros1")) as made:
         for pair in pairs:
             stamp = round(pair.timestamp_s * 1e9) + 10**18
             for topics in (raw, TOPICS):
                 for topic, P in zip(topics, drives.projections(camera), strict=True):
-                    bag.write(topic, stamp, bag.image(stamp, pair.left))
+                    made.write(topic, stamp, made.image(stamp, pair.left))
                     place = topic.rsplit("/", 1)[0]
-                    bag.write(f"{place}/camera_info", stamp, bag.camera_info(stamp, camera, P))
+                    made.write(f"{place}/camera_info", stamp, made.camera_info(stamp, camera, P))
     description = open_source(tmp_path / "drive.bag").description
     assert f"{TOPICS[0]} and {TOPICS[1]}" in description
     assert f"also there: {raw[0]}" in description
@@ -133,35 +126,28 @@ def test_of_several_pairs_of_topics_the_rectified_one_is_taken_and_the_other_nam
 def test_headers_without_stamps_fall_back_to_the_recording_times(
     drive: Drive, tmp_path: Path
 ) -> None:
-    path = write_bag(*drive, tmp_path, Recording("ros1", stamped=False))
+    path = bag(kind="ros1", stamped=False)(*drive, tmp_path)
     # The right images are recorded 104 ms late here: nothing pairs within 10 ms ...
     source = open_source(path, settings=SourceSettings(tolerance_s=0.11))
     # ... and where the recording alone tells the times, that is said.
     assert "recording times" in source.description
 
 
-def spoil_video(write: drives.Writer, victim: str, share: float) -> Callable[[Drive, Path], Path]:
-    def spoil(drive: Drive, folder: Path) -> Path:
-        path = write(*drive, folder)
-        halve(path / victim if path.is_dir() else path, share)
-        return path
-
-    return spoil
-
-
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("write", "victim", "share", "message"),
     [
-        (spoil_video(drives.write_lossy_videos, "left.mp4", 0.5), "not a readable video"),
-        (spoil_video(drives.write_two_videos, "right.avi", 0.5), "video is truncated"),
-        (spoil_video(drives.write_side_by_side, "", 0.0), "not a readable video"),
-        (spoil_video(drives.write_two_videos, "left.avi", 0.01), "video"),
+        (drives.write_lossy_videos, "left.mp4", 0.5, "not a readable video"),
+        (drives.write_two_videos, "right.avi", 0.5, "video is truncated"),
+        (drives.write_side_by_side, "both.mkv", 0.0, "not a readable video"),
+        (drives.write_two_videos, "left.avi", 0.01, "video"),
     ],
 )
 def test_a_video_that_cannot_be_read_is_one_line(
-    drive: Drive, tmp_path: Path, spoil: Callable[[Drive, Path], Path], message: str
+    drive: Drive, tmp_path: Path, write: drives.Writer, victim: str, share: float, message: str
 ) -> None:
-    fails(spoil(drive, tmp_path), message)
+    path = write(*drive, tmp_path)
+    halve(tmp_path / victim, share)
+    fails(path, message)
 
 
 def test_videos_of_different_length_are_refused(drive: Drive, tmp_path: Path) -> None:
@@ -234,7 +220,7 @@ def test_the_command_line_tells_it_in_one_line_and_leaves_nothing(
         path = drives.write_lossy_videos(*drive, tmp_path / "in")
         halve(path / "left.mp4")
     else:
-        path = halve(write_bag(*drive, tmp_path / "in", Recording(kind)))
+        path = halve(bag(kind=kind)(*drive, tmp_path / "in"))
     done = run("map", path, "--out", tmp_path / "out")
     assert_refused(done)
     assert done.err.count("\n") == 1
