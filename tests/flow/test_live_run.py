@@ -15,7 +15,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError, SourceError
 from recon.io.trajectory import read_tum
-from recon.map.drive.map_behind import MapBehind
+from recon.map.drive.drive import MapBehind
 from recon.run.progress import Silent
 from recon.sources import live
 from recon.sources.live import LiveSource

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from recon.core.values import RectifiedPair
-from recon.map.drive.map_behind import MapBehind
+from recon.map.drive.drive import MapBehind
 from recon.odometry.protocol import OdometryResult
 from recon.sources import live
 

@@ -26,14 +26,10 @@ _BEHIND: Final = 4  # frames by which loop detection may lag behind
 
 @dataclass(frozen=True, eq=False)
 class DriveLoops:
-    """The result of loop closure on a drive.
+    """The result of loop closure on a drive: the path before and after it, and the loops.
 
-    Attributes:
-        odometry: The path before closure.
-        closure: The path after closure, and the loops.
-        keyframes: Number of keyframes.
-        found: Number of loops that passed the geometric check, confirmed by neighbours or not.
-        refused: Number of rejected candidates by reason.
+    ``found`` is how many passed the geometric check, confirmed by neighbours or not; ``refused``
+    how many candidates were rejected, by reason.
     """
 
     odometry: Trajectory
@@ -90,11 +86,8 @@ class DriveLoops:
 class LoopWatch:
     """Keeps keyframes in its own thread while a drive is mapped, and closes loops at its end.
 
-    Args:
-        keyframes: Where keyframes are kept; those in it are of the frames before.
-        stopwatch: Records the time spent.
-        search: Whether to look for loops; the keyframes are kept in any case, to find later drives
-            in the map.
+    Keyframes that are kept already are of the frames before. Without ``search`` they are kept, too,
+    to find later drives in the map.
     """
 
     def __init__(

@@ -26,12 +26,10 @@ _KNOWN: Final = PriorSettings(sigma_share=0.01)
 
 @dataclass(frozen=True)
 class UsedPrior:
-    """How an external trajectory was used.
+    """How an external trajectory was used: its axes, known from images, settings, or assumed.
 
-    Attributes:
-        axes: The axes of its poses.
-        known_from: ``images``, ``settings``, or ``assumed``.
-        sigmas: Median distance from the visual motion in each set of axes, standard deviations.
+    ``sigmas`` are median distances from the visual motion in each set of axes, in standard
+    deviations.
     """
 
     axes: str
@@ -73,15 +71,7 @@ def odometry_of(
     prior: Trajectory | None,
     used: UsedPrior | None,
 ) -> Odometry:
-    """Make the odometry of a drive.
-
-    Args:
-        config: The configuration.
-        source: The drive.
-        known_poses: Poses to use instead of an odometry, one per frame of the source.
-        prior: Motion of the camera by other sensors.
-        used: The axes of the prior, once they are known.
-    """
+    """Return the odometry of a drive, or known poses, one per frame, that take its place."""
     if known_poses is None:
         settings = config.odometry
         if used is not None:

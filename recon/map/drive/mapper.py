@@ -30,12 +30,7 @@ from recon.stereo.frame import ReconstructedFrame
 class Mapper:
     """Registers frames; integrates each into the current submap while the next is registered.
 
-    Args:
-        config: The configuration.
-        camera: The rectified camera.
-        odometry: Estimates the poses.
-        session: Where it is kept; its frames, submaps and rays are those before.
-        stopwatch: Times each stage.
+    What it makes is kept in the session, whose frames, submaps and rays are those before.
     """
 
     def __init__(
@@ -46,11 +41,8 @@ class Mapper:
         session: Session,
         stopwatch: Stopwatch,
     ) -> None:
-        self._config = config
-        self._odometry = odometry
-        self._camera = camera
-        self.session = session
-        self._stage = stopwatch.stage
+        self._config, self._camera, self._odometry = config, camera, odometry
+        self.session, self._stage = session, stopwatch.stage
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
         self._behind = OneBehind()
         self._builder: SubmapBuilder | None = None
@@ -146,9 +138,8 @@ class Mapper:
     def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
         """Return the submap under construction; the first frame fixes the map axes."""
         if self._builder is None:
-            ground = estimate_ground(frame.cloud)
-            height_m = self._config.ground.camera_height_m
-            T_map_world = map_axes(ground, self._config.axes, height_m)
+            config, ground = self._config, estimate_ground(frame.cloud)
+            T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m)
             self.session.set_axes(T_map_world, self._camera)
             self._builder = self._new_builder()
         return self._builder
@@ -174,8 +165,7 @@ class FrameResult:
         seconds: Time since the previous frame was done.
         valid_share: Share of pixels with a disparity, in [0, 1].
         points: Number of points in the cloud of the frame.
-        T_world_camera: float64 (4, 4), its pose.
-        health: Health of that pose.
+        T_world_camera: float64 (4, 4).
     """
 
     index: int

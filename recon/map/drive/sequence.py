@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
@@ -53,12 +54,11 @@ class MappedSequence:
 
     Attributes:
         map: The map, in which the drive is the only session.
-        config: The configuration.
         sample: The frame in the middle of the drive, for display.
         seconds: Wall-clock time from the first frame to the last.
         loops: Result of loop closure; None = it was not run.
         prior: How the external trajectory was used; None = there was none.
-        threads: Threads with which rays are cast, where they are.
+        threads: Threads with which rays are cast.
     """
 
     map: Map
@@ -199,6 +199,13 @@ def map_sequence(
     )
 
 
+_AUDIT: Final = "recon audit SOURCE shows what is wrong"
+_PRIOR: Final = (
+    "check the prior: its axes (--set odometry.prior.axes=auto finds them), its unit (metres) and "
+    "its clock"
+)
+
+
 def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) -> None:
     """Refuse a pair whose matches give no point."""
     if not len(frame.cloud):
@@ -213,13 +220,7 @@ def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) 
 
 
 def check_map(mapped: MappedSequence, where: str, findings: Sequence[str] = ()) -> None:
-    """Refuse a drive that gives no map.
-
-    Args:
-        mapped: The drive.
-        where: Its name.
-        findings: What an audit found, the worst first.
-    """
+    """Refuse a drive that gives no map; ``findings`` of an audit come with the worst first."""
     if any(len(tile.cloud) for tile in mapped.tiles):
         return
     why, hint = _explain_poses(mapped.health) or _explain_sample(mapped)
@@ -236,13 +237,8 @@ def _explain_poses(health: Sequence[OdometryHealth]) -> tuple[str, str] | None:
     # Notes differ in their numbers.
     kinds = Counter(re.sub(r"\d+", "", note) for note in notes)
     most = next((n for n in notes if re.sub(r"\d+", "", n) == kinds.most_common(1)[0][0]), "")
-    hint = "recon audit SOURCE shows what is wrong with the images"
-    if "prior" in most:
-        hint = (
-            "check the prior: its axes (--set odometry.prior.axes=auto finds them), its unit "
-            "(metres) and its clock"
-        )
-    return f"{len(bad)} of {counted(len(health), 'pose')} are not to be trusted ({most})", hint
+    found = f"{len(bad)} of {counted(len(health), 'pose')} are not to be trusted ({most})"
+    return found, _PRIOR if "prior" in most else f"{_AUDIT} with the images"
 
 
 def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
@@ -250,22 +246,15 @@ def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
     config, frame = mapped.config, mapped.sample
     if not len(frame.cloud):
         found = _depths(frame.disparity, mapped.camera)
-        return f"no point in the middle of the drive: {found}", (
-            "recon audit SOURCE shows what is wrong; see cloud.max_range_m and "
-            "cloud.max_relative_sigma"
-        )
-    nearest_m, reach_m = _nearest_m(frame), fusion_range_m(mapped.camera, config.fusion)
+        hint = "see cloud.max_range_m and cloud.max_relative_sigma"
+        return f"no point in the middle of the drive: {found}", f"{_AUDIT}; {hint}"
+    nearest_m = float(frame.cloud.xyz[:, 2].min())
+    reach_m = fusion_range_m(mapped.camera, config.fusion)
     if nearest_m > reach_m:
         got = f"the nearest point is {nearest_m:.1f} m away, the map ends at {reach_m:.1f} m"
         return got, "allow larger errors with --set fusion.max_depth_error_m="
-    frames = len(mapped.trajectory)
-    return f"of {counted(frames, 'frame')}, too few saw the same place", (
-        "use recon pair for a single pair, or lower fusion.min_count"
-    )
-
-
-def _nearest_m(frame: ReconstructedFrame) -> float:
-    return float(frame.cloud.xyz[:, 2].min())
+    got = f"of {counted(len(mapped.trajectory), 'frame')}, too few saw the same place"
+    return got, "use recon pair for a single pair, or lower fusion.min_count"
 
 
 def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:

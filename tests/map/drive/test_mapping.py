@@ -13,8 +13,8 @@ from recon.core.errors import MappingError, RegistrationError
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import FREE, OCCUPIED, PointCloud, RectifiedCamera, RectifiedPair, Trajectory
 from recon.core.values.arrays import Float64
+from recon.map.drive.drive import MapBehind
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.map_behind import MapBehind
 from recon.map.fusion import CloudBuilder, FusionSettings
 from recon.map.ground.axes import AxesSettings, estimate_ground, map_axes
 from recon.map.ground.grid import GridSettings, flatten
