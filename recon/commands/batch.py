@@ -21,20 +21,12 @@ from recon.run.run import Run
 def run_batch(
     jobs: Sequence[Job], options: BatchOptions, listed: JobList | None = None
 ) -> dict[str, Any]:
-    """Run many commands: what `recon batch` does.
+    """Run many commands, all checked: what `recon batch` does; returns the summary.
 
-    Each job is a process of its own on its worker and writes a folder of its own, whole or not at
-    all; a job that fails leaves the others alone, and one that breaks is tried again and goes on
-    where it was.
-
-    Args:
-        jobs: The jobs, checked.
-        options: How they are run.
-        listed: What they come from, kept so that the batch can be resumed; None = it is resumed:
-            jobs without a result are run, also those that had failed; the summary is that of all.
-
-    Returns:
-        The summary: ``jobs`` with the figures of each, ``succeeded``, ``failed`` and more.
+    Each job is a process of its own on its worker and writes a folder of its own, all or nothing;
+    a job that fails leaves the others alone, and one that breaks is tried again and goes on where
+    it was. What the jobs come from is kept, so that the batch can be resumed; None = it is resumed:
+    jobs without a result are run, also those that had failed, and the summary is that of all.
     """
     folder = resolved(options.out or default_folder("batch"))
     if listed is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

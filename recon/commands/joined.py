@@ -43,13 +43,7 @@ def make_joined(
 ) -> dict[str, Any]:
     """Fill the map of a run, link and place its drives, and make its products and its report.
 
-    Args:
-        options: Folder, threads, mesh and progress of the run.
-        settings: Its settings.
-        fill: Puts the drives into its map.
-        inputs: The files that are read.
-        replaced: The run whose place it takes; None = it is a new one.
-        survey: Measured positions beside those that the drives have already.
+    It may take the place of a run; positions may be measured beside those that drives have already.
     """
     with (
         WholeRun(

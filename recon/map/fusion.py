@@ -109,14 +109,9 @@ class CloudBuilder:
     def part(self) -> FusedPart:
         """Return what was seen since the start, or since the last `take`."""
         n, s = len(self), self._sums
-        known = tuple(name for name, value in self._known.items() if value)
-        return FusedPart(
-            s.keys[:n].copy(),
-            s.sums[:n].copy(),
-            s.information[:n].copy(),
-            s.frames[:n].copy(),
-            known if self._frames else (),
-        )
+        known = tuple(name for name, value in self._known.items() if value and self._frames)
+        keys, sums = s.keys[:n].copy(), s.sums[:n].copy()
+        return FusedPart(keys, sums, s.information[:n].copy(), s.frames[:n].copy(), known)
 
     def take(self) -> FusedPart:
         """Return the part so far; the builder starts a new one."""
@@ -167,11 +162,8 @@ class CloudBuilder:
 def _values(cloud: PointCloud) -> Float32:
     """Return what is averaged of each point, (N, 7): colour, normal, confidence; 0 = unknown."""
     values = np.zeros((len(cloud), VALUES), np.float32)
-    for columns, array in (
-        (RGB, cloud.rgb),
-        (NORMAL, cloud.normals),
-        (CONFIDENCE, cloud.confidence),
-    ):
+    named = ((RGB, cloud.rgb), (NORMAL, cloud.normals), (CONFIDENCE, cloud.confidence))
+    for columns, array in named:
         if array is not None:
             values[:, columns] = array
     return values
@@ -232,13 +224,8 @@ class FusedPart:
 
     def select(self, which: NDArray[Any]) -> FusedPart:
         """Return the rows of a boolean mask or of an index array, in that order."""
-        return FusedPart(
-            self.keys[which],
-            self.sums[which],
-            self.information[which],
-            self.frames[which],
-            self.known,
-        )
+        keys, sums, information = self.keys[which], self.sums[which], self.information[which]
+        return FusedPart(keys, sums, information, self.frames[which], self.known)
 
     def rounded(self) -> FusedPart:
         """Return the sums to as many digits as they mean something, so that they compress."""

@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.geometry.se3 import as_transform
 from recon.core.values import RectifiedCamera, Trajectory
-from recon.odometry.health import expected_drift
+from recon.odometry.health import doubt_about, expected_drift, health_warnings, stretches
 from recon.odometry.protocol import OdometryHealth
 
 GOOD = OdometryHealth(scale_px=30.0, sigma_m=0.01, sigma_deg=0.02)
@@ -69,3 +69,37 @@ def test_poses_that_were_not_measured_say_nothing(camera: RectifiedCamera) -> No
     some = expected_drift(path(), [GOOD, lost] + [GOOD] * 99, camera)
     assert some is not None
     assert some.rig_percent < 1.0
+
+
+LOST = OdometryHealth(ok=False, notes=("dark",))
+SKIPPED = replace(LOST, skipped=True)
+FINE = OdometryHealth()
+
+
+def test_lost_frames_are_named_by_stretches() -> None:
+    assert health_warnings([FINE] * 3) == []
+    lines = health_warnings([FINE, LOST, LOST, FINE, LOST, *[FINE] * 30])
+    assert [line.split(":")[0] for line in lines] == ["frames 1-2", "frame 4"]
+    assert all("dark" in line for line in lines)
+    first, *others = health_warnings([FINE, *[LOST] * 3, *[FINE] * 16])
+    assert first.startswith("PATH AND MAP ARE NOT TO BE TRUSTED")
+    assert "3 of 20 frames" in first
+    assert len(others) == 1
+    warned = replace(FINE, warnings=("rows are off",))
+    assert health_warnings([warned, FINE, warned, FINE]) == ["frames 0-2: rows are off"]
+
+
+def test_what_follows_a_lost_pose_is_another_stretch_unless_that_was_skipped() -> None:
+    assert stretches([FINE, SKIPPED, FINE, LOST, FINE, FINE]).tolist() == [0, -1, 0, -1, 1, 1]
+    assert stretches([FINE, LOST, SKIPPED, FINE]).tolist() == [0, -1, -1, 1]
+    assert stretches([]).tolist() == []
+
+
+def test_one_line_says_what_is_doubted_of_a_drive() -> None:
+    assert doubt_about([FINE] * 3) == []
+    (line,) = doubt_about([*[FINE] * 20, SKIPPED, *[FINE] * 20])
+    assert line == "1 of 41 poses are not to be trusted (frame 20): nothing of them is in the map"
+    (line,) = doubt_about([*[FINE] * 20, LOST, *[FINE] * 20])
+    assert line.endswith("and what follows may be misplaced")
+    (line,) = doubt_about([FINE, LOST, FINE])
+    assert line.startswith("PATH AND MAP ARE NOT TO BE TRUSTED: the poses of 1 of 3 frames")

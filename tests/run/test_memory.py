@@ -1,7 +1,10 @@
-"""A memory limit is parsed, divided and enforced."""
+"""A memory limit is parsed, divided and enforced; what is measured is that of the process."""
 
 from __future__ import annotations
 
+import platform
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +23,7 @@ from recon.map.store.session import Submaps
 from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles
 from recon.run import memory
+from recon.run.machine import peak_memory_mb
 from recon.run.memory import MemorySettings, parse_size_mb
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
@@ -29,6 +33,44 @@ pytestmark = pytest.mark.usefixtures("blank_figures")
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 SIZE = {"width_px": 256, "height_px": 96, "focal_px": 150.0}
 STREET = StreetScene(frames=12, speed_m_per_frame=0.5, smooth_edges=False, **SIZE)
+
+
+PRINT_PEAK = "from recon.run.machine import peak_memory_mb; print(peak_memory_mb())"
+FREE_AND_RETURN = """
+import resource
+from pathlib import Path
+from recon.run.machine import return_free_memory
+
+def resident_bytes():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+blocks = [b"1" * 60_000 for _ in range(2000)]  # smaller than what malloc maps on its own
+last = blocks[-1]  # stays behind them, so that they are a gap
+blocks.clear()
+freed = resident_bytes()
+return_free_memory()
+print(freed - resident_bytes())
+"""
+
+
+def printed_by(code: str) -> float:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return float(done.stdout)
+
+
+def test_the_peak_is_that_of_the_process_alone_and_stays() -> None:
+    ballast = np.ones(100_000_000)  # 800 MB
+    peak_mb, below_mb = peak_memory_mb(), printed_by(PRINT_PEAK)
+    assert peak_mb > ballast.nbytes / 1e6
+    assert 10 < below_mb < 700
+    del ballast
+    # Linux adds up what each core counted now and then: a few pages more or less.
+    assert peak_memory_mb() > 0.99 * peak_mb
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="malloc_trim is glibc's")
+def test_what_was_freed_before_something_that_stays_is_returned() -> None:
+    assert printed_by(FREE_AND_RETURN) > 100_000_000
 
 
 @pytest.mark.parametrize(
@@ -45,21 +87,17 @@ def test_what_is_no_size_is_refused(text: str) -> None:
         parse_size_mb(text)
 
 
-def test_without_a_limit_nothing_is_cut_and_nothing_stops(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 1e9)
-    free = MemorySettings()
-    free.check("frame 0")
-    assert (free.submap_bytes, free.tile_bytes) == (None, None)
-
-
 def test_what_takes_more_than_the_limit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    limited = MemorySettings(limit_mb=500)
-    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 499.9)
+    free, limited = MemorySettings(), MemorySettings(limit_mb=500)
+    assert (free.submap_bytes, free.tile_bytes) == (None, None)
+    assert 0 < (limited.submap_bytes or 0) < (limited.tile_bytes or 0) < limited.cache_bytes < 1e8
+    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 500.0)
     limited.check("frame 7")
     monkeypatch.setattr(memory, "peak_memory_mb", lambda: 512.0)
-    with pytest.raises(MemoryLimitError, match=r"^frame 7: .*got 512 MB.*at most 500 MB") as told:
+    free.check("frame 7")
+    with pytest.raises(MemoryLimitError, match=r"^frame 7: .*got 512 MB.*at most 500 MB") as caught:
         limited.check("frame 7")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def _along_a_wall(config: ReconConfig) -> Submaps:
@@ -116,19 +154,13 @@ class _Unwatched(MemorySettings):
     def check(self, where: str) -> None: ...
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("drive")
-    write_kitti(SyntheticSource(STREET), folder)
-    return folder
-
-
 def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peaks = iter([400.0] * 6)
     monkeypatch.setattr(memory, "peak_memory_mb", lambda: next(peaks, 600.0))
-    out = tmp_path / "run"
+    drive, out = tmp_path / "drive", tmp_path / "run"
+    write_kitti(SyntheticSource(STREET), drive)
     overrides = ["checkpoints.every_frames=4", "submaps.length_m=4", "memory.limit_mb=500"]
     config = load_config(None, overrides)
     source, options = MapOptions(source=drive, mesh=False).open(config)
@@ -136,8 +168,7 @@ def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
     with pytest.raises(MemoryLimitError, match=r"got 600 MB.*--resume .* larger --memory-limit"):
         run_map(source, config, options)
     options, config = MapOptions(mesh=False).resumed(out, None, [{"memory.limit_mb": 700}])
-    assert config.memory.limit_mb == 700
-    assert config.submaps.length_m == 4
+    assert (config.memory.limit_mb, config.submaps.length_m) == (700, 4)
     assert options.source == str(drive)
     run = run_map(source, config, replace(options, audit=False))
     assert run.summary["frames"] == STREET.frames

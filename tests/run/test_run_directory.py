@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from recon.core.errors import OutputError
+from recon.core.errors import FormatError, OutputError
 from recon.io.atomic import exchange
 from recon.run import directory
-from recon.run.directory import RunDirectory
+from recon.run.directory import RunDirectory, refuse_links, state_folder
 from recon.run.run import Run, WholeRun
 
 
@@ -21,10 +21,16 @@ def write_run(folder: Path, *names: str, whole: bool = False) -> None:
         run.write_json("run.json", {"files": [*run.files(), "run.json"]})
 
 
-def fail_halfway(folder: Path) -> None:
-    with RunDirectory(folder) as run:
-        run.path("map/cloud.ply").write_text("half")
-        raise KeyError
+def fail_halfway(folder: Path, error: type[BaseException] = KeyError, begun: bool = False) -> None:
+    def fail() -> None:
+        with RunDirectory(folder) as run:
+            run.state("map.recon").write_text("so far")
+            run.begun = begun
+            run.path("map/cloud.ply").write_text("half")
+            raise error
+
+    with pytest.raises(error):
+        fail()
 
 
 def files_in(folder: Path) -> set[str]:
@@ -32,28 +38,35 @@ def files_in(folder: Path) -> set[str]:
 
 
 def test_files_appear_when_the_run_ends_well(tmp_path: Path) -> None:
-    write_run(tmp_path / "run", "map/cloud.ply", "summary.json")
-    assert files_in(tmp_path / "run") == {"map/cloud.ply", "summary.json", "run.json"}
-
-
-def test_nothing_is_there_while_the_run_goes_on(tmp_path: Path) -> None:
     with RunDirectory(tmp_path / "run") as run:
         run.path("map/cloud.ply").write_text("half")
-        assert not (tmp_path / "run" / "map").exists()
+        assert [path.name for path in (tmp_path / "run").iterdir()] == [".partial"]
+    assert files_in(tmp_path / "run") == {"map/cloud.ply"}
 
 
-def test_a_failed_run_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(KeyError):
-        fail_halfway(tmp_path / "a" / "b")
+def test_a_failed_run_leaves_an_earlier_run_as_it_was_or_no_folder(tmp_path: Path) -> None:
+    fail_halfway(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_failed_run_leaves_an_earlier_run_as_it_was(tmp_path: Path) -> None:
     write_run(tmp_path / "run", "map/cloud.ply")
-    with pytest.raises(KeyError):
-        fail_halfway(tmp_path / "run")
+    fail_halfway(tmp_path / "run")
     assert (tmp_path / "run" / "map" / "cloud.ply").read_text() == "map/cloud.ply"
     assert files_in(tmp_path / "run") == {"map/cloud.ply", "run.json"}
+
+
+@pytest.mark.parametrize(
+    ("error", "begun", "stays"),
+    [(OSError, True, True), (OSError, False, False), (KeyError, True, False)],
+)
+def test_what_the_input_did_not_cause_leaves_what_a_run_resumes_from(
+    tmp_path: Path, error: type[BaseException], begun: bool, stays: bool
+) -> None:
+    fail_halfway(tmp_path / "run", error, begun)
+    assert (state_folder(tmp_path / "run") / "map.recon").is_file() == stays
+    if stays:
+        with RunDirectory(tmp_path / "run", resume=True) as run:
+            assert (run.begun, run.files()) == (True, [])
+            assert run.state("map.recon").read_text() == "so far"
+    assert not state_folder(tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(("exchanges", "left"), [(False, "old"), (True, "new")])
@@ -87,19 +100,18 @@ def test_an_address_is_not_taken_for_a_folder(
     write_run(address, "summary.json")
 
 
-def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(tmp_path: Path) -> None:
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(
+    tmp_path: Path, whole: bool
+) -> None:
     write_run(tmp_path / "run", "mesh/mesh.ply")
     (tmp_path / "run" / "notes.txt").write_text("mine")
-    write_run(tmp_path / "run", "map/cloud.ply")
+    killed = tmp_path / "run" / ".partial" / "map" / "octomap.ot"
+    killed.parent.mkdir(parents=True)
+    killed.write_text("half")
+    write_run(tmp_path / "run", "map/cloud.ply", whole=whole)
     assert files_in(tmp_path / "run") == {"map/cloud.ply", "notes.txt", "run.json"}
-
-
-def test_what_a_killed_run_left_is_cleared(tmp_path: Path) -> None:
-    leftover = tmp_path / "run" / ".partial" / "map" / "cloud.ply"
-    leftover.parent.mkdir(parents=True)
-    leftover.write_text("half")
-    write_run(tmp_path / "run", "summary.json")
-    assert files_in(tmp_path / "run") == {"summary.json", "run.json"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_a_folder_of_other_files_is_refused(tmp_path: Path) -> None:
@@ -125,6 +137,17 @@ def test_a_record_that_names_files_outside_deletes_nothing(tmp_path: Path) -> No
     (tmp_path / "run" / "run.json").write_text(json.dumps(record))
     write_run(tmp_path / "run", "summary.json")
     assert (tmp_path / "precious").read_text() == "stay"
+
+
+def test_links_below_a_folder_are_refused_and_the_folder_may_be_one(tmp_path: Path) -> None:
+    (tmp_path / "run" / "map").mkdir(parents=True)
+    (tmp_path / "latest").symlink_to("run")
+    refuse_links(tmp_path / "latest" / "map")
+    with pytest.raises(FormatError, match="latest"):
+        refuse_links(tmp_path / "latest" / "map", below=tmp_path)
+    (tmp_path / "run" / "map" / "cloud.ply").symlink_to("/etc/passwd")
+    with pytest.raises(FormatError, match=r"cloud\.ply"):
+        refuse_links(tmp_path / "run")
 
 
 def test_nan_is_refused_in_json(tmp_path: Path) -> None:

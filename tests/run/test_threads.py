@@ -1,30 +1,29 @@
-"""Lookahead changes when results are computed, but not the results or their order."""
+"""Threads change when results are computed, but not the results or their order."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
+import cv2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.run import threads as lookahead
-from recon.run.threads import OneBehind, look_ahead, side_by_side
+from recon.run import threads
+from recon.run.machine import available_cores
+from recon.run.threads import OneBehind, look_ahead, side_by_side, use_threads
 from tests.run.pools import observed_pool
 from tests.scenery.patience import LONG_S
 
 
 @given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
-def test_results_come_in_order(items: list[int], depth: int) -> None:
-    assert list(look_ahead(lambda x: x + 1, items, depth=depth)) == [x + 1 for x in items]
-
-
-@given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
-def test_results_of_several_threads_come_in_order(items: list[int], threads: int) -> None:
-    assert list(side_by_side(lambda x: x + 1, items, threads=threads)) == [x + 1 for x in items]
+def test_results_come_in_order(items: list[int], count: int) -> None:
+    after = [x + 1 for x in items]
+    assert list(look_ahead(lambda x: x + 1, items, depth=count)) == after
+    assert list(side_by_side(lambda x: x + 1, items, threads=count)) == after
 
 
 def test_as_many_items_are_worked_on_as_there_are_threads() -> None:
@@ -38,17 +37,23 @@ def test_as_many_items_are_worked_on_as_there_are_threads() -> None:
     assert list(side_by_side(meet, range(4), threads=2)) == [0, 1, 2, 3]
 
 
-def test_no_more_items_are_begun_than_can_be_held() -> None:
+@pytest.mark.parametrize(
+    ("ahead", "most"), [(partial(look_ahead, depth=3), 5), (partial(side_by_side, threads=2), 3)]
+)
+def test_no_more_items_are_begun_than_can_be_held(
+    ahead: Callable[..., Iterator[int]], most: int
+) -> None:
     begun: list[int] = []
 
-    def work(item: int) -> int:
-        begun.append(item)
-        return item
+    def items() -> Iterator[int]:
+        for item in range(100):
+            begun.append(item)
+            yield item
 
-    results = side_by_side(work, range(100), threads=2)
+    results = ahead(lambda x: x, items())
     assert next(results) == 0
-    results.close()
-    assert len(begun) <= 3
+    results.close()  # type: ignore[attr-defined]
+    assert 1 < len(begun) <= most
 
 
 @pytest.fixture
@@ -75,7 +80,7 @@ def test_nothing_is_begun_after_an_interruption(monkeypatch: pytest.MonkeyPatch)
     begun: list[int] = []
     next_drawn = threading.Event()
     pool, dropped = observed_pool()
-    monkeypatch.setattr(lookahead, "ThreadPoolExecutor", pool)
+    monkeypatch.setattr(threads, "ThreadPoolExecutor", pool)
 
     def items() -> Iterator[int]:
         yield 0
@@ -95,81 +100,50 @@ def test_nothing_is_begun_after_an_interruption(monkeypatch: pytest.MonkeyPatch)
     assert begun == [0]
 
 
-def test_at_most_depth_items_are_drawn_ahead() -> None:
-    drawn: list[int] = []
-
-    def items() -> Iterator[int]:
-        for item in range(100):
-            drawn.append(item)
-            yield item
-
-    results = look_ahead(lambda x: x, items(), depth=3)
-    assert next(results) == 0
-    results.close()
-    assert len(drawn) <= 5
-
-
-def test_an_error_is_raised_at_its_turn() -> None:
-    def fail_at_two(item: int) -> int:
-        if item == 2:
-            raise KeyError(item)
-        return item
-
-    results = look_ahead(fail_at_two, range(5))
-    assert [next(results), next(results)] == [0, 1]
-    with pytest.raises(KeyError):
-        next(results)
-
-
-def test_an_error_of_the_source_is_raised_at_its_turn() -> None:
-    def items() -> Iterator[int]:
-        yield 0
+def test_an_error_of_an_item_or_of_the_source_is_raised_at_its_turn() -> None:
+    def items() -> Iterator[str]:
+        yield from ("0", "1")
         raise OSError("disk gone")
 
-    results = look_ahead(lambda x: x, items())
-    assert next(results) == 0
+    for ahead in (look_ahead, partial(side_by_side, threads=2)):
+        results = ahead(int, ["0", "1", "no number", "3"])
+        assert [next(results), next(results)] == [0, 1]
+        with pytest.raises(ValueError, match="no number"):
+            next(results)
+    results = look_ahead(int, items())
+    assert [next(results), next(results)] == [0, 1]
     with pytest.raises(OSError, match="disk gone"):
         next(results)
 
 
-def test_work_happens_in_another_thread() -> None:
-    [thread] = look_ahead(lambda _: threading.current_thread().name, [0])
-    assert thread.startswith("look-ahead")
-
-
-def test_jobs_behind_are_done_in_order() -> None:
-    behind, done = OneBehind(), []
-    for item in range(50):
-        behind.begin(partial(done.append, item))
-    behind.wait()
-    assert done == list(range(50))
-
-
-def test_one_job_at_a_time_is_behind() -> None:
-    behind, gate, done = OneBehind(), threading.Event(), []
+def test_jobs_behind_are_done_in_order_one_at_a_time() -> None:
+    behind, gate, done = OneBehind(), threading.Event(), list[int]()
 
     def first() -> None:
         gate.wait(LONG_S)
-        done.append("first")
+        done.append(-1)
 
     behind.begin(first)
     assert done == []
     threading.Timer(0.05, gate.set).start()
-    behind.begin(partial(done.append, "second"))
-    assert done[0] == "first"
+    for item in range(50):
+        behind.begin(partial(done.append, item))
+        assert done[: item + 1] == list(range(-1, item))
     behind.abandon()
-    assert done == ["first", "second"]
+    assert done == list(range(-1, 50))
 
 
-def test_an_error_of_a_job_is_raised_once_when_it_is_met() -> None:
+def test_an_error_of_a_job_behind_is_raised_once_and_not_when_it_is_abandoned() -> None:
     behind = OneBehind()
     behind.begin(partial(int, "no number"))
     with pytest.raises(ValueError, match="no number"):
         behind.wait()
     behind.wait()
-
-
-def test_leaving_off_waits_and_raises_nothing() -> None:
-    behind = OneBehind()
     behind.begin(partial(int, "no number"))
     behind.abandon()
+
+
+def test_no_more_threads_are_used_than_there_are_cores() -> None:
+    cores, before = available_cores(), cv2.getNumThreads()
+    assert [use_threads(1), use_threads(None), use_threads(cores + 3)] == [1, cores, cores]
+    cv2.setNumThreads(before)

@@ -82,10 +82,9 @@ class Survey:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Positions that were measured during a drive.
+    """Positions that were measured during a drive, in the order of time.
 
     Attributes:
-        times_s: float64 (N,), ascending.
         position_m: float64 (N, 3), in the coordinates of the survey.
         ours_m: float64 (N, 3), by the path, in map axes.
         agree: bool (N,), False for positions that contradict most others.

@@ -45,13 +45,10 @@ Work = Callable[[Job, str], Outcome]
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How jobs are run.
+    """How jobs are run, until the first one fails or all are done.
 
-    Attributes:
-        out: Folder of the batch; None = a new one below ``outputs/``.
-        scheduler: Address of Dask's scheduler; None = workers on this machine.
-        workers: How many of these; None = one per core.
-        fail_fast: Whether the first job that fails ends the batch.
+    Into a folder (None = a new one below ``outputs/``), by Dask's scheduler of this address (None =
+    workers on this machine, one per core unless their number is given).
     """
 
     out: Path | None = None

@@ -39,17 +39,13 @@ _TAIL_BYTES: Final = 1 << 16
 
 @dataclass(frozen=True)
 class Job:
-    """One command of a batch.
+    """One command of a batch, such as ``evaluate trajectory``, with a folder by its name.
 
     Attributes:
-        name: Its name, and that of its folder below that of the batch.
-        command: The command, such as ``evaluate trajectory``.
-        source: What it works on, for people.
         words: The command line after ``recon``, without the result folder.
         writes: Whether the command has an ``--out``; else what it prints is kept.
         folder: Where relative paths of the command line begin.
         timeout_s: Longest time of one try; None = any.
-        retries: How often it is tried again when its worker died, or it was killed or late.
         needs: What it takes of a worker that declares such resources (``threads``, ``memory``).
         swept: The settings that a sweep gave it.
     """
@@ -71,13 +67,9 @@ class Job:
             return [*self.words, *(["--out", str(out)] if self.writes else [])]
         if self.command == "piece":
             return [*self.words, "--resume", str(out)]
-        # A drive knows what it was begun with.
-        kept = [
-            word
-            for name in ("--threads", "--memory-limit")
-            if name in self.words
-            for word in self.words[self.words.index(name) :][:2]
-        ]
+        limits = ("--threads", "--memory-limit")  # all else a drive knows that was begun
+        at = [self.words.index(name) for name in limits if name in self.words]
+        kept = [word for place in at for word in self.words[place : place + 2]]
         return ["map", "--resume", str(out), *kept, "--json", "--verbose"]
 
     def resumes(self, out: Path) -> bool:
@@ -90,12 +82,8 @@ class Outcome:
     """How the last try of a job ended, as its log has it.
 
     Attributes:
-        state: How.
-        error: Why it did not succeed, in one line.
-        seconds: Its time.
-        worker: Where it ran.
         tries: How often the job was begun.
-        full: Whether a disk is full there.
+        full: Whether a disk is full where it ran.
         stale: Whether what it left is of no use: it went on with that, and failed.
     """
 

@@ -41,12 +41,7 @@ _UNUSUAL: Final = 3.5
 class JobResult:
     """A job of a batch that has ended, or was not run; a `Step` of the progress.
 
-    Attributes:
-        job: The job.
-        last: How its last try ended.
-        figures: Numbers of its summary by dotted name.
-        warnings: Those of its summary.
-        remark: The figure of drift or trust that is most unusual, if any is.
+    It has the numbers of its summary by dotted name, and their most unusual one of drift or trust.
     """
 
     job: Job
@@ -129,10 +124,9 @@ def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
 
 
 def compare(results: Sequence[JobResult]) -> list[JobResult]:
-    """Return the results with a remark where drift or trust are worse than in the other jobs.
+    """Return the results with a remark where drift or trust are much worse than in other jobs.
 
-    Others are those of the same command with the same swept settings; how much worse is told by
-    the distance from their median in (robust) standard deviations.
+    Others are those of the same command with the same swept settings.
     """
     groups: dict[str, list[JobResult]] = {}
     for one in results:

@@ -1,22 +1,18 @@
-"""Jobs on workers: what breaks is tried again, what fails is told, nothing is lost."""
+"""Jobs on workers: what breaks is tried again, what fails is named, nothing is lost."""
 
 from __future__ import annotations
 
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
-from recon.core.errors import (
-    ClusterError,
-    FormatError,
-    MissingDependencyError,
-    SettingsError,
-)
+from recon.core.errors import ClusterError, FormatError, MissingDependencyError, SettingsError
 from recon.run.batch.cluster import BatchOptions, Cluster, _outcome, join_cluster, local_cluster
 from recon.run.batch.job import Job, Outcome, log_file
 from recon.run.batch.results import work_off
@@ -24,6 +20,7 @@ from tests.run.batch.jobs import job, stand_in, tries
 
 distributed = pytest.importorskip("distributed")
 __all__ = ["stand_in"]
+usefixtures = pytest.mark.usefixtures("stand_in")
 
 
 @pytest.fixture(scope="module")
@@ -44,30 +41,23 @@ def run(cluster: Cluster, jobs: list[Job], folder: Path) -> dict[str, Outcome]:
     return dict(ended)
 
 
-@pytest.mark.usefixtures("stand_in")
-def test_a_poisoned_job_among_fifty_is_told_and_the_rest_goes_on(
+@usefixtures
+def test_what_breaks_goes_on_and_what_fails_is_named_and_the_rest_is_done(
     cluster: Cluster, tmp_path: Path
 ) -> None:
-    jobs = [job(f"j{n}", "bad" if n == 17 else "good") for n in range(50)]
-    ended = run(cluster, jobs, tmp_path)
-    states = [outcome.state for outcome in ended.values()]
-    assert (states.count("succeeded"), states.count("failed")) == (49, 1)
-    assert ended["j17"].error == "nowhere: folder does not exist"
-    assert all(tries(tmp_path, one.name) == ["begun"] for one in jobs)
-
-
-@pytest.mark.usefixtures("stand_in")
-def test_a_broken_job_goes_on_and_its_retries_have_a_limit(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+    good = [job(f"j{n}") for n in range(25)]
     jobs = [job("a", "killed once"), job("b", "always killed", retries=3), job("c", "damaged")]
-    ended = run(cluster, jobs, tmp_path)
+    ended = run(cluster, [*good[:9], *jobs, job("d", "bad"), *good[9:]], tmp_path)
+    assert {ended[one.name].state for one in good} == {"succeeded"}
+    assert all(tries(tmp_path, one.name) == ["begun"] for one in good)
     assert (ended["a"].state, ended["a"].tries) == ("succeeded", 2)
     assert tries(tmp_path, "a") == ["begun", "resumed"]
     assert (ended["b"].state, ended["b"].tries) == ("broken", 4)
     assert tries(tmp_path, "b") == ["begun"] * 4
     # The last try does without what the ones before have left.
     assert tries(tmp_path, "c") == ["begun", "resumed", "begun"]
+    assert (ended["d"].state, ended["d"].tries) == ("failed", 1)
+    assert ended["d"].error == "nowhere: folder does not exist"
 
 
 def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
@@ -108,7 +98,27 @@ def test_dask_has_jobs_of_one_kind_and_not_all_of_very_many(
     assert [kind for kind in kinds if "j1" in kind] == []
 
 
-@pytest.mark.usefixtures("stand_in")
+def test_jobs_need_of_workers_what_all_of_these_declare() -> None:
+    class Client:
+        asked: ClassVar[dict[str, object]] = {}
+
+        def scheduler_info(self, n_workers: int) -> dict[str, dict[str, object]]:
+            assert n_workers == -1  # all of them, not only the first
+            return {"workers": {"a": {"resources": {"threads": 8, "memory": 1e9}},
+                                "b": {"resources": {"threads": 4}}}}  # fmt: skip
+
+        def map(self, work: object, jobs: list[Job], resources: object, **_: object) -> list[str]:
+            self.asked |= {one.name: resources for one in jobs}
+            return [one.name for one in jobs]
+
+    needs: list[dict[str, float]] = [{"threads": 2, "memory": 5e8}, {}, {"memory": 5e8}]
+    jobs = [job(f"j{n}", needs=each) for n, each in enumerate(needs)]
+    found = list(Cluster(Client())._submit(jobs, "", ()))
+    assert sorted(found, key=str) == [(one, one.name) for one in jobs]
+    assert Client.asked == {"j0": {"threads": 2}, "j1": None, "j2": None}
+
+
+@usefixtures
 def test_a_worker_that_cannot_run_a_job_says_why(cluster: Cluster, tmp_path: Path) -> None:
     ended = run(cluster, [job("a", retries=1)], tmp_path / "unseen")
     assert ended["a"].state == "broken"
@@ -128,13 +138,6 @@ def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path: Path) 
     assert _outcome(Lost(), None, job("a"), tmp_path) == begun
 
 
-@pytest.mark.usefixtures("stand_in")
-def test_the_folder_of_a_batch_is_made_for_its_workers(cluster: Cluster, tmp_path: Path) -> None:
-    folder = tmp_path / "state" / "pieces"
-    (result,) = work_off([job("a")], folder, cluster, BatchOptions())
-    assert (result.ok, result.figures["points"]) == (True, 7)
-
-
 def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path: Path) -> None:
     def nobody(job: Job, folder: str) -> Outcome:
         raise distributed.scheduler.NoWorkerError(job.name, 120)
@@ -143,23 +146,14 @@ def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path:
         run(Cluster(cluster._client, nobody), [job("a")], tmp_path)
 
 
-@pytest.mark.usefixtures("stand_in")
+@usefixtures
 def test_two_batches_with_jobs_of_the_same_name_share_a_scheduler(
     cluster: Cluster, tmp_path: Path
 ) -> None:
-    for number in range(2):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        assert run(cluster, [job("a")], folder)["a"].state == "succeeded"
+    for folder in (tmp_path / "0", tmp_path / "state" / "1"):  # which is made for its workers
+        (result,) = work_off([job("a")], folder, cluster, BatchOptions())
+        assert (result.ok, result.figures["points"]) == (True, 7)
         assert (folder / "a" / "run.json").is_file()
-
-
-@pytest.mark.usefixtures("stand_in")
-def test_needs_that_no_worker_declares_do_not_keep_a_job_waiting(
-    cluster: Cluster, tmp_path: Path
-) -> None:
-    ended = run(cluster, [job("a", needs={"threads": 64.0})], tmp_path)
-    assert ended["a"].state == "succeeded"
 
 
 def test_a_function_is_called_with_each_item_and_its_error_is_raised(
@@ -174,12 +168,60 @@ def test_a_function_is_called_with_each_item_and_its_error_is_raised(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
     with pytest.raises(FormatError, match="bad: damaged"):
         cluster.each(touch, ["d", "bad"])
+    with pytest.raises(ClusterError, match="no number"):
+        cluster.each(int, ["no number"])
 
 
-def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 0.5)
-    with pytest.raises(SettingsError, match="scheduler cannot be reached"):
-        join_cluster("tcp://127.0.0.1:9").__enter__()
+def test_workers_share_the_cores_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recon.run.batch.cluster.available_cores", lambda: 8)
+    shares = [BatchOptions(workers=count).threads_of(None) for count in (None, 1, 3, 9)]
+    assert shares == [1, 8, 2, 1]
+    assert BatchOptions(workers=3).threads_of(5) == 5
+    assert BatchOptions(scheduler="tcp://x:1").threads_of(None) is None
+
+
+GREETINGS = (b"", b"SSH-2.0-OpenSSH_9.6\r\n", b"HTTP/1.1 400 Bad Request\r\n\r\n" + bytes(1000))
+
+
+def assert_not_reached(address: str | Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
+        with pytest.raises(SettingsError, match="scheduler cannot be reached") as caught:
+            join_cluster(str(address)).__enter__()
+    assert str(address) in str(caught.value)
+
+
+@pytest.mark.parametrize("greeting", GREETINGS)
+@pytest.mark.parametrize("protocol", ["tcp://", "tls://", ""])
+def test_what_is_no_scheduler_is_one_line_and_not_waited_for(
+    protocol: str, greeting: bytes
+) -> None:
+    kept: list[socket.socket] = []
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                kept.append(listening.accept()[0])
+                kept[-1].sendall(greeting)
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve, daemon=True).start()
+        assert_not_reached(f"{protocol}127.0.0.1:{listening.getsockname()[1]}")
+    for connection in kept:
+        connection.close()
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:9", "ucx://x:1", "nonsense", "tcp://", "tcp://127.0.0.1:x", ""]
+)
+def test_what_is_no_address_of_a_scheduler_is_one_line(address: str) -> None:
+    assert_not_reached(address)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"address": 3}'])
+def test_a_file_that_names_no_scheduler_is_one_line(content: str, tmp_path: Path) -> None:
+    (tmp_path / "scheduler.json").write_text(content)
+    assert_not_reached(tmp_path / "scheduler.json")
 
 
 def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -> None:
@@ -189,60 +231,6 @@ def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -
 
     with pytest.raises(ClusterError, match="the scheduler is gone"):
         Cluster(Gone()).workers  # noqa: B018
-
-
-def silent(connection: socket.socket) -> None:
-    del connection
-
-
-def speaks_first(connection: socket.socket) -> None:
-    connection.sendall(b"SSH-2.0-OpenSSH_9.6\r\n")
-
-
-def answers(connection: socket.socket) -> None:
-    connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n" + bytes(1000))
-
-
-@pytest.mark.parametrize("server", [silent, speaks_first, answers])
-@pytest.mark.parametrize("protocol", ["tcp://", "tls://", ""])
-def test_what_is_no_scheduler_is_one_line_and_not_waited_for(
-    protocol: str, server: Callable[[socket.socket], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
-    kept: list[socket.socket] = []
-
-    def serve() -> None:
-        with suppress(OSError):
-            while True:
-                kept.append(listening.accept()[0])
-                server(kept[-1])
-
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        threading.Thread(target=serve, daemon=True).start()
-        address = f"{protocol}127.0.0.1:{listening.getsockname()[1]}"
-        with pytest.raises(SettingsError, match="scheduler cannot be reached"):
-            join_cluster(address).__enter__()
-    for connection in kept:
-        connection.close()
-
-
-@pytest.mark.parametrize("address", ["ucx://x:1", "nonsense", "tcp://", "tcp://127.0.0.1:x", ""])
-def test_what_is_no_address_of_a_scheduler_is_one_line(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
-    with pytest.raises(SettingsError, match="scheduler cannot be reached"):
-        join_cluster(address).__enter__()
-
-
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"address": 3}'])
-def test_a_file_that_names_no_scheduler_is_one_line(
-    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
-    (tmp_path / "scheduler.json").write_text(content)
-    with pytest.raises(SettingsError, match=r"scheduler\.json: the scheduler cannot be reached"):
-        join_cluster(str(tmp_path / "scheduler.json")).__enter__()
 
 
 def test_without_dask_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

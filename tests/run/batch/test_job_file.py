@@ -68,27 +68,27 @@ def test_what_a_batch_was_begun_with_is_read_as_it_was_written(tmp_path: Path) -
     assert read_plan(tmp_path / "out") == listed
 
 
-@pytest.mark.parametrize("content", ["", "3", "[3]", '{"x": 1}', "{", '{"job": [{"name": "a"}]}'])
-def test_a_damaged_plan_is_one_line(tmp_path: Path, content: str) -> None:
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [*((text, r"jobs\.json") for text in
+       ("", "3", "[3]", '{"x": 1}', "{", '{"job": [{"name": "a"}]}')),
+     ('[{"name": "a", "words": ["map", "drive"]}]', r"earlier version.*another --out")],
+)  # fmt: skip
+def test_a_damaged_plan_is_one_line(tmp_path: Path, content: str, words: str) -> None:
     (tmp_path / "jobs.json").write_text(content)
-    with pytest.raises(ReconError, match=r"jobs\.json"):
+    with pytest.raises(ReconError, match=words):
         read_plan(tmp_path)
 
 
-def test_a_batch_of_an_earlier_version_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "jobs.json").write_text('[{"name": "a", "words": ["map", "drive"]}]')
-    with pytest.raises(ReconError, match=r"earlier version.*another --out"):
-        read_plan(tmp_path)
-
-
-def test_sources_are_named_by_their_last_part() -> None:
-    entries = jobs_of_sources("map", ["a/2011_09 x", "b/.c/"]).job
-    assert [entry.name for entry in entries] == ["2011_09-x", "c"]
-
-
-def test_sources_with_one_last_part_are_named_by_more_of_their_paths() -> None:
-    entries = jobs_of_sources("map", ["robot1/monday", "Robot2/monday", "robot2/friday"]).job
-    assert [entry.name for entry in entries] == ["robot1_monday", "Robot2_monday", "robot2_friday"]
+def test_sources_are_named_by_as_many_of_their_last_parts_as_tell_them_apart() -> None:
+    for sources, names in (
+        (["a/2011_09 x", "b/.c/"], ["2011_09-x", "c"]),
+        (
+            ["robot1/monday", "Robot2/monday", "robot2/friday"],
+            ["robot1_monday", "Robot2_monday", "robot2_friday"],
+        ),
+    ):
+        assert [entry.name for entry in jobs_of_sources("map", sources).job] == names
     for same in (["a/x", "b/../a/x"], ["/", "/"]):
         listed = jobs_of_sources("map", same)
         with pytest.raises(SettingsError, match=r"two jobs have one name.*in a file"):
@@ -141,23 +141,16 @@ def test_everything_else_is_one_line(tmp_path: Path, text: str, words: str) -> N
     assert len(str(told.value)) < 1000
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_name_is_that_of_a_folder_below_the_batch(name: str) -> None:
-    with pytest.raises(SettingsError, match="not a name of a folder"):
-        check_names([name])
-
-
 @pytest.mark.parametrize(
-    "name", ["jobs.json", "Summary.JSON", "report.html", "table.csv", "logs", "run.json"]
-)
-def test_a_job_is_not_named_like_a_file_of_the_batch(name: str) -> None:
-    with pytest.raises(SettingsError, match="that of a file of the batch"):
-        check_names([name])
-
-
-def test_names_that_differ_in_capitals_alone_are_the_same() -> None:
-    with pytest.raises(SettingsError, match="job A: two jobs have one name"):
-        check_names(["a", "A"])
+    ("names", "words"),
+    [*(([name], "not a name of a folder") for name in NAMES),
+     *(([name], "that of a file of the batch") for name in
+       ("jobs.json", "Summary.JSON", "report.html", "table.csv", "logs", "run.json")),
+     (["a", "A"], "job A: two jobs have one name")],
+)  # fmt: skip
+def test_a_name_is_that_of_a_folder_below_the_batch_alone(names: list[str], words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        check_names(names)
 
 
 def test_recursion_in_yaml_is_one_line(tmp_path: Path) -> None:

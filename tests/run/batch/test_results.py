@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,26 +13,25 @@ from recon.run.batch.results import JobResult, accuracies, compare, outliers_fir
 from tests.run.batch.jobs import job
 
 DONE = Outcome("succeeded", seconds=1.0, worker="w", tries=1)
+TEXT = """{"a": 1, "b": {"c": 2.5, "d": null, "e": "x"}, "f": true, "g": [1], "h": Infinity,
+"seconds": 4, "warnings": ["dark"]}"""
 
 
 def result(name: str, **figures: float) -> JobResult:
     return JobResult(job(name), DONE, figures)
 
 
-def remarks(name: str, *values: float) -> list[str]:
-    return [
-        one.remark for one in compare([result(f"j{n}", **{name: v}) for n, v in enumerate(values)])
-    ]
-
-
 def test_only_finite_numbers_of_a_summary_are_figures(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
-    text = '{"a": 1, "b": {"c": 2.5, "d": null, "e": "x"}, "f": true, "g": [1], "h": Infinity,'
-    text += '"seconds": 4}'
-    (tmp_path / "a" / "summary.json").write_text(text)
+    (tmp_path / "a" / "summary.json").write_text(TEXT)
     found = result_of(job("a"), replace(DONE, seconds=0.0), tmp_path)
     assert found.figures == {"a": 1, "b.c": 2.5, "seconds": 4}
-    assert found.seconds == 4.0
+    assert (found.seconds, found.warnings) == (4.0, ("dark",))
+    assert result_of(job("a"), DONE, tmp_path).seconds == 1.0
+    (tmp_path / "a" / "summary.json").write_text("{")
+    with pytest.raises(FormatError, match=r"summary\.json"):
+        result_of(job("a"), DONE, tmp_path)
+    assert result_of(job("a"), Outcome("failed", "why"), tmp_path).figures == {}
 
 
 def test_the_job_with_the_unusual_figure_comes_after_the_failed_ones() -> None:
@@ -46,42 +44,36 @@ def test_the_job_with_the_unusual_figure_comes_after_the_failed_ones() -> None:
     assert [one.remark for one in ranked[2:]] == [""] * 6
 
 
-def test_what_is_better_than_usual_is_not_unusual() -> None:
-    assert remarks("t_rel_percent", 5.0, 5.1, 4.9, 5.2, 0.1) == [""] * 5
-    assert remarks("valid_percent", 50, 51, 49, 52, 99) == [""] * 5
-    assert remarks("valid_percent", 90, 91, 89, 92, 9)[4] == "valid_percent 9 (usually 90)"
-
-
-def test_a_few_frames_among_none_are_not_unusual() -> None:
-    assert remarks("frames_not_trusted", *[0] * 6, 1, 2, 1, 3, 2) == [""] * 11
-    assert remarks("frames_not_trusted", *[0] * 6, 1, 40)[7].startswith("frames_not_trusted 40")
+@pytest.mark.parametrize(
+    ("name", "values", "remarks"),
+    [
+        ("t_rel_percent", (5.0, 5.1, 4.9, 5.2, 0.1), {}),  # better than usual
+        ("valid_percent", (50, 51, 49, 52, 99), {}),
+        ("valid_percent", (90, 91, 89, 92, 9), {4: "valid_percent 9 (usually 90)"}),
+        ("frames_not_trusted", (*[0] * 6, 1, 2, 1, 3, 2), {}),  # a few among none
+        ("frames_not_trusted", (*[0] * 7, 40), {7: "frames_not_trusted 40 (usually 0)"}),
+        ("trajectory.ate_m", (1, 1, 1, 9), {3: "trajectory.ate_m 9 (usually 1)"}),
+        ("ate_m", (1, 1, 9), {}),  # too few have no usual value
+        ("points", [10.0**n for n in range(11)], {}),  # drives differ in length
+    ],
+)
+def test_what_is_much_worse_than_usual_is_remarked(
+    name: str, values: tuple[float, ...], remarks: dict[int, str]
+) -> None:
+    results = compare([result(f"j{n}", **{name: value}) for n, value in enumerate(values)])
+    assert {n: one.remark for n, one in enumerate(results) if one.remark} == remarks
 
 
 def test_jobs_of_other_commands_or_settings_are_not_compared() -> None:
-    results = [
-        JobResult(job(f"j{n}", swept={"w": w}), DONE, {"ate_m": 10.0**w})
-        for n, w in enumerate([0, 0, 0, 0, 1, 1, 1, 1])
-    ]
-    assert [one.remark for one in compare(results)] == [""] * 8
-
-
-def test_of_drives_that_differ_in_length_alone_none_is_unusual() -> None:
-    results = [result(f"j{n}", frames=10.0**n, points=7.0**n, ate_m=0.1) for n in range(11)]
-    assert [one.remark for one in compare(results)] == [""] * 11
-
-
-def test_too_few_jobs_have_no_usual_value() -> None:
-    assert remarks("ate_m", 1, 9) == ["", ""]
+    for changes in ("swept", "command"):
+        results = [
+            JobResult(replace(job(f"j{n}"), **{changes: {"w": w}}), DONE, {"ate_m": 10.0**w})
+            for n, w in enumerate([0, 0, 0, 0, 1, 1, 1, 1])
+        ]
+        assert [one.remark for one in compare(results)] == [""] * 8
 
 
 def test_jobs_of_each_command_are_judged_by_their_first_accuracy() -> None:
     drive = {"trajectory.t_rel_percent": 0.5, "points": 7.0}
-    pair: Mapping[str, float] = {"disparity.bad.2.0": 9.0, "valid_percent": 80.0, "points": 7.0}
+    pair = {"disparity.bad.2.0": 9.0, "valid_percent": 80.0, "points": 7.0}
     assert accuracies([pair, drive, {}]) == ["trajectory.t_rel_percent", "disparity.bad.2.0"]
-
-
-def test_a_summary_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "summary.json").write_text("{")
-    with pytest.raises(FormatError, match=r"summary\.json"):
-        result_of(job("a"), DONE, tmp_path)
