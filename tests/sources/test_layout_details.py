@@ -13,9 +13,9 @@ from recon.core.errors import FormatError, ReconError, SourceError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration, StereoPair
 from recon.io.cameras.ros import write_kalibr
-from recon.io.images.image import pixels_of_ros_image, write_image
+from recon.io.images.image import write_image
 from recon.sources.bag import rig_of_messages
-from recon.sources.image_names import find_partners, natural_key
+from recon.sources.image_names import find_partners
 from recon.sources.registry import open_source
 from recon.sources.rosbags import BagCameraInfo
 from recon.sources.settings import SourceSettings
@@ -107,18 +107,6 @@ def test_the_true_path_of_euroc_is_that_of_the_left_camera(
     assert "ground truth for only 10 of 12 frames: not used" in source.description
 
 
-def test_both_cameras_in_one_folder_are_distinguished_by_name(
-    noise: list[StereoPair], tmp_path: Path
-) -> None:
-    for number, pair in enumerate(noise, start=1):
-        write_image(tmp_path / f"left{number:02d}.png", pair.left)
-        write_image(tmp_path / f"right{number:02d}.png", pair.right)
-    drives.write_calib(tmp_path, CAMERA)
-    read = list(open_source(tmp_path))
-    assert len(read) == 12
-    np.testing.assert_array_equal(read[10].right, noise[10].right)
-
-
 @pytest.mark.real
 def test_the_chessboard_images_of_opencv_are_pairs(recon_data: Path) -> None:
     source = open_source(recon_data / "calibration" / "opencv_chessboard")
@@ -183,10 +171,6 @@ def test_partners_are_found_among_names_of_many_rigs() -> None:
     assert find_partners(["/front/image", "/rear/image"]) == []
 
 
-def test_ten_comes_after_nine() -> None:
-    assert sorted(["a10b", "a9b", "a9", "b1"], key=natural_key) == ["a9", "a9b", "a10b", "b1"]
-
-
 @given(
     st.lists(st.integers(0, 10_000), min_size=1, max_size=30, unique=True),
     st.lists(st.integers(0, 10_000), min_size=1, max_size=30, unique=True),
@@ -212,51 +196,6 @@ def test_pairs_by_stamp_are_near_mutual_and_in_order(
     assert times == sorted(times)
 
 
-@pytest.mark.parametrize(
-    ("encoding", "pixel", "expected"),
-    [("rgb8", [10, 20, 30], [10, 20, 30]), ("bgr8", [30, 20, 10], [10, 20, 30]),
-     ("rgba8", [10, 20, 30, 255], [10, 20, 30]), ("bgra8", [30, 20, 10, 9], [10, 20, 30])],
-)  # fmt: skip
-def test_colours_of_a_message_become_rgb(
-    encoding: str, pixel: list[int], expected: list[int]
-) -> None:
-    data = np.tile(np.array(pixel, np.uint8), 6)
-    image = pixels_of_ros_image(data, encoding, (2, 3), 3 * len(pixel))
-    np.testing.assert_array_equal(image, np.broadcast_to(expected, (2, 3, 3)))
-
-
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_bayer_image_of_one_colour_gives_that_colour(pattern: str) -> None:
-    colour = {"r": 200, "g": 90, "b": 20}
-    tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
-    mosaic = np.tile(tile, (4, 4))
-    image = pixels_of_ros_image(mosaic.ravel(), f"bayer_{pattern}8", (8, 8), 8)
-    np.testing.assert_array_equal(image[2:6, 2:6], np.broadcast_to([200, 90, 20], (4, 4, 3)))
-
-
-@pytest.mark.parametrize("big_endian", [False, True])
-def test_sixteen_bits_are_scaled_in_either_order_of_bytes(big_endian: bool) -> None:
-    values = np.array([[0, 257, 65535]], ">u2" if big_endian else "<u2")
-    data = np.frombuffer(values.tobytes(), np.uint8)
-    image = pixels_of_ros_image(data, "mono16", (1, 3), 6, big_endian=big_endian)
-    np.testing.assert_array_equal(image, [[0, 1, 255]])
-
-
-@pytest.mark.parametrize(("encoding", "order"), [("yuv422_yuy2", "yuyv"), ("yuv422", "uyvy")])
-def test_a_grey_yuv_image_is_grey(encoding: str, order: str) -> None:
-    data = np.array([126 if letter == "y" else 128 for letter in order * 4], np.uint8)
-    image = pixels_of_ros_image(data, encoding, (2, 4), 8)
-    # Video levels: 16 is black, 235 white.
-    np.testing.assert_allclose(image, 255 * (126 - 16) / 219, atol=1)
-
-
-def test_a_message_with_too_few_bytes_is_refused() -> None:
-    with pytest.raises(ReconError, match=r"too few bytes \(got 9 bytes, 6 per row, expected 4x2"):
-        pixels_of_ros_image(np.zeros(9, np.uint8), "mono8", (2, 4), 6)
-    # The last row needs no padding.
-    assert pixels_of_ros_image(np.zeros(10, np.uint8), "mono8", (2, 4), 6).shape == (2, 4)
-
-
 def write_named(folder: Path, names: list[str]) -> Path:
     """Pairs of equal names in two folders, the grey values counting the frames."""
     for number, name in enumerate(names):
@@ -272,23 +211,19 @@ def times(folder: Path, **settings: object) -> list[float]:
 
 
 @pytest.mark.parametrize("digits", [10, 13, 16, 19])
-@pytest.mark.parametrize("step", [1, 5])
-def test_padded_counters_are_no_times(tmp_path: Path, digits: int, step: int) -> None:
-    folder = write_named(tmp_path, [f"{100 + step * k:0{digits}d}" for k in range(4)])
-    assert times(folder) == [0.0, 0.1, 0.2, 0.3]
+@pytest.mark.parametrize(("step", "count"), [(1, 4), (5, 4), (1, 1)])
+def test_padded_counters_are_no_times(tmp_path: Path, digits: int, step: int, count: int) -> None:
+    folder = write_named(tmp_path, [f"{100 + step * k:0{digits}d}" for k in range(count)])
+    assert times(folder) == [0.0, 0.1, 0.2, 0.3][:count]
     assert "no times: assumed 10 Hz" in open_source(folder).description
 
 
-def test_a_single_padded_counter_is_no_time(tmp_path: Path) -> None:
-    assert times(write_named(tmp_path, ["0000000123"])) == [0.0]
-
-
+# The last one is nanoseconds since a simulation began.
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
         (["1600000000", "1600000001"], [1600000000, 1600000001]),
         (["1600000000123", "1600000000156"], [1600000000.123, 1600000000.156]),
-        # Nanoseconds since a simulation began.
         (["0000000000000000000", "0000000000050000000"], [0.0, 0.05]),
     ],
 )
