@@ -27,33 +27,32 @@ def estimate(values: list[float]) -> np.ndarray:
 
 def test_a_case_counted_by_hand() -> None:
     # Errors 0, 0.5, 1, 3, none; the sixth truth is unknown, the seventh occluded.
-    result = evaluate_disparity(
+    given = (
         estimate([10, 10.5, 9, 13, NAN, 4, 90]),
         truth([10, 10, 10, 10, 10, NAN, 10], [True] * 6 + [False]),
     )
+    result = evaluate_disparity(*given)
     assert result.pixels == 5
     assert result.bad == pytest.approx({0.5: 40.0, 1.0: 20.0, 2.0: 20.0, 4.0: 0.0})
     assert result.invalid == pytest.approx(20.0)
     assert result.avgerr_px == pytest.approx(4.5 / 4)
     assert result.rms_px == pytest.approx(np.sqrt((0.25 + 1 + 9) / 4))
+    # One of six is off by more than 4 px when occluded ones count; 3 px are not more than 3.
+    assert evaluate_disparity(*given, occluded=True).bad[4.0] == pytest.approx(100 / 6)
+    assert evaluate_disparity(*given, (3.0,)).bad == {3.0: 0.0}
+    # KITTI's outliers are off by three pixels, and by a twentieth.
+    found, true = estimate([13.5, 13, 103.5, 106, NAN]), truth([10, 10, 100, 100, 9])
+    assert evaluate_disparity(found, true).d1 == pytest.approx(40.0)
 
 
-def test_occluded_pixels_count_when_asked_for() -> None:
-    args = estimate([10, 90]), truth([10, 10], [True, False])
-    assert evaluate_disparity(*args).bad[4.0] == 0
-    assert evaluate_disparity(*args, occluded=True).bad[4.0] == pytest.approx(50)
-
-
-def test_an_error_of_exactly_the_threshold_is_not_bad() -> None:
-    assert evaluate_disparity(estimate([12.0]), truth([10.0]), (2.0,)).bad == {2.0: 0.0}
-
-
-def test_nothing_matched_is_all_invalid_and_has_no_mean() -> None:
+def test_maps_without_values_or_truth_or_of_another_size_have_no_errors() -> None:
     result = evaluate_disparity(estimate([NAN, NAN]), truth([1, 2]))
-    assert result.invalid == 100
-    assert set(result.bad.values()) == {0.0}
-    assert np.isnan(result.avgerr_px)
-    assert np.isnan(result.rms_px)
+    assert (result.invalid, set(result.bad.values())) == (100, {0.0})
+    assert np.isnan([result.avgerr_px, result.rms_px]).all()
+    with pytest.raises(EvaluationError, match="differ in size"):
+        evaluate_disparity(estimate([1, 2]), truth([1]))
+    with pytest.raises(EvaluationError, match="no pixel has a known truth"):
+        evaluate_disparity(estimate([1]), truth([NAN]))
 
 
 @given(st.integers(0, 2**16))
@@ -68,18 +67,6 @@ def test_bad_falls_with_the_threshold_and_shares_stay_shares(seed: int) -> None:
     assert 0 <= bad[0] + result.invalid <= 100 + 1e-9
     if np.isfinite(result.rms_px):
         assert result.avgerr_px <= result.rms_px + 1e-9
-
-
-def test_sizes_that_differ_and_truth_that_is_unknown_are_refused() -> None:
-    with pytest.raises(EvaluationError, match="differ in size"):
-        evaluate_disparity(estimate([1, 2]), truth([1]))
-    with pytest.raises(EvaluationError, match="no pixel has a known truth"):
-        evaluate_disparity(estimate([1]), truth([NAN]))
-
-
-def test_an_outlier_of_kitti_is_off_by_three_pixels_and_by_a_twentieth() -> None:
-    result = evaluate_disparity(estimate([13.5, 13, 103.5, 106, NAN]), truth([10, 10, 100, 100, 9]))
-    assert result.d1 == pytest.approx(40.0)
 
 
 def test_quantiles_are_errors_that_occur() -> None:
