@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, ClassVar, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -37,6 +37,9 @@ class Settings(BaseModel):
         use_attribute_docstrings=True,
     )
 
+    fixed: ClassVar[Mapping[str, Any]] = {}
+    """Settings of earlier versions that are constants now; files may have these values."""
+
     @model_validator(mode="before")
     @classmethod
     def _complete(cls, values: Any) -> Any:
@@ -44,7 +47,12 @@ class Settings(BaseModel):
         if not isinstance(values, Mapping):
             return values
         fields = cls.model_fields
-        return {k: _complete(fields[k], v) if k in fields else v for k, v in values.items()}
+        fixed = {name: value for name, value in cls.fixed.items() if name not in fields}
+        for name in fixed.keys() & values.keys():
+            if values[name] != fixed[name]:
+                raise ValueError(f"{name} is fixed in this version, at {fixed[name]}")
+        given = {name: value for name, value in values.items() if name not in fixed}
+        return {k: _complete(fields[k], v) if k in fields else v for k, v in given.items()}
 
     @field_validator("*", mode="before")
     @classmethod

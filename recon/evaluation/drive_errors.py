@@ -69,7 +69,7 @@ def compare_with_truth(
         )
     known = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
     if known is not None:
-        voxels = drop_undecided(mapped.voxels, mapped.config.grid)
+        voxels = drop_undecided(mapped.voxels)
         occupancy = attempt("occupancy", lambda: evaluate_occupancy(voxels, grid, known))
     return DriveErrors(path, surface, occupancy, tuple(warnings), true_path)
 

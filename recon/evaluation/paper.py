@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,18 +58,17 @@ _SIGMA_PX: Final = 1 / math.sqrt(12)
 _EVERY_POINT: Final = CloudSettings(min_range_m=0.0, max_range_m=None, max_relative_sigma=None)
 
 
+_PATCH_PX: Final = 11
+"""Patch size of the printed method, which the paper does not give."""
+
+
 class PaperSettings(Settings):
     """How the seed paper's experiments are repeated."""
 
+    fixed: ClassVar = {"patch_px": 11}
+
     as_printed: bool = Field(
         default=False, description="Run the method as printed as well as the corrected one."
-    )
-    patch_px: int = Field(
-        default=11,
-        ge=3,
-        le=61,
-        description="Patch size of the printed method, odd. The paper does not give one: try "
-        "others.",
     )
     patches_px: tuple[Annotated[int, Field(ge=1, le=61)], ...] = Field(
         default=tuple(range(3, 22, 2)),
@@ -77,11 +76,10 @@ class PaperSettings(Settings):
         description="Patch sizes, and window sizes of the matcher `sad`, to compare; odd.",
     )
 
-    @field_validator("patch_px", "patches_px")
+    @field_validator("patches_px")
     @classmethod
-    def _are_odd(cls, value: int | tuple[int, ...]) -> int | tuple[int, ...]:
-        patches = (value,) if isinstance(value, int) else value
-        if any(patch % 2 == 0 or not 1 <= patch <= 61 for patch in patches):
+    def _are_odd(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        if any(patch % 2 == 0 for patch in value):
             raise ValueError("a patch is an odd number from 1 to 61")
         return value
 
@@ -235,7 +233,7 @@ def apply_method(
         pair, disparity, cloud = frame.pair, frame.disparity, frame.cloud
     else:
         pair = _printed_pair(experiment)
-        disparity = PrintedMatcher(config.paper.patch_px, method == AS_PRINTED).match(pair)
+        disparity = PrintedMatcher(_PATCH_PX, method == AS_PRINTED).match(pair)
         pair = replace(pair, camera=camera_of_table_1(pair.camera))
         cloud = back_project(disparity, pair, _EVERY_POINT, normals=False)
     depth_m, truth = depth_from_disparity(disparity.values, pair.camera), experiment.truth

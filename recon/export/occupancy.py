@@ -160,7 +160,7 @@ class _Flattening:
         ground = estimate_ground_surface(self._ground_points(area), path_m, settings)
         passed = {} if path is None else self._passed(key, path, ground)
         voxels = self._tiles.wide_voxels(key, passed)
-        self._ground_depths.append(ground_depths(voxels, ground, self._config.grid))
+        self._ground_depths.append(ground_depths(voxels, ground))
         return flatten(voxels, ground, self._config.grid) if len(voxels) else None
 
     def _ground_points(self, area: Rectangle) -> PointCloud:
@@ -246,7 +246,7 @@ def octomap_product(order: Order) -> Made:
     The figure is the number of observed voxels, undecided ones included. A map may be too large.
     """
     tiles, stem, warnings = order.placed.tiles, order.run.path("map/octomap"), []
-    known = (drop_undecided(tile.voxels, tiles.config.grid) for tile in tiles)
+    known = (drop_undecided(tile.voxels) for tile in tiles)
     try:
         write_octomap_tiles(stem, known, tiles.edge_cells.bit_length() - 1, tiles.resolution_m)
     except MappingError as error:

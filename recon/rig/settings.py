@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -15,17 +15,12 @@ Metres = Annotated[float, Field(ge=0, le=1e6)]
 class AuditSettings(Settings):
     """Whether and how thoroughly recordings are audited, and what is plausible."""
 
+    fixed: ClassVar = {"frames": 300}
+
     quick: bool = Field(
         default=True,
         description="Whether `recon map`, `pair` and `disparity` start with a quick audit. Off "
         "saves a second.",
-    )
-    frames: int = Field(
-        default=300,
-        ge=2,
-        le=1_000_000,
-        description="Frames to read in all; on longer drives, in several runs. More finds what is "
-        "rare.",
     )
     baseline_m: tuple[Metres, Metres] = Field(
         default=(0.01, 2.0),
@@ -46,6 +41,8 @@ LensKind = Literal["radtan", "rational", "fisheye"]
 class CalibrationSettings(Settings):
     """Lens model, acceptance and uncertainty."""
 
+    fixed: ClassVar = {"bootstrap": 500, "depths_m": [2.0, 5.0, 10.0, 20.0]}
+
     model: LensKind = Field(
         default="radtan",
         description="Lens model: radtan (radial and tangential, most lenses), rational (wide "
@@ -55,16 +52,6 @@ class CalibrationSettings(Settings):
         default=3,
         description="Number of radial coefficients of radtan: k1 k2, or k1 k2 k3. 2 where the "
         "corners of the images hold no board, or for programs that know no k3.",
-    )
-    bootstrap: int = Field(
-        default=500,
-        ge=50,
-        le=100_000,
-        description="Number of bootstrap resamples, of which the intervals come. Fewer are faster.",
-    )
-    depths_m: tuple[Annotated[float, Field(ge=1e-3, le=1e6)], ...] = Field(
-        default=(2.0, 5.0, 10.0, 20.0),
-        description="Depths at which the depth error is predicted, in metres.",
     )
     working_m: float | None = Field(
         default=None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
@@ -22,6 +22,8 @@ class StreetSettings(Settings):
     the same street.
     """
 
+    fixed: ClassVar = {"turn_deg_per_100m": 20.0}
+
     seed: int = Field(
         default=0, ge=0, lt=2**31, description="Seed of the street: another one, another street."
     )
@@ -31,12 +33,6 @@ class StreetSettings(Settings):
     path: Literal["curve", "straight", "block"] = Field(
         default="curve",
         description="Shape of the street; block = repeated laps around a block, for loops.",
-    )
-    turn_deg_per_100m: float = Field(
-        default=20.0,
-        ge=-60.0,
-        le=60.0,
-        description="Mean curvature of a curved street; positive = to the left.",
     )
     width_px: int = Field(
         default=640, ge=16, le=8192, description="Image width. Take that of your rig to try it."
@@ -57,6 +53,8 @@ class StreetSettings(Settings):
 class StreetScene(StreetSettings):
     """A street in every detail; the defaults are those of `recon demo`."""
 
+    #: Mean curvature of a curved street; positive = to the left.
+    turn_deg_per_100m: float = Field(default=20.0, ge=-60.0, le=60.0)
     speed_m_per_frame: float = Field(default=1.0, ge=0.0, le=5.0)
     frame_rate_hz: float = Field(default=10.0, ge=1e-3, le=1e6)  # affects only the time stamps
     block_m: tuple[_SideM, _SideM] = (100.0, 70.0)  # sides of the block for path = block

@@ -27,7 +27,7 @@ from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.sources.drives import write_video
 
 BOARD = parse_board("chess:9x6:25mm")
-QUICK = ["calibration.bootstrap=60"]
+QUICK: list[str] = []
 
 
 @pytest.fixture(scope="session")

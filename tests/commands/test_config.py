@@ -22,7 +22,7 @@ from recon.run.run import Run
         ("map", {}, ["matching.matcher=sgm", "street.seed=3", "mesh.max_distance_spacings=none"]),
         ("pair", PAIR_DEFAULTS, ["filters.statistical_neighbours=none", "filters.voxel_m=0.1"]),
         ("pair", PAIR_DEFAULTS, ["matching.matcher=onnx", "matching.onnx.model=a.onnx"]),
-        ("calibrate", {}, ["calibration.model=fisheye", "calibration.depths_m=[1, 2]"]),
+        ("calibrate", {}, ["calibration.model=fisheye", "calibration.working_m=3"]),
         ("paper", PAIR_DEFAULTS, ["paper.as_printed=true"]),
     ],
 )

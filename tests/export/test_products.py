@@ -61,7 +61,7 @@ def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: Run) ->
 def test_the_octomap_of_tiles_is_that_of_the_whole(mapped: MappedSequence, folder: Run) -> None:
     written = write_products(mapped, folder)
     assert written.figures["voxels"] == len(mapped.voxels) > 1000
-    whole = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels, mapped.config.grid))
+    whole = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels))
     for theirs, end in zip(whole, ("bt", "ot"), strict=True):
         assert folder.path(f"map/octomap.{end}").read_bytes() == theirs.read_bytes()
 

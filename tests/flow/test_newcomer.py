@@ -78,7 +78,7 @@ def test_images_of_a_board_lead_to_a_cloud_in_metres(tmp_path: Path, lens: Lens,
     calibrated = recon(
         "calibrate", tmp_path / "left_board*.png", tmp_path / "right_board*.png", "--board", BOARD,
         "--out", tmp_path / "rig.yaml", "--format", form, "--report", tmp_path / "report",
-        "--model", lens, "--set", "calibration.bootstrap=50",
+        "--model", lens,
     )  # fmt: skip
     assert calibrated["baseline_m"] == pytest.approx(rig.baseline_m, rel=0.005)
     file = tmp_path / ("rig_left.yaml" if form == "ros" else "rig.yaml")

@@ -12,7 +12,7 @@ from recon.core.values import OccupancyMetrics
 
 STREETS = {
     "curve": ["street.seed=1"],
-    "another": ["street.seed=3", "street.turn_deg_per_100m=-35"],
+    "another": ["street.seed=3"],
     "straight, tilted camera": ["street.seed=5", "street.path=straight", "street.pitch_deg=4"],
 }
 

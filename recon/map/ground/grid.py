@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import ClassVar, Final
 
 import cv2
 import numpy as np
@@ -21,20 +21,24 @@ JOINED_CELLS: Final = 2
 many cells, unless they touch a free one."""
 
 
+FREE_HEIGHT_M: Final = 0.8
+"""Free voxels below this height make a cell free; higher ones may be seen over an obstacle that
+hides what is behind it."""
+OCCUPIED_PROBABILITY: Final = 0.55
+"""Voxels at least this probable are obstacles: a few hits, as OctoMap counts them, less misses."""
+FREE_PROBABILITY: Final = 0.35
+"""Voxels at most this probable are free."""
+
+
 class GridSettings(Settings):
     """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
+
+    fixed: ClassVar = {"free_height_m": 0.8, "occupied_probability": 0.55, "free_probability": 0.35}
 
     min_height_m: float = Field(0.3, ge=0.0, le=10.0)
     """Lower end of the band in which obstacles are looked for: what the vehicle can drive over."""
     max_height_m: float = Field(2.0, ge=0.01, le=100.0)
     """Upper end of the band: what is higher is passed under. The height of the vehicle."""
-    free_height_m: float = Field(0.8, ge=0.01, le=100.0)
-    """Free voxels below this height make a cell free; higher ones may be seen over an obstacle that
-    hides what is behind it. About half the height of the camera."""
-    occupied_probability: float = Field(0.55, ge=0.5, lt=1.0)
-    """Voxels at least this probable are obstacles. Raise it for fewer false ones."""
-    free_probability: float = Field(0.35, gt=0.0, le=0.5)
-    """Voxels at most this probable are free. Lower it to drive only where it is sure."""
     min_blob_cells: int = Field(3, ge=1, le=100_000_000)
     """Connected blocked cells fewer than this are taken for noise. 1 keeps thin posts."""
     vehicle_width_m: float = Field(0.6, ge=0.0, le=10.0)
@@ -70,9 +74,9 @@ def flatten(
 
     s = settings
     hit = (height >= s.min_height_m) & (height <= s.max_height_m) & (voxels.log_odds > 0)
-    low_air = (height >= 0) & (height <= s.free_height_m)
-    full = voxels.log_odds >= log_odds(s.occupied_probability)
-    empty = voxels.log_odds <= log_odds(s.free_probability)
+    low_air = (height >= 0) & (height <= FREE_HEIGHT_M)
+    full = voxels.log_odds >= log_odds(OCCUPIED_PROBABILITY)
+    empty = voxels.log_odds <= log_odds(FREE_PROBABILITY)
     blocked = _without_small_blobs(any_in(hit & full), s.min_blob_cells)
     free = any_in(empty & low_air) & ~blocked & ~(any_in(hit & low_air) & _beside(blocked))
     unsure = any_in(hit) & ~free & ~_beside(free)
@@ -84,9 +88,7 @@ def flatten(
     return OccupancyGrid(cells, voxels.resolution_m, origin)
 
 
-def ground_depths(
-    voxels: OccupancyVoxels, ground: GroundSurface, settings: GridSettings
-) -> Float64:
+def ground_depths(voxels: OccupancyVoxels, ground: GroundSurface) -> Float64:
     """Return how far occupied voxels of the ground lie below it; float64 (N,), metres.
 
     Nothing but ground is there, and as far as it is seen too low, it is seen too high elsewhere: by
@@ -95,19 +97,19 @@ def ground_depths(
     if len(voxels) == 0:
         return np.zeros(0)
     below = -_heights(voxels, ground)
-    full = voxels.log_odds >= log_odds(settings.occupied_probability)
+    full = voxels.log_odds >= log_odds(OCCUPIED_PROBABILITY)
     deepest_m = WINDOW_M + voxels.resolution_m / 2
     return np.asarray(below[full & (below >= 0) & (below <= deepest_m)])
 
 
-def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> OccupancyVoxels:
-    """Return the voxels that are occupied or free by the settings; the others count as unknown.
+def drop_undecided(voxels: OccupancyVoxels) -> OccupancyVoxels:
+    """Return the voxels that are occupied or free; the others count as unknown.
 
     Programs that read an OctoMap call everything above 0.5 occupied, and the rest free: a voxel
     that a single uncertain ray touched would be either.
     """
-    full = voxels.log_odds >= log_odds(settings.occupied_probability)
-    empty = voxels.log_odds <= log_odds(settings.free_probability)
+    full = voxels.log_odds >= log_odds(OCCUPIED_PROBABILITY)
+    empty = voxels.log_odds <= log_odds(FREE_PROBABILITY)
     return voxels.select(full | empty)
 
 

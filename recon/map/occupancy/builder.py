@@ -6,7 +6,7 @@ rounded, so that the same map can be built again, and others with other voxels, 
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +43,12 @@ _MIN_POINTS: Final = 2
 class OccupancySettings(Settings):
     """How clouds become occupancy."""
 
+    fixed: ClassVar = {"rays_per_voxel": 2, "thin_surfaces": True}
+
     resolution_m: float = Field(0.2, ge=0.001, le=10.0)
     """Edge of a voxel, and of a cell of the grid. Half of it takes about six times the memory."""
     max_range_m: float = Field(25.0, ge=0.1, le=1000.0)
     """Points farther away hit nothing. Less for short baselines, more for long ones."""
-    rays_per_voxel: int = Field(2, ge=1, le=16)
-    """Points of a frame are averaged in cubes so many times finer than a voxel. Raise it if finer
-    maps shall be made of the run."""
-    thin_surfaces: bool = True
-    """Voxels that the surface of the points around them does not cross are undecided, however often
-    they were hit. Off gives OctoMap's thicker walls."""
     keep_rays: bool = True
     """Keep the rays of every frame in the run's folder, for recon occupancy. Off saves 0.2 to 0.3
     MB per frame."""
@@ -65,8 +61,11 @@ class OccupancyBuilder:
     is updated at most once per frame, and a hit outweighs misses (OctoMap's rule).
     """
 
-    def __init__(self, settings: OccupancySettings, T_map_world: NDArray[Any]) -> None:
+    def __init__(
+        self, settings: OccupancySettings, T_map_world: NDArray[Any], *, thin: bool = True
+    ) -> None:
         self._settings = settings
+        self._thin = thin
         self._T_map_world = np.asarray(T_map_world, dtype=np.float64)
         self._map = clamped.make_clamped(256)
         self._evidence = raycast.make_blocks(256)
@@ -82,7 +81,7 @@ class OccupancyBuilder:
         _check_pose(T_world_camera, self._settings.resolution_m)
         rays = frame_rays(cloud, self._T_map_world @ T_world_camera, self._settings)
         self._evidence = raycast.cast_rays(self._evidence, rays, SPREAD_SIGMAS)
-        if self._settings.thin_surfaces:
+        if self._thin:
             self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
         low, high = log_odds(MIN_PROBABILITY), log_odds(MAX_PROBABILITY)
         self._map = clamped.add_evidence(self._map, self._evidence, low, high)
@@ -93,7 +92,7 @@ class OccupancyBuilder:
 
     def part(self) -> OccupancyPart:
         """Return what was observed since the start, or since the last `take`."""
-        points = points_of(self._points) if self._settings.thin_surfaces else None
+        points = points_of(self._points) if self._thin else None
         return OccupancyPart(clamped.observed_rows(self._map), points)
 
     def take(self) -> OccupancyPart:
@@ -194,13 +193,15 @@ def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
 
 
 _UNITS_PER_CELL: Final = 64
+_RAYS_PER_VOXEL: Final = 2
+"""Points of a frame are averaged in cubes so many times finer than a voxel."""
 _LARGEST: Final = np.iinfo(np.int16).max - 1
 _FIRST_ROWS: Final = 1 << 15
 
 
 def ray_grain(settings: OccupancySettings) -> RayGrain:
     """Return the resolution of the rays that are kept for a map."""
-    cell_m = settings.resolution_m / settings.rays_per_voxel
+    cell_m = settings.resolution_m / _RAYS_PER_VOXEL
     # The farthest places must fit into 16 bits.
     unit_m = max(cell_m / _UNITS_PER_CELL, (_beyond_m(settings) + cell_m) / _LARGEST)
     return RayGrain(cell_m, unit_m, settings.max_range_m)
@@ -237,4 +238,4 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
 
 def _beyond_m(settings: OccupancySettings) -> float:
     """Return where points out of range are moved to: never into a cube with one in range."""
-    return settings.max_range_m + 2 * settings.resolution_m / settings.rays_per_voxel
+    return settings.max_range_m + 2 * settings.resolution_m / _RAYS_PER_VOXEL

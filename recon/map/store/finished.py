@@ -103,7 +103,7 @@ def check_rays(session: Session, settings: DriveSettings) -> None:
             "the rays kept by the run are too coarse for these voxels",
             got=f"{wanted.resolution_m:g} m",
             expected=f"at least {grain.cell_m:g} m",
-            hint="map the drive again with --set occupancy.rays_per_voxel= or resolution_m=",
+            hint="map the drive again with a smaller --set occupancy.resolution_m=",
         )
     if wanted.max_range_m > grain.max_range_m * (1 + 1e-9):
         raise SettingsError(

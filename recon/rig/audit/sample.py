@@ -43,6 +43,7 @@ _LAG_PAIRS = 4
 _QUICK_REACH = 300
 # Smaller images have no features, and are too small to measure their sharpness.
 _LEAST_SIDE_PX = 16
+FRAMES: Final = 300  # frames that are read in all
 _RUNS: Final = 6  # number of runs of consecutive frames on longer drives
 _PAIRS: Final = 12  # pairs in which features are matched
 _FEATURES: Final = 1500  # maximum number of features per image
@@ -109,7 +110,7 @@ def take_sample(
     source: StereoSource, rectifier: Rectifier, settings: AuditSettings, *, quick: bool
 ) -> Sample:
     """Sample a drive; an error of a pair ends the sampling and is kept in ``broken``."""
-    stretches = plan_stretches(len(source), settings.frames, quick=quick)
+    stretches = plan_stretches(len(source), FRAMES, quick=quick)
     centres = plan_centres(stretches, quick=quick)
     sampler = _Sampler(source, rectifier, centres, quick=quick)
     try:

@@ -28,6 +28,8 @@ _MIDDLE: Final = 4
 # Depth error due to matching at the default working distance, relative to it.
 _MATCHED: Final = 0.02
 MATCH_SIGMA_PX: Final = 0.25  # assumed matching error, by which depth errors are predicted
+DEPTHS_M: Final = (2.0, 5.0, 10.0, 20.0)  # depths at which the error is predicted
+_RESAMPLES: Final = 500
 CONFIDENCE: Final = 0.95  # confidence level of the intervals
 
 
@@ -62,14 +64,14 @@ def _resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalib
     count, info = len(fit.views), fit.information
     vectors = _jackknife_vectors(fit)
     rigs = []
-    for _ in range(settings.bootstrap):
+    for _ in range(_RESAMPLES):
         drawn = rng.multinomial(count, np.full(count, 1 / count)).astype(np.float64)
         A = info.prior + np.tensordot(drawn, info.matrices, axes=1)
         # At the solution the vectors sum to zero, up to the prior of rational lenses.
         step = solve_scaled(A, (drawn - 1.0) @ vectors)
         with suppress(CalibrationError):  # it does not determine a rig
             rigs.append(stereo_of(moved(fit.state, step)))
-    if len(rigs) < settings.bootstrap / 2:
+    if len(rigs) < _RESAMPLES / 2:
         raise CalibrationError(
             "views do not determine the rig",
             got=counted(count, "view"),
@@ -87,7 +89,7 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
         focal_px=_interval([rig.left.matrix[0, 0] for rig in rigs]),
         baseline_m=_interval([rig.baseline_m for rig in rigs]),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2)))),
-        depths=tuple(_depth_error(fit, rigs, depth) for depth in settings.depths_m),
+        depths=tuple(_depth_error(fit, rigs, depth) for depth in DEPTHS_M),
         working=_depth_error(fit, rigs, _working_distance(fit.calibration, settings)),
     )
 

@@ -46,13 +46,6 @@ class CloudSettings(Settings):
         description="Largest standard deviation of a depth kept, as a share of it; none = no "
         "limit. Smaller for fewer, more certain points.",
     )
-    min_confidence: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="Least confidence kept: the probability that a match is right. Raise it where "
-        "wrong points matter more than missing ones.",
-    )
     stride: int = Field(
         default=1,
         ge=1,
@@ -103,7 +96,7 @@ def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> p
         nearest=settings.min_range_m,
         farthest=_or_infinity(settings.max_range_m),
         relative_sigma=_or_infinity(settings.max_relative_sigma),
-        confidence=settings.min_confidence,
+        confidence=0.0,
         stride=settings.stride,
         radius=_NORMALS_RADIUS_PX if normals else 0,
     )

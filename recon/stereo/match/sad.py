@@ -46,6 +46,8 @@ from recon.stereo.match.search import (
     texture,
 )
 
+_MIN_TEXTURE: Final = 0.1
+"""Least mean horizontal gradient in the window, grey levels per pixel."""
 _COST_CAP: Final = 20
 """Largest cost of one pixel; limits what an outlier or an edge can do. Times the pixels of both
 halves of the widest window it is below 65535, as the kernel wants."""
@@ -77,18 +79,6 @@ class SadSettings(MeasuredSettings):
         "larger is denser where texture is weak.",
     )
     uniqueness_percent: UniquenessPercent = 2
-    min_texture: float = Field(
-        default=0.1,
-        ge=0.0,
-        le=255.0,
-        description="Least mean horizontal gradient in the window, grey levels per pixel. Raise it "
-        "where noise of a dark or plain surface is matched.",
-    )
-    half_size_first: bool = Field(
-        default=True,
-        description="Match the images at half size first, and search each tile only among the "
-        "disparities found there. Off takes twice the time and may find thinner things.",
-    )
 
 
 class SadMatcher:
@@ -114,14 +104,12 @@ class SadMatcher:
         s = self._settings
         with ThreadPoolExecutor(self._threads) as pool:
             enough = partial(texture, pair, s.window_px)
-            if s.min_texture == 0:
-                enough = partial(no_texture, pair.left.shape[1], pair.valid)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
-            return finish(refined, s, pool, self._threads, average=self._average)
+            return finish(refined, pool, self._threads, average=self._average)
 
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
-        if not self._settings.half_size_first or search.ndisp < LEAST_NDISP:
+        if search.ndisp < LEAST_NDISP:
             return undivided(search, pair.left.shape)
         halved = half_search(search)
         views = halve(pair.left), halve(pair.right)
@@ -146,7 +134,7 @@ class SadMatcher:
         # The middles of the two halves lie half a radius above and below the pixel.
         slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
-        return search, rules_of(s, ndisp, s.window_px**2, min_texture=s.min_texture)
+        return search, rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
 
 
 class _StripSearch:

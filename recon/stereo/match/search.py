@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import Annotated, Final, Generic, TypeVar
+from typing import Annotated, ClassVar, Final, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ LEFT_RIGHT_PX: Final = 1
 _SIGMA_FLOOR_PX: Final = 0.1
 """Smallest standard deviation that a disparity is given: noise is not all that makes it wrong."""
 
+_SPECKLE_SIZE_PX: Final = 50  # regions of fewer pixels are removed
 _SPECKLE_STEP_PX: Final = 1.0  # largest step of disparity between neighbours of one region
 _AVERAGE_PX: Final = 7
 """Each disparity becomes the mean of the pairs of opposite neighbours, in a square of this width,
@@ -95,14 +96,9 @@ class SearchSettings(Settings):
 class MeasuredSettings(SearchSettings):
     """Settings of the matchers with sub-pixel disparities and uncertainties of their own."""
 
+    fixed: ClassVar = {"speckle_size_px": 50, "min_texture": 0.1, "half_size_first": True}
+
     uniqueness_percent: UniquenessPercent = 0
-    speckle_size_px: int = Field(
-        default=50,
-        ge=0,
-        le=100_000_000,
-        description="Regions of fewer pixels are removed; 0 = keep all. Grows with the square of "
-        "the image width.",
-    )
 
 
 def rules_of(
@@ -128,7 +124,6 @@ def rules_of(
 
 def finish(
     refined: Refined,
-    settings: MeasuredSettings,
     pool: Executor,
     threads: int,
     *,
@@ -138,10 +133,9 @@ def finish(
 
     ``refined`` is overwritten: a copy of each array would cost more than the search for speckles.
     """
-    if settings.speckle_size_px >= 2:
-        small = find_speckles(refined.values, _SPECKLE_STEP_PX, settings.speckle_size_px)
-        # A plain number: to look up what an enumeration is takes numba 0.2 ms.
-        reject(small, int(Reason.SPECKLE), refined)
+    small = find_speckles(refined.values, _SPECKLE_STEP_PX, _SPECKLE_SIZE_PX)
+    # A plain number: to look up what an enumeration is takes numba 0.2 ms.
+    reject(small, int(Reason.SPECKLE), refined)
     if average:
         refined = refined._replace(values=_averaged(refined.values, pool, threads))
     return Disparity(*refined)

@@ -147,7 +147,7 @@ class SgmMatcher:
             views = Views(pair.left, *planes)
             list(pool.map(prepare, strips))
             list(pool.map(search, strips))
-            return finish(refined, s, pool, at_once)
+            return finish(refined, pool, at_once)
 
     def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
         height = camera.height_px

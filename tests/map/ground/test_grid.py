@@ -159,7 +159,7 @@ def test_undecided_voxels_are_dropped() -> None:
         0.2,
     )
     # 0.55 and 0.35 are log-odds of 0.20 and -0.62: one look is not enough for free.
-    kept = drop_undecided(voxels, GridSettings())
+    kept = drop_undecided(voxels)
     assert kept.log_odds.tolist() == pytest.approx([2.0, 0.3, -0.8])
     assert kept.keys[:, 0].tolist() == [0, 3, 12]
 
@@ -193,5 +193,5 @@ def test_the_ground_is_as_thick_as_what_is_seen_below_it_but_not_as_deep_as_a_ho
     road = _box((0, -2, -1.6), (4, 2, -1.4)), 2.0
     low, hole = ((_box((0, -2, z), (4, 0, z + 0.2)), 2.0) for z in (-1.8, -2.4))
     unsure = _box((0, -2, -2.0), (4, 2, -1.8)), 0.05
-    depths_m = ground_depths(_voxels(road, low, hole, unsure), _ground(), GridSettings())
+    depths_m = ground_depths(_voxels(road, low, hole, unsure), _ground())
     np.testing.assert_allclose(depths_m, np.full(200, 0.1), atol=1e-6)

@@ -137,7 +137,7 @@ def test_chosen_rays_see_in_cells_what_all_rays_see() -> None:
     assert len(looks) == len(poses)
     assert min((looks == sign).sum() for sign in (-1, 0, 1)) > 100
     for T, cloud, look in zip(poses, rays, looks, strict=True):
-        builder = OccupancyBuilder(SETTINGS.model_copy(update={"thin_surfaces": False}), np.eye(4))
+        builder = OccupancyBuilder(SETTINGS, np.eye(4), thin=False)
         builder.integrate(cloud.cloud(), T)
         seen = builder.voxels()
         assert np.abs(seen.log_odds).max() < log_odds(MAX_PROBABILITY)  # one frame clamps nothing

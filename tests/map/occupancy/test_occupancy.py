@@ -33,9 +33,12 @@ def _cells(voxels: OccupancyVoxels) -> dict[Cell, float]:
 
 
 def _map(
-    *frames: tuple[PointCloud, np.ndarray], T_map_world: np.ndarray = HERE, **settings: float
+    *frames: tuple[PointCloud, np.ndarray],
+    T_map_world: np.ndarray = HERE,
+    thin: bool = True,
+    **settings: float,
 ) -> OccupancyVoxels:
-    builder = OccupancyBuilder(OccupancySettings(**settings), T_map_world)
+    builder = OccupancyBuilder(OccupancySettings(**settings), T_map_world, thin=thin)
     for cloud, T in frames:
         builder.integrate(cloud, T)
     return builder.voxels()
@@ -143,7 +146,7 @@ def _wall_ahead(frames: int, error: float) -> list[tuple[PointCloud, np.ndarray]
 
 def test_a_wall_seen_often_is_thin_and_has_no_holes() -> None:
     frames = _wall_ahead(20, 0.002)
-    thin, thick = (_cells(_map(*frames, thin_surfaces=thinned)) for thinned in (True, False))
+    thin, thick = (_cells(_map(*frames, thin=thinned)) for thinned in (True, False))
     layers = [
         [k for (i, j, k), value in cells.items() if value > 0.2 and -9 <= i < 9 and -9 <= j < 9]
         for cells in (thin, thick)

@@ -21,8 +21,7 @@ from recon.rig.audit.measures import (
     measure_time_skew,
 )
 from recon.rig.audit.row_alignment import align_rows, correct_rig, count_aligned, turn_features
-from recon.rig.audit.sample import plan_centres, plan_stretches
-from recon.rig.settings import AuditSettings
+from recon.rig.audit.sample import FRAMES, plan_centres, plan_stretches
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 
@@ -170,12 +169,11 @@ def test_the_verdict_is_that_of_the_worst_finding() -> None:
 
 @given(frames=st.integers(1, 5000), quick=st.booleans())
 def test_what_is_looked_at_lies_within_the_drive(frames: int, quick: bool) -> None:
-    limits = AuditSettings()
-    stretches = plan_stretches(frames, limits.frames, quick=quick)
+    stretches = plan_stretches(frames, FRAMES, quick=quick)
     assert stretches[0][0] >= 0
     assert stretches[-1][1] <= frames
     assert all(before[1] <= after[0] for before, after in pairwise(stretches))
-    assert sum(stop - start for start, stop in stretches) <= limits.frames
+    assert sum(stop - start for start, stop in stretches) <= FRAMES
     if quick:
         assert stretches[-1][1] <= 300
     centres = plan_centres(stretches, quick=quick)
