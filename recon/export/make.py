@@ -39,7 +39,7 @@ class Products:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Their figures for ``summary.json``."""
+        """Their figures for the summary."""
         return {name: value for one in self.made.values() for name, value in one.figures.items()}
 
     @property

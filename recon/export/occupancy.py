@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Float64
 from recon.core.values.grid import log_odds
 from recon.export.product import Made, Order
 from recon.io.models.nav2 import write_nav2
@@ -31,7 +31,7 @@ from recon.map.ground.surface import (
 )
 from recon.map.occupancy.builder import MIN_PROBABILITY
 from recon.map.occupancy.part import OccupancyPart, free_part
-from recon.map.tiles import Tiles
+from recon.map.sessions.placed import PlacedMap
 
 _MOST_CELLS: Final = 1_000_000_000
 """A city of 6 by 6 km at 0.2 m; each is a byte of memory and of the file."""
@@ -46,8 +46,7 @@ WrittenGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
 
 def grid_product(order: Order) -> Made:
     """Write ``map/grid.*``."""
-    placed, stem = order.placed, order.run.path("map/grid")
-    grid, height_m, warnings = export_grid(placed.tiles, placed.path_m, placed.trusted, stem)
+    grid, height_m, warnings = export_grid(order.placed, order.run.path("map/grid"))
     rows, columns = grid.cells.shape
     figures = {
         "resolution_m": grid.resolution_m,
@@ -61,22 +60,16 @@ def grid_product(order: Order) -> Made:
     return Made(figures, warnings, grid)
 
 
-def export_grid(tiles: Tiles, path_m: Float64, trusted: Bool, stem: Path) -> WrittenGrid:
+def export_grid(placed: PlacedMap, stem: Path) -> WrittenGrid:
     """Flatten the voxels of a map above its ground, and write ``stem.pgm`` and ``stem.yaml``.
-
-    Args:
-        tiles: The map, cut from submaps.
-        path_m: float64 (N, 3), camera positions in map axes; a row of NaN between two drives.
-        trusted: bool (N,), which of them are to be trusted.
-        stem: The common path without suffix.
 
     Returns:
         The grid, the height at which something carried the camera above the ground (None = unknown,
         or not at one height), and what a user of the grid should know.
     """
-    if tiles.extent[0] == tiles.extent[1]:
+    if placed.tiles.extent[0] == placed.tiles.extent[1]:
         raise MappingError("nothing was observed: there is no map to flatten")
-    written = _Flattening(tiles, path_m, trusted).grid()
+    written = _Flattening(placed).grid()
     write_nav2(stem, written[0])
     return written
 
@@ -84,12 +77,9 @@ def export_grid(tiles: Tiles, path_m: Float64, trusted: Bool, stem: Path) -> Wri
 class _Flattening:
     """Makes a grid tile by tile: the ground below the path first, then what stands on it."""
 
-    def __init__(self, tiles: Tiles, path_m: Float64, trusted: Bool) -> None:
-        self._tiles = tiles
-        self._config = tiles.config
-        self._path_m = path_m
-        self._trusted = trusted
-        self._resolution_m = tiles.resolution_m
+    def __init__(self, placed: PlacedMap) -> None:
+        self._tiles, self._path_m, self._trusted = placed.tiles, placed.path_m, placed.trusted
+        self._config, self._resolution_m = placed.tiles.config, placed.tiles.resolution_m
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> WrittenGrid:
@@ -214,15 +204,12 @@ class _Flattening:
 
 
 def _warnings(camera_height_m: float | None, driven: bool) -> tuple[str, ...]:
-    """Return what a user of the grid should know."""
     if driven:
         return ()
     if camera_height_m is None:
-        text = "no ground was found below the path, so every cell of the grid is unknown"
-    else:
-        text = "the camera was not carried at one height above the ground: the grid has only what "
-        text += "was seen, and the base of the trajectory in the map is the camera"
-    return (text,)
+        return ("no ground was found below the path, so every cell of the grid is unknown",)
+    text = "the camera was not carried at one height above the ground: the grid has only what "
+    return (text + "was seen, and the base of the trajectory in the map is the camera",)
 
 
 def _paste(

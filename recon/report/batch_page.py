@@ -38,27 +38,17 @@ def write_batch_page(
     first = outliers_first(results)
     pages = {one.job.name: _page(one, run.folder) for one in first}
     failed = [f"{one.job.name}: {one.last.error}" for one in first if one.failed]
-    write_page(
-        "batch",
-        run,
-        summary,
-        tables=batch_tables(first),
-        pages=pages,
-        sweep=sweep,
-        warnings=[*failed, *summary["warnings"]],
-    )
+    shown = {"tables": batch_tables(first), "pages": pages, "sweep": sweep}
+    write_page("batch", run, summary, **shown, warnings=[*failed, *summary["warnings"]])
 
 
 def batch_tables(results: Sequence[JobResult]) -> list[Table]:
     """Return a table for people for each command: a row per job, with the figures of its kind."""
-    commands = dict.fromkeys(one.job.command for one in results)
-    return [
-        _table(command, [one for one in results if one.job.command == command])
-        for command in commands
-    ]
+    return [_table(command, results) for command in dict.fromkeys(x.job.command for x in results)]
 
 
-def _table(command: str, jobs: Sequence[JobResult]) -> Table:
+def _table(command: str, results: Sequence[JobResult]) -> Table:
+    jobs = [one for one in results if one.job.command == command]
     columns = [name for name in _COLUMNS if any(name in one.figures for one in jobs)]
     rows = []
     for one in jobs:
@@ -79,13 +69,12 @@ def batch_csv(results: Sequence[JobResult]) -> str:
     swept = list(dict.fromkeys(key for one in results for key in one.job.swept))
     names = list(dict.fromkeys(key for one in results for key in one.figures))
     facts = ("name", "command", "source", "state", "tries", "seconds", "error")
-    rows = []
-    for one in results:
-        job = one.facts
-        rows.append(
-            [*(job.get(key, "") for key in facts), *(one.job.swept.get(key, "") for key in swept),
-             *(one.figures.get(key, "") for key in names)]
-        )  # fmt: skip
+    rows = [
+        [found.get(key, "") for found, keys in parts for key in keys]
+        for parts in (
+            ((one.facts, facts), (one.job.swept, swept), (one.figures, names)) for one in results
+        )
+    ]
     return csv_text([["job", *facts[1:], *swept, *names], *rows])
 
 
@@ -99,9 +88,8 @@ def sweep_figure(results: Sequence[JobResult]) -> bytes:
     rows = list(dict.fromkeys((one.job.command, key) for one in done for key in one.job.swept))
     if not rows:
         return b""
-    figure, panels = style.subplots(
-        style.WIDE_IN, _PANEL_IN * len(rows), len(rows), 2, squeeze=False
-    )
+    size_in = (style.WIDE_IN, _PANEL_IN * len(rows))
+    figure, panels = style.subplots(*size_in, len(rows), 2, squeeze=False)
     for (command, setting), (left, right) in zip(rows, panels, strict=True):
         jobs = [one for one in done if one.job.command == command]
         for name in accuracies(one.figures for one in jobs)[:1]:

@@ -156,12 +156,9 @@ def error_figure(error_px: NDArray[Any]) -> bytes:
 def reasons_figure(disparity: Disparity) -> bytes:
     """Draw why each pixel has a disparity or not, and the share of each reason."""
     figure = _image(style.colour_reasons(disparity.reason))
-    handles = [
-        style.colour_key(
-            f"{style.REASON_LABELS[reason]} {100 * share:.1f} %", style.REASON_COLOURS[reason]
-        )
-        for reason, share in disparity.reason_shares.items()
-    ]
+    shares = disparity.reason_shares
+    labels = [f"{style.REASON_LABELS[reason]} {100 * shares[reason]:.1f} %" for reason in shares]
+    handles = [*map(style.colour_key, labels, map(style.REASON_COLOURS.__getitem__, shares))]
     columns = 4 if is_wide(disparity.reason.shape) else 3
     middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
     figure.legend(handles=handles, loc="center", ncols=columns, bbox_to_anchor=(0.5, middle))

@@ -127,9 +127,7 @@ def surface_figure(disparity: Disparity) -> bytes:
 
 @style.styled
 def depth_curve_figure(camera: RectifiedCamera, disparities_px: Float32) -> bytes:
-    """Draw depth against disparity, with the true camera and the focal length of Table 1.
-
-    The range of the disparities that occur is shaded.
+    """Draw depth by disparity, with the true camera and that of Table 1; shade what occurs.
 
     Ref: Fig. 24-26 of the seed paper.
     """
@@ -148,9 +146,8 @@ def depth_curve_figure(camera: RectifiedCamera, disparities_px: Float32) -> byte
     known = disparities_px[np.isfinite(disparities_px)]
     if known.size:
         low, high = np.percentile(known, (1.0, 99.0))
-        axes.axvspan(
-            low, high, color=style.FAINT, alpha=0.13, linewidth=0, label="disparities found"
-        )
+        look = {"color": style.FAINT, "alpha": 0.13, "linewidth": 0}
+        axes.axvspan(low, high, label="disparities found", **look)
     axes.set(yscale="log", xlabel="disparity d (px)", ylabel="depth Z (m, logarithmic)")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     figure.legend(loc="outside lower center", fontsize=9)

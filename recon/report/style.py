@@ -136,9 +136,7 @@ GRID_NOT_COUNTED: Final[Rgb] = (120, 128, 136)
 def colour_disparity(values: NDArray[Any], limits: tuple[float, float] | None = None) -> UInt8:
     """Colour a disparity map (H, W): far is blue, near is red, NaN is almost black.
 
-    Args:
-        values: Pixels; NaN = no match.
-        limits: Values of the first and the last colour; None = `value_range`.
+    ``limits`` are the values of the first and the last colour; None = `value_range`.
     """
     return colour_values(values, DISPARITY_SCALE, limits or value_range(values))
 

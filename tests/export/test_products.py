@@ -23,6 +23,7 @@ from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.ground.grid import drop_undecided, flatten
 from recon.map.ground.surface import add_floors, estimate_ground_surface, find_floors
+from recon.map.sessions.placed import PlacedMap
 from recon.run.run import Run
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
@@ -156,7 +157,7 @@ def test_a_grid_that_a_far_pose_makes_too_large_is_refused(
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
     path_m[-1] = (1e4, 1e4, 0.0)
     with pytest.raises(MappingError, match="grid would be too large"):
-        export_grid(mapped.tiles, path_m, np.ones(len(path_m), bool), tmp_path / "grid")
+        export_grid(PlacedMap(mapped.tiles, path_m, np.ones(len(path_m), bool)), tmp_path / "grid")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -165,14 +166,11 @@ def _random_cloud(seed: int, points: int) -> PointCloud:
     return PointCloud(rng.uniform(-20, 20, (points, 3)).astype(np.float32), frame="map")
 
 
-def test_a_sample_keeps_all_of_a_small_cloud() -> None:
+def test_a_sample_is_small_and_even_and_all_of_a_small_cloud() -> None:
     sample, cloud = CloudSample(1000, 0.1), _random_cloud(0, 900)
+    assert len(sample.cloud()) == 0
     sample.add(cloud)
-    kept = sample.cloud()
-    np.testing.assert_array_equal(kept.xyz, cloud.xyz)
-
-
-def test_a_sample_of_a_large_cloud_is_small_and_even() -> None:
+    np.testing.assert_array_equal(sample.cloud().xyz, cloud.xyz)
     sample = CloudSample(2000, 0.1)
     for seed in range(20):
         sample.add(_random_cloud(seed, 1500))
@@ -183,28 +181,19 @@ def test_a_sample_of_a_large_cloud_is_small_and_even() -> None:
     assert np.abs(octants / len(kept) - 1 / 8).max() < 3 * np.sqrt(7 / 64 / len(kept))
 
 
-def test_a_sample_of_nothing_is_nothing() -> None:
-    assert len(CloudSample(10, 0.1).cloud()) == 0
-
-
-def test_tiles_in_one_file_are_read_as_one_cloud(tmp_path: Path) -> None:
+def test_tiles_in_one_file_are_read_as_one_cloud_and_an_error_leaves_none(tmp_path: Path) -> None:
     tiles = [_random_cloud(seed, 7 + 100 * seed) for seed in range(4)]
     assert write_ply_tiles(tmp_path / "a.ply", iter(tiles), frame="map") == 628
     back = read_ply(tmp_path / "a.ply")
     np.testing.assert_array_equal(back.xyz, np.concatenate([tile.xyz for tile in tiles]))
     assert back.frame == "map"
-
-
-def test_a_file_of_no_tiles_has_no_points(tmp_path: Path) -> None:
     assert write_ply_tiles(tmp_path / "a.ply", iter([]), frame="map") == 0
     assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
 
-
-def test_tiles_that_end_in_an_error_leave_no_file(tmp_path: Path) -> None:
-    def tiles() -> Iterator[PointCloud]:
-        yield _random_cloud(0, 10)
+    def failing() -> Iterator[PointCloud]:
+        yield tiles[0]
         raise OutputError("disk full")
 
     with pytest.raises(OutputError):
-        write_ply_tiles(tmp_path / "a.ply", tiles(), frame="map")
-    assert list(tmp_path.iterdir()) == []
+        write_ply_tiles(tmp_path / "b.ply", failing(), frame="map")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]

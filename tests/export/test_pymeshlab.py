@@ -23,17 +23,13 @@ def ball(n: int = 600) -> np.ndarray:
     return (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
 
 
-def test_arrays_come_back_typed_and_matching() -> None:
+def test_arrays_come_back_typed_and_matching_and_pymeshlab_is_not_loaded_here() -> None:
+    loaded = "pymeshlab" in sys.modules
     vertices, faces, density = reconstruct(ball(), ball())
+    assert ("pymeshlab" in sys.modules) == loaded
     assert (vertices.dtype, faces.dtype, density.dtype) == (np.float32, np.int32, np.float32)
     assert len(density) == len(vertices)
     assert 0 <= faces.min() <= faces.max() < len(vertices)
-
-
-def test_pymeshlab_is_not_loaded_into_this_process() -> None:
-    loaded = "pymeshlab" in sys.modules
-    reconstruct(ball(), ball())
-    assert ("pymeshlab" in sys.modules) == loaded
 
 
 def test_a_poisoned_cloud_is_an_error_and_not_an_empty_mesh() -> None:

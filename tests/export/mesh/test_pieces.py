@@ -164,13 +164,10 @@ def test_tiles_with_too_few_points_are_reported_in_one_line(store: Tiles, tmp_pa
     assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")
 
 
-def test_a_store_without_a_surface_is_an_error(tmp_path: Path) -> None:
+def test_a_store_without_a_surface_or_a_folder_is_an_error(store: Tiles, tmp_path: Path) -> None:
     with pytest.raises(MeshingError, match="no part of the map gives a surface"):
         written(Tiles(CONFIG, np.eye(4)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_cannot_be_written_is_reported(store: Tiles, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     with pytest.raises(OutputError):
         written(store, tmp_path / "out")

@@ -43,29 +43,20 @@ def whole_sphere() -> TriangleMesh:
     return reconstruct_mesh(sphere(), WHOLE)
 
 
-def test_the_mesh_of_a_sphere_lies_on_it_and_is_closed() -> None:
+def test_the_mesh_of_a_sphere_lies_on_it_is_closed_faces_out_and_has_its_colours() -> None:
     mesh = whole_sphere()
     # Cells of 2.2 m / 2^5 = 69 mm; the surface is placed far better than a cell.
     assert np.abs(radii(mesh) - 1).max() < 0.005
     assert boundary_edges(mesh) == 0
-
-
-def test_normals_and_faces_of_the_mesh_point_out() -> None:
-    mesh = whole_sphere()
     outwards = mesh.vertices - np.float32([3, 0, 5])
     assert mesh.normals is not None
     assert (np.einsum("ij,ij->i", mesh.normals, outwards) > 0.99).all()
     a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
     volume = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - [3, 0, 5]).sum() / 6
     assert volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
-
-
-def test_colours_come_from_the_nearest_points() -> None:
-    mesh = whole_sphere()
     assert mesh.rgb is not None
-    side = mesh.vertices[:, 0] - 3
-    assert (mesh.rgb[side > 0.05] == [200, 0, 0]).all()
-    assert (mesh.rgb[side < -0.05] == [0, 0, 200]).all()
+    assert (mesh.rgb[outwards[:, 0] > 0.05] == [200, 0, 0]).all()
+    assert (mesh.rgb[outwards[:, 0] < -0.05] == [0, 0, 200]).all()
 
 
 def test_a_hole_in_the_data_stays_a_hole() -> None:
@@ -97,10 +88,15 @@ def test_decimation_reaches_its_target_and_stays_on_the_sphere() -> None:
     assert np.abs(radii(mesh) - 1).max() < 0.02
 
 
-def test_the_same_cloud_gives_the_same_mesh() -> None:
+def test_the_same_cloud_gives_the_same_mesh_and_nothing_else_is_touched(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    before = os.getcwd()  # noqa: PTH109 - the very thing that MeshLab can break
     first, second = (reconstruct_mesh(sphere(1000), MeshSettings(depth=4)) for _ in range(2))
     np.testing.assert_array_equal(first.vertices, second.vertices)
     np.testing.assert_array_equal(first.faces, second.faces)
+    assert os.getcwd() == before  # noqa: PTH109
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("viewpoint_m", [None, (3.0, 0.0, 5.0)])
@@ -144,15 +140,6 @@ def test_points_and_normals_that_are_not_finite_are_left_out() -> None:
 def test_clouds_without_a_surface_are_refused(xyz: np.ndarray, complaint: str) -> None:
     with pytest.raises(MeshingError, match=complaint):
         reconstruct_mesh(PointCloud(xyz.astype(np.float32)), MeshSettings())
-
-
-def test_the_working_directory_and_standard_output_stay_as_they_were(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    before = os.getcwd()  # noqa: PTH109 - the very thing that MeshLab can break
-    reconstruct_mesh(sphere(1000), MeshSettings(depth=4))
-    assert os.getcwd() == before  # noqa: PTH109
-    assert capfd.readouterr() == ("", "")
 
 
 def test_the_depth_follows_the_spacing_of_the_points() -> None:
