@@ -4,12 +4,12 @@ from recon.commands.config import ReconConfig as ReconConfig
 from recon.commands.config import load_config as load_config
 from recon.commands.evaluate_middlebury import run_middlebury as run_middlebury
 from recon.commands.export import run_export as run_export
+from recon.commands.export import run_occupancy as run_occupancy
 from recon.commands.localize import run_live as run_live
 from recon.commands.localize import run_localize as run_localize
 from recon.commands.map import run_map as run_map
 from recon.commands.map_options import MapOptions as MapOptions
 from recon.commands.merge import run_merge as run_merge
-from recon.commands.occupancy import run_occupancy as run_occupancy
 from recon.commands.pair import match as match
 from recon.commands.pair import reconstruct as reconstruct
 from recon.commands.pair import run_disparity as run_disparity

@@ -109,7 +109,7 @@ def mesh(
     """
     with shared.one_line_errors():
         from recon.commands.config import PAIR_DEFAULTS
-        from recon.commands.mesh import run_mesh
+        from recon.commands.export import run_mesh
         from recon.run.finished import is_pair_run
 
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
@@ -161,7 +161,7 @@ def occupancy(
     """
     with shared.one_line_errors():
         from recon.commands.config import run_settings
-        from recon.commands.occupancy import run_occupancy
+        from recon.commands.export import run_occupancy
 
         settings = run_settings(run, shared.config, shared.changes)
         summary = run_occupancy(run, settings, out=out, threads=shared.threads)

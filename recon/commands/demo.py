@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
+from recon.commands.export import run_occupancy
 from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
-from recon.commands.occupancy import run_occupancy
 from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling

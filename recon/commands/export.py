@@ -1,4 +1,4 @@
-"""`recon export`: products of a finished run, with other settings or formats."""
+"""`recon export`, `occupancy` and `mesh`: products of a finished run, other settings or formats."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
-from recon.core.errors import SettingsError
+from recon.core.errors import FormatError, SettingsError
 from recon.export.make import known_products, make, need_rays
-from recon.export.pair import export_pair
+from recon.export.pair import export_pair, finish_cloud_run, mesh_cloud
 from recon.export.product import Order
 from recon.io.files import StrPath, resolved
 from recon.io.models.las import SUFFIXES as SURVEYED
@@ -23,6 +23,8 @@ from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,
     MAPPED_BY,
+    PAIR_CLOUD,
+    camera_of_pair,
     command_of_map,
     is_pair_run,
     refuse_as_target,
@@ -124,3 +126,62 @@ def _check_survey(survey: Survey, products: Sequence[str]) -> None:
         )
     if survey.crs is not None:
         check_crs(survey.crs)
+
+
+def run_mesh(
+    source: Path,
+    config: ReconConfig,
+    *,
+    formats: Sequence[str] = ("ply",),
+    out: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Reconstruct the surface of a cloud file or of a run's map, and write a MeshLab project.
+
+    A cloud file is meshed in one piece, since its scale is unknown; the cloud of a pair as
+    `recon pair` does. The map of a run is meshed in pieces, and faces in observed free space are
+    removed.
+
+    Args:
+        source: A PLY file, or the folder of a run of map, demo or pair.
+        config: Settings of the mesh; the rest is that of the run.
+        formats: As for `run_export`, like all that follows.
+        out: As before.
+        threads: As before.
+    """
+    check_mesh_formats(formats)
+    cloud, camera = source, None
+    if source.is_dir():
+        refuse_as_target(source, out)
+        if not is_pair_run(source):
+            settings = run_settings(source).model_copy(update={"mesh": config.mesh})
+            how: Any = {"out": out, "threads": threads, "command": "mesh"}
+            return run_export(source, settings, products=["mesh"], formats=formats, **how)
+        cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
+    with Run("mesh", out, config, threads=threads) as run:
+        figures = mesh_cloud(cloud, camera, config.mesh, run, formats)
+        return finish_cloud_run(source, cloud, run, figures)
+
+
+def run_occupancy(
+    run: StrPath,
+    config: ReconConfig | None = None,
+    *,
+    out: StrPath | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Make voxels and grid of a run with other settings: what `recon occupancy` does.
+
+    Args:
+        run: Folder of the run that mapped the drive.
+        config: As for `run_export`, like all that follows.
+        out: As before.
+        threads: As before.
+
+    Raises:
+        ReconError: As for `run_export`.
+    """
+    if is_pair_run(Path(run)):
+        raise FormatError("the run made no map: it is one of recon pair", where=run)
+    products = ("octomap", "grid")
+    return run_export(run, config, products=products, out=out, threads=threads, command="occupancy")

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 
 from recon.cli import app
 from recon.commands.config import load_config
+from recon.commands.export import run_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_map_into, run_merge, run_remove
-from recon.commands.occupancy import run_occupancy
 from recon.core.errors import FormatError
 from recon.io.trajectory import read_trajectory
 from recon.map.ground.axes import AXES_MAP_WORLD

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.mesh import run_mesh
+from recon.commands.export import run_mesh
 from recon.core.errors import FormatError, SettingsError
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply

@@ -14,9 +14,9 @@ import yaml
 
 from recon.commands.config import load_config, run_settings
 from recon.commands.demo import demo_source
+from recon.commands.export import run_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.commands.occupancy import run_occupancy
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_tum

@@ -11,12 +11,10 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.commands.evaluate import run_evaluate_map, run_evaluate_trajectory
-from recon.commands.export import run_export
+from recon.commands.export import run_export, run_mesh, run_occupancy
 from recon.commands.localize import run_localize
 from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_merge, run_remove
-from recon.commands.mesh import run_mesh
-from recon.commands.occupancy import run_occupancy
 from recon.core.values import RectifiedPair
 from recon.evaluation.trajectory import TrajectoryRules
 from recon.sources.registry import open_source

@@ -13,7 +13,7 @@ import pytest
 
 from recon.commands.config import run_settings
 from recon.commands.evaluate import run_evaluate_occupancy
-from recon.commands.occupancy import run_occupancy
+from recon.commands.export import run_occupancy
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import OCCUPIED
 from recon.io.models.nav2 import read_nav2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
-from recon.commands.mesh import run_mesh
+from recon.commands.export import run_mesh
 from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.core.geometry.se3 import make_transform
