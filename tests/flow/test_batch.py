@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.flow.test_killed_runs import content
 from tests.flow.test_paper import write_scene
-from tests.hostile.refusals import assert_refused, run, run_apart
+from tests.hostile.refusals import assert_refused, run
 from tests.scenery.kitti import write_kitti
 from tests.scenery.patience import LONG_S
 from tests.scenery.planes import slanted_pair
@@ -37,36 +38,40 @@ JOBS = "".join(
 PAIR = '[[job]]\nname = "pair"\ncommand = "pair"\nsource = "scene"\n'
 
 
+RECON = [sys.executable, "-m", "recon"]
+
+
 class Batches:
     """Drives and a pair, and the results of an undisturbed batch."""
 
     def __init__(self, folder: Path) -> None:
-        self.jobs = folder / "jobs.toml"
+        self.folder, self.jobs = folder, folder / "jobs.toml"
         self.jobs.write_text(JOBS + PAIR)
         for n in range(DRIVES):
             settings = StreetSettings(frames=24, width_px=256, height_px=96, focal_px=144.0, seed=n)
             write_kitti(SyntheticSource(settings), folder / f"drive{n}")
         write_scene(folder / "scene", slanted_pair(CAMERA, 1.5, (0.1, -0.1), seed=1))
-        done = subprocess.run(self.command(folder / "unbroken"), capture_output=True, check=False)
-        assert done.returncode == 0, done.stderr
+        ended(self.command(folder / "unbroken"), DRIVES + 1)
         self.content = content_of_jobs(folder / "unbroken")
 
-    def command(self, out: Path, *more: str) -> list[str]:
-        started = [str(self.jobs), "--out", str(out)] if not more else [*more, str(out)]
+    def command(self, out: Path) -> list[str]:
         options = ["--workers", "2", "--threads", "1", "--retries", "30", "--json"]
-        if more:
-            options = ["--workers", "2", "--json"]
-        return [sys.executable, "-m", "recon", "batch", *started, *options]
+        return [*RECON, "batch", str(self.jobs), "--out", str(out), *options]
 
     def finish(self, out: Path) -> None:
         """Resume until everything is there, and compare with the undisturbed batch."""
-        done = subprocess.run(
-            self.command(out, "--resume"), capture_output=True, check=False, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        summary = json.loads(done.stdout)
-        assert (summary["succeeded"], summary["failed"]) == (DRIVES + 1, 0)
+        ended([*RECON, "batch", "--resume", str(out), "--workers", "2", "--json"], DRIVES + 1)
         assert content_of_jobs(out) == self.content
+
+
+def ended(command: list[str], succeeded: int, failed: int = 0, not_run: int = 0) -> dict[str, Any]:
+    """Run a batch to its end; its summary."""
+    done = subprocess.run(command, capture_output=True, check=False, text=True)
+    assert done.returncode == (1 if failed else 0), done.stderr
+    summary: dict[str, Any] = json.loads(done.stdout)
+    counts = [summary[state] for state in ("succeeded", "failed", "not_run")]
+    assert counts == [succeeded, failed, not_run]
+    return summary
 
 
 def content_of_jobs(out: Path) -> dict[str, bytes]:
@@ -132,14 +137,12 @@ def test_a_client_that_is_killed_leaves_no_process_and_what_is_missing_is_done(
     batches: Batches, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    client = subprocess.Popen(
-        batches.command(out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    client = subprocess.Popen(batches.command(out), **quiet)
     # One drive is done, another is being mapped.
     wait_until(lambda: list(out.glob("drive?/run.json")), client, "first result")
     wait_until(lambda: below(client, "recon.run.batch.guard"), client, "second job")
-    done = [path.stat().st_mtime_ns for path in sorted(out.glob("*/run.json"))]
-    named = [path.parent.name for path in sorted(out.glob("*/run.json"))]
+    done = {path: path.stat().st_mtime_ns for path in out.glob("*/run.json")}
     left = below(client, "recon", "spawn")
     client.kill()
     client.wait()
@@ -147,7 +150,7 @@ def test_a_client_that_is_killed_leaves_no_process_and_what_is_missing_is_done(
     assert alive == []
     assert not (out / "summary.json").exists()
     batches.finish(out)
-    assert [(out / name / "run.json").stat().st_mtime_ns for name in named] == done
+    assert {path: path.stat().st_mtime_ns for path in done} == done
 
 
 @pytest.mark.slow
@@ -178,13 +181,9 @@ def test_an_interrupted_batch_says_how_to_go_on(batches: Batches, tmp_path: Path
 def test_a_job_that_fails_by_its_input_is_reported_and_the_exit_code_is_1(
     batches: Batches, tmp_path: Path
 ) -> None:
-    scene = str(batches.jobs.parent / "scene")
-    sources = [scene, str(tmp_path / "nowhere")]
-    words = ("batch", "pair", *sources, "--out", tmp_path / "out")
-    ended = run_apart(*words, "--workers", "1", "--json")
-    assert ended.code == 1, ended.err
-    summary = json.loads(ended.out)
-    assert (summary["succeeded"], summary["failed"]) == (1, 1)
+    sources = [str(batches.folder / "scene"), str(tmp_path / "nowhere")]
+    words = ["batch", "pair", *sources, "--out", str(tmp_path / "out")]
+    summary = ended([*RECON, *words, "--workers", "1", "--json"], succeeded=1, failed=1)
     assert summary["jobs"][0]["figures"]["disparity.bad.2.0"] < 5
     assert "nowhere" in summary["jobs"][1]["error"]
     assert (tmp_path / "out" / "report.html").is_file()
@@ -195,24 +194,15 @@ def test_a_job_that_fails_by_its_input_is_reported_and_the_exit_code_is_1(
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_first_failure_ends_a_batch_that_fails_fast(batches: Batches, tmp_path: Path) -> None:
-    place, out = batches.jobs.parent, tmp_path / "out"
-    sources = [str(tmp_path / "nowhere"), *(str(place / f"drive{n}") for n in range(DRIVES))]
-    words = ["batch", "map", *sources, "--option=--no-mesh", "--out", str(out), "--workers", "1"]
-    command = [sys.executable, "-m", "recon", *words, "--fail-fast", "--json"]
-    done = subprocess.run(command, capture_output=True, check=False, text=True)
-    assert done.returncode == 1, done.stderr
-    summary = json.loads(done.stdout)
-    assert (summary["succeeded"], summary["failed"], summary["not_run"]) == (0, 1, DRIVES)
+    sources = [
+        str(tmp_path / "nowhere"),
+        *(str(batches.folder / f"drive{n}") for n in range(DRIVES)),
+    ]
+    words = ["batch", "map", *sources, "--option=--no-mesh", "--out", str(tmp_path / "out")]
+    options = ["--workers", "1", "--json"]
+    ended([*RECON, *words, *options, "--fail-fast"], 0, failed=1, not_run=DRIVES)
     # A job that had begun is killed; what it left is gone on with.
-    resumed = subprocess.run(
-        [*command[:3], "batch", "--resume", str(out), "--workers", "1", "--json"],
-        capture_output=True,
-        check=False,
-        text=True,
-    )
-    assert resumed.returncode == 1
-    summary = json.loads(resumed.stdout)
-    assert (summary["succeeded"], summary["failed"], summary["not_run"]) == (DRIVES, 1, 0)
+    ended([*RECON, "batch", "--resume", str(tmp_path / "out"), *options], DRIVES, failed=1)
 
 
 @pytest.mark.parametrize(

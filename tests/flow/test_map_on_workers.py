@@ -126,33 +126,32 @@ def test_a_client_that_is_killed_leaves_what_resume_goes_on_with(
     assert content(tmp_path / "out") == content(runs.pieces)
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--poses", "DRIVE/poses.txt"], "--poses or --prior is mapped in one"),
-        (["--prior", "DRIVE/prior.txt"], "--poses or --prior is mapped in one"),
-        (["--set", "occupancy.keep_rays=false"], "joined by their rays"),
-    ],
-)
-def test_what_does_not_combine_is_refused_and_nothing_is_left(
-    tmp_path: Path, words: list[str], told: str
-) -> None:
-    drive, out = tmp_path / "drive", tmp_path / "out"
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    drive = tmp_path_factory.mktemp("short")
     source = SyntheticSource(StreetSettings(frames=3, width_px=128, height_px=48, focal_px=80.0))
     write_kitti(source, drive)
     lines = (f"{n} 0 0 0 0 0 0 1\n" for n in range(-1, 9))
     (drive / "prior.txt").write_text("".join(lines))
-    words = [word.replace("DRIVE", str(drive)) for word in words]
-    assert_refused(run("map", drive, "--out", out, "--workers", "2", *words), told)
+    return drive
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--workers", "2", "--poses", "DRIVE/poses.txt"], "--poses or --prior is mapped in one"),
+        (["--workers", "2", "--prior", "DRIVE/prior.txt"], "--poses or --prior is mapped in one"),
+        (["--workers", "2", "--set", "occupancy.keep_rays=false"], "joined by their rays"),
+        (["--scheduler", "nonsense"], "nonsense: the scheduler cannot be reached"),
+    ],
+)
+def test_what_does_not_combine_is_refused_and_nothing_is_left(
+    short: Path, tmp_path: Path, words: list[str], said: str
+) -> None:
+    out = tmp_path / "out"
+    words = [word.replace("DRIVE", str(short)) for word in words]
+    assert_refused(run("map", short, "--out", out, *words), said)
     assert not out.exists()
-
-
-def test_a_scheduler_that_cannot_be_reached_leaves_nothing(tmp_path: Path) -> None:
-    source = SyntheticSource(StreetSettings(frames=3, width_px=128, height_px=48, focal_px=80.0))
-    write_kitti(source, tmp_path / "drive")
-    words = ("map", tmp_path / "drive", "--out", tmp_path / "out", "--scheduler", "nonsense")
-    assert_refused(run(*words), "nonsense: the scheduler cannot be reached")
-    assert not (tmp_path / "out").exists()
 
 
 def test_options_that_say_nothing_together_are_wrong_usage(tmp_path: Path) -> None:
@@ -162,11 +161,9 @@ def test_options_that_say_nothing_together_are_wrong_usage(tmp_path: Path) -> No
 
 
 def test_without_dask_the_line_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = SyntheticSource(StreetSettings(frames=3, width_px=128, height_px=48, focal_px=80.0))
-    write_kitti(source, tmp_path / "drive")
     monkeypatch.setitem(sys.modules, "distributed", None)
-    words = ("map", tmp_path / "drive", "--out", tmp_path / "out", "--workers", "2")
+    words = ("map", short, "--out", tmp_path / "out", "--workers", "2")
     assert_refused(run(*words), "pip install 'recon[cluster]'")
     assert not (tmp_path / "out").exists()

@@ -85,6 +85,11 @@ def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path)
     assert found["links"]["count"] >= 3
     assert found["frames"] == 2 * FRAMES  # those of the drives that are linked
     assert any("session 2 (film)" in warning for warning in found["warnings"])
+    true = street(2, FIRST + FRAMES).trajectory
+    path = read_trajectory(merged / "sessions/1/trajectory_tum.txt")
+    off_m = np.linalg.norm(path.positions_m - true.positions_m[FIRST:], axis=1)
+    assert off_m.max() < 0.3
+    assert not (merged / "sessions/2").exists()
 
 
 def test_one_run_is_held_at_measured_positions(runs: Path, tmp_path: Path) -> None:
@@ -102,27 +107,20 @@ def test_one_run_is_held_at_measured_positions(runs: Path, tmp_path: Path) -> No
     assert "From measured positions" in page
 
 
-def test_the_second_drive_is_placed_where_it_was(merged: Path) -> None:
-    true = street(2, FIRST + FRAMES).trajectory
-    path = read_trajectory(merged / "sessions/1/trajectory_tum.txt")
-    off_m = np.linalg.norm(path.positions_m - true.positions_m[FIRST:], axis=1)
-    assert off_m.max() < 0.3
-    assert not (merged / "sessions/2").exists()
-
-
 def test_the_folder_of_a_merged_map_is_a_run_like_others(merged: Path, tmp_path: Path) -> None:
     for name in ("map/cloud.ply", "map/removed.ply", "map/octomap.bt", "report.html"):
         assert (merged / name).is_file()
     run_occupancy(merged, out=tmp_path / "again")
     grids = [(folder / "map/grid.pgm").read_bytes() for folder in (merged, tmp_path / "again")]
     assert grids[0] == grids[1]
-
-
-def test_the_map_of_several_drives_is_open_to_python(merged: Path, runs: Path) -> None:
-    with Map.open(merged) as map_, Map.temporary() as other:
+    with Map.open(merged) as map_:
         assert [session.number for session in map_.linked] == [0, 1]
         assert all(link.kept for link in map_.links)
         assert sum(len(tile.cloud) for tile in map_.tiles()) > 1000
+
+
+def test_maps_are_merged_in_python(runs: Path) -> None:
+    with Map.temporary() as other:
         for name in ("first", "second"):
             with Map.open(runs / name) as one:
                 other.merge(one)
@@ -195,33 +193,28 @@ def _refused(*arguments: object) -> str:
 def test_what_cannot_be_merged_is_one_line(
     runs: Path, tmp_path: Path, second: str, message: str
 ) -> None:
-    other = tmp_path / second
-    if second == "first":
-        other = runs / "first"
-    elif second not in ("missing", "unfinished"):
+    other = runs / "first" if second == "first" else tmp_path / second
+    if second not in ("missing", "unfinished", "first"):
         shutil.copytree(runs / ("first" if second == "copy" else "second"), other)
     if second == "pair":
         (other / "run.json").write_text('{"command": "pair"}')
     elif second == "unfinished":
         (other / ".partial/.state").mkdir(parents=True)
-    elif second == "coarse":
+    elif second == "no map":
+        (other / "map/map.recon").unlink()
+    elif second in ("coarse", "newer", "damaged", "odd"):
         with Map.open(other, read_only=False) as map_:
-            info = map_.store.read("session", 0)
-            info["config"]["fusion"]["voxel_m"] = 0.2
-            map_.store.put("session", 0, info)
-            map_.commit()
-    elif second == "newer":
-        with Map.open(other, read_only=False) as map_:
-            map_.store._database.execute("PRAGMA user_version = 99")
-            map_.commit()
-    elif second in ("damaged", "odd"):  # with a wrong checksum, and with one that is right
-        with Map.open(other, read_only=False) as map_:
-            map_.store.put("rays", (0, 0), {})
+            if second == "coarse":
+                info = map_.store.read("session", 0)
+                info["config"]["fusion"]["voxel_m"] = 0.2
+                map_.store.put("session", 0, info)
+            elif second == "newer":
+                map_.store._database.execute("PRAGMA user_version = 99")
+            else:  # with a wrong checksum, and with one that is right
+                map_.store.put("rays", (0, 0), {})
             if second == "damaged":
                 map_.store._database.execute("UPDATE record SET checksum = 0 WHERE kind = 'rays'")
             map_.commit()
-    elif second == "no map":
-        (other / "map/map.recon").unlink()
     told = _refused("merge", runs / "first", other, "--out", tmp_path / "out", "--no-mesh")
     assert message in told
     assert not (tmp_path / "out").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -35,6 +34,15 @@ State = Literal["not run", "succeeded", "failed", "broken"]
 LOGS: Final = "logs"
 _TAIL_BYTES: Final = 1 << 16
 """At the end of a log, in which the last try is found."""
+_PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")
+_LOOK_S: Final = 0.2
+_OTHERS_S: Final = 90.0
+_LOG_S: Final = 10.0
+"""The log of a job has so many seconds between two of its frames."""
+_LEAST_FREE_BYTES: Final = 32_000_000
+_INPUT: Final = (1, 2)
+"""Exit codes of bad input and of wrong usage."""
+_LONGEST: Final = 400
 
 
 @dataclass(frozen=True)
@@ -129,19 +137,9 @@ def is_done(out: Path) -> bool:
     return (out / RECORD).is_file() and (out / SUMMARY).is_file()
 
 
-Asked = Callable[[], bool]
-_PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")
-_LOOK_S: Final = 0.2
-_OTHERS_S: Final = 90.0
-_LOG_S: Final = 10.0
-"""The log of a job has so many seconds between two of its frames."""
-_LEAST_FREE_BYTES: Final = 32_000_000
-_INPUT: Final = (1, 2)
-"""Exit codes of bad input and of wrong usage."""
-_LONGEST: Final = 400
-
-
-def run_job(job: Job, folder: Path, worker: str = "", stopped: Asked = lambda: False) -> Outcome:
+def run_job(
+    job: Job, folder: Path, worker: str = "", stopped: Callable[[], bool] = lambda: False
+) -> Outcome:
     """Run the command of a job in a process of its own, which ends with this one.
 
     A result that is there is not made again; what an earlier try of `recon map` has committed is
@@ -172,12 +170,12 @@ def run_job(job: Job, folder: Path, worker: str = "", stopped: Asked = lambda: F
             full=full,
             stale=resume and code > 0 and not full,
         )
-        with contextlib.suppress(OSError):  # a full disk, of which the outcome tells
+        with suppress(OSError):  # a full disk, of which the outcome tells
             log.write(ended.line())
     return ended
 
 
-def _wait_for_others(out: Path, stopped: Asked) -> None:
+def _wait_for_others(out: Path, stopped: Callable[[], bool]) -> None:
     """Wait for an earlier try, whose worker does not know yet that its scheduler is gone."""
     late = time.monotonic() + _OTHERS_S
     while is_locked(lock_file(out)) and time.monotonic() < late and not stopped():
@@ -194,7 +192,9 @@ def _is_full(folder: Path) -> bool:
     return shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
 
 
-def _run(job: Job, line: list[str], out: Path, log: IO[bytes], stopped: Asked) -> tuple[int, str]:
+def _run(
+    job: Job, line: list[str], out: Path, log: IO[bytes], stopped: Callable[[], bool]
+) -> tuple[int, str]:
     """Run the process to its end; returns its exit code and the line in which it says why."""
     said = [""]
     try:
@@ -232,7 +232,7 @@ def _listen(stream: IO[bytes], log: IO[bytes], said: list[str]) -> None:
             if time.monotonic() < shown_s + _LOG_S:
                 continue
             shown_s = time.monotonic()
-        with contextlib.suppress(OSError, ValueError):  # a full disk; a log that was closed
+        with suppress(OSError, ValueError):  # a full disk; a log that was closed
             log.write(line)
         text = line.decode("utf-8", "replace").strip().strip("│ ")  # a box around it
         is_plain = any(map(str.isalnum, text)) and not text.startswith("{")
@@ -240,7 +240,7 @@ def _listen(stream: IO[bytes], log: IO[bytes], said: list[str]) -> None:
             said[0] = text
 
 
-def _wait(process: subprocess.Popen[bytes], timeout_s: float, stopped: Asked) -> str:
+def _wait(process: subprocess.Popen[bytes], timeout_s: float, stopped: Callable[[], bool]) -> str:
     """Wait for the end of a process, or end it with all it started; returns why, or ""."""
     late, why = time.monotonic() + timeout_s, ""
     try:
@@ -249,10 +249,10 @@ def _wait(process: subprocess.Popen[bytes], timeout_s: float, stopped: Asked) ->
                 why = f"took more than {timeout_s:g} s"
             elif stopped():
                 why = "was stopped"
-            with contextlib.suppress(subprocess.TimeoutExpired):
+            with suppress(subprocess.TimeoutExpired):
                 process.wait(_LOOK_S)
     finally:
-        with contextlib.suppress(ProcessLookupError):
+        with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         if process.stdin is not None:
