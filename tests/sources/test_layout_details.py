@@ -9,13 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.errors import FormatError, ReconError, SourceError
+from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration, StereoPair
 from recon.io.cameras.ros import write_kalibr
 from recon.io.images.image import write_image
 from recon.sources.bag import rig_of_messages
+from recon.sources.calibration import camera_of_numbers
 from recon.sources.image_names import find_partners
+from recon.sources.opencv_camera import Camera
 from recon.sources.registry import open_source
 from recon.sources.rosbags import BagCameraInfo
 from recon.sources.settings import SourceSettings
@@ -71,13 +73,80 @@ def test_a_euroc_drive_without_sensor_yaml_takes_the_camchain_beside_it(
         open_source(tmp_path)
 
 
-def test_messages_of_two_single_calibrations_have_no_baseline() -> None:
-    K = CAMERA.matrix
+@pytest.mark.parametrize("rectified", [True, False])
+@pytest.mark.parametrize(
+    ("focal_px", "message"),
+    [
+        (60.0, "CameraInfo has no baseline.*--calib"),
+        (0.0, "CameraInfo is of .* not calibrated.*--calib"),
+    ],
+)
+def test_messages_without_baseline_or_focal_length_are_refused(
+    rectified: bool, focal_px: float, message: str
+) -> None:
+    K = np.diag([focal_px, focal_px, 1.0])
     P = np.hstack([K, np.zeros((3, 1))])
     info = BagCameraInfo(64, 32, "plumb_bob", np.zeros(5), K, np.eye(3), P)
-    for rectified in (True, False):
-        with pytest.raises(ReconError, match=r"drive\.bag: CameraInfo has no baseline.*--calib"):
-            rig_of_messages(info, info, Path("drive.bag"), rectified)
+    with pytest.raises(ReconError, match=rf"drive\.bag: {message}"):
+        rig_of_messages(info, info, Path("drive.bag"), rectified)
+
+
+def test_numbers_alone_make_a_camera_that_looks_through_the_middle() -> None:
+    known = SourceSettings(focal_px=60.0, baseline_m=0.5)
+    assert camera_of_numbers(known, (64, 32)) == CAMERA
+    shifted = camera_of_numbers(known.model_copy(update={"cx_px": 3.0, "cy_px": 7.0}), (64, 32))
+    assert (shifted.cx_px, shifted.cx_right_px, shifted.cy_px) == (3.0, 3.0, 7.0)
+    for wrong in (SourceSettings(focal_px=60.0), SourceSettings(focal_px=2.0, baseline_m=0.5)):
+        with pytest.raises(CalibrationError, match="--focal"):
+            camera_of_numbers(wrong, (64, 32))
+    camera_of_numbers(known.model_copy(update={"focal_px": 4.5}), (64, 32))  # sees 164 degrees
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize(
+    ("write", "names"),
+    [(drives.write_tum, ("left.txt", "right.txt")),
+     (drives.write_two_videos, ("left.avi", "right.avi"))],
+)  # fmt: skip
+def test_lists_and_videos_can_be_named_and_one_name_alone_is_not_enough(
+    noise: list[StereoPair],
+    tmp_path: Path,
+    write: drives.Writer,
+    names: tuple[str, str],
+    side: str,
+) -> None:
+    folder = write(noise, CAMERA, tmp_path)
+    for view, name in zip(("port", "starboard"), names, strict=True):
+        (folder / name).rename(folder / f"{view}{name[-4:]}")
+    kind = "tum" if names[0].endswith("txt") else "video"
+    named = {"left": f"port{names[0][-4:]}", "right": f"starboard{names[1][-4:]}"}
+    assert len(list(open_source(folder, kind, SourceSettings(**named)))) == 12
+    with pytest.raises(SourceError, match="name them with --left and --right"):
+        open_source(folder, kind, SourceSettings(**{side: named[side]}))
+
+
+def test_two_videos_must_advance_alike(noise: list[StereoPair], tmp_path: Path) -> None:
+    source = open_source(drives.write_two_videos(noise, CAMERA, tmp_path))
+    for drift_s in (0.049, -0.049):
+        source._check_pace(3, drift_s)
+    for drift_s in (0.051, -0.051):
+        with pytest.raises(SourceError, match=rf"right\.avi, frame 3: .*{drift_s}"):
+            source._check_pace(3, drift_s)
+
+
+def test_a_video_file_can_take_the_place_of_a_camera(
+    noise: list[StereoPair], tmp_path: Path
+) -> None:
+    camera = Camera(str(drives.write_video(tmp_path / "left.avi", [p.left for p in noise])))
+    assert not camera.live
+    assert camera.rate_hz == pytest.approx(10.0)
+    assert camera.lock(None) is None
+    times = []
+    while (time_s := camera.grab()) is not None:
+        times.append(time_s)
+        np.testing.assert_array_equal(camera.retrieve()[:, :, 0], noise[len(times) - 1].left)
+    np.testing.assert_allclose(times, 0.1 * np.arange(12), atol=1e-6)
+    camera.close()
 
 
 def test_the_true_path_of_euroc_is_that_of_the_left_camera(

@@ -86,6 +86,21 @@ def test_topics_that_are_not_used_are_reported(tmp_path: Path, kind: str) -> Non
     assert "not used: /odom, /tf, /tf_static (for --prior: /odom, /tf)" in description
 
 
+@pytest.mark.parametrize("others", [20, 21])
+def test_of_many_topics_the_first_are_named(tmp_path: Path, others: int) -> None:
+    with recorder(tmp_path, Recording("ros1")) as bag:
+        for topic, P in zip(TOPICS, drives.projections(CAMERA), strict=True):
+            name = topic.rsplit("/", 1)[0] + "/camera_info"
+            bag.write(name, START_NS, bag.camera_info(START_NS, CAMERA, P))
+            bag.write(topic, START_NS, bag.image(START_NS, np.zeros((32, 64), np.uint8)))
+        for number in range(others):
+            topic = f"/wheel{number:02d}"
+            bag.write(topic, START_NS, bag.odometry(START_NS, np.eye(4)))
+    listed = open_source(tmp_path / "drive.bag").description.partition("not used: ")[2]
+    assert ("/wheel19 …" in listed) == (others > 20)
+    assert "/wheel19" in listed.partition(" (for --prior")[0]
+
+
 def test_a_topic_that_is_no_prior_is_refused_with_those_that_are(tmp_path: Path) -> None:
     source = open_source(write(tmp_path, "ros1"))
     for name in (TOPICS[0], "/wheels"):
