@@ -1,10 +1,12 @@
-"""`recon.stereo.kernels.sad` in plain numpy: slow, short, and the definition of its results."""
+"""The searches in plain numpy: slow, short, and the definition of their results."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
+from recon.core.kernels.compiled import Bool, Float32, Int64, UInt8, UInt16
 from recon.stereo.kernels.half_windows import Search
 from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.path_costs import Views, Window
@@ -13,10 +15,21 @@ from recon.stereo.kernels.plane_minima import PARTS, Band
 from recon.stereo.kernels.tiles import GROUP, Support, Tiles
 
 
-def sad_minima_reference(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search, tiles: Tiles
-) -> Minima:
-    """Return all rows of `recon.stereo.kernels.sad.sad_minima`, from images (H, W)."""
+@st.composite
+def pairs(draw: st.DrawFn, rows: tuple[int, int], columns: tuple[int, int]) -> tuple[UInt8, UInt8]:
+    shape = draw(st.tuples(st.integers(*rows), st.integers(*columns)))
+    # Few grey levels make ties, many make overflows.
+    grey = hnp.arrays(np.uint8, shape, elements=st.integers(0, draw(st.sampled_from([1, 3, 255]))))
+    return draw(grey), draw(grey)
+
+
+def assert_equal(found: Minima, expected: Minima) -> None:
+    for name in Minima._fields:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+def sad_minima_reference(left: UInt8, right: UInt8, search: Search, tiles: Tiles) -> Minima:
+    """Return all rows of `sad_minima`, from images (H, W)."""
     upright = window_costs_reference(left, right, search._replace(slant=0))
     slanted = window_costs_reference(left, right, search)
     lowest = np.minimum(upright, slanted)
@@ -31,9 +44,7 @@ def sad_minima_reference(
     return minima._replace(right_winner=right_winners_reference(minima, search))
 
 
-def window_costs_reference(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search
-) -> NDArray[np.int64]:
+def window_costs_reference(left: UInt8, right: UInt8, search: Search) -> Int64:
     """int64 (H, W, ndisp), the cost of each candidate, as if both images went on for ever."""
     height, width = left.shape
     costs = np.zeros((height, width, search.ndisp), np.int64)
@@ -53,7 +64,7 @@ def window_costs_reference(
     return costs
 
 
-def right_winners_reference(minima: Minima, search: Search) -> NDArray[np.uint16]:
+def right_winners_reference(minima: Minima, search: Search) -> UInt16:
     """uint16 (H, W), the candidate of the left pixel that chose each right pixel at least cost."""
     chosen = np.full_like(minima.winner, search.ndisp)
     x_last_first = -np.arange(chosen.shape[1])
@@ -66,7 +77,7 @@ def right_winners_reference(minima: Minima, search: Search) -> NDArray[np.uint16
     return chosen
 
 
-def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:
+def minima_reference(costs: Int64, minimum: int) -> Minima:
     """Return the minima of costs (H, W, ndisp) in both views; `NO_COST` = not offered."""
     width, ndisp = costs.shape[1:]
     k = np.arange(ndisp)
@@ -74,14 +85,10 @@ def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:
     inside = (x - minimum - k >= 0) & (x - minimum - k < width) & (costs < NO_COST)
     open_costs = np.where(inside, costs, NO_COST)
     winner = np.where(inside.any(axis=2), open_costs.argmin(axis=2), ndisp)
-    picked = np.stack(
-        [
-            _cost_at(open_costs, winner),
-            _cost_at(open_costs, winner - 1),
-            _cost_at(open_costs, np.where(winner < ndisp, winner + 1, ndisp)),
-            np.where(np.abs(k - winner[:, :, None]) < 2, NO_COST, open_costs).min(axis=2),
-        ]
-    )
+    after = np.where(winner < ndisp, winner + 1, ndisp)
+    beside = [_cost_at(open_costs, place) for place in (winner, winner - 1, after)]
+    second = np.where(np.abs(k - winner[:, :, None]) < 2, NO_COST, open_costs).min(axis=2)
+    picked = np.stack([*beside, second])
     # Column x_right of the right view sees left column x_right + minimum + k as candidate k.
     seen = x + minimum + k
     clipped = np.clip(seen, 0, width - 1)
@@ -90,7 +97,7 @@ def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:
     return Minima(winner.astype(np.uint16), picked.astype(np.uint16), right.astype(np.uint16))
 
 
-def _cost_at(costs: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
+def _cost_at(costs: Int64, k: Int64) -> Int64:
     """Return costs (H, W) of one candidate of each pixel; `NO_COST` outside the range."""
     ndisp = costs.shape[2]
     there = np.clip(k, 0, ndisp - 1)[:, :, None]
@@ -98,20 +105,10 @@ def _cost_at(costs: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64
     return np.where((k >= 0) & (k < ndisp), cost, NO_COST)
 
 
-Int64 = NDArray[np.int64]
-
-
 def semi_global_minima_reference(
     views: Views, window: Window, paths: Paths, bands: list[Band] | None = None
 ) -> Minima:
-    """Return all rows of `recon.stereo.kernels.semi_global.semi_global_minima`, as one block.
-
-    Args:
-        views: As there.
-        window: As there.
-        paths: As there.
-        bands: How the columns are divided; None = not at all.
-    """
+    """Return all rows of `semi_global_minima`, as one block, in columns divided into bands."""
     costs, width = path_costs_reference(views, window, paths.ndisp), views.grey.shape[1]
     parts = [
         _path_means(views.grey[:, start:end], costs[:, start:end], paths)[
@@ -122,9 +119,7 @@ def semi_global_minima_reference(
     return minima_reference(PARTS * np.concatenate(parts, axis=1), paths.minimum)
 
 
-def _path_means(grey: NDArray[np.uint8], costs: Int64, paths: Paths) -> Int64:
-    """Return int64 (H, W, P), mean costs of the paths to each pixel."""
-
+def _path_means(grey: UInt8, costs: Int64, paths: Paths) -> Int64:
     def along(dy: int, dx: int) -> Int64:
         return path_reference(grey, costs, paths, dy, dx)
 
@@ -152,7 +147,7 @@ def path_costs_reference(views: Views, window: Window, ndisp: int) -> Int64:
     return sums * window.factor >> window.shift
 
 
-def path_reference(grey: NDArray[np.uint8], costs: Int64, paths: Paths, dy: int, dx: int) -> Int64:
+def path_reference(grey: UInt8, costs: Int64, paths: Paths, dy: int, dx: int) -> Int64:
     """Return int64 (H, W, P), costs of the paths that step by ``(dy, dx)`` to each pixel."""
     height, width, candidates = costs.shape
     closed = np.full(candidates + 2, 255 - paths.p1)
@@ -172,9 +167,9 @@ def path_reference(grey: NDArray[np.uint8], costs: Int64, paths: Paths, dy: int,
 
 
 def offer_supported_reference(
-    halved: NDArray[np.float32], minimum: int, ndisp: int, support: Support, tiles: Tiles
-) -> NDArray[np.bool_]:
-    """Return what `recon.stereo.kernels.tiles.offer_supported` writes to ``offered``."""
+    halved: Float32, minimum: int, ndisp: int, support: Support, tiles: Tiles
+) -> Bool:
+    """Return what `offer_supported` writes to ``offered``."""
     y = 2 * np.arange(halved.shape[0])[:, None]
     x = 2 * np.arange(halved.shape[1])[None, :]
     k = np.clip(np.rint(2 * halved) - minimum, 0, ndisp - 1)
@@ -192,7 +187,7 @@ def offer_supported_reference(
     return offered
 
 
-def offered_reference(tiles: Tiles, shape: tuple[int, int], ndisp: int) -> NDArray[np.bool_]:
+def offered_reference(tiles: Tiles, shape: tuple[int, int], ndisp: int) -> Bool:
     """Return bool (H, W, ndisp), which candidates are offered to which pixel."""
     y, x = np.arange(shape[0]) // tiles.height, np.arange(shape[1]) // tiles.width
     return tiles.offered[y[:, None, None], x[:, None], np.arange(ndisp) // GROUP]

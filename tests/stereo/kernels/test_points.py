@@ -8,21 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from recon.core.kernels.compiled import Bool, Float32, Float64
 from recon.stereo.kernels.points import MIN_SPREAD, Maps, PointRules, Points, make_points
 
-RULES = PointRules(
-    focal=100.0,
-    cx=12.3,
-    cy=7.7,
-    fb=20.0,
-    doffs=2.0,
-    nearest=0.1,
-    farthest=8.0,
-    relative_sigma=0.2,
-    confidence=0.2,
-    stride=1,
-    radius=3,
-)
+RULES = PointRules(100.0, 12.3, 7.7, 20.0, 2.0, 0.1, 8.0, 0.2, 0.2, stride=1, radius=3)
 
 
 def make_maps(seed: int, height: int, width: int, *, known: float, channels: int) -> Maps:
@@ -78,7 +67,6 @@ def test_points_equal_their_reference(given_maps: Maps, radius: int, stride: int
     np.testing.assert_allclose(ours.normals, reference.normals, atol=2e-3)
 
 
-Float32 = NDArray[np.float32]
 Index = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
@@ -106,7 +94,7 @@ def make_points_reference(maps: Maps, rules: PointRules) -> Points:
     )
 
 
-def _candidates(maps: Maps, rules: PointRules) -> NDArray[np.bool_]:
+def _candidates(maps: Maps, rules: PointRules) -> Bool:
     """Return bool (H, W), pixels on the raster that have a disparity and are sure enough."""
     with np.errstate(invalid="ignore"):
         candidates = maps.values.astype(np.float64) + rules.doffs > 0
@@ -128,9 +116,7 @@ def _normals(values: Float32, at: Index, rules: PointRules) -> Float32:
     return np.asarray(normals / length, dtype=np.float32)
 
 
-def _slopes(
-    values: Float32, at: Index, radius: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _slopes(values: Float32, at: Index, radius: int) -> tuple[Float64, Float64]:
     """Disparity gradients (along u, along v) of the plane fitted to the window of each pixel."""
     padded = np.pad(values.astype(np.float64), radius, constant_values=np.nan)
     offset = np.arange(-radius, radius + 1)
@@ -141,7 +127,7 @@ def _slopes(
     known = np.isfinite(d)
     n = known.sum(axis=1, keepdims=True)
 
-    def centred(x: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+    def centred(x: NDArray[np.floating | np.integer]) -> Float64:
         x = np.where(known, x, 0.0).astype(np.float64)
         return np.where(known, x - x.sum(axis=1, keepdims=True) / n, 0.0)
 

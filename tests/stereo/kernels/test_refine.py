@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from numpy.typing import NDArray
 
+from recon.core.kernels.compiled import Bool, Float32, Float64, UInt8, UInt16
 from recon.core.values import Reason
 from recon.stereo.kernels import refine
 from recon.stereo.kernels.minima import NO_COST, Minima
@@ -86,9 +85,7 @@ def cases(draw: st.DrawFn) -> tuple[Minima, np.ndarray, Rules]:
 
 LEFT_RIGHT_OR_OCCLUDED = (
     Minima(
-        winner=np.array([[2, 3]], np.uint16),
-        costs=np.zeros((4, 1, 2), np.uint16),
-        right_winner=np.zeros((1, 2), np.uint16),
+        np.array([[2, 3]], np.uint16), np.zeros((4, 1, 2), np.uint16), np.zeros((1, 2), np.uint16)
     ),
     np.zeros((1, 2), np.float32),
     RULES._replace(ndisp=3, minimum=-3, left_right=0, fit=False),
@@ -134,9 +131,8 @@ def test_results_lie_within_their_bounds(case: tuple[Minima, np.ndarray, Rules])
 
 
 def test_codes_are_those_of_the_values() -> None:
-    names = ("VALID", "LOW_TEXTURE", "AMBIGUOUS", "LEFT_RIGHT", "OCCLUDED", "OUT_OF_RANGE")
-    for name in (*names, "BORDER"):
-        assert getattr(refine, name) == Reason[name]
+    for reason in set(Reason) - {Reason.SPECKLE, Reason.EDGE}:
+        assert getattr(refine, reason.name) == reason
 
 
 def test_vertex_of_two_equal_slopes_is_found_exactly() -> None:
@@ -144,19 +140,6 @@ def test_vertex_of_two_equal_slopes_is_found_exactly() -> None:
     value, _, _, reason = refine_one(one_pixel((20, 60, 40, 100)))
     assert reason == Reason.VALID
     assert value == 3.25
-
-
-@pytest.mark.parametrize(("chooser", "reason"), [(None, Reason.OCCLUDED), (4, Reason.LEFT_RIGHT)])
-def test_pixel_is_occluded_where_no_pixel_of_the_right_view_has_its_match(
-    chooser: int | None, reason: Reason
-) -> None:
-    minima = one_pixel((20, 60, 40, 100))
-    # Left pixel 5 looks at right pixel 2, which has its match elsewhere (2 + 6 = 8).
-    minima.right_winner[:] = 8
-    minima.right_winner[0, 2] = 6
-    if chooser is not None:
-        minima.right_winner[0, chooser] = 5 - chooser
-    assert refine_one(minima)[3] == reason
 
 
 def test_confidence_is_the_odds_of_margin_and_noise() -> None:
@@ -169,14 +152,6 @@ def test_confidence_is_the_odds_of_margin_and_noise() -> None:
     assert confidence / (1 - confidence) == pytest.approx(
         3 * (margin / sigma_px**3) ** 0.5, rel=1e-5
     )
-
-
-def test_sigma_is_that_of_right_and_wrong_together() -> None:
-    _, confidence, sigma_px, _ = refine_one(one_pixel((20, 60, 40, 100)))
-    right_px = np.hypot(0.1, 0.5 * np.pi * 10 / (40 * 5))
-    expected = confidence * right_px**2 + (1 - confidence) * refine.WRONG_PX**2
-    # 1e-5: float32.
-    assert sigma_px**2 == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(("costs", "sigma_px"), [((20, 20, 20, 100), 2.0), ((0, 50, 50, 100), 0.1)])
@@ -199,7 +174,7 @@ def test_rejected_pixels_have_nothing_left_but_a_reason() -> None:
     assert np.isfinite(refined.values[0, 5])
 
 
-def refine_minima_reference(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> Refined:
+def refine_minima_reference(minima: Minima, texture: Float32, rules: Rules) -> Refined:
     """Return all rows of `recon.stereo.kernels.refine.refine_minima`."""
     reason = _reasons(minima, texture, rules)
     keep = reason == VALID
@@ -221,7 +196,7 @@ def refine_minima_reference(minima: Minima, texture: NDArray[np.float32], rules:
     )
 
 
-def _reasons(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> NDArray[np.uint8]:
+def _reasons(minima: Minima, texture: Float32, rules: Rules) -> UInt8:
     k = minima.winner.astype(np.int64)
     best, before, after, second = minima.costs.astype(np.int64)
     width = k.shape[1]
@@ -246,7 +221,7 @@ def _reasons(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> NDAr
     return np.asarray(np.select(conditions, codes, VALID), dtype=np.uint8)
 
 
-def _chosen_beside(right_winner: NDArray[np.uint16], rules: Rules) -> NDArray[np.bool_]:
+def _chosen_beside(right_winner: UInt16, rules: Rules) -> Bool:
     height, width = right_winner.shape
     x = np.arange(width) + rules.minimum + right_winner.astype(np.int64)
     chosen = np.zeros((height, width), np.bool_)
@@ -256,16 +231,12 @@ def _chosen_beside(right_winner: NDArray[np.uint16], rules: Rules) -> NDArray[np
     return chosen
 
 
-def _offsets(
-    best: NDArray[Any], before: NDArray[Any], after: NDArray[Any], fit: bool
-) -> NDArray[np.float64]:
+def _offsets(best: Float64, before: Float64, after: Float64, fit: bool) -> Float64:
     slope = np.maximum(before, after) - best
     return np.where(fit & (slope > 0), 0.5 * (before - after) / slope, 0.0)
 
 
-def _sigmas(
-    best: NDArray[Any], before: NDArray[Any], after: NDArray[Any], rules: Rules
-) -> NDArray[np.float64]:
+def _sigmas(best: Float64, before: Float64, after: Float64, rules: Rules) -> Float64:
     slope = np.maximum(before, after) - best
     vertex = np.maximum(best - 0.5 * np.abs(before - after), 0.0)
     noise = 0.5 * np.pi * vertex / (slope * np.sqrt(rules.window_pixels))
