@@ -3,25 +3,37 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.errors import EvaluationError, ShapeError
-from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedCamera
+from recon.core.errors import EvaluationError, SettingsError, ShapeError, SourceError
+from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedCamera, RectifiedPair
 from recon.evaluation.confidence import share_within_sigma
 from recon.evaluation.disparity import evaluate_depth
-from recon.evaluation.middlebury.bench import weighted_confidence, weighted_figures
+from recon.evaluation.middlebury.bench import (
+    Bench,
+    read_result,
+    summarise_scenes,
+    weighted_confidence,
+    weighted_figures,
+)
+from recon.evaluation.middlebury.scenes import find_results, find_scenes, read_scored_scene
 from recon.evaluation.middlebury.score import (
     MiddleburyRules,
     at_truth_size,
     confidence_figures,
+    error_map,
     evaluate_middlebury,
     fill_holes,
     scene_weight,
 )
+from recon.io.images.disparity import write_pfm
+from recon.stereo.frame import StereoSettings
+from tests.flow.test_evaluate import write_scene
 
 N = float("nan")
 
@@ -217,3 +229,64 @@ def test_the_mean_counts_scenes_by_weight_and_leaves_out_those_without() -> None
     # 1e-5: the lists have six digits.
     assert mean["reliability"]["right"][8] == pytest.approx(2 / 3, abs=1e-5)
     assert mean["sparsification"]["wrong"][0] == pytest.approx(1 / 3, abs=1e-5)
+
+
+class Shifted:
+    """A matcher that finds the truth of a scene, 1 px too far, with one confidence for all."""
+
+    name = "shifted"
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values + np.float32(1)
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        return Disparity.from_values(self.values[: pair.left.shape[0]])
+
+
+def test_scenes_and_results_of_a_folder_become_figures(tmp_path: Path) -> None:
+    for name in ("Teddy", "Vintage"):
+        write_scene(tmp_path / "trainingQ" / name)
+    paths = find_scenes(tmp_path / "trainingQ")
+    scenes = {name: read_scored_scene(name, path, None) for name, path in paths.items()}
+    teddy = scenes["Teddy"]
+    assert teddy is not None
+    true, submitted = teddy.truth.values, tmp_path / "theirs" / "trainingQ" / "Teddy"
+    write_pfm(submitted / "disp0X.pfm", true + np.float32(0.5))
+    (submitted / "timeX.txt").write_text("1.5\n")
+    (theirs,) = find_results([tmp_path / "theirs"], paths, ["shifted"])
+    given = read_result(theirs, teddy)
+    assert given is not None
+    assert read_result(theirs, scenes["Vintage"]) is None
+    (own,) = Bench([Shifted(true)], StereoSettings(), 1).results(teddy)
+    figures = {"Teddy": {"shifted": own.figures, "theirs": given.figures}, "Vintage": None}
+    summary = summarise_scenes(figures, ["shifted", "theirs"], [theirs], tmp_path)
+    for name, error_px in (("shifted", 4.0), ("theirs", 2.0)):
+        mask = summary["matchers"][name]["weighted"]["nonocc"]
+        # A pixel is four full-size ones here; what is exactly off by a limit is not bad.
+        assert mask["dense"]["avgerr"] == mask["sparse"]["rms"] == pytest.approx(error_px)
+        assert mask["dense"]["bad"]["4"] == 0
+        assert mask["dense"]["bad"]["1"] == 100
+        assert mask["dense"]["depth"]["median_m"] > 0
+        assert (mask["invalid"], own.figures["confidence"]) == (0, None)
+    assert summary["matchers"]["theirs"]["weighted"]["seconds"] == 1.5
+    assert summary["matchers"]["shifted"]["weighted"]["seconds"] >= 0
+    assert (summary["skipped"], summary["mean_over"]) == (["Vintage"], ["Teddy"])
+    assert (teddy.camera.ndisp or 0) > np.nanmax(true)
+    assert error_map(teddy, own.values)[np.isfinite(true)] == pytest.approx(4.0)
+
+
+def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path: Path) -> None:
+    write_scene(tmp_path / "Teddy")
+    paths = find_scenes(tmp_path)
+    for folder, names, message in (
+        ("none", (), "no result for any scene"),
+        ("several", ("disp0A.pfm", "disp0B.pfm", "disp0B_s.pfm"), "several results"),
+    ):
+        for name in names or ("other.pfm",):
+            write_pfm(tmp_path / folder / "Teddy" / name, np.zeros((2, 2), np.float32))
+        with pytest.raises(SourceError, match=message):
+            find_results([tmp_path / folder], paths, [])
+    with pytest.raises(SettingsError, match="given twice"):
+        find_results([tmp_path / "none", tmp_path / "none"], paths, [])
+    with pytest.raises(SourceError, match="no Middlebury scene"):
+        find_scenes(tmp_path / "none")

@@ -108,6 +108,10 @@ def test_only_pixels_whose_patch_leaves_the_image_have_no_value() -> None:
     expected[2:-2, 2:-2] = True
     assert np.array_equal(found.valid, expected)
     assert np.all(found.reason[~expected] == Reason.BORDER)
+    # A value rounded to whole pixels is off by up to half a pixel, each amount as likely.
+    np.testing.assert_allclose(
+        found.sigma_px[expected], np.std(np.linspace(-0.5, 0.5, 999)), rtol=0.01
+    )
 
 
 def test_a_patch_larger_than_the_image_is_refused() -> None:

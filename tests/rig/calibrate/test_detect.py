@@ -165,6 +165,9 @@ def test_no_board_is_seen_in_noise() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
     assert find_board(noise, parse_board("chess:9x6:25mm")) is None
     assert find_board(noise, parse_board(CHARUCO)) is None
+    flat = np.full((240, 320), 90, np.uint8)
+    check_chessboard([None], lambda _: flat, parse_board("chess:9x6:25mm"))
+    check_charuco(1, lambda _: flat, parse_board(CHARUCO))
 
 
 def test_an_unknown_or_small_dictionary_is_refused() -> None:
