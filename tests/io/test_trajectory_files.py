@@ -11,6 +11,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
 from recon.io.trajectory import (
+    holds_times,
     read_kitti_poses,
     read_trajectory,
     read_tum,
@@ -35,27 +36,17 @@ def random_trajectory(seed: int, length: int) -> Trajectory:
 TRAJECTORIES = st.builds(random_trajectory, st.integers(0, 2**31), st.integers(1, 8))
 
 
+@pytest.mark.parametrize("form", ["kitti", "tum"])
 @settings(max_examples=30)
 @given(trajectory=TRAJECTORIES)
-def test_kitti_poses_lose_nothing_that_matters(
-    trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory
+def test_poses_lose_nothing_that_matters(
+    trajectory: Trajectory, form: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    path = tmp_path_factory.getbasetemp() / "poses_kitti.txt"
-    write_kitti_poses(path, trajectory)
-    read = read_kitti_poses(path, trajectory.timestamps_s)
-    # 13 digits of numbers up to 5 km: below a micrometre.
-    np.testing.assert_allclose(read.T_world_camera, trajectory.T_world_camera, rtol=0, atol=1e-8)
-    np.testing.assert_array_equal(read.timestamps_s, trajectory.timestamps_s)
-
-
-@settings(max_examples=30)
-@given(trajectory=TRAJECTORIES)
-def test_tum_poses_lose_nothing_that_matters(
-    trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "poses_tum.txt"
-    write_tum(path, trajectory)
-    read = read_tum(path)
+    path = tmp_path_factory.getbasetemp() / f"poses_{form}.txt"
+    (write_tum if form == "tum" else write_kitti_poses)(path, trajectory)
+    read = read_trajectory(path, trajectory.timestamps_s if form == "kitti" else None)
+    assert holds_times(path) == (form == "tum")
+    # 12 digits of numbers up to 5 km: below a micrometre.
     np.testing.assert_allclose(read.T_world_camera, trajectory.T_world_camera, rtol=0, atol=1e-8)
     # A float64 near 1.3e9 seconds resolves 2.4e-7.
     np.testing.assert_allclose(read.timestamps_s, trajectory.timestamps_s, rtol=0, atol=1e-6)
@@ -93,15 +84,6 @@ def test_kitti_rotations_of_few_digits_become_orthonormal(tmp_path: Path) -> Non
 def test_kitti_poses_without_times_are_one_second_apart(tmp_path: Path) -> None:
     (tmp_path / "p.txt").write_text(IDENTITY * 3)
     assert read_kitti_poses(tmp_path / "p.txt").timestamps_s.tolist() == [0, 1, 2]
-
-
-def test_the_kind_is_reported_by_the_columns(tmp_path: Path) -> None:
-    trajectory = random_trajectory(1, 4)
-    write_tum(tmp_path / "tum.txt", trajectory)
-    write_kitti_poses(tmp_path / "kitti.txt", trajectory)
-    tum = read_trajectory(tmp_path / "tum.txt")
-    kitti = read_trajectory(tmp_path / "kitti.txt", trajectory.timestamps_s)
-    np.testing.assert_allclose(tum.T_world_camera, kitti.T_world_camera, rtol=0, atol=1e-8)
 
 
 def test_a_number_of_poses_that_is_not_that_of_the_times_is_reported(tmp_path: Path) -> None:

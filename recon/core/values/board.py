@@ -29,27 +29,18 @@ _DEFAULT_DICTIONARY: Final = "5X5_100"
 
 @dataclass(frozen=True)
 class CalibrationBoard:
-    """A chessboard, or a ChArUco board (chessboard with ArUco markers in its white squares).
+    """A chessboard, or a ChArUco board (chessboard with ArUco markers in its white squares)."""
 
-    Attributes:
-        kind: ``chess`` or ``charuco``.
-        columns: Number along x of inner corners (chessboard) or squares (ChArUco).
-        rows: The same along y.
-        square_m: Side length of a square.
-        marker_m: Side length of a marker; 0 for a chessboard.
-        dictionary: OpenCV's name of the ArUco dictionary without ``DICT_``; "" for a chessboard.
-        metric: Whether the square size is known; if not, ``square_m`` is 1.
-        legacy: Whether a ChArUco board has the layout that OpenCV used before 4.6: with an even
-            number of rows, its first square is white.
-    """
-
-    kind: BoardKind
-    columns: int
-    rows: int
-    square_m: float
-    marker_m: float = 0.0
+    kind: BoardKind  # ``chess`` or ``charuco``
+    columns: int  # number along x of inner corners (chessboard) or squares (ChArUco)
+    rows: int  # the same along y
+    square_m: float  # side length of a square
+    marker_m: float = 0.0  # side length of a marker; 0 for a chessboard
+    # OpenCV's name of the ArUco dictionary without ``DICT_``; "" for a chessboard
     dictionary: str = ""
-    metric: bool = True
+    metric: bool = True  # whether the square size is known; if not, ``square_m`` is 1
+    # whether a ChArUco board has the layout that OpenCV used before 4.6: with an even number of
+    # rows, its first square is white
     legacy: bool = False
 
     def __post_init__(self) -> None:

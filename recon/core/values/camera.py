@@ -235,10 +235,7 @@ Rig = RectifiedCamera | StereoCalibration
 
 
 def check_size(
-    calibration: Rig,
-    width_px: int,
-    height_px: int,
-    where: str | PathLike[str] | None,
+    calibration: Rig, width_px: int, height_px: int, where: str | PathLike[str] | None
 ) -> None:
     """Check that images have the size of their calibration; every use of a calibration does."""
     camera = calibration if isinstance(calibration, RectifiedCamera) else calibration.left

@@ -19,13 +19,7 @@ from recon.core.values.arrays import Int32, UInt8
 from recon.core.values.cloud import Frame
 from recon.io.atomic import atomic_path, write_bytes
 from recon.io.files import StrPath, reader
-from recon.io.models.ply import (
-    colours_of,
-    fill_vertices,
-    normals_of,
-    positions_of,
-    vertex_dtype,
-)
+from recon.io.models.ply import colours_of, fill_vertices, normals_of, positions_of, vertex_dtype
 from recon.io.models.ply_tables import (
     Table,
     list_length,

@@ -194,11 +194,6 @@ def test_an_opencv_file_says_that_it_is_of_a_fisheye_and_refuses_two_models(tmp_
     assert read_recon_calibration(tmp_path / "mixed.yaml").left.model == "fisheye"
 
 
-def test_a_fisheye_needs_four_coefficients() -> None:
-    with pytest.raises(CalibrationError, match=r"four distortion coefficients.*got 5"):
-        CameraIntrinsics(np.diag([300.0, 300.0, 1.0]), np.zeros(5), 640, 480, "fisheye")
-
-
 def test_homographies_are_distinguished_from_a_calibration(tmp_path: Path) -> None:
     path = tmp_path / "homographies.yaml"
     path.write_text("note: up to scale\nwidth_px: 64\nH_left:\n- [1, 0, 0]\n")

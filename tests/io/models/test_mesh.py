@@ -178,8 +178,7 @@ def test_only_colours_from_images_are_unlit_and_unknown_axes_are_not_turned(tmp_
 
 
 @pytest.mark.parametrize(
-    ("frame", "up", "ahead"),
-    [("camera", [0, -1, 0], [0, 0, 1]), ("map", [0, 0, 1], [1, 0, 0])],
+    ("frame", "up", "ahead"), [("camera", [0, -1, 0], [0, 0, 1]), ("map", [0, 0, 1], [1, 0, 0])]
 )
 def test_the_node_turns_the_mesh_upright(
     tmp_path: Path, frame: Frame, up: list[int], ahead: list[int]

@@ -40,13 +40,6 @@ def test_meshlab_opens_every_layer_after_the_folder_has_moved(tmp_path: Path) ->
     assert sizes == [(12, 0), (3, 1)]
 
 
-def test_names_are_relative_to_the_project(tmp_path: Path) -> None:
-    text = write_project(tmp_path).read_text()
-    assert 'filename="../map/cloud &amp; more.ply"' in text
-    assert 'filename="mesh.ply"' in text
-    assert str(tmp_path) not in text
-
-
 def test_a_layer_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="does not exist"):
         write_mlp(tmp_path / "a.mlp", {"cloud": tmp_path / "none.ply"})

@@ -42,19 +42,6 @@ def test_an_ot_file_keeps_cells_and_log_odds(tmp_path: Path) -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_pyoctomap_finds_all_cells_of_a_bt_file_and_no_others(tmp_path: Path) -> None:
-    scene = _scene()
-    binary, _ = write_octomap(tmp_path / "octomap", scene)
-    tree = pyoctomap.OcTree(0.1)
-    assert tree.readBinary(str(binary))
-    assert tree.getResolution() == 0.2
-    for centre, value in zip(scene.centres_m, scene.log_odds, strict=True):
-        assert tree.isNodeOccupied(tree.search(centre)) == (value > 0)
-    # A leaf of a pruned tree stands for several cells.
-    cells = [round(leaf.getSize() / 0.2) ** 3 for leaf in tree.begin_leafs()]
-    assert sum(cells) == len(scene)
-
-
 def _by_pyoctomap(voxels: OccupancyVoxels) -> tuple[bytes, bytes]:
     """The contents of the ``.ot`` and the ``.bt`` file that OctoMap itself writes."""
     tree = pyoctomap.OcTree(voxels.resolution_m)
