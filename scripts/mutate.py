@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Change one token at random, run the tests of that room, and count how many changes they notice.
 
-An operator, a comparison, `and`, `or` or `not` outside kernels is changed in a copy of the project,
-so the checkout stays as it is. What no test notices is printed.
+An operator, a comparison (into its opposite), `and`, `or` or `not` outside kernels is changed in a
+copy of the project, so the checkout stays as it is. What no test notices is printed.
 
     scripts/mutate.py --count 100 --seed 1
     scripts/mutate.py --room stereo --count 8
@@ -32,10 +32,10 @@ OTHER: Final[dict[type[ast.AST], tuple[str, str]]] = {
     ast.Sub: ("-", "+"),
     ast.Mult: ("*", "/"),
     ast.Div: ("/", "*"),
-    ast.Lt: ("<", "<="),
-    ast.LtE: ("<=", "<"),
-    ast.Gt: (">", ">="),
-    ast.GtE: (">=", ">"),
+    ast.Lt: ("<", ">="),
+    ast.LtE: ("<=", ">"),
+    ast.Gt: (">", "<="),
+    ast.GtE: (">=", "<"),
     ast.Eq: ("==", "!="),
     ast.NotEq: ("!=", "=="),
     ast.Is: ("is", "is not"),

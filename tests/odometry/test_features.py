@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from recon.odometry import features
-from recon.odometry.features import find_corners, find_fewer_corners, in_crowd
+from recon.odometry.features import find_corners, find_fewer_corners, follow, in_crowd
 from recon.odometry.protocol import OdometryFrame
 
 NONE = np.zeros((0, 2), np.float32)
@@ -65,3 +65,16 @@ def test_fewer_corners_are_corners_too(see: Callable[..., OdometryFrame]) -> Non
     assert np.median(score[row, column]) > np.median(score)
     more = find_fewer_corners(grey, few)
     assert len(more) < 0.2 * len(few)
+
+
+def test_what_leaves_the_image_is_not_followed(see: Callable[..., OdometryFrame]) -> None:
+    grey = see(np.eye(4)).pair.left
+    uv = find_corners(grey, NONE)
+    shift = np.array([30, 12])
+    moved = np.roll(grey, shift[::-1], axis=(0, 1))
+    there, found = follow(grey, moved, uv, (uv + shift).astype(np.float32))
+    height, width = grey.shape
+    inside = (uv + shift < [width - 15, height - 15]).all(axis=1)
+    assert found[inside].mean() > 0.9
+    assert np.median(np.abs(there - uv - shift)[found & inside]) < 0.01
+    assert not found[((there > [width - 1, height - 1]) | (there < 0)).any(axis=1)].any()

@@ -7,7 +7,13 @@ import pytest
 
 from recon.core.geometry.se3 import as_transform
 from recon.core.values import RectifiedCamera, Trajectory
-from recon.odometry.health import doubt_about, expected_drift, health_warnings, stretches
+from recon.odometry.health import (
+    doubt_about,
+    expected_drift,
+    health_warnings,
+    name_frames,
+    stretches,
+)
 from recon.odometry.protocol import OdometryHealth
 
 GOOD = OdometryHealth(scale_px=30.0, sigma_m=0.01, sigma_deg=0.02)
@@ -103,3 +109,9 @@ def test_one_line_says_what_is_doubted_of_a_drive() -> None:
     assert line.endswith("and what follows may be misplaced")
     (line,) = doubt_about([FINE, LOST, FINE])
     assert line.startswith("PATH AND MAP ARE NOT TO BE TRUSTED: the poses of 1 of 3 frames")
+
+
+def test_frames_are_named_by_their_first_three_stretches() -> None:
+    assert name_frames([4]) == "frame 4"
+    assert name_frames([1, 2, 5, 7, 8, 9]) == "frames 1-2, frame 5, frames 7-9"
+    assert name_frames([1, 3, 5, 7]) == "frame 1, frame 3, frame 5, …"

@@ -11,6 +11,8 @@ from recon.odometry.window import (
     TrackWindow,
     adjust,
     misfits,
+    newest_health,
+    newest_information,
     pose_information,
     reprojection,
 )
@@ -101,6 +103,24 @@ def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
     # 60 trials: ±10 %; Cauchy weights cost some efficiency and shrink the formal information.
     assert (ratio > 0.7).all()
     assert (ratio < 1.5).all()
+
+
+def test_health_states_the_certainty_that_the_misfit_of_the_features_gives(
+    camera: RectifiedCamera,
+) -> None:
+    right, sigma_px = truth(camera), 0.4
+    uvd = right.uvd.copy()
+    uvd[-1, :, :2] += np.random.default_rng(14).normal(0.0, sigma_px, uvd[-1, :, :2].shape)
+    noisy = TrackWindow(right.T_world_camera, uvd, right.xyz_world)
+    found = newest_health(noisy, camera, tracks=200, note="noted")
+    covariance = np.linalg.inv(newest_information(noisy, camera, sigma_px))
+    # The median of 150 errors is known to 6 %.
+    assert found.sigma_m == pytest.approx(np.sqrt(np.trace(covariance[:3, :3])), rel=0.1)
+    turn_deg = np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:])))
+    assert found.sigma_deg == pytest.approx(turn_deg, rel=0.1)
+    assert (found.tracks, found.inliers, found.notes) == (200, 150, ("noted",))
+    d = right.uvd[-1, :, 2] + camera.doffs_px
+    assert found.scale_px == pytest.approx(np.average(d, weights=d))
 
 
 def test_trimming_keeps_what_is_followed_and_what_was_seen_twice(camera: RectifiedCamera) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
+from recon.core.errors import ShapeError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
-from recon.places.keyframe import FEATURES, Keyframe, make_keyframe, words_of
+from recon.places.keyframe import FEATURES, WORDS, Keyframe, make_keyframe, words_of
 from recon.places.places import WordIndex
 from tests.places.conftest import LAP
 from tests.places.test_verify import CAMERA
@@ -104,3 +106,26 @@ def test_nearly_the_same_focal_length_changes_nothing():
         near = make_keyframe(0, pair, _flat(pair), focal_px=focal_px)
         np.testing.assert_array_equal(near.uvd, plain.uvd)
         np.testing.assert_array_equal(near.descriptors, plain.descriptors)
+
+
+def test_equal_bits_of_two_tables_are_two_words():
+    words = words_of(np.zeros((2, 32), np.uint8))
+
+    assert len(words) == WORDS
+    assert (np.diff(words.astype(np.int64)) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("uvd", "coarse"),
+    [
+        ([np.nan, 5.0, 1.0], [[1.0]]),
+        ([3.0, 5.0, np.inf], [[1.0]]),
+        ([3.0, 5.0, 1.0], [[]]),
+        ([3.0, 5.0, 1.0], [[np.inf]]),
+    ],
+)
+def test_a_keyframe_of_impossible_numbers_is_refused(uvd, coarse):
+    descriptors = np.zeros((1, 32), np.uint8)
+    with pytest.raises(ShapeError, match="keyframe"):
+        Keyframe(0, np.float32([uvd]), descriptors, np.float32(coarse))
+    Keyframe(0, np.float32([[3.0, 5.0, np.nan]]), descriptors, np.float32([[np.nan]]))

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 
 from recon.core.geometry import se3
 from recon.places import places as places_file
-from recon.places.places import SIGMAS, Place, Places, WordIndex, drift_over
+from recon.places.places import (
+    SIGMAS,
+    Place,
+    Places,
+    WordIndex,
+    drift_over,
+    fit_to_path,
+    most_alike,
+)
 
 images = st.lists(st.sets(st.integers(0, 30)), max_size=20)
 
@@ -94,3 +102,28 @@ def test_a_question_after_ten_kilometres_takes_milliseconds():
         seconds.append(time.perf_counter() - start)
     # Ten milliseconds on an idle core; comparing image with image takes half a second.
     assert min(seconds) < 0.1
+
+
+def test_the_most_alike_images_stand_apart():
+    stands_m = np.array([[0.0], [1.0], [4.0], [9.0], [20.0], [30.0]])
+    likeness = np.array([0.5, 0.9, 0.8, 0.7, 0.6, 1.0])
+
+    assert most_alike(likeness, np.arange(5), stands_m) == [1, 3, 4]
+    assert most_alike(likeness, np.arange(2), stands_m) == [1]
+    assert most_alike(likeness, np.array([0, 2]), stands_m) == [2, 0]  # 4 m are enough
+
+
+@pytest.mark.parametrize(("scale", "off_m"), [(1.0, 0.0), (1.05, 0.0), (1.0, 0.5)])
+def test_a_fit_to_a_path_states_misfit_and_scale(scale, off_m):
+    angle = np.linspace(0.0, 3.0, 60)
+    ours_m = 40.0 * np.column_stack([np.cos(angle), np.sin(angle), 0.1 * angle])
+    zigzag = off_m * (-1.0) ** np.arange(60)
+    there = ours_m + np.outer(zigzag, [0.0, 0.0, 1.0])
+    turned = se3.exp_so3(np.array([0.3, -0.2, 1.0]))
+    found = fit_to_path(ours_m, scale * there @ turned.T + [500.0, 20.0, 3.0], 1.0, 0.1)
+
+    assert found.scale == pytest.approx(scale, rel=1e-3)
+    assert found.scaled_m == pytest.approx(off_m, rel=0.01, abs=1e-9)
+    spread_m = np.sqrt(np.square(ours_m - ours_m.mean(axis=0)).sum(axis=1).mean())
+    assert found.rms_m == pytest.approx(np.hypot(off_m, (scale - 1) * spread_m), rel=0.02, abs=1e-9)
+    assert found.most_m == pytest.approx(SIGMAS * np.hypot(1.0, 0.1))
