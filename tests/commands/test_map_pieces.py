@@ -14,7 +14,6 @@ from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace, session_info
 from recon.map.sessions.copying import join_parts
 from recon.map.verbs import Map
-from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
 from tests.scenery.film import Film, film
 
@@ -38,14 +37,6 @@ def test_pieces_have_every_frame_once_behind_their_leads(frames: int, workers: i
 @pytest.fixture(scope="module")
 def source() -> Film:
     return film(STREET)
-
-
-def test_a_part_of_a_source_has_its_frames(source: Film) -> None:
-    part = SourcePart(source, 5, 9, 2)
-    times = [pair.timestamp_s for pair in source.frames(5)][:4]
-    assert [pair.timestamp_s for pair in part] == times
-    assert [pair.timestamp_s for pair in part.frames(3)] == times[3:]
-    assert (len(part), part.truth, list(part.frames(4))) == (4, None, [])
 
 
 @pytest.fixture(scope="module")
@@ -96,5 +87,4 @@ def test_the_map_is_about_that_of_one_run(whole: MappedSequence, joined: MappedS
 
 
 def test_keyframes_lie_on_the_path_of_the_drive(joined: MappedSequence) -> None:
-    assert joined.loops is not None
     assert joined.loops.keyframes >= STREET.frames // 2

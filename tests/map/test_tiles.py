@@ -72,7 +72,7 @@ def _sorted(cloud: PointCloud) -> PointCloud:
 
 
 def test_tiles_of_the_cloud_together_are_the_filtered_whole(store: Submaps) -> None:
-    tiles = _tiles(store)
+    tiles = _tiles(store, np.tile(np.eye(4), (len(store), 1, 1)))
     fused = join_fused(submap.fused for submap in store).cloud(0.1, 2)
     whole = transform_cloud(filter_cloud(fused, CONFIG.map_filters), T_MAP_WORLD, frame="map")
     assert sum(len(tile.cloud) > 0 for tile in tiles) >= 3
@@ -148,28 +148,15 @@ def test_points_and_voxels_that_are_put_in_come_out(store: Submaps) -> None:
     assert {tuple(key) for key in _voxels(filled).keys} == {tuple(key) for key in voxels.keys}
     for tile in filled:
         assert tiles_of(tile.cloud.xyz, filled.edge_m) <= {tile.key}
+    # A tile without points takes nothing from the others.
+    far = OccupancyVoxels(np.int32([[40, 3, 0]]), np.ones(1, np.float32), filled.resolution_m)
+    filled.put_voxels(far)
+    assert filled.cloud_in(Rectangle((-1e3, -1e3), (1e3, 1e3))).sigma_m is not None
 
 
 def tiles_of(xyz: Float32, edge_m: float) -> set[tuple[int, int]]:
     """The tiles in which points lie."""
     return {(int(x), int(y)) for x, y in np.floor(xyz[:, :2] / edge_m)}
-
-
-def test_a_tile_without_points_takes_nothing_from_the_others() -> None:
-    tiles = Tiles(CONFIG, T_MAP_WORLD)
-    xyz = np.float32([[1, 1, 0], [2, 1, 0]])
-    tiles.put_cloud(PointCloud(xyz, rgb=np.full((2, 3), 7, np.uint8), frame="map"))
-    far = np.int32([[40, 3, 0]])
-    tiles.put_voxels(OccupancyVoxels(far, np.ones(1, np.float32), tiles.resolution_m))
-    assert len(tiles) == 2
-    assert tiles.cloud_in(Rectangle((0.0, 0.0), (12.0, 6.0))).rgb is not None
-
-
-def test_an_identity_for_every_submap_changes_nothing(store: Submaps) -> None:
-    still = np.tile(np.eye(4), (len(store), 1, 1))
-    plain, moved = (_tiles(store, T) for T in (None, still))
-    np.testing.assert_array_equal(_cloud(plain).xyz, _cloud(moved).xyz)
-    np.testing.assert_array_equal(_voxels(plain).log_odds, _voxels(moved).log_odds)
 
 
 def test_corrections_move_the_submaps_apart(store: Submaps) -> None:
@@ -188,25 +175,12 @@ def test_a_path_that_leaves_a_rectangle_and_comes_back_is_in_pieces() -> None:
     np.testing.assert_array_equal(inside, [[1, 1, 0], [2, 1, 0], gap, [3, 2, 0]])
 
 
-def test_a_map_of_the_disk_does_not_fill_the_memory(tmp_path: Path) -> None:
-    submaps = _fill(Submaps(Store.create(tmp_path / "map.recon")))
-    assert len(submaps) > 3
-    assert [submap.index for submap in submaps] == list(range(len(submaps)))
-    assert submaps.store.cache.nbytes == 0
-
-
-def test_submaps_are_found_again(tmp_path: Path) -> None:
-    with Store.create(tmp_path / "map.recon") as store:
-        submaps = _fill(Submaps(store))
-        store.commit()
-        entries, sums = submaps.entries, submaps[1].fused.sums
-    with Store.open(tmp_path / "map.recon", read_only=True) as store:
-        again = Submaps(store)
-        assert again.entries == entries
-        np.testing.assert_array_equal(again[1].fused.sums, sums)
-
-
 def test_a_missing_or_foreign_submap_is_one_clear_line(store: Submaps) -> None:
+    again, sums = Submaps(store.store), store[1].fused.sums
+    assert again.entries == store.entries
+    assert [submap.index for submap in again] == list(range(len(again)))
+    np.testing.assert_array_equal(again[1].fused.sums, sums)
+    assert store.store.cache.nbytes == 0  # submaps are large, and used once
     store.store.delete("submap", (0, 0))
     with pytest.raises(FormatError, match=r"map.*lacks a record"):
         store[0]

@@ -106,6 +106,9 @@ def street() -> Film:
 @pytest.mark.parametrize("T_there_world", [np.eye(4), T_SURVEY_WORLD])
 def test_right_poses_are_not_doubted(street: Film, T_there_world: Float64) -> None:
     assert doubts(street, T_there_world @ street.trajectory.T_world_camera) == ()
+    assert doubts(street.taken(slice(0, 1)), np.eye(4)[None]) == ()
+    with pytest.raises(RegistrationError, match="fewer known poses than frames"):
+        doubts(street, street.trajectory.T_world_camera[:5])
 
 
 def scaled(poses: Float64) -> Float64:
@@ -125,15 +128,6 @@ def test_poses_of_a_body_are_recognised(street: Film) -> None:
     poses = T_BODY_CAMERA @ street.trajectory.T_world_camera @ invert(T_BODY_CAMERA)
     (line,) = doubts(street, poses)
     assert "as those of a body" in line
-
-
-def test_a_rig_that_stands_still_doubts_nothing(street: Film) -> None:
-    assert doubts(street.taken(slice(0, 1)), np.eye(4)[None]) == ()
-
-
-def test_fewer_poses_than_frames_are_refused(street: Film) -> None:
-    with pytest.raises(RegistrationError, match="fewer known poses than frames"):
-        doubts(street, street.trajectory.T_world_camera[:5])
 
 
 GREY = np.zeros((16, 16), np.uint8)
@@ -214,16 +208,3 @@ def test_what_goes_wrong_is_raised_where_frames_are_added() -> None:
     with pytest.raises(MappingError, match="no"):
         behind.add(_frame(1))
     behind.stop()
-
-
-def test_frames_that_wait_are_forgotten_when_it_is_stopped() -> None:
-    mapper = Mapper()
-    behind = MapBehind(Counted(), mapper)
-    behind.add(_frame(0))
-    mapper.begun.wait(LONG_S)
-    behind.add(_frame(1))
-    mapper.go.set()
-
-    behind.stop()
-
-    assert mapper.done in ([(0, True)], [(0, True), (1, True)])

@@ -49,18 +49,12 @@ def test_a_vehicle_takes_up_its_width_from_the_ground_to_the_camera() -> None:
     assert (centres[:, 2].min(), centres[:, 2].max()) == pytest.approx((-1.5, -0.1))
     # Half a width before the start, and behind the end.
     assert centres[:, 0].min() == pytest.approx(-0.3)
+    narrow = sweep(np.array([[0.45, 0.45, 0.0]]), _ground(), 0.1, 0.5)
+    assert np.unique(narrow[:, :2], axis=0).tolist() == [[0, 0]]
 
 
-def test_the_cell_of_a_pose_is_taken_up_however_narrow_the_vehicle() -> None:
-    keys = sweep(np.array([[0.45, 0.45, 0.0]]), _ground(), 0.1, 0.5)
-    assert np.unique(keys[:, :2], axis=0).tolist() == [[0, 0]]
-
-
-def test_where_no_ground_is_known_nothing_is_taken_up() -> None:
+def test_above_a_table_or_without_ground_nothing_is_taken_up() -> None:
     assert len(sweep(np.array([[30.0, 0.0, 0.0]]), _ground(), 1.0, CELL_M)) == 0
-
-
-def test_above_a_table_nothing_is_taken_up() -> None:
     assert len(sweep(_line(), _ground(drops_m=0.7), 1.0, CELL_M)) == 0
     assert len(sweep(_line(), _ground(drops_m=1.7), 1.0, CELL_M)) > 0
 
@@ -73,12 +67,8 @@ def test_a_path_is_filled_in_between_trusted_poses_alone() -> None:
     broken = _through(path, [True, True, False, True, False])
     assert broken.points_m[:, 0] == pytest.approx([*np.arange(0, 1.05, 0.1), 3.0])
     assert len(_through(path, [False] * 5).points_m) == 0
-
-
-def test_a_path_of_one_pose_or_of_rest_is_a_place() -> None:
     assert len(_through(np.zeros((1, 3))).points_m) == 1
-    rest = _through(np.zeros((5, 3)))
-    assert rest.submap.tolist() == [0, 1, 2, 3, 4]
+    assert _through(np.zeros((5, 3))).submap.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_cars_and_walkers_drive_and_drones_do_not() -> None:
@@ -121,16 +111,12 @@ def test_what_drove_off_before_the_vehicle_came_leaves_no_trace() -> None:
     passed = free_part(sweep(_line(), _ground(), 1.8, CELL_M), EMPTY)
     after = _flat([before, passed])
     assert _cell(after, 3.1, 0.1) == FREE
+    # Seen on the track on a later visit, it is there.
+    assert _cell(_flat([passed]), 3.1, 0.1) == FREE
+    assert _cell(_flat([passed, before]), 3.1, 0.1) == OCCUPIED
     # Beside the vehicle's width, what was seen stays.
     narrow = free_part(sweep(_line(), _ground(), 0.6, CELL_M), EMPTY)
     assert _cell(_flat([before, narrow]), 3.1, 0.6) == OCCUPIED
-
-
-def test_what_is_seen_on_the_track_on_a_later_visit_is_there() -> None:
-    passed = free_part(sweep(_line(), _ground(), 1.8, CELL_M), EMPTY)
-    later = _part_of([_plate(3.1)] * 6)
-    assert _cell(_flat([passed]), 3.1, 0.1) == FREE
-    assert _cell(_flat([passed, later]), 3.1, 0.1) == OCCUPIED
 
 
 def test_what_hangs_above_the_camera_stays() -> None:

@@ -61,11 +61,8 @@ def test_a_box_on_slanted_ground_is_occupied_and_the_ground_is_not() -> None:
     assert _cell(grid, 15.5, 2.5) == OCCUPIED
     assert (grid.cells == OCCUPIED).sum() == 25
     assert (grid.cells == FREE).sum() == grid.cells.size - 25
-
-
-def test_a_level_band_would_call_the_slope_an_obstacle() -> None:
-    grid = _flatten(_slanted_scene(), _ground(0.0))
-    assert _cell(grid, 19.0, -3.0) == OCCUPIED
+    # A level band would call the slope an obstacle.
+    assert _cell(_flatten(_slanted_scene(), _ground(0.0)), 19.0, -3.0) == OCCUPIED
 
 
 def test_the_grid_is_the_right_way_round() -> None:
@@ -80,14 +77,6 @@ def test_the_grid_is_the_right_way_round() -> None:
     assert (columns.min(), columns.max()) == (15, 17)
 
 
-def test_what_hangs_above_the_band_can_be_driven_under() -> None:
-    seen = _road((0, 0), (4, 4))
-    bridge = (_box((1, 0, 1.0), (2, 4, 1.4)), 2.0)
-    assert _cell(_flatten(_voxels(*seen, bridge), _ground()), 1.5, 2.0) == FREE
-    low = _flatten(_voxels(*seen, bridge), _ground(), max_height_m=3.0)
-    assert _cell(low, 1.5, 2.0) == OCCUPIED
-
-
 def test_unknown_stays_unknown() -> None:
     seen = _road((0, 0), (2, 4))
     above = (_box((2, 0, 0.0), (4, 4, 0.2)), -1.0)
@@ -97,15 +86,34 @@ def test_unknown_stays_unknown() -> None:
     # Free only at 1.6 m above ground, as behind a parked car that is looked over.
     assert _cell(grid, 3.0, 2.0) == UNKNOWN
     assert _cell(grid, 4.5, 2.0) == UNKNOWN
-
-
-def test_ground_seen_below_an_unknown_body_is_not_free() -> None:
+    assert (grid.cells != OCCUPIED).all()
     # A parked car whose sides gave no match: the road below it is seen, nothing above it.
     below = (_box((2, 0, -1.6), (4, 2, -1.4)), 2.0)
     over = (_box((2, 0, 0.0), (4, 2, 0.4)), -2.0)
-    grid = _flatten(_voxels(*_road((0, 0), (2, 2)), below, over), _ground())
-    assert _cell(grid, 1.0, 1.0) == FREE
-    assert _cell(grid, 3.0, 1.0) == UNKNOWN
+    assert (
+        _cell(_flatten(_voxels(*_road((0, 0), (2, 2)), below, over), _ground()), 3.0, 1.0)
+        == UNKNOWN
+    )
+    # Where no ground is known, even what is full is unknown.
+    far = _voxels((_box((100, 0, -1.6), (104, 4, 1.0)), 2.0))
+    assert (_flatten(far, _ground()).cells == UNKNOWN).all()
+    low = _voxels((_box((0, 0, -1.0), (4, 4, -0.8)), -1.0))
+    assert (_flatten(low, _ground()).cells == FREE).all()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "setting", "cells"),
+    [
+        ((1, 0, 1.0), (2, 4, 1.4), {"max_height_m": 3.0}, 100),  # a bridge above the band
+        ((1, 1, -1), (1.2, 1.4, -0.6), {"min_blob_cells": 1}, 2),  # a speck
+    ],
+)
+def test_what_is_driven_under_or_taken_for_noise_is_a_setting(
+    low: tuple, high: tuple, setting: dict[str, float], cells: int
+) -> None:
+    voxels = _voxels(*_road((0, 0), (4, 4)), (_box(low, high), 2.0))
+    assert (_flatten(voxels, _ground()).cells == FREE).all()
+    assert (_flatten(voxels, _ground(), **setting).cells == OCCUPIED).sum() == cells
 
 
 def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,12 +154,6 @@ def test_a_cell_beside_an_obstacle_that_was_hit_low_is_not_free() -> None:
     ]
 
 
-def test_uncertain_hits_alone_make_no_obstacle() -> None:
-    undecided = (_box((2, 0, -1.0), (4, 4, -0.6)), 0.1)
-    grid = _flatten(_voxels(*_road((0, 0), (2, 4)), undecided), _ground())
-    assert (grid.cells != OCCUPIED).all()
-
-
 def test_undecided_voxels_are_dropped() -> None:
     voxels = OccupancyVoxels(
         np.arange(15, dtype=np.int32).reshape(5, 3),
@@ -162,24 +164,6 @@ def test_undecided_voxels_are_dropped() -> None:
     kept = drop_undecided(voxels)
     assert kept.log_odds.tolist() == pytest.approx([2.0, 0.3, -0.8])
     assert kept.keys[:, 0].tolist() == [0, 3, 12]
-
-
-def test_free_space_near_the_ground_frees() -> None:
-    grid = _flatten(_voxels((_box((0, 0, -1.0), (4, 4, -0.8)), -1.0)), _ground())
-    assert (grid.cells == FREE).all()
-
-
-def test_a_place_without_ground_is_unknown_even_when_full() -> None:
-    voxels = _voxels((_box((100, 0, -1.6), (104, 4, 1.0)), 2.0))
-    assert (_flatten(voxels, _ground()).cells == UNKNOWN).all()
-
-
-def test_lone_cells_are_taken_for_noise() -> None:
-    seen = _road((0, 0), (4, 4))
-    speck = (_box((1, 1, -1), (1.2, 1.4, -0.6)), 2.0)
-    assert (_flatten(_voxels(*seen, speck), _ground()).cells == FREE).all()
-    kept = _flatten(_voxels(*seen, speck), _ground(), min_blob_cells=1)
-    assert (kept.cells == OCCUPIED).sum() == 2
 
 
 def test_impossible_requests_are_refused() -> None:

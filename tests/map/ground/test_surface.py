@@ -9,7 +9,6 @@ import pytest
 
 from recon.core.errors import MappingError
 from recon.core.values import OccupancyVoxels, PointCloud
-from recon.map.ground import surface as ground
 from recon.map.ground import surface as ground_file
 from recon.map.ground.surface import (
     GroundSettings,
@@ -45,6 +44,18 @@ def _surface(points: np.ndarray, **settings: float) -> GroundSurface:
     return estimate_ground_surface(cloud, _path(), GroundSettings(**settings))
 
 
+@pytest.mark.parametrize(
+    ("points", "path", "words"),
+    [
+        (PointCloud(np.zeros((0, 3), np.float32), frame="world"), PATH, "map axes"),
+        (PointCloud(np.zeros((0, 3), np.float32), frame="map"), PATH[:0], "path is empty"),
+    ],
+)
+def test_wrong_input_is_refused(points: PointCloud, path: np.ndarray, words: str) -> None:
+    with pytest.raises(MappingError, match=words):
+        estimate_ground_surface(points, path, GroundSettings())
+
+
 def _error(surface: GroundSurface, half_width: float = 10.0) -> np.ndarray:
     rng = np.random.default_rng(9)
     x, y = rng.uniform(1, 59, 3000), rng.uniform(-half_width, half_width, 3000)
@@ -56,6 +67,21 @@ def test_slopes_are_followed() -> None:
     assert surface.camera_height_m == pytest.approx(CAMERA_M, abs=0.03)
     # Slope up to 13 % and 25 points per cell: what is left is smoothing over curvature.
     assert np.abs(_error(surface)).max() < 0.1
+    given = _surface(_ground(), camera_height_m=CAMERA_M)
+    assert given.camera_height_m == CAMERA_M
+    assert np.abs(_error(given)).max() < 0.1
+    cloud = PointCloud(_ground().astype(np.float32), frame="map")
+    of_one_frame = estimate_ground_surface(cloud, _path()[30:31], GroundSettings())
+    height_m = float(_slope(np.array(33.0), np.array(2.0)))
+    assert of_one_frame.height_at(np.array([[33.0, 2.0]]))[0] == pytest.approx(height_m, abs=0.1)
+
+
+def test_what_is_beyond_the_reach_or_has_no_ground_is_unknown() -> None:
+    surface = _surface(_ground(), reach_m=5.0)
+    assert np.isnan(surface.height_at(np.array([[30.0, 9.0], [1e4, -1e4]]))).all()
+    nothing = _surface(np.zeros((0, 3)))
+    assert np.isnan(nothing.heights_m).all()
+    assert math.isnan(nothing.camera_height_m)
 
 
 def test_boxes_and_walls_do_not_lift_the_ground() -> None:
@@ -97,32 +123,6 @@ def test_heights_are_carried_over_small_gaps_and_not_over_large_ones(
     assert np.isfinite(surface.height_at(np.array([[30.0, 2.0], [30.0, -2.0]]))).all()
 
 
-def test_nothing_is_known_beyond_the_reach() -> None:
-    surface = _surface(_ground(), reach_m=5.0)
-    assert math.isnan(surface.height_at(np.array([[30.0, 9.0]]))[0])
-    assert math.isnan(surface.height_at(np.array([[1e4, -1e4]]))[0])
-
-
-def test_a_path_without_ground_gives_an_unknown_surface() -> None:
-    surface = _surface(np.zeros((0, 3)))
-    assert np.isnan(surface.heights_m).all()
-    assert math.isnan(surface.camera_height_m)
-
-
-def test_a_given_camera_height_needs_no_measuring() -> None:
-    surface = _surface(_ground(), camera_height_m=CAMERA_M)
-    assert surface.camera_height_m == CAMERA_M
-    assert np.abs(_error(surface)).max() < 0.1
-
-
-def test_one_frame_is_a_path_too() -> None:
-    cloud = PointCloud(_ground().astype(np.float32), frame="map")
-    surface = estimate_ground_surface(cloud, _path()[30:31], GroundSettings())
-    assert surface.height_at(np.array([[33.0, 2.0]]))[0] == pytest.approx(
-        float(_slope(np.array(33.0), np.array(2.0))), abs=0.1
-    )
-
-
 def test_height_is_linear_between_centres_of_cells() -> None:
     surface = GroundSurface(np.array([[0.0, 1.0], [2.0, np.nan]]), 1.0, (10.0, 20.0))
     places = np.array([[10.5, 20.5], [11.0, 20.5], [10.5, 21.0], [11.5, 21.5], [10.0, 20.0]])
@@ -132,18 +132,10 @@ def test_height_is_linear_between_centres_of_cells() -> None:
     assert heights[4] == 0.0  # outside of the centres: the nearest cell's
 
 
-@pytest.mark.parametrize(
-    ("frame", "positions", "words"),
-    [("world", PATH, "map axes"), ("map", np.zeros((0, 3)), "path is empty")],
-)
-def test_wrong_input_is_refused(frame: str, positions: np.ndarray, words: str) -> None:
-    cloud = PointCloud(np.zeros((0, 3), np.float32), frame=frame)  # type: ignore[arg-type]
-    with pytest.raises(MappingError, match=words):
-        estimate_ground_surface(cloud, positions, GroundSettings())
-
-
 EDGE_M = 0.2
-SETTINGS = GroundSettings()
+NOTHING = PointCloud(
+    np.zeros((0, 3), np.float32), normals=np.zeros((0, 3), np.float32), frame="map"
+)
 
 
 def _columns(x: range, y: range, heights: dict[int, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -157,21 +149,17 @@ def _voxels(*parts: tuple[np.ndarray, np.ndarray]) -> OccupancyVoxels:
     return OccupancyVoxels(keys, values.astype(np.float32), EDGE_M)
 
 
-def _empty(normals: bool = True) -> PointCloud:
-    none = np.zeros((0, 3), np.float32)
-    return PointCloud(none, normals=none if normals else None, frame="map")
-
-
 ROAD = _columns(range(20), range(5), {-8: 2.0, -7: -1.0, -6: -1.0})
 WALL = _columns(range(20), range(5, 6), dict.fromkeys(range(-8, 4), 2.0))
 
 
 def test_floors_are_occupied_voxels_below_free_ones() -> None:
-    added = add_floors(_empty(), find_floors(_voxels(ROAD, WALL)))
+    added = add_floors(NOTHING, find_floors(_voxels(ROAD, WALL)))
+    none = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), EDGE_M)
+    assert len(find_floors(none)) == len(add_floors(NOTHING, find_floors(none))) == 0
     assert len(added) == 100
     assert added.xyz[:, 2] == pytest.approx(-7.5 * EDGE_M)
     assert added.xyz[:, 1].max() < 1.0
-    assert added.normals is not None
     assert (added.normals == [0, 0, 1]).all()
 
 
@@ -179,7 +167,7 @@ def test_a_floor_may_share_its_evidence_with_the_voxel_above() -> None:
     undecided = _columns(range(5), range(5), {-8: 2.0, -7: 0.1, -6: -1.0})
     thick = _columns(range(10, 15), range(5), {-8: 2.0, -7: 2.0, -6: -1.0})
     unknown = _columns(range(20, 25), range(5), {-8: 2.0})
-    added = add_floors(_empty(), find_floors(_voxels(undecided, thick, unknown)))
+    added = add_floors(NOTHING, find_floors(_voxels(undecided, thick, unknown)))
     heights = {x0: added.xyz[np.floor(added.xyz[:, 0]) == x0, 2] for x0 in (0, 2, 4)}
     assert heights[0] == pytest.approx(-7.5 * EDGE_M)
     assert heights[2] == pytest.approx(-6.5 * EDGE_M)
@@ -204,15 +192,9 @@ def test_the_ground_reaches_as_far_as_the_voxels(monkeypatch: pytest.MonkeyPatch
     near = np.column_stack([np.random.default_rng(1).uniform(0, 2, (300, 2)), np.full(300, -1.5)])
     cloud = PointCloud(near.astype(np.float32), frame="map")
     place = np.array([[18.0, 0.5]])
-    monkeypatch.setattr(ground, "_MAX_GAP_M", 2.0)
+    monkeypatch.setattr(ground_file, "_MAX_GAP_M", 2.0)
     settings = GroundSettings()
     assert np.isnan(estimate_ground_surface(cloud, path, settings).height_at(place)).all()
     floor = add_floors(cloud, find_floors(_voxels(long)))
     height = estimate_ground_surface(floor, path, settings).height_at(place)
     assert height == pytest.approx(-7.5 * EDGE_M, abs=0.01)
-
-
-def test_without_voxels_the_cloud_stays_as_it_is() -> None:
-    none = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), EDGE_M)
-    cloud = PointCloud(np.ones((4, 3), np.float32), frame="map")
-    assert (add_floors(cloud, find_floors(none)).xyz == cloud.xyz).all()

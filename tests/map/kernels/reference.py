@@ -122,20 +122,6 @@ def apply_evidence_reference(
         log_odds[cell] = min(max(log_odds.get(cell, 0.0) + change, lowest), highest)
 
 
-def chain_reference(first: dict[Cell, Clamped], then: dict[Cell, Clamped]) -> dict[Cell, Clamped]:
-    """What two parts of a drive did to each cell, one after the other."""
-    both = {**first, **then}
-    for cell in first.keys() & then.keys():
-        total, low, high = first[cell]
-        change, lowest, highest = then[cell]
-        both[cell] = (
-            total + change,
-            min(max(low + change, lowest), highest),
-            min(max(high + change, lowest), highest),
-        )
-    return both
-
-
 def move_reference(cells: dict[Cell, Clamped], T_new_old: NDArray[Any]) -> dict[Cell, Clamped]:
     """Each new cell takes what the old cell at its centre has."""
     centres = np.array(list(cells), dtype=np.float64).reshape(-1, 3) + 0.5

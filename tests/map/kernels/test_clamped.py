@@ -15,7 +15,6 @@ from tests.map.kernels.reference import (
     Cell,
     Clamped,
     apply_evidence_reference,
-    chain_reference,
     move_reference,
 )
 
@@ -92,18 +91,6 @@ def test_parts_in_a_row_equal_one_drive(seed: int, cut: int, again: int) -> None
         assert value == pytest.approx(expected[cell], abs=ROUNDING)
 
 
-@settings(max_examples=60)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_chaining_equals_that_of_the_reference(seed: int) -> None:
-    frames = _random_frames(seed, 8)
-    one, two = _drive(frames[:3]), _drive(frames[3:])
-    expected = chain_reference(_cells(one), _cells(two))
-    found = _cells(clamped.chain_rows(one, clamped.observed_rows(two)))
-    assert found.keys() == expected.keys()
-    for cell, values in found.items():
-        assert values == pytest.approx(expected[cell], abs=ROUNDING)
-
-
 def test_what_a_later_part_looks_through_is_free_however_often_it_was_hit() -> None:
     cell = (1, 2, 3)
     parked, gone = [{cell: 1.0}] * 20, [{cell: -0.5}] * 12
@@ -121,13 +108,6 @@ def test_moved_cells_equal_those_of_the_reference(seed: int) -> None:
     blocks = _drive(_random_frames(seed, 5))
     T = make_transform(exp_so3(rng.normal(0, 0.5, 3)), rng.normal(0, 20, 3))
     assert _cells(clamped.move_blocks(blocks, T)) == move_reference(_cells(blocks), T)
-
-
-def test_moving_by_whole_cells_moves_every_cell() -> None:
-    blocks = _drive(_random_frames(3, 5))
-    T = make_transform(np.eye(3), np.array([5.0, -9.0, 100.0]))
-    expected = {(i + 5, j - 9, k + 100): values for (i, j, k), values in _cells(blocks).items()}
-    assert _cells(clamped.move_blocks(blocks, T)) == expected
 
 
 def test_a_turned_wall_has_no_holes() -> None:

@@ -87,7 +87,4 @@ def test_a_lone_point_crosses_its_own_cell_alone() -> None:
     xyz = np.array([[0.9, 0.5, 0.5]])
     assert _crossed(_block(2), xyz, np.ones(1)).sum() == 1
     assert _crossed(np.zeros((1, 3)), xyz, np.ones(1)).tolist() == [True]
-
-
-def test_without_points_nothing_is_crossed() -> None:
     assert not _crossed(_block(2), np.zeros((0, 3)), np.zeros(0)).any()

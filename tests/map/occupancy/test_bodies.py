@@ -33,17 +33,13 @@ def _while(frames: slice, number: int) -> np.ndarray:
 
 
 def test_what_was_there_as_a_whole_for_a_while_came_or_went() -> None:
-    assert _judged(WALL, _while(slice(10, 15), len(WALL))).all()
-
-
-def test_two_that_pass_one_after_the_other_both_moved() -> None:
-    seen = _while(slice(4, 7), len(WALL))
-    seen[20:24] = 1
-    assert _judged(WALL, seen).all()
-
-
-def test_what_enters_a_place_by_one_edge_moved() -> None:
-    # Column after column is hit, each for six frames.
+    once = _while(slice(10, 15), len(WALL))
+    assert _judged(WALL, once).all()
+    # Two that pass one after the other.
+    twice = once.copy()
+    twice[20:24] = 1
+    assert _judged(WALL, twice).all()
+    # Column after column is hit, each for six frames: it enters by one edge.
     since = np.arange(FRAMES)[:, None] - 2 * WALL[:, 0]
     assert _judged(WALL, np.where((since >= 3) & (since < 9), 1, -1)).all()
 
@@ -53,28 +49,16 @@ def test_what_each_frame_hits_at_random_did_not_move() -> None:
         rng = np.random.default_rng(3)
         seen = np.where(rng.random((FRAMES, len(WALL))) < share, 1, -1)
         assert not _judged(WALL, seen).any()
-
-
-def test_boards_of_a_fence_that_some_frames_hit_and_others_do_not_did_not_move() -> None:
-    # Each board is hit or looked through from top to bottom, whatever the others are.
-    rng = np.random.default_rng(5)
+    # Boards of a fence are hit or looked through from top to bottom, whatever the others are.
     boards = rng.random((FRAMES, 8)) < 0.3
     assert not _judged(WALL, np.where(boards[:, WALL[:, 0]], 1, -1)).any()
-
-
-def test_what_was_hit_or_looked_through_by_all_frames_did_not_move() -> None:
-    assert not _judged(WALL, np.ones((FRAMES, len(WALL)))).any()
-    assert not _judged(WALL, np.full((FRAMES, len(WALL)), -1)).any()
-    assert not _judged(WALL, np.zeros((FRAMES, len(WALL)))).any()
-
-
-def test_pieces_are_judged_apart() -> None:
+    for always in (-1, 0, 1):
+        assert not _judged(WALL, np.full((FRAMES, len(WALL)), always)).any()
+    # Beside a body, but apart from it.
     cells = np.concatenate([WALL, WALL + np.array([20, 0, 0])])
-    rng = np.random.default_rng(7)
-    noise = np.where(rng.random((FRAMES, len(WALL))) < 0.4, 1, -1)
-    judged = _judged(cells, np.concatenate([_while(slice(5, 9), len(WALL)), noise], axis=1))
-    assert judged[: len(WALL)].all()
-    assert not judged[len(WALL) :].any()
+    judged = _judged(cells, np.concatenate([_while(slice(5, 9), len(WALL)), seen], axis=1))
+    assert judged.tolist() == [True] * len(WALL) + [False] * len(WALL)
+    assert len(_judged(WALL[:0], np.zeros((FRAMES, 0)))) == 0
 
 
 def test_a_cell_alone_moved_if_it_was_hit_in_one_run_of_frames() -> None:
@@ -102,10 +86,6 @@ def test_cells_of_which_too_little_is_known_belong_to_a_body_beside_them() -> No
     beside = [[9, 0, 0], [12, 0, 0]]  # each two cells from the one before, both alone
     seen = np.concatenate([_while(slice(5, 9), len(WALL)), np.zeros((FRAMES, 2))], axis=1)
     assert _judged(np.concatenate([WALL, beside]), seen)[len(WALL) :].tolist() == [True, False]
-
-
-def test_nothing_is_judged_to_be_nothing() -> None:
-    assert len(_judged(WALL[:0], np.zeros((FRAMES, 0)))) == 0
 
 
 SETTINGS = load_config().occupancy

@@ -151,6 +151,7 @@ def test_frames_that_both_drives_have_link_them_exactly() -> None:
     assert np.abs(_path(map_, 1) - later[:, :3, 3]).max() < 1e-6
     assert seen_before(map_, other) == set(range(FRAMES - behind))
     assert not seen_before(map_, one)
+    assert not len(shared_frames(one, _drive(map_, TRUE[0], seed=0, noise=1)))
 
 
 def test_a_drive_cut_in_two_that_overlap_gives_the_voxels_of_one() -> None:
@@ -177,23 +178,10 @@ def test_a_drive_cut_in_two_that_overlap_gives_the_voxels_of_one() -> None:
     assert (states[0] == states[1]).mean() > 0.99
 
 
-def test_frames_of_one_time_with_other_images_are_not_shared() -> None:
-    map_ = Map.temporary()
-    _drive(map_, TRUE[0], seed=0)
-    other = _drive(map_, TRUE[0], seed=0, noise=1)
-    assert not len(shared_frames(map_.session(0), other))
-
-
-def test_a_drive_that_is_linked_through_another_is_placed_too() -> None:
-    map_ = _map(3)
-    join_sessions(map_, [*_links(1, 2, TRUE[1:]), *_links(0, 1, TRUE[:2])])
-    assert [session.number for session in map_.linked] == [0, 1, 2]
-    assert _off_m(map_, 2) < 0.02
-
-
 def test_the_cloud_and_the_voxels_are_those_of_all_linked_drives() -> None:
-    map_ = _map()
+    map_ = _map(3)
     join_sessions(map_, _links(0, 1, TRUE[:2]))
+    assert [session.number for session in map_.linked] == [0, 1]
     placed = place_map(map_, CONFIG)
     cloud = join_clouds(tile.cloud for tile in placed.tiles)
     assert np.abs(-cloud.xyz[:, 1] - WALL_M).max() < 0.1  # one wall, not two
@@ -205,13 +193,6 @@ def test_the_cloud_and_the_voxels_are_those_of_all_linked_drives() -> None:
     assert np.isnan(placed.path_m[FRAMES]).all()
     assert not placed.trusted[FRAMES]
     assert placed.tiles.submap_of_frame[FRAMES] == -1
-
-
-def test_a_drive_without_links_stays_apart() -> None:
-    map_ = _map(3)
-    join_sessions(map_, _links(0, 2, (TRUE[0], TRUE[2])))
-    assert [session.number for session in map_.linked] == [0, 2]
-    assert place_map(map_, CONFIG).path_m.shape == (2 * FRAMES + 1, 3)
 
 
 def test_links_that_would_tear_a_drive_are_not_believed() -> None:
@@ -234,31 +215,27 @@ def test_a_map_in_a_file_is_merged_and_its_drives_get_the_next_numbers(tmp_path:
     rays = [s.rays(3)[0].cloud().xyz for s in (copied, other)]
     np.testing.assert_array_equal(*rays)
     assert copied.submaps.entries == other.submaps.entries
-
-
-def test_the_same_drive_twice_is_refused() -> None:
     with pytest.raises(FormatError, match="has this drive already"):
-        copy_sessions(_map(1), _map(1))
+        copy_sessions(source, target)
+    for setting in ("fusion.voxel_m=0.2", "occupancy.resolution_m=0.05"):
+        with pytest.raises(SettingsError):
+            check_session(copied, load_config(None, [setting]))
 
 
 def test_a_drive_that_is_taken_out_leaves_the_others_where_they_are() -> None:
     map_ = _map(3)
     join_sessions(map_, [*_links(0, 1, TRUE[:2]), *_links(1, 2, TRUE[1:])])
+    assert _off_m(map_, 2) < 0.02
     in_map = map_.session(2).T_map_world
+    apart = Map.temporary()
+    copy_sessions(map_, apart, without=[1])
+    join_sessions(apart, apart.links)
+    assert [session.number for session in apart.linked] == [0]
     left = Map.temporary()
     assert copy_sessions(map_, left, without=[0]) == [1, 2]
     join_sessions(left, left.links)
     assert [session.number for session in left.linked] == [1, 2]
     np.testing.assert_allclose(left.session(2).T_map_world, in_map, atol=1e-3)
-
-
-def test_what_only_one_that_is_taken_out_held_is_apart() -> None:
-    map_ = _map(3)
-    join_sessions(map_, [*_links(0, 1, TRUE[:2]), *_links(1, 2, TRUE[1:])])
-    left = Map.temporary()
-    copy_sessions(map_, left, without=[1])
-    join_sessions(left, left.links)
-    assert [session.number for session in left.linked] == [0]
 
 
 LOST = OdometryHealth(ok=False)
@@ -335,12 +312,6 @@ def test_a_first_frame_that_sees_nothing_is_not_where_the_map_begins() -> None:
     join_sessions(map_, _links(0, 1, TRUE[:2]))
     assert np.flatnonzero(~map_.placed[0]).tolist() == [0, 1]
     assert map_.placed[1].all()
-
-
-@pytest.mark.parametrize("setting", ["fusion.voxel_m=0.2", "occupancy.resolution_m=0.05"])
-def test_a_drive_of_other_voxels_is_refused(setting: str) -> None:
-    with pytest.raises(SettingsError):
-        check_session(_map(1).session(), load_config(None, [setting]))
 
 
 def test_a_damaged_record_of_links_is_one_clear_line() -> None:

@@ -67,6 +67,10 @@ def test_frames_come_back_bit_by_bit(tmp_path: Path) -> None:
             with Map.open(path) as read:
                 _assert_same(read.session(), session)
                 assert read.session().info == session.info
+        assert made.store.keys("frames") == [(0, 0), (0, 1), (0, 8)]
+        assert made.store.read("frames", (0, 8))["times_s"].shape == (32,)
+    with Map.temporary() as made, pytest.raises(FormatError, match="no frame"):
+        _ = made.begin(SessionInfo()).odometry
 
 
 @pytest.mark.parametrize(("measured", "length_m"), [((), 0.0), ((2,), 3.0)])
@@ -82,16 +86,6 @@ def test_only_a_path_that_is_known_throughout_does_not_drift(
         made.commit()
         with Map.open(tmp_path / "map.recon") as read:
             assert path_up_to(read.session())[-1] == length_m
-
-
-def test_a_commit_writes_the_frames_since_the_last_one_alone(tmp_path: Path) -> None:
-    with Map.create(tmp_path / "map.recon") as made:
-        session = made.begin(SessionInfo())
-        for last in (30, 32):
-            _fill(session, len(session), last)
-            made.commit()
-        assert made.store.keys("frames") == [(0, 0), (0, 30)]
-        assert made.store.read("frames", (0, 30))["times_s"].shape == (2,)
 
 
 def test_what_was_not_committed_is_forgotten(tmp_path: Path) -> None:
@@ -159,11 +153,6 @@ def test_each_drive_of_a_map_has_its_own_records(tmp_path: Path) -> None:
             read.session(2)
 
 
-def test_a_session_without_frames_has_no_path() -> None:
-    with Map.temporary() as made, pytest.raises(FormatError, match="no frame"):
-        _ = made.begin(SessionInfo()).odometry
-
-
 def test_submaps_of_frames_without_a_pose_are_refused(tmp_path: Path) -> None:
     entry = {"index": 0, "first_frame": 0, "frames": 2, "voxels": 0, "cells": 0}
     with Map.create(tmp_path / "map.recon") as made:
@@ -211,13 +200,20 @@ def _keyframe(frame: int) -> Keyframe:
 
 @pytest.fixture
 def map_() -> Map:
-    """Three drives with other cameras and axes; the last one has no keyframes."""
+    return _three()
+
+
+def _three(lost: tuple[int, int] | None = None) -> Map:
+    """Three drives with other cameras and axes; the last one has no keyframes.
+
+    One may lose its way: number of the drive, and of the frame.
+    """
     made = Map.temporary()
     for n in range(3):
         session = made.begin(SessionInfo(f"drive {n}"))
         session.set_axes(T_MAP_WORLD[n], CAMERAS[n])
         for frame in range(FRAMES):
-            session.add_frame(_pose(frame), 0.1 * frame, OdometryHealth())
+            session.add_frame(_pose(frame), 0.1 * frame, OdometryHealth(ok=(n, frame) != lost))
         for frame in KEYFRAMES if n < 2 else ():
             session.keyframes.put(StoredKeyframe(_keyframe(frame), _pose(frame), 1.5 * frame))
     loop = Loop(0, 0, np.eye(4), np.eye(6), 50, 0.9)
@@ -232,14 +228,12 @@ def test_views_are_the_keyframes_of_all_linked_drives(map_):
         (n, frame) for n in (0, 1) for frame in KEYFRAMES
     ]
     assert [view.camera for view in views[2:4]] == CAMERAS[:2]
-
-
-def test_views_are_in_the_world_of_the_first_drive(map_):
-    first, other = MapViews(map_)[1], MapViews(map_)[4]
-
-    assert first.T_world_camera == pytest.approx(_pose(2))
+    assert views[1].T_world_camera == pytest.approx(_pose(2))
     T_map_camera = T_MAP_WORLD[1] @ _pose(2)
-    assert T_MAP_WORLD[0] @ other.T_world_camera == pytest.approx(T_map_camera)
+    assert T_MAP_WORLD[0] @ views[4].T_world_camera == pytest.approx(T_map_camera)
+    assert [view.session for view in MapViews(map_, [1])] == [1, 1, 1]
+    map_.set_links([], [1])
+    assert [view.session for view in MapViews(map_)] == [1, 1, 1]
 
 
 def test_views_follow_the_path_after_loop_closure(map_):
@@ -249,22 +243,8 @@ def test_views_follow_the_path_after_loop_closure(map_):
     assert MapViews(map_)[1].T_world_camera == pytest.approx(moved[2])
 
 
-def test_some_drives_may_be_left_out(map_):
-    assert [view.session for view in MapViews(map_, [1])] == [1, 1, 1]
-    map_.set_links([], [1])
-    assert [view.session for view in MapViews(map_)] == [1, 1, 1]
-
-
 def test_what_follows_a_lost_pose_is_not_to_be_recognised_among_several_drives():
-    map_ = Map.temporary()
-    for n in range(2):
-        session = map_.begin(SessionInfo())
-        session.set_axes(T_MAP_WORLD[n], CAMERAS[n])
-        for frame in range(FRAMES):
-            session.add_frame(_pose(frame), 0.1 * frame, OdometryHealth(ok=(n, frame) != (1, 3)))
-        for frame in KEYFRAMES:
-            session.keyframes.put(StoredKeyframe(_keyframe(frame), _pose(frame), 1.5 * frame))
-    map_.set_links([Link((0, 1), Loop(0, 0, np.eye(4), np.eye(6), 50, 0.9))], [0, 1])
+    map_ = _three(lost=(1, 3))
 
     seen = [(view.session, view.keyframe.frame) for view in MapViews(map_)]
 
