@@ -14,6 +14,7 @@ from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace, session_info
 from recon.map.sessions.copying import join_parts
 from recon.map.verbs import Map
+from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
 from tests.scenery.film import Film, film
 
