@@ -1,17 +1,12 @@
 """Clamped log-odds in blocks of 8×8×8 voxels, such that parts of a drive can be chained later.
 
 A frame changes the log-odds of a cell by ``x → min(max(x + change, lowest), highest)``. Functions
-of this form are closed under composition:
+of this form are closed under composition, ``x → min(max(x + sum, low), high)``: three numbers per
+cell describe what a part of a drive did to it, whatever was known before, and chaining the parts in
+order gives exactly what one long drive would have given. Adding up clamped log-odds would not: a
+car that was seen ten times in one part, and looked through ten times in the next, would stay.
 
-    x → min(max(x + sum, low), high)
-
-So three numbers per cell describe what a part of a drive did to it, whatever was known before; and
-chaining the parts in order gives exactly what one long drive would have given, clamps included.
-Adding up clamped log-odds would not: a car that was seen ten times in one part, and looked through
-ten times in the next, would stay.
-
-The reference implementations in plain Python are in
-`tests/map/kernels/reference.py`.
+The reference implementations in plain Python are in `tests/map/kernels/reference.py`.
 """
 
 from __future__ import annotations

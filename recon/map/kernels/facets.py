@@ -1,10 +1,8 @@
-"""Which cells the surface of the points around them crosses.
+"""Which cells the surface of the points around them crosses; all lengths are in cells.
 
-Depth is uncertain, so hits of one surface scatter over several cells along the rays. The mean of
-many hits is more precise than each: a plane through the points in and around a cell, weighted by
-their precision, tells whether the surface is in this cell or in the one before or behind it.
-
-All lengths are in cells. The reference implementation in plain Python is in
+Hits of one surface scatter over several cells along the rays, but the mean of many is precise: a
+plane through the points in and around a cell, weighted by their precision, decides whether the
+surface is in this cell or in the one before or behind it. The reference implementation is in
 `tests/map/kernels/reference.py`.
 
 Ref: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.2

@@ -1,16 +1,13 @@
 """Which pieces of surface came or went as one body, by what each frame saw of them.
 
-Two things are hit in some frames and looked through in others: what moved, and what stands but is
-seen badly or through its gaps, such as fences, hedges, glass and the edges of things. What moved
-was there as a whole at one time, and its whole place was free at another: in one frame its cells
-agree. Of a fence one frame hits some cells and looks through others.
-
-So pairs of cells that touch are counted, frame by frame: those that a frame saw differently, and
-those that it would have if each cell had been hit at random, as often as it was. The ratio is 0
-where all is hit or looked through at once, and 1 where cells have nothing in common (the join count
-of spatial statistics). A piece moved if the ratio is small, over all pairs and over those that lie
-one above the other: things that move are upright, and what is entered by one edge first agrees from
-top to bottom.
+Two things are hit in some frames and looked through in others: what moved, and what is seen badly
+or through its gaps, such as fences, hedges and glass. What moved was there as a whole at one time,
+and free at another: in one frame its cells agree. Of a fence one frame hits some cells and looks
+through others. So pairs of cells that touch are counted, frame by frame: those that a frame saw
+differently, and those that it would have if each cell had been hit at random, as often as it was
+(the join count of spatial statistics). A piece moved if the ratio of the two is small, over all
+pairs and over those that lie one above the other: things that move are upright, and what is entered
+by one edge first agrees from top to bottom.
 
 Ref: P. A. P. Moran, "The interpretation of statistical maps", J. R. Statist. Soc. B 10, 1948.
 """

@@ -1,25 +1,20 @@
 """What moved: points of the fused cloud that were there at one time only.
 
-First what may have moved is found. All that a drive saw in a voxel adds up: hits, and rays that
-passed before and after. Rays of a frame end two standard deviations before what they hit, so what
-is far or uncertain frees nothing near itself. A voxel that a frame hit is not freed by that frame.
+First what may have moved is found, by all that a drive saw in a voxel: hits, and rays that passed
+before and after. Rays of a frame end two standard deviations before what they hit, so what is far
+or uncertain frees nothing near itself, and a voxel that a frame hit is not freed by that frame. One
+voxel alone says little: someone who walks is hit in it nearly as often as it is seen through. So
+evidence is averaged over the voxels around a point in which there are points. What a later drive
+looked through is free, however often it was hit before.
 
-One voxel alone says little. Someone who walks is hit in it nearly as often as it is seen through,
-and the surface of a wall lies partly in voxels that rays pass. So evidence is averaged over the
-voxels around a point in which there are points. What moved left a whole body where space was free;
-next to what stands, most voxels are surely occupied. What a later drive looked through is free,
-however often it was hit before.
-
-No ray passes some of the places where something moved, such as its last ones in a drive. They touch
-the others, and less is known of them than of what stands. So where a whole piece of surface was
-free, what moved grows into voxels that are not surely occupied, if half of those beside them at the
-same height have moved. That is one of two along an upright surface; at a straight edge on the
-ground it is three of eight, and nothing grows.
+No ray passes some of the places where something moved, such as its last ones in a drive. So where a
+whole piece of surface was free, what moved grows into voxels that are not surely occupied, if half
+of those beside them at the same height have moved: one of two along an upright surface; at a
+straight edge on the ground it is three of eight, and nothing grows.
 
 Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noise are looked
-through as well, but no frame sees a whole piece of them gone. They are contradicted, and stay.
-
-A point that its frames could not place in a voxel stays if something occupied is in its reach.
+through as well, but no frame sees a whole piece of them gone. A point that its frames could not
+place in a voxel stays if something occupied is in its reach.
 """
 
 from __future__ import annotations
