@@ -32,13 +32,7 @@ _LENSES: Final[dict[Lens, tuple[LensModel, float, tuple[float, ...]]]] = {
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """One position of the board.
-
-    Attributes:
-        T_left_board: float64 (4, 4).
-        left_px: float64 (N, 2), true positions of the board corners in the left image.
-        right_px: The same in the right image.
-    """
+    """One position of the board, and the true pixels (N, 2) of its corners."""
 
     T_left_board: Float64
     left_px: Float64
@@ -71,17 +65,7 @@ def board_rig(
 def place_boards(
     rig: StereoCalibration, board: CalibrationBoard, count: int, seed: int = 0
 ) -> list[BoardView]:
-    """Board poses that together cover both images, at various tilts and distances.
-
-    Args:
-        rig: The true rig.
-        board: The board.
-        count: Number of poses.
-        seed: Seed of the poses.
-
-    Raises:
-        CalibrationError: The board does not fit into both images.
-    """
+    """Board poses that together cover both images, at various tilts and distances."""
     rng = np.random.default_rng(seed)
     views: list[BoardView] = []
     for _ in range(400 * count):
@@ -94,13 +78,7 @@ def place_boards(
 
 
 class BoardRenderer:
-    """Renders images of a board as seen by one camera.
-
-    Args:
-        camera: The raw camera.
-        board: The board, printed on white paper with a margin of one square.
-        samples: Samples per pixel along each axis, averaged.
-    """
+    """Renders a board on white paper as seen by one camera, with samples² rays per pixel."""
 
     def __init__(self, camera: CameraIntrinsics, board: CalibrationBoard, samples: int = 4) -> None:
         self._camera, self._board, self._samples = camera, board, samples

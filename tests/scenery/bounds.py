@@ -11,23 +11,14 @@ from recon.core.settings import Settings
 
 @dataclass(frozen=True)
 class Number:
-    """A setting that is a number, or several.
-
-    Attributes:
-        name: Its dotted name.
-        low: The smallest value; None = no bound.
-        high: The largest value; None = no bound.
-        outside: Whether the bounds themselves are refused, the lower and the upper one.
-        whole: Whether it is an integer.
-        count: How many numbers it takes; 0 = it is no list.
-    """
+    """A setting that is a number, or several."""
 
     name: str
-    low: float | None
+    low: float | None  # None = no bound
     high: float | None
-    outside: tuple[bool, bool]
+    outside: tuple[bool, bool]  # whether the lower and the upper bound themselves are refused
     whole: bool
-    count: int
+    count: int  # how many numbers it takes; 0 = it is no list
 
 
 def numbers_of(settings: type[Settings], prefix: str = "") -> Iterator[Number]:

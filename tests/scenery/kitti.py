@@ -19,23 +19,7 @@ _BT601 = np.array([0.299, 0.587, 0.114])
 
 
 def write_kitti(source: SyntheticSource | Film, folder: StrPath, *, grey: bool = True) -> None:
-    """Write a drive as a KITTI odometry sequence.
-
-    ::
-
-        folder/
-          image_0/ image_1/   grey (optional)
-          image_2/ image_3/   colour
-          calib.txt  times.txt  poses.txt
-
-    Args:
-        source: The drive.
-        folder: Output folder, created if missing.
-        grey: Also write the grey images.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write a drive as a KITTI odometry sequence, with its grey images or without."""
     target = Path(folder)
     for pair in source:
         name = f"{pair.index:06d}.png"

@@ -22,13 +22,7 @@ _GAIN = 0.9
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane, or a rectangular part of one, in left camera axes.
-
-    Attributes:
-        normal: Any vector perpendicular to the plane; ``normal · xyz = offset_m`` on it.
-        offset_m: See ``normal``.
-        window_m: Extent in x and y, ``(x0, x1, y0, y1)``; None = infinite.
-    """
+    """A plane ``normal · xyz = offset_m`` in left camera axes, or its part (x0, x1, y0, y1)."""
 
     normal: tuple[float, float, float]
     offset_m: float
@@ -44,12 +38,7 @@ class _Texture(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlanePair:
-    """A grey pair with its ground truth.
-
-    Attributes:
-        pair: The images.
-        truth: Disparity of the left image, NaN where it sees no plane; and which points both see.
-    """
+    """A grey pair with its ground truth; NaN where the left image sees no plane."""
 
     pair: RectifiedPair
     truth: DisparityTruth
@@ -84,16 +73,7 @@ def step_pair(
     seed: int = 0,
     noise_dn: float = 0.0,
 ) -> PlanePair:
-    """A square in the centre of the left image in front of a wall, with an occluded strip.
-
-    Args:
-        camera: The rectified camera.
-        near_m: Depth of the square.
-        far_m: Depth of the wall.
-        half_width_px: Half the side of the square in the left image.
-        seed: Seed of the texture.
-        noise_dn: Sensor noise, grey levels.
-    """
+    """A square in the centre of the left image in front of a wall, with an occluded strip."""
     half = half_width_px * near_m / camera.focal_px
     x = ((camera.width_px - 1) / 2 - camera.cx_px) * near_m / camera.focal_px
     y = ((camera.height_px - 1) / 2 - camera.cy_px) * near_m / camera.focal_px
@@ -105,17 +85,7 @@ def step_pair(
 def plane_pair(
     camera: RectifiedCamera, planes: Sequence[Plane], *, seed: int = 0, noise_dn: float = 0.0
 ) -> PlanePair:
-    """Render planes; the nearest occludes the others.
-
-    Args:
-        camera: The rectified camera.
-        planes: The planes.
-        seed: Seed of texture and noise.
-        noise_dn: Sensor noise, standard deviation in grey levels.
-
-    Raises:
-        SettingsError: There is no plane, or none is in view.
-    """
+    """Render planes; the nearest occludes the others."""
     if not planes:
         raise SettingsError("no plane to render", expected="at least one")
     left, right = stereo_views(camera, np.eye(4))

@@ -49,29 +49,21 @@ def test_a_quad_has_its_area_and_metric_surface_coordinates():
     assert soup.uv.reshape(-1, 2).max(axis=0).tolist() == [12.0, 23.0]
 
 
-def test_a_box_is_closed_and_has_six_faces():
-    soup = boxes([0, 0, 0], [1, 2, 3], PAINT)
-    assert len(soup) == 12
-    assert _area(soup) == pytest.approx(22.0)
-    assert _open_edges(soup.vertices) == 0
-
-
-def test_a_cylinder_mantle_tends_to_its_area():
-    soup = cylinder((0.5, 0.5), 2.0, PAINT, 64)
-    assert _area(soup) == pytest.approx(2.0 * np.pi, rel=1e-3)
+@pytest.mark.parametrize(
+    ("soup", "area", "closed"),
+    [
+        (boxes([0, 0, 0], [1, 2, 3], PAINT), 22.0, True),
+        (cylinder((0.5, 0.5), 2.0, PAINT, 64), 2.0 * np.pi, False),
+        (disc(2.0, PAINT, 100), 4.0 * np.pi, False),
+        (extrusion([(0, 0), (2, 0), (2, 1), (0, 1)], 1.5, PAINT), 13.0, True),
+        (frustum([0, 0, 0], [1, 2, 3], (0, 0, 0), PAINT), 18.0, False),
+    ],
+    ids=["box", "cylinder", "disc", "extrusion", "frustum"],
+)
+def test_shapes_have_their_area_and_are_closed(soup, area: float, closed: bool):
+    assert _area(soup) == pytest.approx(area, rel=2e-3)
+    assert (_open_edges(soup.vertices) == 0) == closed
     assert np.allclose(np.linalg.norm(soup.normals, axis=2), 1.0)
-
-
-def test_a_disc_tends_to_its_area():
-    assert _area(disc(2.0, PAINT, 100)) == pytest.approx(4.0 * np.pi, rel=2e-3)
-
-
-def test_an_extrusion_is_closed():
-    assert _open_edges(extrusion([(0, 0), (2, 0), (2, 1), (0, 1)], 1.5, PAINT).vertices) == 0
-
-
-def test_a_frustum_without_inset_has_the_walls_of_a_box():
-    assert _area(frustum([0, 0, 0], [1, 2, 3], (0, 0, 0), PAINT)) == pytest.approx(18.0)
 
 
 @pytest.mark.parametrize("splits", [0, 1, 3])
@@ -116,17 +108,9 @@ def test_stripes_are_the_mean_over_the_footprint(x, period, share, w):
     assert got == pytest.approx(expected, abs=0.03)
 
 
-def test_a_wide_footprint_sees_the_share_of_the_stripes():
-    got = stripes(np.linspace(0, 1, 7), 0.01, 0.003, np.full(7, 1.0))
-    assert np.allclose(got, 0.3)
-
-
-def test_a_point_sees_a_stripe_or_not():
+def test_a_stripe_covers_its_share_of_a_footprint():
     x = np.array([-0.1, 0.1, 0.4, 0.6])
     assert np.allclose(stripe(x, 0.0, 0.5, np.zeros(4)), [0, 1, 1, 0])
-
-
-def test_half_a_footprint_on_a_stripe_is_half():
     assert stripe(np.array([0.5]), 0.0, 0.5, np.array([0.2]))[0] == pytest.approx(0.5)
 
 

@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 
 from recon.core.values.arrays import UInt8
 from recon.stereo.kernels.minima import Minima, empty_minima
-from recon.stereo.kernels.path_costs import (
-    Views,
-    Window,
-    empty_planes,
-    scaled_window,
-    write_views,
-)
+from recon.stereo.kernels.path_costs import Views, Window, empty_planes, scaled_window, write_views
 from recon.stereo.kernels.paths import Paths
 from recon.stereo.kernels.semi_global import (
     ROWS,

@@ -77,16 +77,27 @@ def test_a_network_of_another_size_gives_disparities_in_pixels_of_the_image(
     assert np.nanmedian(match(difference, pair_of(18, 10), **fixed).values) == pytest.approx(16)
 
 
-def test_one_stacked_input_is_fed_where_the_network_has_one(tmp_path: Path) -> None:
-    nodes = [(["both"], "d", "ReduceMean")]
-    path = write_network(tmp_path / "one.onnx", ["both"], nodes, (1, None, None, None))
-    model = onnx.load(str(path))
-    model.graph.node[0].attribute.extend(
-        [onnx.helper.make_attribute("axes", [1]), onnx.helper.make_attribute("keepdims", 1)]
-    )
+def write_mean(path: Path, inputs: list[str], shape: tuple[int | None, ...]) -> Path:
+    """A network that gives the mean over the channels of its input, or of the difference of two."""
+    nodes = [(inputs, "x", "Sub")] if len(inputs) == 2 else []
+    write_network(path, inputs, [*nodes, (["x"] if nodes else inputs, "d", "ReduceMean")], shape)
+    model, make = onnx.load(str(path)), onnx.helper.make_attribute
+    model.graph.node[-1].attribute.extend([make("axes", [1]), make("keepdims", 1)])
     onnx.save(model, str(path))
+    return path
+
+
+def test_one_stacked_input_is_fed_where_the_network_has_one(tmp_path: Path) -> None:
+    path = write_mean(tmp_path / "one.onnx", ["both"], (1, None, None, None))
     disparity = match(path, pair_of(4, 8), std=(1 / 255,))
     assert np.nanmedian(disparity.values) == pytest.approx(6, abs=1e-3)
+
+
+def test_the_size_and_the_channels_that_a_network_declares_are_kept(tmp_path: Path) -> None:
+    path = write_mean(tmp_path / "fixed.onnx", ["left", "right"], (1, 3, 20, 30))
+    disparity = match(path, pair_of(18, 10), mean=(0.1, 0.1, 0.1), std=(1 / 255,))
+    # 8 pixels of an image half as wide are 16 of the image.
+    assert np.nanmedian(disparity.values) == pytest.approx(16)
 
 
 def test_what_is_not_finite_is_no_match(tmp_path: Path) -> None:
@@ -95,19 +106,6 @@ def test_what_is_not_finite_is_no_match(tmp_path: Path) -> None:
     ])  # fmt: skip
     disparity = match(path, pair_of(10, 30))
     assert (disparity.reason == Reason.AMBIGUOUS).all()
-
-
-def test_the_size_and_the_channels_that_a_network_declares_are_kept(tmp_path: Path) -> None:
-    nodes = [(["left", "right"], "x", "Sub"), (["x"], "d", "ReduceMean")]
-    path = write_network(tmp_path / "fixed.onnx", ["left", "right"], nodes, (1, 3, 20, 30))
-    model = onnx.load(str(path))
-    model.graph.node[1].attribute.extend(
-        [onnx.helper.make_attribute("axes", [1]), onnx.helper.make_attribute("keepdims", 1)]
-    )
-    onnx.save(model, str(path))
-    disparity = match(path, pair_of(18, 10), mean=(0.1, 0.1, 0.1), std=(1 / 255,))
-    # 8 pixels of an image half as wide are 16 of the image.
-    assert np.nanmedian(disparity.values) == pytest.approx(16)
 
 
 def test_a_network_that_gives_no_map_or_takes_other_inputs_is_refused(

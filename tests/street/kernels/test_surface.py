@@ -116,35 +116,30 @@ def test_kernel_equals_reference(seed, n, pixel):
         assert (difference <= getattr(bounds, name)).all(), name
 
 
-def test_a_wall_seen_straight_on_has_a_square_footprint():
-    hits = describe_hits(
-        _wall(8.0), np.zeros(1, np.int32), np.zeros(3), np.array([[0.0, 0.0, 1.0]]), 1 / 400
+def _look(z: float, origin: list[float], ray: list[float], pixel: float) -> SurfaceHits:
+    return describe_hits(
+        _wall(z), np.zeros(1, np.int32), np.array(origin, float), np.array([ray], float), pixel
     )
+
+
+def test_a_wall_seen_straight_on_has_a_square_footprint_and_faces_the_viewer():
+    hits = _look(8.0, [0, 0, 0], [0, 0, 1], 1 / 400)
     assert np.allclose(hits.xyz, [[0.0, 0.0, 8.0]])
-    assert np.allclose(hits.width, 8.0 / 400)
+    assert np.allclose([hits.width[0], *hits.spread[0]], 8.0 / 400)
     assert np.allclose(hits.smear, 0.0)
-    assert np.allclose(hits.spread, 8.0 / 400)
-
-
-def test_the_normal_faces_the_viewer_from_both_sides():
-    rays = np.array([[0.1, 0.0, 1.0]])
-    front = describe_hits(_wall(5.0), np.zeros(1, np.int32), np.zeros(3), rays, 0.01)
-    behind = describe_hits(_wall(5.0), np.zeros(1, np.int32), np.array([0, 0, 9.0]), -rays, 0.01)
-    assert np.allclose(front.normal, [[0, 0, -1]])
-    assert np.allclose(behind.normal, [[0, 0, 1]])
+    assert np.allclose(hits.normal, [[0, 0, -1]])
+    assert np.allclose(_look(5.0, [0, 0, 9], [-0.1, 0, -1], 0.01).normal, [[0, 0, 1]])
 
 
 def test_a_slanted_view_smears_along_the_surface_by_the_inverse_cosine():
     # 60° from the normal: the footprint is twice as long as it is wide.
-    rays = np.array([[np.sqrt(3.0), 0.0, 1.0]])
-    hits = describe_hits(_wall(4.0), np.zeros(1, np.int32), np.zeros(3), rays, 0.01)
+    hits = _look(4.0, [0, 0, 0], [np.sqrt(3.0), 0, 1], 0.01)
     assert np.allclose(np.hypot(hits.width, np.linalg.norm(hits.smear)), 2.0 * hits.width)
     assert np.allclose(hits.smear[0, 1:], 0.0)
 
 
 def test_a_grazing_view_is_widened_beyond_the_greatest_stretch():
-    rays = np.array([[1e5, 0.0, 1.0]])
-    hits = describe_hits(_wall(1.0), np.zeros(1, np.int32), np.zeros(3), rays, 0.001)
+    hits = _look(1.0, [0, 0, 0], [1e5, 0, 1], 0.001)
     ratio = np.linalg.norm(hits.smear) / hits.width[0]
     assert MAX_STRETCH - 1.0 < ratio <= MAX_STRETCH
     assert hits.width[0] > 0.001
@@ -215,27 +210,19 @@ def test_noise_equals_its_reference(xyz, smear, width, wavelength, octaves, gain
     )
 
 
-def test_noise_has_mean_zero_and_moderate_spread():
-    xyz = _points(3000)
-    noise = fractal_noise(xyz, np.zeros_like(xyz), np.full(3000, 1e-4), np.ones(3000), 6, 0.8, 3)
+def _plain_noise(n: int, width: float, seed: int = 0) -> np.ndarray:
+    xyz = _points(n)
+    return fractal_noise(xyz, np.zeros_like(xyz), np.full(n, width), np.ones(n), 6, 0.8, seed)
+
+
+def test_noise_has_mean_zero_and_a_spread_that_shrinks_with_the_footprint():
+    noise = _plain_noise(3000, 1e-4)
     assert abs(noise.mean()) < 0.02
     assert 0.2 < noise.std() < 0.4
     assert np.abs(noise).max() < 2.0
-
-
-def test_pixels_wider_than_the_coarsest_blotch_see_no_noise():
-    xyz = _points(50)
-    noise = fractal_noise(xyz, np.zeros_like(xyz), np.full(50, 1.0), np.full(50, 0.9), 5, 0.8, 0)
-    assert np.array_equal(noise, np.zeros(50))
-
-
-def test_blur_grows_with_the_footprint():
-    xyz = _points(1000)
-    spread = [
-        fractal_noise(xyz, np.zeros_like(xyz), np.full(1000, w), np.ones(1000), 6, 0.8, 0).std()
-        for w in (0.01, 0.1, 0.3, 0.6)
-    ]
+    spread = [_plain_noise(1000, width).std() for width in (0.01, 0.1, 0.3, 0.6)]
     assert spread == sorted(spread, reverse=True)
+    assert not _plain_noise(50, 1.1).any()  # wider than the coarsest blotch
 
 
 def test_a_smear_averages_along_its_direction():
@@ -251,11 +238,7 @@ def test_a_smear_averages_along_its_direction():
 
 
 def test_another_seed_is_another_pattern():
-    xyz = _points(2000)
-    one, two = (
-        fractal_noise(xyz, np.zeros_like(xyz), np.full(2000, 1e-3), np.ones(2000), 4, 0.8, seed)
-        for seed in (1, 2_000_000)
-    )
+    one, two = (_plain_noise(2000, 1e-3, seed) for seed in (1, 2_000_000))
     # 2000 independent pairs correlate by 0.02 (one sigma).
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.1
 
