@@ -21,12 +21,11 @@ from recon.cli.batch import batch
 from recon.cli.cameras import board, calibrate, rectify
 from recon.cli.commands import Commands
 from recon.cli.errors import interrupt_on_signals, report_unforeseen
+from recon.cli.evaluate import paper
 from recon.cli.getting_started import demo, doctor, settings
 from recon.cli.live import live, localize
-from recon.cli.map import map_, piece
-from recon.cli.merge import merge
+from recon.cli.map import map_, merge, piece
 from recon.cli.pair import disparity, pair
-from recon.cli.paper import paper
 from recon.cli.products import export, mesh, occupancy
 from recon.cli.recording import audit, capture
 

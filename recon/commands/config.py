@@ -107,9 +107,7 @@ PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
 
 
 def load_config(
-    path: StrPath | None = None,
-    overrides: Changes = (),
-    defaults: Mapping[str, Any] | None = None,
+    path: StrPath | None = None, overrides: Changes = (), defaults: Mapping[str, Any] | None = None
 ) -> ReconConfig:
     """Build the configuration; what comes later wins: defaults, file, overrides.
 
@@ -136,18 +134,12 @@ def load_config(
 
 
 def run_settings(
-    folder: Path,
-    file: Path | None = None,
-    overrides: Changes = (),
-    without: Collection[str] = (),
+    folder: Path, file: Path | None = None, overrides: Changes = (), without: Collection[str] = ()
 ) -> ReconConfig:
     """Return the settings of a finished run of map, demo or pair, with changes.
 
-    Args:
-        folder: Folder of the run.
-        file: YAML file of settings, applied before the overrides; None = none.
-        overrides: ``key=value`` settings.
-        without: Sections that are the defaults again, since they are of its source.
+    The file comes before the overrides. The sections ``without`` are the defaults again, since
+    they are of its source.
     """
     if is_pair_run(folder):
         return load_config(file, overrides, PAIR_DEFAULTS)
@@ -164,13 +156,7 @@ def run_settings(
 
 
 def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[str]) -> None:
-    """Refuse settings that differ from those of a run where that has no effect.
-
-    Args:
-        ran: The settings of the run.
-        config: Those to make something of it with.
-        sections: Where they may differ.
-    """
+    """Refuse settings that differ from those that a run had, but for those of some sections."""
     for name in type(config).model_fields:
         if name not in sections and getattr(config, name) != getattr(ran, name):
             raise SettingsError(
@@ -278,11 +264,7 @@ class SettingGroup:
 
 
 def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
-    """List the settings with a dotted name, or all below it.
-
-    Args:
-        name: Dotted name of a setting or a group, or any part of one; None = all.
-    """
+    """List the settings of a dotted name or part of one, and all below it; None = all."""
     every = tuple(_groups(ReconConfig(), ReconConfig.parse(PAIR_DEFAULTS)))
     names = [entry.name for group in every for entry in group.settings]
     if name is None:
@@ -300,11 +282,7 @@ def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
 
 def settings_page(groups: Sequence[SettingGroup]) -> str:
     """Return the page docs/settings.md."""
-    lines = [
-        "# Settings",
-        "<!-- Written by `recon settings --markdown`. -->",
-        _INTRODUCTION,
-    ]
+    lines = ["# Settings", "<!-- Written by `recon settings --markdown`. -->", _INTRODUCTION]
     for group in groups:
         lines += ["", f"## {group.name}", group.purpose, ""]
         lines += ["| setting | default | values | what it does |", "|---|---|---|---|"]

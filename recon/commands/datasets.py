@@ -42,11 +42,7 @@ def run_fetch(
 ) -> dict[str, Any]:
     """Download, check and unpack data sets, or parts of them, that are not there yet.
 
-    Args:
-        names: Data sets, or parts of them.
-        folder: Where to.
-        address: A mirror: a folder on a server that has the archives by their names.
-        progress: Shown each megabyte.
+    ``address`` is a mirror: a folder on a server that has the archives by their names.
     """
     parts = {part.name: part for name in names for part in find_parts(name)}
     return {"datasets": [fetch_part(one, folder, address, progress) for one in parts.values()]}

@@ -43,12 +43,7 @@ def run_demo(
 ) -> MapRun:
     """Render a street and map it: what `recon demo` does.
 
-    Args:
-        config: The configuration; ``street`` says what is rendered.
-        out: As for `run_map`.
-        mesh: As for `run_map`.
-        threads: As for `run_map`.
-        progress: As for `run_map`.
+    ``street`` of the configuration says what is rendered.
     """
     options = MapOptions("demo", out, threads, mesh=mesh, progress=progress, audit=False)
     return run_map(demo_source(config), config, options)
@@ -75,12 +70,7 @@ _SMALL: Final = (
 
 @dataclass(frozen=True)
 class WarmUp:
-    """What was compiled.
-
-    Attributes:
-        kernels: Number of kernels that were not in the cache.
-        seconds: Time that all of it took.
-    """
+    """How many kernels were not in the cache, and what compiling them took."""
 
     kernels: int
     seconds: float
@@ -89,9 +79,7 @@ class WarmUp:
 def compile_kernels() -> WarmUp:
     """Compile the kernels that pairs, drives and occupancy maps run, for all matchers of ours.
 
-    They run once on small rendered images.
-
-    The real stages run, so that a kernel that is added to one needs no mention here.
+    The real stages run once, on small rendered images.
     """
     begun, compiled = time.perf_counter(), set[str]()
     with when_compiling(compiled.add), tempfile.TemporaryDirectory() as name:

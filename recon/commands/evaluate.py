@@ -1,11 +1,11 @@
-"""`recon evaluate trajectory`: compare two trajectory files."""
+"""`recon evaluate`: compare trajectories, maps, disparities and occupancy with the truth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -73,13 +73,8 @@ def run_evaluate_trajectory(
     Poses are associated by time if both files have timestamps, else in order; the paths are
     aligned as the rules say. With a folder, the aligned paths and a report go there.
 
-    Args:
-        estimate: KITTI or TUM file.
-        truth: Ground truth, KITTI or TUM file.
-        rules: How the two are aligned and compared.
-        times: Timestamps of the poses of a KITTI file in seconds, one per line; None = unknown.
-        tolerance_s: Largest time difference of two associated poses.
-        out: Result folder; None = nothing is written.
+    The files are KITTI or TUM; ``times`` has the timestamps of the poses of a KITTI file (s, one
+    per line), ``tolerance_s`` is the largest time difference of two associated poses.
     """
     ours, true, by_time = _read_paths(estimate, truth, times)
     poses = {"estimate_poses": len(ours), "true_poses": len(true)}
@@ -113,7 +108,7 @@ def run_evaluate_trajectory(
 def _read_paths(
     estimate: Path, truth: Path, times: Path | None
 ) -> tuple[Trajectory, Trajectory, bool]:
-    """Estimate and truth, and whether the times of both are known."""
+    """Return estimate and truth, and whether the times of both are known."""
     stamped = [holds_times(path) for path in (estimate, truth)]
     paths = [read_trajectory(path) for path in (estimate, truth)]
     if times is not None:
@@ -155,12 +150,9 @@ def run_evaluate_map(
         align_to: Ground-truth poses of the run's cameras, in the axes of the reference; the run's
             path is aligned rigidly to them, and its map moves with it.
         icp: Whether the cloud is then aligned to the reference by ICP.
-        thresholds_m: Distances below which a point counts as correct.
+        thresholds_m: Distances below which a point counts as correct; the figures returned are
+            those of the first, with those of each in ``by_threshold``.
         out: Result folder; None = nothing is written.
-
-    Returns:
-        The figures of the first threshold, those of each in ``by_threshold``, and how far the
-        alignment moved the cloud.
     """
     if not thresholds_m:
         raise SettingsError("there is no threshold", where="--threshold")
@@ -195,9 +187,6 @@ def run_evaluate_map(
     return summary
 
 
-_COUNTED: Final = 255
-
-
 def run_evaluate_disparity(
     estimate: Path,
     truth: Path,
@@ -217,7 +206,7 @@ def run_evaluate_disparity(
             most one pixel of the map.
     """
     values, true = read_disparity(estimate), read_disparity(truth)
-    counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == _COUNTED
+    counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == 255
     if counted.shape != true.shape:
         raise EvaluationError(
             "mask and truth differ in size", where=mask, got=counted.shape, expected=true.shape
@@ -240,7 +229,6 @@ def run_evaluate_disparity(
 
 
 def _rated(values: Float32, path: Path) -> Disparity:
-    """Return a disparity map with the confidence read from a file."""
     confidence = read_pfm(path)
     if confidence.shape != values.shape:
         raise EvaluationError(
@@ -262,14 +250,7 @@ def _rated(values: Float32, path: Path) -> Disparity:
 
 @dataclass(frozen=True, eq=False)
 class OccupancyComparison:
-    """The occupancy of a run and its ground truth.
-
-    Attributes:
-        metrics: The figures.
-        grid: The 2-D grid of the run.
-        truth: Ground truth, in the cells of the run.
-        doubts: What is not to be trusted in the map of the run.
-    """
+    """The occupancy of a run, its ground truth in the same cells, and what is not to be trusted."""
 
     metrics: OccupancyMetrics
     grid: OccupancyGrid
@@ -282,12 +263,9 @@ def run_evaluate_occupancy(
 ) -> OccupancyComparison:
     """Compare ``map/octomap.ot`` and ``map/grid.*`` of a run: `recon evaluate occupancy`.
 
-    The street is rendered again, and what its cameras can have known of each cell is the truth.
-
-    Args:
-        folder: A run of a rendered street: of ``recon demo``, or of ``recon occupancy`` on one.
-        least_frames: Number of frames that must have seen a cell for it to be compared.
-        image: PNG for the grid with its errors in colour; None = none is drawn.
+    ``folder`` is a run of ``recon demo``, or of ``recon occupancy`` on one: the street is rendered
+    again, and what its cameras can have known of each cell is the truth, if ``least_frames`` saw
+    it. The grid is drawn with its errors in colour into the PNG ``image``.
     """
     if image is not None:
         check_targets([image], (folder / name for name in recorded_files(folder)))

@@ -76,7 +76,6 @@ def run_localize(
 
 
 def _grid_of(folder: Path | None) -> OccupancyGrid | None:
-    """Return the grid of the run that made the map; None = there is none."""
     if folder is None or not (folder / GRID).is_file():
         return None
     return read_nav2(folder / GRID)
@@ -137,7 +136,6 @@ def run_live(
 
 
 def _because_it_was_too_fast(error: MappingError, played: LiveSource) -> MappingError:
-    """Say of a drive that gave no map what was left out of it, if anything was."""
     if not played.warnings():
         return error
     why = "; ".join(played.warnings())
@@ -171,7 +169,6 @@ def _warm_up(source: LiveSource, config: ReconConfig, map_path: StrPath | None) 
 
 
 def _check_pose_first(config: ReconConfig) -> None:
-    """Refuse an odometry that needs exact disparities."""
     if config.odometry.method == "kiss":
         raise SettingsError(
             "while images arrive, poses come before the points that kiss-icp needs",

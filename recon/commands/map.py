@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map_options import MapOptions, with_resume_hint
+from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import begun_in_pieces, map_pieces, pieces_of
+from recon.core.errors import ClusterError, MemoryLimitError, OutputError, ReconError
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
 from recon.evaluation.drive_errors import DriveErrors, compare_with_truth
@@ -23,6 +29,7 @@ from recon.map.verbs import Map
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
+from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.run import Run, plain
 from recon.sources.source import StereoSource, check_source
 
@@ -75,9 +82,7 @@ class MapRun:
 
 
 def run_map(
-    source: StereoSource,
-    config: ReconConfig | None = None,
-    options: MapOptions | None = None,
+    source: StereoSource, config: ReconConfig | None = None, options: MapOptions | None = None
 ) -> MapRun:
     """Map a drive: what `recon map` does.
 
@@ -184,3 +189,39 @@ def _summary(
         **source.figures(),
         **({} if prior is None else {"prior": {"from": options.prior_origin, **plain(prior)}}),
     }
+
+
+@contextmanager
+def with_resume_hint(run: RunDirectory, source: StereoSource) -> Iterator[None]:
+    """Add a hint on how to resume to errors after which the run can be resumed.
+
+    Of a live source, whose drive is over then, it says where the map is that was made so far.
+    """
+    try:
+        yield
+    except (KeyboardInterrupt, MemoryError, OSError, ReconError) as error:
+        hinted = _with_hint(error, _way_on(run.folder, source)) if run.begun else None
+        if hinted is None:
+            raise
+        raise hinted from error
+
+
+def _way_on(folder: Path, source: StereoSource) -> str:
+    if source.live:
+        return f"the map so far is in {state_folder(folder) / STARTED}"
+    return f"recon map --resume {shlex.quote(str(folder))} goes on from there"
+
+
+def _with_hint(error: BaseException, hint: str) -> BaseException | None:
+    match error:
+        case KeyboardInterrupt():
+            return KeyboardInterrupt(hint)
+        case OutputError() | ClusterError():
+            return error.but(hint=hint)
+        case MemoryLimitError():
+            return error.but(hint=f"{hint} with a larger --memory-limit")
+        case MemoryError():
+            return MemoryLimitError("out of memory", hint=f"{hint}; give it a --memory-limit")
+        case OSError(errno=errno.ENOSPC | errno.EDQUOT | errno.EFBIG, strerror=why):
+            return OutputError("the disk is full", where=error.filename, got=why, hint=hint)
+    return None

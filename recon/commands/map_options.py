@@ -6,12 +6,9 @@ the same result (``identity``): settings, source, poses, prior and versions.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
-import shlex
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -20,9 +17,7 @@ from typing_extensions import Self
 
 from recon.commands.config import Changes, ReconConfig, load_config
 from recon.core.errors import (
-    ClusterError,
     FormatError,
-    MemoryLimitError,
     OutputError,
     ReconError,
     SettingsError,
@@ -34,7 +29,7 @@ from recon.io.trajectory import read_trajectory
 from recon.map.drive.workspace import ANEW, resuming, session_info
 from recon.map.verbs import Map
 from recon.run.batch.cluster import BatchOptions
-from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
+from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.machine import versions
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run, fingerprint
@@ -67,12 +62,11 @@ class MapOptions:
         audit: Whether a quick audit of the recording comes first, unless the settings forbid it.
         warn: Given the findings of the audit, before the drive is mapped.
         resume: Resume the unfinished run in ``out``.
-        workers: Where pieces of the drive are mapped side by side; None = it is mapped here, in one
-            piece, unless a run that is resumed was begun in pieces.
-        source: File or folder that `open` opens, with the poses and the prior below.
-        kind: Kind of the source; None = inferred from its files.
-        poses_file: File of known poses.
-        prior_from: File of the prior, or a topic of the source.
+        workers: Where pieces of the drive are mapped side by side; None = in one piece, here,
+            unless a run that is resumed was begun in pieces.
+        source, kind: What `open` opens; kind None = inferred from its files.
+        poses_file: File of the known poses, which `open` reads.
+        prior_from: File of the prior, or a topic of the source; likewise.
     """
 
     command: str = "map"
@@ -141,10 +135,7 @@ class MapOptions:
     ) -> tuple[Self, ReconConfig]:
         """Complete the options by those of the unfinished run in a folder; and its settings.
 
-        Args:
-            folder: Folder of the run.
-            file: YAML file of settings; they must be those of the run, all but the memory limit.
-            changes: Settings, likewise.
+        Those in ``file`` and ``changes`` must be those of the run, all but the memory limit.
         """
         started = _read_started(folder)
         earlier = self.of(started["arguments"])
@@ -193,41 +184,6 @@ class MapOptions:
         map_.commit()
         run.begun = run.command != "demo"  # whose street no command line names
         return map_
-
-
-@contextmanager
-def with_resume_hint(run: RunDirectory, source: StereoSource) -> Iterator[None]:
-    """Add a hint on how to resume to errors after which the run can be resumed.
-
-    Of a live source, whose drive is over then, it says where the map is that was made so far.
-    """
-    hint = f"recon map --resume {shlex.quote(str(run.folder))} goes on from there"
-    if source.live:
-        hint = f"the map so far is in {state_folder(run.folder) / STARTED}"
-    try:
-        yield
-    except (KeyboardInterrupt, MemoryError, OSError, ReconError) as error:
-        hinted = _with_hint(error, hint) if run.begun else None
-        if hinted is None:
-            raise
-        raise hinted from error
-
-
-def _with_hint(error: BaseException, hint: str) -> BaseException | None:
-    """Return the error with a hint on how to go on; None if it is raised unchanged."""
-    match error:
-        case KeyboardInterrupt():
-            return KeyboardInterrupt(hint)
-        case OutputError() | ClusterError():
-            return error.but(hint=hint)
-        case MemoryLimitError():
-            return error.but(hint=f"{hint} with a larger --memory-limit")
-        case MemoryError():
-            return MemoryLimitError("out of memory", hint=f"{hint}; give it a --memory-limit")
-        case OSError(errno=errno.ENOSPC | errno.EDQUOT | errno.EFBIG):
-            full, where = "the disk is full", error.filename
-            return OutputError(full, where=where, got=error.strerror, hint=hint)
-    return None
 
 
 def _read_started(folder: Path) -> dict[str, Any]:

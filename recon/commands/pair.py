@@ -62,8 +62,7 @@ def run_pair(
         progress: Shown the name of each long stage when it begins.
 
     Raises:
-        ReconError: The pair cannot be matched, or the folder cannot be written; nothing is left
-            behind.
+        ReconError: The pair cannot be matched, or the folder not be written; nothing is left.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
     check_mesh_formats(formats)
@@ -149,7 +148,6 @@ def run_disparity(
 def _measure(
     given: PairInput, disparity: Disparity
 ) -> tuple[DisparityMetrics | None, dict[str, Any]]:
-    """Return the errors of a disparity, None without ground truth, and its figures with them."""
     figures = {"pair": given.pair.name, **disparity_figures(disparity)}
     if given.truth is None:
         return None, figures
@@ -225,7 +223,6 @@ def reconstruct(
 
 
 def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
-    """Return the calibration, read for images of this size if it is a file."""
     if isinstance(calibration, RectifiedCamera | StereoCalibration):
         return calibration
     height_px, width_px = pair.left.shape[:2]
@@ -233,7 +230,6 @@ def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
 
 
 def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of one matcher as a part of those of all."""
     if isinstance(matcher, str) and matcher in MATCHERS:
         return {field_of(matcher): settings}
     if settings:

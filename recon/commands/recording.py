@@ -1,4 +1,4 @@
-"""`recon capture`: record cameras into a folder of pairs."""
+"""`recon capture` and `recon audit`: record pairs; is a recording good enough for a long run?"""
 
 from __future__ import annotations
 
@@ -38,17 +38,11 @@ def run_capture(
     calibration: Path | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Record until told to stop; with a calibration, the folder can be mapped as it is.
+    """Record until stopped; with a calibration, the folder can be mapped as it is.
 
-    Args:
-        devices: Left and right camera, or one with both views: numbers, paths or video files.
-        folder: Output folder; must be new or empty.
-        settings: Image size, frame rate, duration.
-        calibration: File to copy into the folder.
-        stopped: Called before each pair; True ends the recording.
-
-    Returns:
-        The figures, as written to ``capture.json`` in the folder.
+    ``devices`` are left and right camera, or one with both views: numbers, paths or video files.
+    The folder must be new or empty; its ``capture.json`` gets the figures that are returned.
+    ``stopped`` is called before each pair.
     """
     if calibration is not None and not calibration.is_file():
         raise FormatError("file does not exist", where=calibration)

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.commands.calibrate import run_rectify
 from recon.commands.config import load_config
-from recon.commands.rectify import run_rectify
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.calibration import read_calibration
