@@ -1,4 +1,4 @@
-"""`recon evaluate`: compare results with ground truth."""
+"""`recon evaluate` and `recon paper`: compare results with ground truth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.__init__ import Commands
+from recon.cli.commands import Commands
 from recon.cli.errors import one_line_errors
 from recon.cli.tables import print_evaluation, print_figures, print_json
 

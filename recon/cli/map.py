@@ -1,4 +1,4 @@
-"""`recon map`: map a stereo drive."""
+"""`recon map` and `recon merge`: map a stereo drive; make one map of several."""
 
 from __future__ import annotations
 
