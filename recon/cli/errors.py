@@ -16,7 +16,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final, NoReturn, TextIO
+from typing import Final, TextIO
 
 import typer
 
@@ -43,7 +43,7 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     try:
         _check_surroundings()
         notice = _CompilingNotice(quiet)
-        with _standard_output_kept_clean(quiet), when_compiling(notice.tell):
+        with _standard_output_kept_clean(quiet), when_compiling(notice.show):
             yield
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
@@ -54,7 +54,7 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     except ImportError as error:
         # Ctrl-C while a native library initialises surfaces as an import failure.
         if not _interrupted(error):
-            _fail_unforeseen(error)
+            raise typer.Exit(report_unforeseen(error)) from None
         typer.echo("interrupted", err=True)
         raise typer.Exit(INTERRUPTED) from None
     except OSError as error:
@@ -64,7 +64,7 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
         typer.echo("; ".join(["interrupted", *map(str, interrupt.args)]), err=True)
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:  # noqa: BLE001 - whatever it is, it is a bug
-        _fail_unforeseen(error)
+        raise typer.Exit(report_unforeseen(error)) from None
 
 
 def _check_surroundings() -> None:
@@ -114,7 +114,7 @@ class _CompilingNotice:
     def __init__(self, quiet: bool) -> None:
         self._silent = quiet or not sys.stderr.isatty()
 
-    def tell(self, kernel: str) -> None:
+    def show(self, kernel: str) -> None:
         del kernel
         if not self._silent:
             self._silent = True
@@ -144,15 +144,10 @@ def _escape_what_is_not_unicode(stream: TextIO) -> None:
 
 
 def _interrupted(error: BaseException) -> bool:
-    """Return whether an error was caused by Ctrl-C."""
     earlier = error.__cause__ or error.__context__
     if earlier is None:
         return isinstance(error, KeyboardInterrupt)
     return isinstance(error, KeyboardInterrupt) or _interrupted(earlier)
-
-
-def _fail_unforeseen(error: BaseException) -> NoReturn:
-    raise typer.Exit(report_unforeseen(error)) from None
 
 
 def _fail(line: str) -> None:

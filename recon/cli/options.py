@@ -34,13 +34,7 @@ Read = str | Callable[[Any], Mapping[str, Any]]
 
 
 def setting(read: Read, *names: str, **how: Any) -> Any:
-    """Declare an option that stands for a setting.
-
-    Args:
-        read: The dotted name of the setting, or a function for what is not as simple.
-        names: Names of the option, as for `typer.Option`.
-        how: What else `typer.Option` takes.
-    """
+    """Declare an option, as `typer.Option` does, that stands for a setting."""
     option = typer.Option(*names, **how)
     option.setting = read
     return option

@@ -37,10 +37,7 @@ def choose_viewer(
 ) -> Shown:
     """Choose a progress bar on a terminal, elsewhere JSON lines if verbose, else nothing.
 
-    Args:
-        quiet: Whether to show no progress.
-        verbose: Whether to write JSON lines where the stream is no terminal.
-        stream: Output stream; None = standard error, as standard output is for results.
+    ``stream`` None = standard error, as standard output is for results.
     """
     out = sys.stderr if stream is None else stream
     if quiet or not (out.isatty() or verbose):
@@ -49,11 +46,7 @@ def choose_viewer(
 
 
 class JsonLines:
-    """Writes one JSON object per event and line.
-
-    Args:
-        stream: Output stream; flushed after each line, so that a reader sees it at once.
-    """
+    """Writes one JSON object per event and line, and flushes it for who reads it at once."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -143,12 +136,7 @@ _NAME_SHARE: Final = 0.3
 
 
 class FittingColumn(ProgressColumn):
-    """All that is shown of a task: its name, a bar, and then texts.
-
-    Args:
-        always: Texts that are always shown.
-        if_room: Texts that follow where there is room, the most important one first.
-    """
+    """All that is shown of a task: its name, a bar, and texts; those ``if_room`` by importance."""
 
     def __init__(
         self, always: Sequence[ProgressColumn], if_room: Sequence[ProgressColumn] = ()
@@ -205,7 +193,6 @@ class _Line:
 
 
 def _text(shown: RenderableType) -> Text:
-    """Return what a column shows, which is text."""
     return shown if isinstance(shown, Text) else Text(str(shown))
 
 
@@ -221,13 +208,9 @@ def announce(
     verbose: bool = False,
     stream: TextIO | None = None,
 ) -> None:
-    """Write one line: text on a terminal, else a JSON object if verbose.
+    """Write one line about a source: text on a terminal, else a JSON object if verbose.
 
-    Args:
-        source: The source.
-        quiet: Whether to write nothing.
-        verbose: Whether to write JSON where the stream is no terminal.
-        stream: Output stream; None = standard error, as standard output is for results.
+    ``stream`` None = standard error.
     """
     event = {
         "event": "source",

@@ -123,7 +123,6 @@ def print_datasets(found: Mapping[str, Any]) -> None:
 
 
 def _how_much(entry: Mapping[str, Any]) -> str:
-    """Return how many of the parts of a data set are there."""
     if isinstance(entry["fetched"], bool):
         return "fetched" if entry["fetched"] else ""
     return f"{entry['fetched']} of {entry['parts']}"
