@@ -17,7 +17,7 @@ from recon.core.text import counted, with_unit
 
 if TYPE_CHECKING:
     from recon.commands.config import SettingEntry, SettingGroup
-    from recon.run.installation import Check
+    from recon.commands.doctor import Check
 
 
 _MOST_JOBS: Final = 200

@@ -5,15 +5,22 @@ It imports no library and no kernel itself: whatever lacks is to be found, and s
 
 from __future__ import annotations
 
+import ctypes
 import os
+import platform
+import shutil
+import subprocess
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
 from recon.core.kernels.cache import cache_parent
-from recon.run import installation
-from recon.run.installation import SYSTEM_LIBRARIES, Check, check_folder, check_library, run_python
+from recon.run.machine import available_cores
 
 _ROOMS: Final = Path(__file__).parents[1]
 _COMPILE_TIMEOUT_S: Final = 600.0
@@ -22,20 +29,17 @@ _COMPILE_TIMEOUT_S: Final = 600.0
 def examine(outputs: Path = Path("outputs")) -> list[Check]:
     """Check Python, packages, system libraries, machine and folders, and run some kernels.
 
-    Each package is imported in a process of its own, so that a crash is reported as well; this
-    takes some seconds. So does each kernel: more where they are not compiled.
-
-    Args:
-        outputs: The folder that runs write to; it need not exist, and is not created.
+    Each package and kernel has a process of its own, so that a crash is reported as well. The
+    folder that runs write to need not exist, and is not created.
     """
     return [
-        *installation.check_packages(),
+        *check_packages(),
         *(check_library(*one) for one in SYSTEM_LIBRARIES.items() if sys.platform == "linux"),
-        *installation.check_machine(),
+        *check_machine(),
         *check_kernels(),
-        *installation.check_environment(),
+        *check_environment(),
         check_folder("results can be written", outputs, "use --out", needed=True),
-        installation.check_disk(outputs),
+        check_disk(outputs),
     ]
 
 
@@ -52,3 +56,138 @@ def check_kernels() -> Iterator[Check]:
         ran, printed = run_python(sample, _COMPILE_TIMEOUT_S)
         hint = "install recon anew, with the versions of its constraints.txt"
         yield Check(f"kernels of {room}", ran, "run" if ran else printed, hint)
+
+
+_MIN_PYTHON: Final = (3, 10)
+_MIN_MEMORY_GB: Final = 3.0
+_MIN_DISK_GB: Final = 1.0
+_NO_DATA: Final = "not set; only tests and benchmarks use it"
+_TIMEOUT_S: Final = 120.0
+#: Package name -> module name.
+PACKAGES: Final[Mapping[str, str]] = {
+    "numpy": "numpy", "llvmlite": "llvmlite", "numba": "numba", "opencv-python-headless": "cv2",
+    "open3d": "open3d", "kiss-icp": "kiss_icp", "pymeshlab": "pymeshlab", "pillow": "PIL",
+    "jinja2": "jinja2", "matplotlib": "matplotlib", "plotly": "plotly", "pydantic": "pydantic",
+    "typer": "typer", "rich": "rich", "pyyaml": "yaml", "threadpoolctl": "threadpoolctl",
+    "typing-extensions": "typing_extensions",
+    **({} if sys.version_info >= (3, 11) else {"tomli": "tomli"}),
+}  # fmt: skip
+#: Shared library -> Debian or Ubuntu package that provides it.
+SYSTEM_LIBRARIES: Final[Mapping[str, str]] = {
+    "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1", "libX11.so.6": "libx11-6",
+    "libusb-1.0.so.0": "libusb-1.0-0", "libOpenGL.so.0": "libopengl0",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Check:
+    """What was checked and found, and what to do if it failed; runs fail without what is needed."""
+
+    name: str
+    ok: bool
+    found: str
+    hint: str = ""
+    needed: bool = True
+
+    def __post_init__(self) -> None:
+        if self.ok:
+            object.__setattr__(self, "hint", "")
+
+
+def check_packages() -> Iterator[Check]:
+    """Check the version of Python, and of each package whether it can be imported."""
+    least = ".".join(map(str, _MIN_PYTHON))
+    old = sys.version_info < _MIN_PYTHON
+    yield Check("Python", not old, platform.python_version(), f"install Python >= {least}")
+    with ThreadPoolExecutor(max_workers=available_cores()) as pool:
+        yield from pool.map(check_package, PACKAGES, PACKAGES.values())
+
+
+def check_package(name: str, module: str) -> Check:
+    """Check one package, imported in its own process."""
+    try:
+        installed = version(name)
+    except PackageNotFoundError:
+        return Check(name, ok=False, found="not installed", hint=f"run: pip install {name}")
+    done, printed = run_python(f"import {module}")
+    again = "pip install --force-reinstall"
+    lacks = (package for library, package in SYSTEM_LIBRARIES.items() if library in printed)
+    hint = next((f"run: apt-get install {package}" for package in lacks), f"run: {again} {name}")
+    return Check(name, done, installed if done else f"{installed}, {printed}", hint)
+
+
+def check_library(library: str, package: str) -> Check:
+    """Check whether a shared library loads, which packages need."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return Check(library, ok=False, found="missing", hint=f"run: apt-get install {package}")
+    return Check(library, ok=True, found="loads")
+
+
+def check_machine() -> Iterator[Check]:
+    """Check cores, memory and OpenCV's number of threads."""
+    yield Check("cores", ok=True, found=str(available_cores()), needed=False)
+    try:
+        memory_gb = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
+    except (AttributeError, ValueError, OSError):  # not available on this system
+        yield Check("memory", ok=True, found="unknown", needed=False)
+    else:
+        hint = f"long drives need {_MIN_MEMORY_GB:g} GB: map fewer frames"
+        found = f"{memory_gb:.1f} GB"
+        yield Check("memory", memory_gb >= _MIN_MEMORY_GB, found, hint, needed=False)
+    done, printed = run_python("import cv2; print(cv2.getNumThreads())")
+    found = printed if done else "unknown"
+    yield Check("OpenCV threads", done, found, "see opencv", needed=False)
+
+
+def check_environment() -> Iterator[Check]:
+    """Check variables that would silently change kiss-icp's settings, and that of real data."""
+    names = sorted(name for name in os.environ if name.lower().startswith("kiss_icp"))
+    found, hint = ", ".join(names) or "none set", f"unset {' '.join(names)}"
+    yield Check("kiss-icp variables", not names, found, hint, needed=False)
+    folder, hint = os.environ.get("RECON_DATA"), "set RECON_DATA to a folder, or unset it"
+    ok = not folder or Path(folder).is_dir()
+    found = (folder if ok else f"{folder} is no folder") or _NO_DATA
+    yield Check("real data (RECON_DATA)", ok, found, hint, needed=False)
+
+
+def check_folder(name: str, folder: Path, hint: str, *, needed: bool) -> Check:
+    """Check whether a folder, or the one that it would be created in, is writable."""
+    nearest = _nearest(folder)
+    try:
+        with tempfile.TemporaryFile(dir=nearest):
+            return Check(name, ok=True, found=str(folder.absolute()), needed=needed)
+    except OSError as error:
+        found = f"{nearest.absolute()}: {error.strerror or error}"
+        return Check(name, ok=False, found=found, hint=hint, needed=needed)
+
+
+def check_disk(folder: Path) -> Check:
+    """Check the free disk space for results."""
+    free_gb = shutil.disk_usage(_nearest(folder)).free / 1e9
+    found, hint = f"{free_gb:.1f} GB", "free some space, or use --out on another disk"
+    return Check("free disk space", free_gb >= _MIN_DISK_GB, found, hint, needed=False)
+
+
+def _nearest(folder: Path) -> Path:
+    return next((path for path in (folder, *folder.absolute().parents) if path.exists()), Path())
+
+
+def run_python(code: str, timeout_s: float = _TIMEOUT_S) -> tuple[bool, str]:
+    """Run code in a new Python process: whether it ran, and the last line that it printed."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return False, f"no answer in {timeout_s:g} s"
+    if done.returncode < 0:
+        return False, f"crashed with signal {-done.returncode}"
+    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
+    return done.returncode == 0, lines[-1] if lines else ""

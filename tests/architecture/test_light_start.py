@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from recon.run.installation import PACKAGES
+from recon.commands.doctor import PACKAGES
 
 HEAVY = {
     "cv2", "kiss_icp", "matplotlib", "numba", "open3d", "plotly", "pymeshlab", "pyoctomap",

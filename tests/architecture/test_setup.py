@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from recon.commands.doctor import PACKAGES, SYSTEM_LIBRARIES
 from recon.commands.kernel_samples import SAMPLES
-from recon.run.installation import PACKAGES, SYSTEM_LIBRARIES
 
 
 def test_doctor_looks_for_the_libraries_that_setup_installs(root: Path) -> None:

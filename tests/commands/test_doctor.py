@@ -13,9 +13,8 @@ from rich.console import Console
 
 import recon
 from recon.cli.tables import print_checks
-from recon.commands.doctor import check_kernels, examine
-from recon.run import installation
-from recon.run.installation import Check
+from recon.commands import doctor
+from recon.commands.doctor import Check, check_kernels, examine
 
 
 def test_this_machine_is_examined_and_ready(tmp_path: Path) -> None:
@@ -38,14 +37,14 @@ def test_what_kernels_lack_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_failed_checks_say_what_to_do() -> None:
-    missing = installation.check_package("no-such-package", "no_such_package")
+    missing = doctor.check_package("no-such-package", "no_such_package")
     assert not missing.ok
     assert missing.found == "not installed"
     assert missing.hint == "run: pip install no-such-package"
 
 
 def test_a_package_that_cannot_be_imported_is_reported_with_its_last_line() -> None:
-    broken = installation.check_package("numpy", "no_such_module")
+    broken = doctor.check_package("numpy", "no_such_module")
     assert not broken.ok
     assert "ModuleNotFoundError" in broken.found
     assert broken.hint
@@ -55,19 +54,19 @@ def test_a_missing_system_library_names_its_package(monkeypatch: pytest.MonkeyPa
     def fail(_: str) -> tuple[bool, str]:
         return False, "OSError: libGL.so.1: cannot open shared object file"
 
-    monkeypatch.setattr(installation, "run_python", fail)
-    assert installation.check_package("numpy", "numpy").hint == "run: apt-get install libgl1"
+    monkeypatch.setattr(doctor, "run_python", fail)
+    assert doctor.check_package("numpy", "numpy").hint == "run: apt-get install libgl1"
 
 
 def test_a_library_that_is_missing_names_its_package() -> None:
-    check = installation.check_library("libnothing.so.9", "libnothing9")
+    check = doctor.check_library("libnothing.so.9", "libnothing9")
     assert not check.ok
     assert check.hint == "run: apt-get install libnothing9"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals of this kind")
 def test_a_package_that_crashes_the_process_is_reported() -> None:
-    done, told = installation.run_python("import os; os.abort()")
+    done, told = doctor.run_python("import os; os.abort()")
     assert not done
     assert told.startswith("crashed with signal")
 
@@ -77,7 +76,7 @@ def test_an_import_that_never_ends_is_reported(monkeypatch: pytest.MonkeyPatch) 
         raise subprocess.TimeoutExpired("python", 1)
 
     monkeypatch.setattr(subprocess, "run", late)
-    done, told = installation.run_python("pass")
+    done, told = doctor.run_python("pass")
     assert not done
     assert "no answer" in told
 
@@ -95,7 +94,7 @@ def test_variables_that_change_results_or_lead_nowhere_are_reported(
 ) -> None:
     def hints() -> str:
         quick = (check for check in check_kernels() if not check.needed)
-        checks = [*installation.check_environment(), *itertools.islice(quick, 2)]
+        checks = [*doctor.check_environment(), *itertools.islice(quick, 2)]
         return "".join(check.hint for check in checks)
 
     monkeypatch.delenv(name, raising=False)
@@ -107,8 +106,8 @@ def test_variables_that_change_results_or_lead_nowhere_are_reported(
 def test_a_folder_below_a_file_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     below = tmp_path / "file" / "outputs"
-    assert not installation.check_folder("x", below, "use --out", needed=True).ok
-    assert installation.check_folder("x", tmp_path / "a" / "b", "", needed=True).ok
+    assert not doctor.check_folder("x", below, "use --out", needed=True).ok
+    assert doctor.check_folder("x", tmp_path / "a" / "b", "", needed=True).ok
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
