@@ -15,20 +15,14 @@ from recon.run.run import Run
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """A map with its drives in tiles, and how its products are wanted.
-
-    Attributes:
-        run: The run, whose folder they go to.
-        mesh: Settings of the mesh.
-        formats: Formats of the mesh.
-        survey: In whose coordinates LAS and LAZ are written; None = in those of the map.
-    """
+    """A map with its drives in tiles, and how its products are wanted."""
 
     map: Map
     placed: PlacedMap
-    run: Run
-    mesh: MeshSettings
-    formats: Sequence[str] = ("ply",)
+    run: Run  # the run, whose folder they go to
+    mesh: MeshSettings  # settings of the mesh
+    formats: Sequence[str] = ("ply",)  # formats of the mesh
+    # In whose coordinates LAS and LAZ are written; None = in those of the map
     survey: Survey | None = None
 
 

@@ -21,23 +21,14 @@ _LARGEST_STRETCH: Final = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """Where a map is in the coordinates of a survey.
+    """Where a map is in the coordinates of a survey."""
 
-    Attributes:
-        T_survey_map: float64 (4, 4), rigid.
-        misfit_m: float64 (N,), distances of the measured positions from those of the map.
-        span_m: Diagonal of the box around the positions.
-        scale: How many times as far apart the positions are as those of the map.
-        left_out: Number of positions that contradict the others.
-        lines: Warnings that name them.
-    """
-
-    T_survey_map: Float64
-    misfit_m: Float64
-    span_m: float
-    scale: float
-    left_out: int
-    lines: tuple[str, ...]
+    T_survey_map: Float64  # float64 (4, 4), rigid
+    misfit_m: Float64  # float64 (N,), distances of the measured positions from those of the map
+    span_m: float  # diagonal of the box around the positions
+    scale: float  # how many times as far apart the positions are as those of the map
+    left_out: int  # number of positions that contradict the others
+    lines: tuple[str, ...]  # warnings that name them
 
     @property
     def rms_m(self) -> float:

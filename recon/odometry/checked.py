@@ -37,15 +37,10 @@ MIN_SHARE: Final = 0.6  # least share of patches that must agree with a trusted 
 
 @dataclass(frozen=True, eq=False)
 class CheckedState:
-    """What is kept from frame to frame.
+    """What is kept from frame to frame."""
 
-    Attributes:
-        sight: The last frame.
-        T_world_camera: float64 (4, 4), its pose.
-    """
-
-    sight: Sight
-    T_world_camera: Float64
+    sight: Sight  # the last frame
+    T_world_camera: Float64  # (4, 4), its pose
 
 
 class CheckedOdometry:
@@ -138,28 +133,18 @@ _MIN_CORRELATION: Final = 0.6  # least correlation of a patch that agrees
 
 @dataclass(frozen=True)
 class Agreement:
-    """How many patches of an image a motion explains.
+    """How many patches of an image a motion explains."""
 
-    Attributes:
-        informative: Patches with texture in all directions, which can distinguish motions.
-        share: Share of them that match where the motion takes them; NaN = there are none.
-    """
-
-    informative: int
-    share: float
+    informative: int  # patches with texture in all directions, which can distinguish motions
+    share: float  # share of them that match where the motion takes them; NaN = there are none
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the check needs of a frame.
+    """What the check needs of a frame."""
 
-    Attributes:
-        left: uint8 (H, W).
-        disparity: Its disparity.
-    """
-
-    left: UInt8
-    disparity: Disparity
+    left: UInt8  # (H, W)
+    disparity: Disparity  # its disparity
 
     @cached_property
     def noise(self) -> float:
@@ -169,19 +154,12 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Pixels of an image that another image should show too.
+    """Pixels of an image that another image should show too."""
 
-    Attributes:
-        patch: int64 (N,), number of the patch of each.
-        before: float64 (N,), grey values in the last image.
-        now: float64 (N,), grey values where the motion takes them in this one.
-        slope: float64 (N, 2), gradient of ``before`` per pixel to the right and down.
-    """
-
-    patch: Int64
-    before: Float64
-    now: Float64
-    slope: Float64
+    patch: Int64  # (N,), number of the patch of each
+    before: Float64  # (N,), grey values in the last image
+    now: Float64  # (N,), grey values where the motion takes them in this one
+    slope: Float64  # (N, 2), gradient of ``before`` per pixel to the right and down
 
 
 def explain_motion(

@@ -25,21 +25,13 @@ MIN_DISPARITY_PX: Final = 0.5  # features with less disparity count as without d
 
 @dataclass(frozen=True, eq=False)
 class VisualState:
-    """What is kept from frame to frame.
+    """What is kept from frame to frame."""
 
-    Attributes:
-        window: The last frames that were registered, and the points in them.
-        left: uint8 (H, W), the left image of the newest of them.
-        disparity: Its disparity.
-        motion: Pose and motion by now, which may be some frames later.
-        seen_s: Time of the newest frame that was registered.
-    """
-
-    window: TrackWindow
-    left: UInt8
-    disparity: Disparity
-    motion: Motion
-    seen_s: float
+    window: TrackWindow  # the last frames that were registered, and the points in them
+    left: UInt8  # (H, W), the left image of the newest of them
+    disparity: Disparity  # its disparity
+    motion: Motion  # pose and motion by now, which may be some frames later
+    seen_s: float  # time of the newest frame that was registered
 
 
 def follow_points(state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:

@@ -114,17 +114,11 @@ _MOST_PERCENT: Final = 3.0
 
 @dataclass(frozen=True)
 class ExpectedDrift:
-    """Standard deviation of a position after a segment of the path, per cent of its length.
+    """Standard deviation of a position after a segment of the path, per cent of its length."""
 
-    Attributes:
-        percent: All of it.
-        rig_percent: The part that is due to the rig, common to the whole path: its length.
-        rests_on_m: Distance of the points on which the length rests.
-    """
-
-    percent: float
-    rig_percent: float
-    rests_on_m: float
+    percent: float  # all of it
+    rig_percent: float  # the part that is due to the rig, common to the whole path: its length
+    rests_on_m: float  # distance of the points on which the length rests
 
     @property
     def radius_share(self) -> float:

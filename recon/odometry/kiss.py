@@ -84,32 +84,20 @@ _MIN_MOTION_M: Final = 0.1  # smaller deviations from the motion model do not ch
 
 @dataclass(frozen=True)
 class KissIcpOptions:
-    """What users of kiss-icp choose.
+    """What users of kiss-icp choose."""
 
-    Attributes:
-        max_range_m: Points farther from the sensor are dropped, and the map is clipped there.
-        voxel_m: Voxel size of the map.
-        iterations: Maximum number of ICP iterations.
-        convergence: Step length below which ICP has converged.
-    """
-
-    max_range_m: float
-    voxel_m: float
-    iterations: int = 500
-    convergence: float = 1e-4
+    max_range_m: float  # points farther from the sensor are dropped, and the map is clipped there
+    voxel_m: float  # voxel size of the map
+    iterations: int = 500  # maximum number of ICP iterations
+    convergence: float = 1e-4  # step length below which ICP has converged
 
 
 @dataclass(frozen=True, eq=False)
 class IcpAlignment:
-    """Result of ICP for one frame.
+    """Result of ICP for one frame."""
 
-    Attributes:
-        T_world_camera: float64 (4, 4), the aligned pose.
-        source: float64 (N, 3), the points used for alignment, camera axes.
-    """
-
-    T_world_camera: Float64
-    source: Float64
+    T_world_camera: Float64  # (4, 4), the aligned pose
+    source: Float64  # (N, 3), the points used for alignment, camera axes
 
 
 class KissIcp:

@@ -69,15 +69,10 @@ def _agreement(
 
 @dataclass(frozen=True, eq=False)
 class LocatedCamera:
-    """The pose of a camera, from known points.
+    """The pose of a camera, from known points."""
 
-    Attributes:
-        T_world_camera: float64 (4, 4).
-        agree: bool (N,), True for the points that agree with it.
-    """
-
-    T_world_camera: Float64
-    agree: Bool
+    T_world_camera: Float64  # (4, 4)
+    agree: Bool  # (N,), True for the points that agree with it
 
 
 def find_consensus(
@@ -150,19 +145,13 @@ _LONGEST_GAP: Final = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The last pose, and how the camera moved to it.
+    """The last pose, and how the camera moved to it."""
 
-    Attributes:
-        T_world_camera: float64 (4, 4), the last pose.
-        T_before_camera: float64 (4, 4), the motion to it.
-        timestamp_s: Time of the last pose.
-        interval_s: Time that the motion took; 0 = not known.
-    """
-
-    T_world_camera: Float64
-    timestamp_s: float
+    T_world_camera: Float64  # (4, 4), the last pose
+    timestamp_s: float  # time of the last pose
+    # float64 (4, 4), the motion to it
     T_before_camera: Float64 = field(default_factory=lambda: np.eye(4))
-    interval_s: float = 0.0
+    interval_s: float = 0.0  # time that the motion took; 0 = not known
 
     def predict(self, timestamp_s: float) -> Float64:
         """The pose (4, 4) at a time: with constant velocity, where times are known."""

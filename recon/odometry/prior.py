@@ -25,15 +25,10 @@ each other: 0.1 % of right ones do, with six degrees of freedom."""
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """A path of the same rig on the same clock, of which only relative motions are used.
+    """A path of the same rig on the same clock, of which only relative motions are used."""
 
-    Attributes:
-        path: Poses at any rate and in any world frame.
-        settings: Axes, gaps, accuracy.
-    """
-
-    path: Trajectory
-    settings: PriorSettings
+    path: Trajectory  # poses at any rate and in any world frame
+    settings: PriorSettings  # axes, gaps, accuracy
 
     def __post_init__(self) -> None:
         if len(self.path) < 2:

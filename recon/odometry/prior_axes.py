@@ -30,17 +30,12 @@ _MOST_FRAMES: Final = 100  # frames looked at; matching them takes about ten sec
 
 @dataclass(frozen=True)
 class FoundAxes:
-    """The axes of a prior.
+    """The axes of a prior."""
 
-    Attributes:
-        axes: Those that explain the visual motion best.
-        sigmas: Median distance from the visual motion, standard deviations, for each set of axes.
-        motions: Number of motions compared.
-    """
-
-    axes: Axes
+    axes: Axes  # those that explain the visual motion best
+    # Median distance from the visual motion, standard deviations, for each set of axes
     sigmas: Mapping[str, float]
-    motions: int
+    motions: int  # number of motions compared
 
 
 def find_axes(

@@ -13,69 +13,48 @@ from recon.core.values.arrays import Float64, array_in, freeze
 
 @dataclass(frozen=True, eq=False)
 class OdometryFrame:
-    """What an odometry is given of one frame.
+    """What an odometry is given of one frame."""
 
-    Attributes:
-        pair: The rectified images.
-        disparity: Their disparity.
-        rough: Whether it is off by a quarter of a pixel or more: features are then measured in the
-            images themselves.
-    """
-
-    pair: RectifiedPair
-    disparity: Disparity
+    pair: RectifiedPair  # the rectified images
+    disparity: Disparity  # their disparity
+    # Whether it is off by a quarter of a pixel or more: features are then measured in the images
+    # themselves
     rough: bool = False
 
 
 @dataclass(frozen=True)
 class OdometryHealth:
-    """How far the pose of one frame can be trusted. NaN = does not apply or not measured.
+    """How far the pose of one frame can be trusted. NaN = does not apply or not measured."""
 
-    Attributes:
-        ok: False where the pose is not to be trusted: it is extrapolated, or the image
-            contradicts it.
-        skipped: True where later poses are measured past this one, from those before it. After
-            any other pose that is not ok, nothing says where the later ones are.
-        known: True where the pose was given, not measured: nothing later bends it.
-        tracks: Features followed from the last frame.
-        inliers: Features that agree with the visual motion.
-        reprojection_px: Their median reprojection error.
-        sigma_m: Standard deviation of the visual translation, given the frames before: from how
-            well features fit, and how far their disparities may be off.
-        sigma_deg: That of the rotation.
-        scale_px: Disparity on which the length of the motion rests: the mean over the features,
-            each weighted by its information. If all disparities are off by 1 % of it, so is the
-            length of the motion.
-        icp_points: Points given to ICP.
-        notes: Why something was refused or went wrong, for the log.
-        warnings: Problems of the frame that the user should know, even if it has a pose.
-    """
-
+    # False where the pose is not to be trusted: it is extrapolated, or the image contradicts it
     ok: bool = True
+    # True where later poses are measured past this one, from those before it. After any other pose
+    # that is not ok, nothing says where the later ones are.
     skipped: bool = False
-    known: bool = False
-    tracks: int = 0
-    inliers: int = 0
-    reprojection_px: float = float("nan")
+    known: bool = False  # True where the pose was given, not measured: nothing later bends it
+    tracks: int = 0  # features followed from the last frame
+    inliers: int = 0  # features that agree with the visual motion
+    reprojection_px: float = float("nan")  # their median reprojection error
+    # Standard deviation of the visual translation, given the frames before: from how well features
+    # fit, and how far their disparities may be off
     sigma_m: float = float("nan")
-    sigma_deg: float = float("nan")
+    sigma_deg: float = float("nan")  # that of the rotation
+    # Disparity on which the length of the motion rests: the mean over the features, each weighted
+    # by its information. If all disparities are off by 1 % of it, so is the length of the motion.
     scale_px: float = float("nan")
-    icp_points: int = 0
+    icp_points: int = 0  # points given to ICP
+    # Why something was refused or went wrong, for the log
     notes: tuple[str, ...] = field(default=())
+    # Problems of the frame that the user should know, even if it has a pose
     warnings: tuple[str, ...] = field(default=())
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryResult:
-    """Where the left camera was when the frame was taken.
+    """Where the left camera was when the frame was taken."""
 
-    Attributes:
-        T_world_camera: float64 (4, 4); the first frame is the identity.
-        health: How far it can be trusted.
-    """
-
-    T_world_camera: Float64
-    health: OdometryHealth
+    T_world_camera: Float64  # (4, 4); the first frame is the identity
+    health: OdometryHealth  # how far it can be trusted
 
     def __post_init__(self) -> None:
         freeze(self, "T_world_camera", np.float64, (4, 4))

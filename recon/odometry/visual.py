@@ -45,16 +45,12 @@ _RELOCATE_FEATURES: Final = 2000  # features matched over the whole image where 
 
 @dataclass(frozen=True, eq=False)
 class VisualEstimate:
-    """A pose and its uncertainty.
+    """A pose and its uncertainty."""
 
-    Attributes:
-        result: Pose and health.
-        information: float64 (6, 6) of a step (translation in metres, rotation vector in
-            radians) in camera axes: of the tracks if they are as uncertain as assumed, or of the
-            prior where there are none; None where the pose is extrapolated.
-    """
-
-    result: OdometryResult
+    result: OdometryResult  # pose and health
+    # float64 (6, 6) of a step (translation in metres, rotation vector in radians) in camera axes:
+    # of the tracks if they are as uncertain as assumed, or of the prior where there are none; None
+    # where the pose is extrapolated
     information: Float64 | None
 
 

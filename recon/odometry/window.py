@@ -41,18 +41,13 @@ _MAX_SIGMAS: Final = 3.0  # residual above which an observation ends its track
 
 @dataclass(frozen=True, eq=False)
 class TrackWindow:
-    """W frames and N tracked points.
+    """W frames and N tracked points."""
 
-    Attributes:
-        T_world_camera: float64 (W, 4, 4), poses, oldest first.
-        uvd: float64 (W, N, 3), column, row and disparity of each point in each frame; all NaN
-            = not seen, NaN disparity = seen, but not matched.
-        xyz_world: float64 (N, 3), the points.
-    """
-
-    T_world_camera: Float64
+    T_world_camera: Float64  # (W, 4, 4), poses, oldest first
+    # float64 (W, N, 3), column, row and disparity of each point in each frame; all NaN = not seen,
+    # NaN disparity = seen, but not matched
     uvd: Float64
-    xyz_world: Float64
+    xyz_world: Float64  # (N, 3), the points
 
     def __post_init__(self) -> None:
         poses, points = len(self.T_world_camera), len(self.xyz_world)

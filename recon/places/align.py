@@ -26,17 +26,11 @@ _SHARED: Final = 0.5  # both directions see the same matches, so together they c
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Matched points as one frame sees them.
+    """Matched points as one frame sees them."""
 
-    Attributes:
-        uvd: float64 (N, 3), column, row, disparity.
-        xyz: float64 (N, 3), the same points in camera axes.
-        camera: That of the frame.
-    """
-
-    uvd: Float64
-    xyz: Float64
-    camera: RectifiedCamera
+    uvd: Float64  # (N, 3), column, row, disparity
+    xyz: Float64  # (N, 3), the same points in camera axes
+    camera: RectifiedCamera  # that of the frame
 
     def select(self, rows: NDArray[np.bool_]) -> Seen:
         """Return some of the points."""
@@ -45,17 +39,12 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A motion between two frames.
+    """A motion between two frames."""
 
-    Attributes:
-        T_first_last: float64 (4, 4).
-        agree: bool (N,), matches that agree with it in both views.
-        information: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
-            in the axes of the last frame.
-    """
-
-    T_first_last: Float64
-    agree: Bool
+    T_first_last: Float64  # (4, 4)
+    agree: Bool  # (N,), matches that agree with it in both views
+    # float64 (6, 6) of a step (translation in metres, rotation vector in radians) in the axes of
+    # the last frame
     information: Float64
 
 

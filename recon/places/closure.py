@@ -46,17 +46,11 @@ _HELD_ROUNDS: Final = 2
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """A path after loop closure.
+    """A path after loop closure."""
 
-    Attributes:
-        trajectory: The corrected path; the same object where no loop is closed.
-        closed: The loops that are closed.
-        refused: The loops that the rest of the graph contradicts.
-    """
-
-    trajectory: Trajectory
-    closed: tuple[Loop, ...]
-    refused: tuple[Loop, ...]
+    trajectory: Trajectory  # the corrected path; the same object where no loop is closed
+    closed: tuple[Loop, ...]  # the loops that are closed
+    refused: tuple[Loop, ...]  # the loops that the rest of the graph contradicts
 
     def correction(self, odometry: Trajectory, frame: int) -> Float64:
         """Return ``T_corrected_world`` (4, 4) for what was mapped at a frame by odometry."""
@@ -66,42 +60,28 @@ class Closure:
 
 @dataclass(frozen=True, eq=False)
 class DrivePath:
-    """The path of a drive in the graph.
+    """The path of a drive in the graph."""
 
-    Attributes:
-        trajectory: By odometry; about where it lies beside the other drives.
-        path_m: float64 (N,), path up to each frame, by `path_lengths`; 0 everywhere where poses are
-            known, which moves the drive as one rigid thing.
-    """
-
-    trajectory: Trajectory
+    trajectory: Trajectory  # by odometry; about where it lies beside the other drives
+    # float64 (N,), path up to each frame, by `path_lengths`; 0 everywhere where poses are known,
+    # which moves the drive as one rigid thing
     path_m: Float64
 
 
 @dataclass(frozen=True, eq=False)
 class Tie:
-    """A place that two drives saw, or one drive twice.
+    """A place that two drives saw, or one drive twice."""
 
-    Attributes:
-        drives: Numbers of the drives of the loop's first and last frame.
-        loop: The motion between the two frames, each counted in its own drive.
-    """
-
-    drives: tuple[int, int]
-    loop: Loop
+    drives: tuple[int, int]  # numbers of the drives of the loop's first and last frame
+    loop: Loop  # the motion between the two frames, each counted in its own drive
 
 
 @dataclass(frozen=True, eq=False)
 class JoinedDrives:
-    """Paths after all drives were joined by their ties.
+    """Paths after all drives were joined by their ties."""
 
-    Attributes:
-        trajectories: One for each drive, in the world of the first.
-        kept: bool (T,), ties that the rest of the graph does not contradict.
-    """
-
-    trajectories: tuple[Trajectory, ...]
-    kept: Bool
+    trajectories: tuple[Trajectory, ...]  # one for each drive, in the world of the first
+    kept: Bool  # (T,), ties that the rest of the graph does not contradict
 
 
 def close_loops(trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop]) -> Closure:

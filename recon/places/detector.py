@@ -38,21 +38,13 @@ _MIN_LIKENESS: Final = 0.3
 
 @dataclass(frozen=True, eq=False)
 class StoredKeyframe:
-    """A keyframe with its pose and the result of its search for loops.
+    """A keyframe with its pose and the result of its search for loops."""
 
-    Attributes:
-        keyframe: Features and coarse disparities.
-        T_world_camera: float64 (4, 4), by odometry.
-        path_m: Path up to it, by `path_lengths`.
-        loops: Verified loops that end in it.
-        refused: Why other candidates were refused.
-    """
-
-    keyframe: Keyframe
-    T_world_camera: Float64
-    path_m: float
-    loops: tuple[Loop, ...] = ()
-    refused: tuple[str, ...] = ()
+    keyframe: Keyframe  # features and coarse disparities
+    T_world_camera: Float64  # (4, 4), by odometry
+    path_m: float  # path up to it, by `path_lengths`
+    loops: tuple[Loop, ...] = ()  # verified loops that end in it
+    refused: tuple[str, ...] = ()  # why other candidates were refused
 
 
 @runtime_checkable
@@ -175,19 +167,12 @@ _TURN_M: Final = 4.0  # two views in opposite directions count as twice this far
 
 @dataclass(frozen=True, eq=False)
 class KnownView:
-    """A keyframe of a map.
+    """A keyframe of a map."""
 
-    Attributes:
-        keyframe: What it shows.
-        camera: The rectified camera that took it.
-        T_world_camera: float64 (4, 4), in the world of the map.
-        session: Number of its drive.
-    """
-
-    keyframe: Keyframe
-    camera: RectifiedCamera
-    T_world_camera: Float64
-    session: int = 0
+    keyframe: Keyframe  # what it shows
+    camera: RectifiedCamera  # the rectified camera that took it
+    T_world_camera: Float64  # (4, 4), in the world of the map
+    session: int = 0  # number of its drive
 
     def __post_init__(self) -> None:
         freeze(self, "T_world_camera", np.float64, (4, 4))
@@ -195,16 +180,12 @@ class KnownView:
 
 @dataclass(frozen=True)
 class Recognised:
-    """What a search for a place gives.
+    """What a search for a place gives."""
 
-    Attributes:
-        loops: One for each place that is verified, most similar first; several are alike. ``first``
-            is the number of the view, ``last`` the frame that was looked for.
-        refused: Why other candidates were refused.
-    """
-
+    # One for each place that is verified, most similar first; several are alike. ``first`` is the
+    # number of the view, ``last`` the frame that was looked for.
     loops: tuple[Loop, ...]
-    refused: tuple[str, ...]
+    refused: tuple[str, ...]  # why other candidates were refused
 
 
 class KnownPlaces:

@@ -20,19 +20,13 @@ _NO_TURN: Final = 1e-9  # information of a rotation that was not measured; the o
 
 @dataclass(frozen=True, eq=False)
 class Fixes:
-    """Where something on a vehicle was measured during a drive.
+    """Where something on a vehicle was measured during a drive."""
 
-    Attributes:
-        frames: int32 (N,), the frame nearest to each measurement.
-        offset_m: float64 (N, 3), where it was then, from the camera of that frame, in its axes.
-        position_m: float64 (N, 3), where it was measured, in the coordinates of a survey.
-        sigma_m: Standard deviation of a measured coordinate.
-    """
-
-    frames: Int32
+    frames: Int32  # int32 (N,), the frame nearest to each measurement
+    # float64 (N, 3), where it was then, from the camera of that frame, in its axes
     offset_m: Float64
-    position_m: Float64
-    sigma_m: float
+    position_m: Float64  # (N, 3), where it was measured, in the coordinates of a survey
+    sigma_m: float  # standard deviation of a measured coordinate
 
     def __post_init__(self) -> None:
         count = len(self.frames)
@@ -64,15 +58,10 @@ NO_FIXES: Final = Fixes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """What holds drives at measured positions.
+    """What holds drives at measured positions."""
 
-    Attributes:
-        T_world_survey: float64 (4, 4), about where the coordinates of the survey are.
-        fixes: Those of each drive, of which some may be empty.
-    """
-
-    T_world_survey: Float64
-    fixes: Sequence[Fixes]
+    T_world_survey: Float64  # (4, 4), about where the coordinates of the survey are
+    fixes: Sequence[Fixes]  # those of each drive, of which some may be empty
 
     def edges(
         self, drives: Sequence[Trajectory], nodes: Sequence[NDArray[np.intp]], T_world_node: Float64
@@ -104,22 +93,15 @@ def _placed(T: Float64, offset_m: Float64) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class PoseEdge:
-    """Relative pose constraint between two nodes.
+    """Relative pose constraint between two nodes."""
 
-    Attributes:
-        first: Index of one node.
-        last: Index of the other node.
-        T_first_last: float64 (4, 4).
-        information: float64 (6, 6), information matrix of a step (translation in metres, rotation
-            vector in radians).
-        doubtful: Whether the edge may be an outlier, which the optimiser may switch off.
-    """
-
-    first: int
-    last: int
-    T_first_last: Float64
+    first: int  # index of one node
+    last: int  # index of the other node
+    T_first_last: Float64  # (4, 4)
+    # float64 (6, 6), information matrix of a step (translation in metres, rotation vector in
+    # radians)
     information: Float64
-    doubtful: bool = False
+    doubtful: bool = False  # whether the edge may be an outlier, which the optimiser may switch off
 
     def __post_init__(self) -> None:
         freeze(self, "T_first_last", np.float64, (4, 4))

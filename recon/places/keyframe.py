@@ -42,19 +42,13 @@ _BITS: Final = 20  # bits of a descriptor per word
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """What is kept of a frame to recognise its place.
+    """What is kept of a frame to recognise its place."""
 
-    Attributes:
-        frame: Number of the frame in the drive.
-        uvd: float32 (N, 3), column, row and disparity of each feature; disparity NaN = unknown.
-        descriptors: uint8 (N, 32), ORB.
-        coarse: float32 (h, w), every n-th disparity of the image; NaN = unknown.
-    """
-
-    frame: int
+    frame: int  # number of the frame in the drive
+    # float32 (N, 3), column, row and disparity of each feature; disparity NaN = unknown
     uvd: Float32
-    descriptors: UInt8
-    coarse: Float32
+    descriptors: UInt8  # (N, 32), ORB
+    coarse: Float32  # (h, w), every n-th disparity of the image; NaN = unknown
 
     def __post_init__(self) -> None:
         freeze(self, "uvd", np.float32, (None, 3))

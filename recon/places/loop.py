@@ -15,26 +15,17 @@ from recon.places.places import Drift, drift_over, is_possible
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Two frames that show the same place, and the motion between them.
+    """Two frames that show the same place, and the motion between them."""
 
-    Attributes:
-        first: Number of the earlier frame.
-        last: Number of the later frame.
-        T_first_last: float64 (4, 4).
-        information: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
-            in the axes of the later frame.
-        inliers: Matches that agree in both frames.
-        dense_share: Share of the coarse disparities that agree.
-        same_frame: Whether the two are one frame, in two recordings that overlap.
-    """
-
-    first: int
-    last: int
-    T_first_last: Float64
+    first: int  # number of the earlier frame
+    last: int  # number of the later frame
+    T_first_last: Float64  # (4, 4)
+    # float64 (6, 6) of a step (translation in metres, rotation vector in radians) in the axes of
+    # the later frame
     information: Float64
-    inliers: int
-    dense_share: float
-    same_frame: bool = False
+    inliers: int  # matches that agree in both frames
+    dense_share: float  # share of the coarse disparities that agree
+    same_frame: bool = False  # whether the two are one frame, in two recordings that overlap
 
     def __post_init__(self) -> None:
         freeze(self, "T_first_last", np.float64, (4, 4))

@@ -28,19 +28,12 @@ _APART_M: Final = 4.0  # least distance between two candidates
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """What is kept in memory of a keyframe.
+    """What is kept in memory of a keyframe."""
 
-    Attributes:
-        frame: Its frame.
-        T_world_camera: float64 (4, 4), by odometry.
-        path_m: Path up to it, by `path_lengths`.
-        words: uint32 (W,), sorted, each once.
-    """
-
-    frame: int
-    T_world_camera: Float64
-    path_m: float
-    words: NDArray[np.uint32]
+    frame: int  # its frame
+    T_world_camera: Float64  # (4, 4), by odometry
+    path_m: float  # path up to it, by `path_lengths`
+    words: NDArray[np.uint32]  # uint32 (W,), sorted, each once
 
 
 class Places:
@@ -109,19 +102,12 @@ def most_alike(likeness: Float64, worth: NDArray[np.intp], stands_m: Float64) ->
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """The sorted words of consecutive images, with the image of each.
+    """The sorted words of consecutive images, with the image of each."""
 
-    Attributes:
-        first: Number of the first image.
-        count: Number of images.
-        words: uint32 (W,), sorted.
-        owners: uint16 (W,), image of each word, counted from the first.
-    """
-
-    first: int
-    count: int
-    words: NDArray[np.uint32]
-    owners: NDArray[np.uint16]
+    first: int  # number of the first image
+    count: int  # number of images
+    words: NDArray[np.uint32]  # uint32 (W,), sorted
+    owners: NDArray[np.uint16]  # uint16 (W,), image of each word, counted from the first
 
     def followed_by(self, other: _Run) -> _Run:
         """Return two runs as one."""
@@ -182,15 +168,10 @@ TURN_DEG: Final = 0.15
 
 @dataclass(frozen=True)
 class Drift:
-    """Standard deviations of a motion by odometry.
+    """Standard deviations of a motion by odometry."""
 
-    Attributes:
-        position_m: Of its translation.
-        angle_rad: Of its rotation.
-    """
-
-    position_m: float
-    angle_rad: float
+    position_m: float  # of its translation
+    angle_rad: float  # of its rotation
 
     @property
     def covariance(self) -> Float64:
@@ -247,21 +228,13 @@ _SHORTEST_M: Final = 0.1  # path below which nothing is a share of it
 
 @dataclass(frozen=True)
 class PathFit:
-    """How positions fit a path.
+    """How positions fit a path."""
 
-    Attributes:
-        rms_m: How far they are apart after a rigid fit, root mean square.
-        scaled_m: The same after a fit that also scales the path.
-        scale: How many times as far from one another as those of the path the positions are.
-        most_m: Largest distance that drift and noise explain.
-        most_stretch: Largest difference of the scale from 1 that they explain.
-    """
-
-    rms_m: float
-    scaled_m: float
-    scale: float
-    most_m: float
-    most_stretch: float
+    rms_m: float  # how far they are apart after a rigid fit, root mean square
+    scaled_m: float  # the same after a fit that also scales the path
+    scale: float  # how many times as far from one another as those of the path the positions are
+    most_m: float  # largest distance that drift and noise explain
+    most_stretch: float  # largest difference of the scale from 1 that they explain
 
     @property
     def stretched(self) -> bool:

@@ -35,15 +35,10 @@ _MIN_DENSE_POINTS: Final = 50  # least number of dense points that both frames s
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The result of a verification.
+    """The result of a verification."""
 
-    Attributes:
-        loop: The loop; None = refused.
-        refused: Why; "" where there is a loop.
-    """
-
-    loop: Loop | None
-    refused: str = ""
+    loop: Loop | None  # the loop; None = refused
+    refused: str = ""  # why; "" where there is a loop
 
 
 def verify(
