@@ -79,11 +79,6 @@ def refuse_links(folder: Path, *, below: Path | None = None) -> None:
 class RunDirectory:
     """Context manager: files are written to `path` and appear in `folder` on success.
 
-    Args:
-        folder: Result folder; created if missing.
-        latest: Keep a link ``latest`` beside the folder (for the default folders).
-        resume: Resume the unfinished run in the folder.
-
     Attributes:
         begun: Whether there is a map from which the run can be resumed; who begins one says so.
         whole: Write beside the folder, and put the new one in its place in one step.
@@ -151,12 +146,9 @@ class RunDirectory:
         except OSError as failure:
             raise _unwritable(self.folder, failure) from failure
         finally:
-            self._release()
-
-    def _release(self) -> None:
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+            if self._lock is not None:
+                os.close(self._lock)
+                self._lock = None
 
     def _clear(self) -> None:
         """Remove partial files of an earlier run; a resumed run keeps its state."""
@@ -166,12 +158,8 @@ class RunDirectory:
             shutil.rmtree(self._content, ignore_errors=True)
         kept = {_LOCK, _STATE} if self.resumes else {_LOCK}
         for path in self._partial.iterdir():
-            if path.name in kept:
-                continue
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+            if path.name not in kept:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def check_targets(self, inputs: Iterable[Path]) -> None:
         """Refuse to replace or remove what this run has read, or what is no regular file."""

@@ -28,11 +28,7 @@ DOUBTS: Final = "doubts"
 
 
 def command_of_map(folder: Path) -> str:
-    """Return the command that mapped the drive of a finished run, such as ``demo``.
-
-    Raises:
-        FormatError: The folder has no finished run, or one that made no map.
-    """
+    """Return the command that mapped the drive of a finished run, such as ``demo``."""
     record = _record_of_map(folder)
     command = record.get(MAPPED_BY, record.get("command"))
     if not isinstance(command, str):
@@ -41,11 +37,7 @@ def command_of_map(folder: Path) -> str:
 
 
 def made_from(folder: Path) -> tuple[Float64, list[str]]:
-    """Return axes and doubts of the map that a run without a map of its own was made from.
-
-    Returns:
-        ``T_map_world``, float64 (4, 4), and what was doubted in the map.
-    """
+    """Return ``T_map_world`` and doubts of the map that a run without a map was made from."""
     path, record = folder / RECORD, _record_of_map(folder)
     with reading(path):
         T_map_world = np.array(record["T_map_world"], dtype=np.float64)

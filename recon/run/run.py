@@ -42,13 +42,7 @@ class Run(RunDirectory):
                 write_pair_page(result, run)
             run.finish(summary, source="im0.png", inputs=files)
 
-    Args:
-        command: Its name, for the record and the default folder.
-        out: The result folder; None = a new one below ``outputs/<command>/``.
-        config: The configuration; None = the command has none.
-        threads: Threads to use; None = all cores. `threads` is their number.
-        progress: Shown how far the run is.
-        resume: Resume the unfinished run in the folder.
+    ``out`` None is a new folder below ``outputs/<command>/``, ``threads`` None all cores.
     """
 
     def __init__(

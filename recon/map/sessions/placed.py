@@ -41,10 +41,9 @@ _SHARE: Final = 4
 
 @dataclass(frozen=True, eq=False)
 class PlacedMap:
-    """The drives of a map that share its axes.
+    """What the drives of a map that share its axes observed, in tiles.
 
     Attributes:
-        tiles: What they observed.
         path_m: float64 (N, 3), positions of the camera, map axes; a row of NaN between two drives.
         trusted: bool (N,), which of them are to be trusted, and have a place in the map.
     """
