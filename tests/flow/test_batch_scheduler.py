@@ -18,9 +18,10 @@ from recon.street.settings import StreetSettings
 from tests.flow.test_batch import below, wait_until
 from tests.flow.test_killed_runs import content
 from tests.scenery.kitti import write_kitti
+from tests.scenery.patience import LONG_S
 
 psutil = pytest.importorskip("psutil")
-pytest.importorskip("distributed")
+distributed = pytest.importorskip("distributed")
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
@@ -46,6 +47,8 @@ def cluster(folder: Path, small: Path | None = None) -> Iterator[list[subprocess
         line = [*dask, "worker", *worker]
         first = line if small is None else in_small_disk(line, small)
         started += [subprocess.Popen(command, **QUIET) for command in (first, line)]
+        with distributed.Client(scheduler_file=str(place)) as client:
+            client.wait_for_workers(2, timeout=LONG_S)  # else one may get all jobs
         yield started
     finally:
         for process in reversed(started):
