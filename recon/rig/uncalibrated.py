@@ -161,7 +161,6 @@ def _turned(features: PairFeatures, size: Size, focal_widths: float) -> Homograp
 
 
 def _fit(features: PairFeatures, size: Size, min_features: int) -> Homographies:
-    """Return rectifying homographies of any two pinhole cameras."""
     F, agreeing = find_fundamental(features, _INLIER_PX)
     if F is None or agreeing.sum() < min_features:
         raise CalibrationError(

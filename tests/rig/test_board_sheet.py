@@ -120,9 +120,9 @@ def test_squares_as_large_as_the_error_allows_do_fit() -> None:
         (CHESS, "b.pdf", {"paper": "a9"}, SettingsError, "unknown paper .*a4.*600x400mm"),
         (CHESS, "b.pdf", {"paper": "10x10mm"}, SettingsError, "too small for any board"),
         (
-            "chess:9x6:90mm", "b.png", {"dpi": 2400}, SettingsError, "too large .*a smaller --dpi",
+            "chess:9x6:90mm", "b.png", {"dpi": 2400}, SettingsError, "too large .*a smaller --dpi"
         ),
-        ("charuco:30x20:5mm:4mm:4x4_50", "b.pdf", {}, SettingsError, "too few markers"),
+        ("charuco:30x20:5mm:4mm:4x4_50", "b.pdf", {}, SettingsError, "too few markers")
     ],
 )  # fmt: skip
 def test_what_cannot_be_drawn_is_one_clear_line_and_no_file(

@@ -203,7 +203,6 @@ def _rows_off(alignment: RowAlignment) -> bool:
 
 
 def _turned(rig: Rig, turn: Float64, config: AuditedSettings) -> StereoCalibration:
-    """Return a calibration after a turn of its rectified right camera."""
     left = np.eye(3)
     if isinstance(rig, StereoCalibration):
         left = plan_turns(rig, config.rectification).R_left
@@ -223,7 +222,6 @@ def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None
 def _figures(
     source: StereoSource, sample: Sample, geometry: Geometry, gaps: Gaps, camera: RectifiedCamera
 ) -> dict[str, Any]:
-    """All measures of the audit; None if unknown."""
     sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
     gains = np.concatenate([np.zeros(0), *sample.gains])
     return {
@@ -320,7 +318,6 @@ def check_found(
 
 
 def _reasons(disparity: Disparity) -> str:
-    """Return the two most common reasons for having no disparity."""
     shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
     most = list(shares.items())[:2]
     return ", ".join(f"{share:.0f} % {r.name.lower().replace('_', ' ')}" for r, share in most)

@@ -165,7 +165,6 @@ def find_geometry_faults(geometry: Geometry, source: StereoSource) -> Iterator[F
 
 
 def _in_step(source: StereoSource, lag: int) -> str:
-    """Return how the images of two cameras come to belong together."""
     shift = source.shift_of(lag)
     if shift is None:
         return "pair the images by timestamp"

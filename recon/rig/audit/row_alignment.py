@@ -140,7 +140,6 @@ def _linear(
 
 
 def _solve(basis: Float64, rows: Float64) -> Float64:
-    """Return float64 (2,): least-squares pitch and roll."""
     return np.asarray(np.linalg.lstsq(basis, rows, rcond=None)[0], dtype=np.float64)
 
 

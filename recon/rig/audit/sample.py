@@ -181,7 +181,6 @@ class _Sampler:
                 self._measure(waiting.pop(0))
 
     def _measure(self, centre: int) -> None:
-        """Measure one pair, alone and against its neighbours."""
         pair, sample = self._recent[centre], self.sample
         sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
         sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
@@ -205,7 +204,6 @@ class _Sampler:
         self._measure_motion(centre, features)
 
     def _compare_lags(self, centre: int, features: PairFeatures) -> None:
-        """Match the left image with the right images before and after it."""
         ends = (min(self._recent), max(self._recent))
         span = min(self._lag, *(abs(end - centre) for end in ends))
         pair, sample = self._recent[centre], self.sample
@@ -219,7 +217,6 @@ class _Sampler:
             sample.lagged.setdefault(lag, []).append(_Lagged(found, flow, agreeing))
 
     def _measure_motion(self, centre: int, features: PairFeatures) -> None:
-        """Measure speed and row flow against the left image of the next frame."""
         flow, there = self._follow(centre, features)
         self.sample.flows.append(flow)
         found, later = np.isfinite(flow), self._recent.get(centre + 1)

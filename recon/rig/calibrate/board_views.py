@@ -175,14 +175,12 @@ def pick_views(
 def _frames(
     videos: Sequence[VideoFile], numbers: Sequence[int], settings: SourceSettings
 ) -> Iterator[tuple[UInt8, UInt8]]:
-    """Yield both views of frames of increasing numbers."""
     for images in zip(*(video.pick(list(numbers)) for video in videos), strict=True):
         views = [image for _, image in images]
         yield split_views(views[0], settings) if len(views) == 1 else (views[0], views[1])
 
 
 def _shrunk(both: tuple[UInt8, UInt8]) -> Float32:
-    """Return float32 (H, W), both views side by side, small."""
     height, width = both[0].shape[:2]
     size = (_SMALL_PX, max(1, round(_SMALL_PX * height / width)))
     small = [cv2.resize(to_grey(view), size, interpolation=cv2.INTER_AREA) for view in both]

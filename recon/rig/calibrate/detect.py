@@ -215,7 +215,6 @@ def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
 
 
 def _probe_size(grey: UInt8) -> Inner | None:
-    """Return inner columns and rows of any chessboard in an image, or None."""
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(
         grey, (3, 3), cv2.CALIB_CB_LARGER | _SLOW_FLAGS
     )
@@ -348,7 +347,6 @@ def _find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]
 
 
 def _find_markers(grey: UInt8, dictionary: str) -> Int32:
-    """Return int32 (N,), ids of the markers of a dictionary found in an image."""
     numbers = cv2.aruco.ArucoDetector(_dictionary(dictionary)).detectMarkers(grey)[1]
     return np.zeros(0, np.int32) if numbers is None else np.asarray(numbers, np.int32).ravel()
 
@@ -362,7 +360,6 @@ def _marker_votes(images: Sequence[UInt8]) -> tuple[str, Counter[str]]:
 
 
 def _dictionaries() -> list[str]:
-    """Return names of OpenCV's marker dictionaries, in upper case, without ``DICT_``."""
     return sorted({n[len(_PREFIX) :].upper() for n in dir(cv2.aruco) if n.startswith(_PREFIX)})
 
 

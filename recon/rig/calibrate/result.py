@@ -73,7 +73,6 @@ def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) ->
 
 
 def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
-    """Return float64 (N,), row of each corner in the rectified left image minus the right."""
     left_px, right_px = shared_pixels(view)
     left = turns.place(fit.calibration, left_px)
     right = turns.place(fit.calibration, right_px, right=True)
@@ -83,7 +82,6 @@ def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
 def _summarise(
     seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
 ) -> dict[str, Any]:
-    """Return the figures of ``summary.json``, without time and memory of the run."""
     rig, tilts_deg, away_m = fit.calibration, _tilt_deg(fit), _distances_m(fit)
     return {
         "board": str(seen.board),

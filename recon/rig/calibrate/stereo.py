@@ -127,7 +127,6 @@ def _group_views(views: Sequence[View]) -> list[list[View]]:
 
 
 def _moved(first: View, second: View) -> float:
-    """Return how far corners moved between two views, relative to the board; the larger."""
     return max(_shift(*both) for both in zip(first.seen, second.seen, strict=True))
 
 
@@ -244,7 +243,6 @@ def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigS
 
 
 def _locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
-    """Return float64 (4, 4), T_camera_board of one sighting."""
     rays = rays_of(camera, seen.pixels)
     known = np.isfinite(rays).all(axis=1)
     try:
@@ -280,6 +278,5 @@ def _solve_robustly(views: Sequence[View], start: RigState) -> RigState:
 
 
 def _view_errors(views: Sequence[View], state: RigState) -> Float64:
-    """Return float64 (V,), rms reprojection error of each view, pixels."""
     sums, counts = squared_errors(views, state)
     return np.asarray(np.sqrt(sums.sum(axis=1) / counts.sum(axis=1)))

@@ -107,7 +107,6 @@ def _finding(
 def _find_depth_faults(
     board: CalibrationBoard, summary: dict[str, Any]
 ) -> Iterator[CalibrationFinding]:
-    """Yield what the calibration does to depth at the working distance."""
     expected = summary["working_error"]
     distance_m, share = expected["distance_m"], expected["calibration_share"]
     own = {"at": _length(distance_m, board)}
@@ -119,7 +118,6 @@ def _find_depth_faults(
 
 
 def _doubts(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
-    """Yield reasons for which depth may be worse than expected."""
     if summary["views_used"] < _FEW_VIEWS:
         yield "views", {"views": counted(summary["views_used"], "different view")}
     for side in ("left", "right"):
@@ -153,7 +151,6 @@ def _left_out(board: CalibrationBoard, images: ImagePairs, summary: dict[str, An
 
 
 def _lacks(summary: dict[str, Any]) -> Found:
-    """Yield what the views lack for a better calibration."""
     side, share = min((summary[f"coverage_{side}"], side) for side in ("left", "right"))[::-1]
     if _SMALL_COVERAGE <= share < _COVERED:
         yield "corners", {"percent": 100 * share, "side": side}

@@ -11,12 +11,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
-from recon.core.values import (
-    CameraIntrinsics,
-    RectifiedCamera,
-    StereoCalibration,
-    StereoPair,
-)
+from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64
 from recon.sources.source import StereoSource
 
@@ -156,6 +151,11 @@ def blur(right: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.GaussianBlur(right, (0, 0), 2.0))
 
 
+def tenfold_baseline(source: StereoSource) -> Spoiled:
+    same, camera = changed(source, lambda left, right: (left, right)), rectified(source)
+    return replace(same, camera=replace(camera, baseline_m=10 * camera.baseline_m))
+
+
 FAULTS: dict[str, tuple[str, Callable[[StereoSource], Spoiled]]] = {
     "swapped": ("swapped", lambda s: changed(s, lambda left, right: (right, left))),
     "lag of three frames": ("lag", lambda s: lag(s, 3)),
@@ -163,22 +163,10 @@ FAULTS: dict[str, tuple[str, Callable[[StereoSource], Spoiled]]] = {
     "roll of 1 degree": ("rows", lambda s: turned(s, roll_deg=1.0)),
     "gain of 1.4": ("gain", lambda s: gain(s, 1.4)),
     "duplicated frames": ("duplicates", duplicated),
-    "baseline times ten": (
-        "baseline",
-        lambda s: replace(
-            changed(s, lambda left, right: (left, right)),
-            camera=replace(rectified(s), baseline_m=10 * rectified(s).baseline_m),
-        ),
-    ),
+    "baseline times ten": ("baseline", tenfold_baseline),
     "right camera blurred": ("blur", lambda s: changed(s, lambda left, right: (left, blur(right)))),
-    "both cameras blurred": (
-        "blur",
-        lambda s: changed(s, lambda left, right: (blur(left), blur(right))),
-    ),
-    "right camera black": (
-        "black",
-        lambda s: changed(s, lambda left, right: (left, np.zeros_like(right))),
-    ),
+    "both cameras blurred": ("blur", lambda s: changed(s, lambda *both: tuple(map(blur, both)))),
+    "right camera black": ("black", lambda s: changed(s, lambda left, right: (left, 0 * right))),
     "wrong size": ("size", wrong_size),
     "wrong size untold": ("size", silently_wrong_size),
 }

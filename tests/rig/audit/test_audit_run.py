@@ -121,11 +121,7 @@ def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street: faults.Spoile
     ("yaw_deg", "enlarged", "pitch_deg"), [(0.25, 1.0, 0.0), (-0.25, 1.005, 0.0), (0.25, 1.0, 0.3)]
 )
 def test_a_turn_that_only_motion_shows_is_mended(
-    longer_street: faults.Spoiled,
-    tmp_path: Path,
-    yaw_deg: float,
-    enlarged: float,
-    pitch_deg: float,
+    longer_street: faults.Spoiled, tmp_path: Path, yaw_deg: float, enlarged: float, pitch_deg: float
 ) -> None:
     spoiled = faults.turned(longer_street, pitch_deg, yaw_deg=yaw_deg, enlarged=enlarged)
     before = audit_source(spoiled, CONFIG)

@@ -27,7 +27,7 @@ SIZE = (640, 480)
 
 def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_path: Path) -> None:
     rig, views = make_views(count=12)
-    settings = CalibrationSettings(bootstrap=60, depths_m=(2.0, 500.0), radial_terms=2)
+    settings = CalibrationSettings(radial_terms=2)
     fit = calibrate_stereo(views, SIZE, settings)
     seen = BoardViews(tuple(views), {}, (), SIZE, 14, parse_board("chess:9x6:25mm"))
     spread = measure_spread(fit, settings)
