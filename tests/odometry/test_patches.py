@@ -10,8 +10,14 @@ import pytest
 from recon.core.geometry.projection import project, unproject
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
-from recon.odometry.features import find_corners, follow
-from recon.odometry.patches import find_again, measure_disparity, surface_slopes, warp_of
+from recon.odometry.features import (
+    find_again,
+    find_corners,
+    follow,
+    measure_disparity,
+    surface_slopes,
+    warp_of,
+)
 from recon.odometry.protocol import OdometryFrame
 
 See = Callable[..., OdometryFrame]

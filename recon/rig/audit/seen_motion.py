@@ -22,7 +22,7 @@ import numpy as np
 from recon.core.geometry.projection import map_pixels
 from recon.core.values import RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.odometry.patches import find_in_right, surface_slopes
+from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
 from recon.odometry.window import TrackWindow
