@@ -32,6 +32,13 @@ from recon.run.directory import refuse_links
 from recon.run.progress import Progress
 
 _LIST: Final = Path(__file__).with_suffix(".toml")
+RECORD: Final = "dataset.json"
+"""What was fetched, and size and hash of each file."""
+_RECORD_BYTES: Final = 1 << 28
+_HASH: Final = "hash"
+_HASH_BYTES: Final = 4096
+_PARTIAL: Final = ".partial"
+_MEGABYTE: Final = 1_000_000
 
 
 class Facts(Settings):
@@ -125,15 +132,6 @@ def find_parts(name: str) -> list[Part]:
         expected = ", ".join(near) or None
         raise SettingsError("unknown data set or part", got=name, expected=expected, hint=hint)
     return found
-
-
-RECORD: Final = "dataset.json"
-"""What was fetched, and size and hash of each file."""
-_RECORD_BYTES: Final = 1 << 28
-_HASH: Final = "hash"
-_HASH_BYTES: Final = 4096
-_PARTIAL: Final = ".partial"
-_MEGABYTE: Final = 1_000_000
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Names of the images of two cameras: which mark the left one, and in which order they come."""
+"""Names of the images of two cameras: which mark the left one, their order, which are pairs."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ SIDES: Final = (
     ("0", "1"),
 )
 _DIGITS: Final = re.compile(r"([0-9]+)")
+_Key = tuple[object, ...]
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
@@ -92,11 +93,6 @@ def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
         if partner is not None:
             pairs.append((name, partner))
     return pairs
-
-
-_NUMBER: Final = re.compile(r"[0-9]+")
-
-Key = tuple[object, ...]
 
 
 @dataclass(frozen=True)
@@ -159,27 +155,27 @@ def find_images(where: str | Path) -> list[Path]:
     return sorted(images, key=lambda path: natural_key(path.name))
 
 
-def _by_name(side: Sequence[Path]) -> dict[Key, Path]:
+def _by_name(side: Sequence[Path]) -> dict[_Key, Path]:
     return {(path.stem,): path for path in side}
 
 
-def _by_numbers(side: Sequence[Path]) -> dict[Key, Path]:
+def _by_numbers(side: Sequence[Path]) -> dict[_Key, Path]:
     """Return images by those numbers in their names that vary within the side.
 
     Names with more or fewer numbers than most are left out.
     """
-    numbers = {path: tuple(int(word) for word in _NUMBER.findall(path.stem)) for path in side}
+    numbers = {path: tuple(int(word) for word in re.findall(_DIGITS, path.stem)) for path in side}
     usual = Counter(len(each) for each in numbers.values()).most_common(1)[0][0]
     numbers = {path: each for path, each in numbers.items() if len(each) == usual}
     varying = [k for k in range(usual) if len({each[k] for each in numbers.values()}) > 1]
-    keyed: dict[Key, Path] = {
+    keyed: dict[_Key, Path] = {
         tuple(each[k] for k in varying): path for path, each in numbers.items()
     }
     return keyed if varying and len(keyed) == len(numbers) else {}
 
 
 def _match(
-    sides: Sequence[Sequence[Path]], left: dict[Key, Path], right: dict[Key, Path]
+    sides: Sequence[Sequence[Path]], left: dict[_Key, Path], right: dict[_Key, Path]
 ) -> ImagePairs:
     pairs = tuple((path, right[key]) for key, path in left.items() if key in right)
     paired = {path for pair in pairs for path in pair}

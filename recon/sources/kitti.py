@@ -19,6 +19,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -62,7 +63,7 @@ def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSou
     views = [folder / f"image_{camera}" for camera in pair]
     images, listing = _list_pairs(views[0], views[1], settings)
     times, time_files = _read_times(folder, listing, settings)
-    rig, calibration_files = _read_rig(folder, settings, pair, image_size(images[0][0], settings))
+    rig, calibration_files = _read_rig([folder / "calib.txt"], settings, pair, images[0][0])
     texts = (*calibration_files, *time_files, _find_poses(folder))
     return ImageSource(
         name=resolved(folder).name,
@@ -128,13 +129,18 @@ def _read_times(
 
 
 def _read_rig(
-    folder: Path, settings: SourceSettings, cameras: tuple[int, int], size: tuple[int, int]
+    paths: Sequence[Path], settings: SourceSettings, cameras: tuple[int, int], image: Path
 ) -> tuple[Rig, tuple[Path, ...]]:
-    path = folder / "calib.txt"
+    """Return the rig by the settings, else by the first of some files that is there."""
+    size = image_size(image, settings)
     if settings.has_camera:
-        return read_rig(settings, folder, size, cameras)
-    if not path.exists():
-        raise SourceError("calibration is missing", where=path, hint=CALIBRATE)
+        return read_rig(settings, paths[0].parent, size, cameras)
+    path = next((path for path in paths if path.is_file()), None)
+    if path is None:
+        expected = " or ".join(map(str, paths))
+        raise SourceError(
+            "calibration is missing", where=paths[0], expected=expected, hint=CALIBRATE
+        )
     return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)
 
 
@@ -171,8 +177,9 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
     cameras = _choose_cameras(folder, "image_{:02d}")
     views = [folder / f"image_{camera:02d}" for camera in cameras]
     frames, listing = pair_listed([_read_dated(v) for v in views], settings, folder)
-    size = image_size(frames[0].left, settings)
-    rig, calibration_files = _read_raw_rig(folder, settings, cameras, size)
+    # Of the drive, or of its day.
+    calibrations = [place / _RAW_CALIBRATION for place in (folder, resolved(folder).parent)]
+    rig, calibration_files = _read_rig(calibrations, settings, cameras, frames[0].left)
     rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
     return ImageSource(
         name=resolved(folder).name,
@@ -204,20 +211,3 @@ def _read_dated(view: Path) -> list[tuple[float, Path]]:
     named = {int(image.stem): image for image in images}
     missing = [view / "data" / f"{number:010d}.png" for number in range(len(stamps))]
     return [(stamp, named.get(k, missing[k])) for k, stamp in enumerate(stamps.tolist())]
-
-
-def _read_raw_rig(
-    folder: Path, settings: SourceSettings, cameras: tuple[int, int], size: tuple[int, int]
-) -> tuple[Rig, tuple[Path, ...]]:
-    if settings.has_camera:
-        return read_rig(settings, folder, size, cameras)
-    candidates = [place / _RAW_CALIBRATION for place in (folder, resolved(folder).parent)]
-    path = next((candidate for candidate in candidates if candidate.is_file()), None)
-    if path is None:
-        raise SourceError(
-            "calibration is missing",
-            where=folder,
-            expected=f"{_RAW_CALIBRATION} in the folder of the drive or of its day",
-            hint=f"download the calibration of the day, or {CALIBRATE}",
-        )
-    return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)

@@ -24,15 +24,15 @@ _PATIENCE_S: Final = 0.2
 
 
 class LiveSource(DerivedSource):
-    """The pairs of a source when they are due; what comes too fast is left out.
+    """The pairs of a source when they are due, read by a thread.
 
-    A thread reads each pair and hands it over when it is due. Where the consumer is not ready, one
-    pair waits, and the next takes its place: the older one is dropped.
+    Where the consumer is not ready, one pair waits, and the next takes its place: the older one is
+    dropped.
 
     Args:
         source: A recording, or cameras.
-        rate: How many times as fast as recorded it is played; None = it is not recorded, and pairs
-            are due when they were taken, by the clock of `time.monotonic`.
+        rate: How many times as fast as recorded it is played; None = pairs are due when they were
+            taken, by the clock of `time.monotonic`.
         stopped: Asked now and then; True ends the drive.
     """
 

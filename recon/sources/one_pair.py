@@ -1,4 +1,4 @@
-"""Sources of one pair: two image files, or a Middlebury scene."""
+"""One pair, of two image files or a Middlebury scene: read, as a source, with its truth."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from recon.sources.frame_list import pair_frames
 from recon.sources.settings import SourceSettings
 from recon.sources.source import StereoSource
 
+UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
 LEAST_SIDE_PX: Final = 16
 """Smaller than this, an image does not hold the windows that are compared."""
 
@@ -105,9 +106,6 @@ def join_pair(
     return StereoPair(left, right, timestamp_s, index, name)
 
 
-UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
-
-
 @dataclass(frozen=True, eq=False)
 class PairInput:
     """One pair with its calibration and ground truth.
@@ -138,16 +136,16 @@ def read_pair_input(
     metres_per_unit: float = 1.0,
     max_megapixels: float = MAX_MEGAPIXELS,
 ) -> PairInput:
-    """Read two images with their calibration.
+    """Read two images with their calibration; without one the pair is rectified.
 
     Args:
         left: Left image.
         right: Right image.
-        calibration: Any file that `read_calibration` understands; None = the pair is rectified.
+        calibration: Any file that `read_calibration` understands.
         known: Numbers of the camera, if depth is wanted without a calibration file; the focal
             length may be that in the EXIF data of the left image, and without a baseline the cloud
             is up to scale. The result has notes on both.
-        metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
+        metres_per_unit: Unit of the translation in an OpenCV file.
         max_megapixels: Refuse larger images, in 10⁶ pixels.
     """
     if known is not None:

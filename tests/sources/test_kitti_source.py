@@ -132,7 +132,7 @@ def empty_both(folder: Path) -> None:
         (empty("image_1"), SourceError, "image_1: folder contains no images"),
         (empty_both, SourceError, "image_0: folder contains no images"),
         (drop_folder("image_1"), SourceError, "folder of the other camera is missing.*image_1"),
-        (remove("calib.txt"), SourceError, r"calib\.txt: calibration is missing; .*--calib"),
+        (remove("calib.txt"), SourceError, r"calib\.txt: calibration is missing .*--calib"),
         (write("calib.txt", f"P0: {CALIB[0]}\n"), FormatError, r"calib\.txt: .*has no P1"),
         (write("calib.txt", f"P0: {CALIB[0]}\nP1: {CALIB[0]}\n"), CalibrationError,
          r"calib\.txt: baseline is zero"),

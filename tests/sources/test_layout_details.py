@@ -199,6 +199,20 @@ def test_folders_of_any_name_and_place_can_be_named(
         )
 
 
+@pytest.mark.parametrize("left", ["front_left", "rear_left", None])
+def test_of_several_pairs_of_folders_one_can_be_named(
+    noise: list[StereoPair], tmp_path: Path, left: str | None
+) -> None:
+    for number, side in enumerate(("front_left", "front_right", "rear_left", "rear_right")):
+        for k in range(3):
+            write_image(tmp_path / side / "data" / f"{k}.png", noise[4 * k + number].left)
+    drives.write_calib(tmp_path, CAMERA)
+    pair = list(open_source(tmp_path, settings=SourceSettings(left=left)))[2]
+    first = 10 if left == "rear_left" else 8
+    np.testing.assert_array_equal(pair.left, noise[first].left)
+    np.testing.assert_array_equal(pair.right, noise[first + 1].left)
+
+
 @pytest.mark.parametrize(
     ("layout", "flip", "stack"),
     [("right-left", True, np.hstack), ("top-bottom", False, np.vstack),
