@@ -12,8 +12,7 @@ from typing import Any, Final
 
 from typing_extensions import Self
 
-_LONGEST: Final = 300
-"""Letters of a value in a message: content from outside may have any length."""
+_LONGEST: Final = 300  # letters of a value in a message: content from outside may have any length
 
 
 class ReconError(Exception):

@@ -188,8 +188,7 @@ def _forget(part: Path) -> None:
 #: Images and clouds hardly shrink in an archive; what grows by more than this fills the disk.
 _MOST_GROWTH: Final = 50
 _SMALL_BYTES: Final = 100_000_000
-_LEAST_BYTES: Final = 4096
-"""What an entry takes of a disk, however small it is."""
+_LEAST_BYTES: Final = 4096  # what an entry takes of a disk, however small it is
 _RESOURCE_FORKS: Final = "__MACOSX"
 _LONGEST_TARGET: Final = 4096
 

@@ -29,8 +29,7 @@ from recon.sources.times import check_increasing, pair_stamps
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
 _S: Final = 1e-9
 _IMAGES: Final = (IMAGE, COMPRESSED)
-_LISTED: Final = 20
-"""Most topics in a description."""
+_LISTED: Final = 20  # most topics in a description
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

@@ -16,8 +16,7 @@ from recon.sources.rosbags import POSES, TRANSFORMS, Bag, BagPose
 from recon.sources.source import ReadPrior
 
 _STATIC: Final = "tf_static"
-_ODOMETRY: Final = "odom"
-"""The frame in which wheels and inertial units measure, by REP 105."""
+_ODOMETRY: Final = "odom"  # the frame in which wheels and inertial units measure, by REP 105
 _S: Final = 1e-9
 
 

@@ -32,8 +32,7 @@ from recon.run.directory import refuse_links
 from recon.run.progress import Progress
 
 _LIST: Final = Path(__file__).with_suffix(".toml")
-RECORD: Final = "dataset.json"
-"""What was fetched, and size and hash of each file."""
+RECORD: Final = "dataset.json"  # what was fetched, and size and hash of each file
 _RECORD_BYTES: Final = 1 << 28
 _HASH: Final = "hash"
 _HASH_BYTES: Final = 4096

@@ -21,22 +21,16 @@ _ONE_RATE: Final = 2 / 3
 
 @dataclass(frozen=True)
 class FrameList:
-    """Which frames of a recording are pairs.
+    """Which frames of a recording are pairs."""
 
-    Attributes:
-        names: Names without suffix of all frames in order, also of those without a partner; empty
-            names where there are none.
-        paired: Positions of the pairs among them.
-        alone: Numbers of left and right images without a partner, which are left out.
-        chosen: Which of the pairs are used; None = all.
-        shift: By how many frames the right images were taken later than the left ones.
-    """
-
+    # Names without suffix of all frames in order, also of those without a partner; empty names
+    # where there are none
     names: Sequence[str]
-    paired: Sequence[int]
+    paired: Sequence[int]  # positions of the pairs among them
+    # Numbers of left and right images without a partner, which are left out
     alone: tuple[int, int] = (0, 0)
-    chosen: range | None = None
-    shift: int = 0
+    chosen: range | None = None  # which of the pairs are used; None = all
+    shift: int = 0  # by how many frames the right images were taken later than the left ones
 
     def __str__(self) -> str:
         text = (

@@ -19,8 +19,7 @@ _WAITING: Final = 1
 """Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
 gets the newest pair, and what is dropped is spread evenly."""
 
-_PATIENCE_S: Final = 0.2
-"""How long to wait for a pair before asking whether to stop."""
+_PATIENCE_S: Final = 0.2  # how long to wait for a pair before asking whether to stop
 
 
 class LiveSource(DerivedSource):

@@ -26,8 +26,7 @@ from recon.sources.settings import SourceSettings
 from recon.sources.source import StereoSource
 
 UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
-LEAST_SIDE_PX: Final = 16
-"""Smaller than this, an image does not hold the windows that are compared."""
+LEAST_SIDE_PX: Final = 16  # smaller than this, an image does not hold the windows that are compared
 
 
 @dataclass(frozen=True, eq=False, repr=False)

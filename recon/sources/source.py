@@ -157,18 +157,13 @@ def check_source(source: object) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Recording(StereoSource):
-    """A recorded drive, of which frames may lack a partner.
-
-    Attributes:
-        listing: Which frames of the recording are pairs.
-        texts: Calibration and other text files that were read.
-    """
+    """A recorded drive, of which frames may lack a partner."""
 
     name: str
     description: str
     calibration: Rig
-    listing: FrameList
-    texts: tuple[Path, ...]
+    listing: FrameList  # which frames of the recording are pairs
+    texts: tuple[Path, ...]  # calibration and other text files that were read
     truth: SequenceTruth | None = None
 
     @cached_property

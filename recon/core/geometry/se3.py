@@ -19,8 +19,7 @@ from recon.core.errors import FormatError
 from recon.core.values import Frame, PointCloud
 from recon.core.values.arrays import Float64
 
-_FARTHEST_M: Final = 1e5
-"""From the first camera to the origin of a map: farther than any drive."""
+_FARTHEST_M: Final = 1e5  # from the first camera to the origin of a map: farther than any drive
 _RIGID_TOLERANCE: Final = 1e-6
 
 

@@ -131,8 +131,8 @@ class RayCloud:
 
     places: NDArray[np.int16]  # int16 (N, 3), end points of the rays, multiples of ``unit_m``
     sigma_m: NDArray[np.float16]  # float16 (N,), standard deviation of the depth
-    confidence: UInt8  # uint8 (N,), 255 = certain
-    count: UInt8  # uint8 (N,), number of averaged points; 255 = 255 or more
+    confidence: UInt8  # (N,), 255 = certain
+    count: UInt8  # (N,), number of averaged points; 255 = 255 or more
     unit_m: float  # quantisation step of ``places``
 
     def __post_init__(self) -> None:

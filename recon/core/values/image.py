@@ -112,11 +112,8 @@ class RectifiedPair:
         return np.repeat(self.left[:, :, None], 3, axis=2)
 
 
-ASSUMED_CONFIDENCE: Final = 0.9
-"""Confidence of matches whose matcher gives none."""
-
-ASSUMED_SIGMA_PX: Final = 0.25
-"""Standard deviation of matches whose matcher gives none."""
+ASSUMED_CONFIDENCE: Final = 0.9  # confidence of matches whose matcher gives none
+ASSUMED_SIGMA_PX: Final = 0.25  # standard deviation of matches whose matcher gives none
 
 
 class Reason(IntEnum):

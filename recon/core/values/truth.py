@@ -101,7 +101,7 @@ class OccupancyTruth:
     keys: Int32  # int32 (N, 3), voxels at the resolution of the grid that contain a seen surface
     frames: Int32  # int32 (N,), number of frames that saw each voxel from within ``range_m``
     camera: RectifiedCamera  # the rectified camera
-    T_map_camera: Float64  # float64 (F, 4, 4), true poses of the camera
+    T_map_camera: Float64  # (F, 4, 4), true poses of the camera
     range_m: float  # maximum distance from the camera at which a surface counts as seen
     least_frames: int  # minimum number of frames that must have seen what is counted
 

@@ -27,8 +27,7 @@ from recon.run.threads import look_ahead, work_in_background
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
-_COMMIT_S: Final = 3.0
-"""Time between two commits of a drive whose images arrive just now."""
+_COMMIT_S: Final = 3.0  # time between two commits of a drive whose images arrive just now
 
 
 class Drive:

@@ -157,23 +157,14 @@ class Mapper:
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """Result of one frame; a `Step` of the progress of a run.
+    """Result of one frame; a `Step` of the progress of a run."""
 
-    Attributes:
-        index: Position in the run, from 0.
-        total: Number of frames in the run.
-        seconds: Time since the previous frame was done.
-        valid_share: Share of pixels with a disparity, in [0, 1].
-        points: Number of points in the cloud of the frame.
-        T_world_camera: float64 (4, 4).
-    """
-
-    index: int
-    total: int
-    seconds: float
-    valid_share: float
-    points: int
-    T_world_camera: Float64
+    index: int  # position in the run, from 0
+    total: int  # number of frames in the run
+    seconds: float  # time since the previous frame was done
+    valid_share: float  # share of pixels with a disparity, in [0, 1]
+    points: int  # number of points in the cloud of the frame
+    T_world_camera: Float64  # (4, 4)
     health: OdometryHealth
 
     def __post_init__(self) -> None:

@@ -22,18 +22,13 @@ ANEW: Final = "start the run anew, without --resume"
 
 @dataclass(frozen=True)
 class Workspace:
-    """What a drive is mapped with, none of which affects the result.
+    """What a drive is mapped with, none of which affects the result."""
 
-    Attributes:
-        map: The map whose last session the drive goes on with, or which it becomes a session of;
-            it must stay open as long as the result is used.
-        stopwatch: Times each stage.
-        threads: Threads of the matcher; None = all cores.
-    """
-
+    # The map whose last session the drive goes on with, or which it becomes a session of; it must
+    # stay open as long as the result is used
     map: Map = field(default_factory=Map.temporary)
-    stopwatch: Stopwatch = field(default_factory=Stopwatch)
-    threads: int | None = None
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)  # times each stage
+    threads: int | None = None  # threads of the matcher; None = all cores
 
     def session(self, source: StereoSource, config: DriveSettings) -> Session:
         """Return the session of a drive: the last one of the map, or a new one."""
