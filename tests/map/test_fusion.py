@@ -116,6 +116,19 @@ def test_what_one_cloud_does_not_have_the_map_does_not_have() -> None:
     assert fused.sigma_m is None
 
 
+def test_a_part_is_gone_on_with_as_if_it_had_not_been_taken() -> None:
+    xyz = np.full((1, 3), 0.05)
+    plain, coloured = _cloud(xyz), _cloud(xyz, rgb=np.full((1, 3), 9, np.uint8))
+    for before, rgb in (([coloured], [[9, 9, 9]]), ([plain], None), ([], [[9, 9, 9]])):
+        builder = CloudBuilder(FusionSettings())
+        builder.resume(_build(*before).part(), len(before))
+        builder.integrate(coloured)
+        found, whole = builder.cloud(1), _build(*before, coloured).cloud(1)
+        assert (None if found.rgb is None else found.rgb.tolist()) == rgb
+        np.testing.assert_array_equal(found.count, whole.count)
+        np.testing.assert_array_equal(found.xyz, whole.xyz)
+
+
 def test_empty_frames_and_an_empty_map_are_fine() -> None:
     empty = _cloud(np.zeros((0, 3)))
     assert len(_build().cloud()) == 0

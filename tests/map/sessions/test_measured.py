@@ -123,6 +123,16 @@ def test_positions_count_as_much_as_the_file_says(tmp_path: Path) -> None:
     assert _off_m(map_, 0) > 0.1
 
 
+def test_positions_that_jump_more_than_the_file_states_are_refused(tmp_path: Path) -> None:
+    rows = np.loadtxt(positions(tmp_path, every_s=0.05))
+    rows[1:, 1:] += np.random.default_rng(3).normal(0.0, 0.15, rows[1:, 1:].shape)
+    np.savetxt(tmp_path / "plain.txt", rows, fmt="%.4f")
+    np.savetxt(tmp_path / "sure.txt", np.column_stack([rows, np.full(len(rows), 0.02)]), fmt="%.4f")
+    assert hold(drives(), Survey(tmp_path / "plain.txt", ANTENNA)) == []
+    with pytest.raises(EvaluationError, match=r"jump.*expected 0\.02 m, as the file states"):
+        hold(drives(), Survey(tmp_path / "sure.txt", ANTENNA))
+
+
 def test_positions_far_from_the_path_are_warned_of(tmp_path: Path) -> None:
     map_ = drives()
     hold(map_, Survey(winding(tmp_path, 3.0, 0.25), ANTENNA))
