@@ -141,8 +141,7 @@ class MapOptions:
         earlier = self.of(started["arguments"])
         if earlier.mesh and not self.mesh:
             raise SettingsError("the run was started with a mesh", hint="drop --no-mesh")
-        ran = ReconConfig.parse(started["identity"]["config"], where=str(folder))
-        settings = load_config(file, changes, ran.model_dump(mode="json"))
+        settings = load_config(file, changes, started["identity"]["config"])
         now = {"config": settings.model_dump(mode="json")}
         _refuse_others(now, started["identity"], folder)
         return replace(
@@ -191,7 +190,7 @@ def _read_started(folder: Path) -> dict[str, Any]:
     path = state_folder(folder) / STARTED
     try:
         with Map.open(path) as map_:
-            return _checked(map_.session().info.start)
+            started = _checked(map_.session().info.start)
     except (ReconError, LookupError, TypeError) as error:
         if path.is_file():
             what = "the unfinished map cannot be read"
@@ -200,6 +199,10 @@ def _read_started(folder: Path) -> dict[str, Any]:
         hint = finished if (folder / RECORD).is_file() else "start it without --resume"
         what = "there is no unfinished run to resume"
         raise OutputError(what, where=folder, hint=hint) from error
+    # As in this version: settings that are fixed by now are left out.
+    config = ReconConfig.parse(started["identity"]["config"], where=str(folder))
+    started["identity"]["config"] = config.model_dump(mode="json")
+    return started
 
 
 def _checked(started: Any) -> dict[str, Any]:

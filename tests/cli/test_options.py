@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from recon.cli import app
+from recon.cli import app, evaluate
 from recon.cli.drive_options import DriveOptions, StartInMap
 from recon.cli.options import Shared, takes_groups
 from recon.commands.config import ReconConfig, load_config
 from recon.core.settings import setting_names
-from tests.cli.test_help import COMMANDS, _command
 
 SEEN: list[ReconConfig] = []
 probe = typer.Typer()
@@ -63,26 +63,11 @@ def test_what_is_no_value_of_its_setting_is_refused(line: str, words: str) -> No
 
 
 def test_every_option_that_names_a_setting_names_one_that_there_is() -> None:
-    params = [one for words in COMMANDS for one in _command(words).params]
-    assert len(params) > 100
-    declared = [
-        mark.setting
-        for words in COMMANDS
-        for option in _declared(words)
-        for mark in getattr(option.annotation, "__metadata__", ())
-        if isinstance(getattr(mark, "setting", None), str)
+    commands = [
+        one.callback for one in (*app.registered_commands, *evaluate.app.registered_commands)
     ]
-    assert len(declared) > 50
-    assert {*declared} <= {*setting_names(ReconConfig)}
-
-
-def _declared(words: tuple[str, ...]) -> list[Any]:
-    groups = {group.name: group.typer_instance for group in app.registered_groups}
-    inside = groups[words[0]] if len(words) > 1 else app
-    found = [
-        one
-        for one in inside.registered_commands  # type: ignore[union-attr]
-        if (one.name or one.callback.__name__) == words[-1]  # type: ignore[union-attr]
-    ]
-    signature = getattr(found[0].callback, "__signature__", None)
-    return [] if signature is None else list(signature.parameters.values())
+    options = [p for one in commands for p in inspect.signature(one or see).parameters.values()]
+    marks = [mark for one in options for mark in getattr(one.annotation, "__metadata__", ())]
+    named = [mark.setting for mark in marks if isinstance(getattr(mark, "setting", None), str)]
+    assert len(named) > 50
+    assert {*named} <= {*setting_names(ReconConfig)}

@@ -78,6 +78,7 @@ def test_bar_shows_frames_rate_and_lost_poses() -> None:
     assert "3/3" in shown
     assert "4.0 frames/s" in shown  # 0.25 s each
     assert "1 not trusted" in shown
+    assert "70 % valid, 120 inliers" in shown
     assert "drive [1]" in shown  # a name is no markup
     assert "mesh" in shown
 
@@ -90,18 +91,14 @@ def test_bar_may_be_finished_twice_and_asked_before_its_start() -> None:
     viewer.on_finish()
 
 
-def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    run(choose_viewer(quiet=True))
-    assert capsys.readouterr() == ("", "")
-
-
-def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose() -> None:
+def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert isinstance(choose_viewer(stream=Terminal()), ProgressBar)
     assert isinstance(choose_viewer(stream=io.StringIO(), verbose=True), JsonLines)
     assert isinstance(choose_viewer(stream=io.StringIO()), Silent)
-
-
-def test_progress_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    run(choose_viewer(quiet=True))
+    assert capsys.readouterr() == ("", "")
     run(choose_viewer(verbose=True))
     out, err = capsys.readouterr()
     assert out == ""
@@ -123,14 +120,6 @@ def test_lines_of_scenes_have_the_seconds_of_each_matcher() -> None:
     assert events[0]["scenes"] == 2
     assert events[1] == {"event": "scene", "name": "Piano", "seconds": {"sad": 0.25}}
     assert events[2]["seconds"] == {}
-
-
-def test_the_bar_counts_scenes_and_names_one_without_truth() -> None:
-    stream = Terminal()
-    run_scenes(ProgressBar(Console(file=stream, force_terminal=True, width=120)))
-    assert "trainingQ [1]" in stream.getvalue()
-    assert "2/2" in stream.getvalue()
-    assert "Pipes: no truth" in stream.getvalue()
 
 
 def located(state: State) -> LocalizedFrame:
@@ -173,12 +162,6 @@ def test_the_bar_fits_the_terminal_and_what_counts_is_never_cut(
     assert f" 4.0 {unit}/s " in f"{last} "
     assert bad in last
     assert re.search(r" \d:\d\d:\d\d ", last) or width < 80
-
-
-def test_a_wide_terminal_shows_the_state_of_the_last_frame_too() -> None:
-    stream = Terminal()
-    run(ProgressBar(Console(file=stream, force_terminal=True, width=100)))
-    assert "70 % valid, 120 inliers" in stream.getvalue()
 
 
 def test_frames_that_are_searched_are_not_called_untrusted() -> None:

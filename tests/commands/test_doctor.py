@@ -36,18 +36,16 @@ def test_what_kernels_lack_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert check.found == "ImportError: half of it is gone"
 
 
-def test_failed_checks_say_what_to_do() -> None:
+def test_what_is_missing_says_what_to_do() -> None:
     missing = doctor.check_package("no-such-package", "no_such_package")
-    assert not missing.ok
-    assert missing.found == "not installed"
+    assert (missing.ok, missing.found) == (False, "not installed")
     assert missing.hint == "run: pip install no-such-package"
-
-
-def test_a_package_that_cannot_be_imported_is_reported_with_its_last_line() -> None:
     broken = doctor.check_package("numpy", "no_such_module")
     assert not broken.ok
     assert "ModuleNotFoundError" in broken.found
     assert broken.hint
+    library = doctor.check_library("libnothing.so.9", "libnothing9")
+    assert (library.ok, library.hint) == (False, "run: apt-get install libnothing9")
 
 
 def test_a_missing_system_library_names_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,12 +54,6 @@ def test_a_missing_system_library_names_its_package(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(doctor, "run_python", fail)
     assert doctor.check_package("numpy", "numpy").hint == "run: apt-get install libgl1"
-
-
-def test_a_library_that_is_missing_names_its_package() -> None:
-    check = doctor.check_library("libnothing.so.9", "libnothing9")
-    assert not check.ok
-    assert check.hint == "run: apt-get install libnothing9"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals of this kind")
