@@ -172,9 +172,23 @@ def test_evaluating_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     assert_one_line(done, str(tmp_path))
 
 
-def test_wrong_usage_exits_with_two(tmp_path: Path) -> None:
-    assert run("map").code == 2
-    assert run("map", tmp_path, "--no-such-option").code == 2
+@pytest.mark.parametrize(
+    "line",
+    [
+        "map", "map x --no-such-option", "map x --poses p --prior q", "map --remove 1",
+        "map x --into run --remove 1", "map x --into run --out o", "map --into run --resume run",
+        "map x --into run --workers 2", "map --resume a --out b", "map x --workers 2 --scheduler s",
+        "export run --workers 2 --scheduler s", "evaluate middlebury x --json --latex", "board",
+        "board chess:9x6 --board chess:9x6", "batch", "batch map x --resume y", "piece plan 0",
+    ],
+)  # fmt: skip
+def test_wrong_usage_exits_with_two(line: str) -> None:
+    assert run(*line.split()).code == 2
+
+
+@pytest.mark.parametrize("option", ["--json", "--latex"])
+def test_tables_are_json_or_latex(tmp_path: Path, option: str) -> None:
+    assert_one_line(run("evaluate", "middlebury", tmp_path, option), str(tmp_path))
 
 
 def test_ctrl_c_while_a_native_library_starts_is_an_interruption(
