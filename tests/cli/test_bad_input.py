@@ -178,7 +178,7 @@ def test_evaluating_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
         "map", "map x --no-such-option", "map x --poses p --prior q", "map --remove 1",
         "map x --into run --remove 1", "map x --into run --out o", "map --into run --resume run",
         "map x --into run --workers 2", "map --resume a --out b", "map x --workers 2 --scheduler s",
-        "export run --workers 2 --scheduler s", "evaluate middlebury x --json --latex", "board",
+        "evaluate middlebury x --json --latex", "board",
         "board chess:9x6 --board chess:9x6", "batch", "batch map x --resume y", "piece plan 0",
     ],
 )  # fmt: skip
