@@ -156,8 +156,12 @@ def test_a_corrected_submap_keeps_its_wall_thin() -> None:
     assert (np.abs(back[:, 1] + 2.03) < 0.18).mean() > 0.99
 
 
-def test_a_corrected_submap_has_its_points_where_the_correction_puts_them() -> None:
-    [submap] = _submaps(_builder(length_m=1000.0), _frames())
+@pytest.fixture(scope="module")
+def submap() -> Submap:
+    return _submaps(_builder(length_m=1000.0), _frames())[0]
+
+
+def test_a_corrected_submap_has_its_points_where_the_correction_puts_them(submap: Submap) -> None:
     T = make_transform(exp_so3(np.array([0.0, 0.03, 0.0])), np.array([0.7, -0.2, 3.0]))
     moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
     before, after = (s.fused.cloud(FUSION.voxel_m, 1) for s in (submap, moved))
@@ -172,8 +176,7 @@ def test_a_corrected_submap_has_its_points_where_the_correction_puts_them() -> N
     assert moved.fused.frames.max() <= submap.frames
 
 
-def test_a_corrected_submap_has_its_walls_where_the_correction_puts_them() -> None:
-    [submap] = _submaps(_builder(length_m=1000.0), _frames())
+def test_a_corrected_submap_has_its_walls_where_the_correction_puts_them(submap: Submap) -> None:
     T = make_transform(np.eye(3), np.array([0.8, 0.0, 2.0]))
     moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
     before, after = (s.occupancy.voxels(OCCUPANCY.resolution_m) for s in (submap, moved))

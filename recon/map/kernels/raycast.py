@@ -122,6 +122,7 @@ def _measure_points(
         values[n, 3] = 1.0 if near else 0.0
 
 
+@kernel
 def limit_points(
     xyz: NDArray[np.float32],
     sigma: NDArray[np.float32],
@@ -136,15 +137,6 @@ def limit_points(
     the depth shrinks by as much as the point moves, down to none.
     """
     moved, left = xyz.copy(), sigma.copy()
-    _limit_points(moved, left, (max_range, beyond, margin))
-    return moved, left
-
-
-@kernel
-def _limit_points(
-    xyz: NDArray[np.float32], sigma: NDArray[np.float32], limits: tuple[float, float, float]
-) -> None:
-    max_range, beyond, margin = limits
     for n in range(len(xyz)):
         x, y, z = np.float64(xyz[n, 0]), np.float64(xyz[n, 1]), np.float64(xyz[n, 2])
         length = math.sqrt(x * x + y * y + z * z)
@@ -153,8 +145,9 @@ def _limit_points(
         # A point between the two is moved outwards, and its free length does not change either.
         shrink = beyond / length
         surplus = np.float64(sigma[n]) * margin - abs(z) * (1.0 - shrink)
-        sigma[n] = max(surplus, 0.0) / margin if margin > 0 else sigma[n]
-        xyz[n, 0], xyz[n, 1], xyz[n, 2] = x * shrink, y * shrink, z * shrink
+        left[n] = max(surplus, 0.0) / margin if margin > 0 else sigma[n]
+        moved[n, 0], moved[n, 1], moved[n, 2] = x * shrink, y * shrink, z * shrink
+    return moved, left
 
 
 def make_blocks(rows: int) -> Blocks:

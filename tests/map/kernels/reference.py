@@ -1,4 +1,4 @@
-"""The twin of `recon.map.kernels.raycast`: one ray at a time, cells in a dictionary."""
+"""Reference implementations of the kernels of the map, with cells in a dictionary."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.kernels.voxels import unpack_keys
+from recon.map.kernels.clamped import ClampedBlocks, observed_rows
 from recon.map.kernels.facets import LEAST
 from recon.map.kernels.raycast import MIN_DEPTH_M, Rays
 from tests.core.kernels.voxels_reference import Cell
@@ -166,3 +168,18 @@ def _crossed(cell: Cell, points: dict[Cell, tuple[float, NDArray[Any]]]) -> bool
     beside = (places**2).sum(axis=1) - along**2
     distance = np.average(along, weights=weights * np.exp(-beside))
     return bool(abs(distance) <= 0.5 * np.abs(normal).sum())
+
+
+def cells_of(blocks: ClampedBlocks) -> dict[Cell, Clamped]:
+    """Sum, low and high of each observed cell."""
+    rows = observed_rows(blocks)
+    corner = np.repeat(unpack_keys(rows.blocks) * 8, np.diff(rows.starts), axis=0)
+    local = np.stack(np.unravel_index(rows.cells, (8, 8, 8)), axis=1)
+    keys = (tuple(key) for key in (corner + local).tolist())
+    return dict(zip(keys, map(tuple, rows.values.tolist()), strict=True))
+
+
+def log_odds_of(blocks: ClampedBlocks) -> dict[Cell, float]:
+    """Log-odds of each observed cell, as of one drive."""
+    cells = cells_of(blocks).items()
+    return {cell: min(max(change, low), high) for cell, (change, low, high) in cells}

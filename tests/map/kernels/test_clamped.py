@@ -13,8 +13,9 @@ from recon.core.kernels import voxels
 from recon.map.kernels import clamped, raycast
 from tests.map.kernels.reference import (
     Cell,
-    Clamped,
     apply_evidence_reference,
+    cells_of,
+    log_odds_of,
     move_reference,
 )
 
@@ -47,20 +48,6 @@ def _drive(frames: list[Frame]) -> clamped.ClampedBlocks:
     return blocks
 
 
-def _cells(blocks: clamped.ClampedBlocks) -> dict[Cell, Clamped]:
-    rows = clamped.observed_rows(blocks)
-    corner = np.repeat(voxels.unpack_keys(rows.blocks) * 8, np.diff(rows.starts), axis=0)
-    local = np.stack(np.unravel_index(rows.cells, (8, 8, 8)), axis=1)
-    keys = (tuple(key) for key in (corner + local).tolist())
-    return dict(zip(keys, map(tuple, rows.values.tolist()), strict=True))
-
-
-def _log_odds(blocks: clamped.ClampedBlocks) -> Frame:
-    return {
-        cell: min(max(change, low), high) for cell, (change, low, high) in _cells(blocks).items()
-    }
-
-
 def _random_frames(seed: int, number: int) -> list[Frame]:
     rng = np.random.default_rng(seed)
     # Few cells, so that most are seen often and reach their clamps; some in other blocks.
@@ -85,7 +72,7 @@ def test_parts_in_a_row_equal_one_drive(seed: int, cut: int, again: int) -> None
     expected: Frame = {}
     for frame in frames:
         apply_evidence_reference(expected, frame, LOWEST, HIGHEST)
-    found = _log_odds(total)
+    found = log_odds_of(total)
     assert found.keys() == expected.keys()
     for cell, value in found.items():
         assert value == pytest.approx(expected[cell], abs=ROUNDING)
@@ -97,8 +84,8 @@ def test_what_a_later_part_looks_through_is_free_however_often_it_was_hit() -> N
     total = _drive(parked)
     total = clamped.chain_rows(total, clamped.observed_rows(_drive(gone)))
     # 3.5 after the hits, 12 misses of 0.5 later below 0; a sum of the clamped parts stays above.
-    assert _log_odds(total)[cell] == pytest.approx(-2.0)
-    assert 3.5 + _log_odds(_drive(gone))[cell] > 0
+    assert log_odds_of(total)[cell] == pytest.approx(-2.0)
+    assert 3.5 + log_odds_of(_drive(gone))[cell] > 0
 
 
 @settings(max_examples=5 if numba.config.DISABLE_JIT else 30)
@@ -107,7 +94,7 @@ def test_moved_cells_equal_those_of_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     blocks = _drive(_random_frames(seed, 5))
     T = make_transform(exp_so3(rng.normal(0, 0.5, 3)), rng.normal(0, 20, 3))
-    assert _cells(clamped.move_blocks(blocks, T)) == move_reference(_cells(blocks), T)
+    assert cells_of(clamped.move_blocks(blocks, T)) == move_reference(cells_of(blocks), T)
 
 
 def test_a_turned_wall_has_no_holes() -> None:
@@ -115,6 +102,6 @@ def test_a_turned_wall_has_no_holes() -> None:
     blocks = clamped.make_clamped(1)
     blocks = clamped.add_evidence(blocks, _evidence(wall), LOWEST, HIGHEST)
     T = make_transform(exp_so3(np.array([0.0, 0.0, 0.1])), np.zeros(3))
-    moved = _cells(clamped.move_blocks(blocks, T))
+    moved = cells_of(clamped.move_blocks(blocks, T))
     # Every column across the wall has it, at all heights.
     assert {(i, k) for i, _, k in moved} >= {(i, k) for i in range(-18, 18) for k in range(-20, 20)}

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.core.kernels import voxels
 from recon.map.kernels import clamped, raycast
 from tests.map.kernels.reference import (
     apply_evidence_reference,
     cast_rays_reference,
     limit_points_reference,
+    log_odds_of,
     measure_points_reference,
     walk_reference,
 )
@@ -55,21 +55,11 @@ class _Map:
         self.evidence = raycast.cast_rays(self.evidence, rays, spread)
         self.blocks = clamped.add_evidence(self.blocks, self.evidence, -2.0, 3.5)
 
-    def cells(self) -> dict[Cell, float]:
-        rows = clamped.observed_rows(self.blocks)
-        corners = voxels.unpack_keys(rows.blocks) * raycast.BLOCK_EDGE
-        corner = np.repeat(corners, np.diff(rows.starts), axis=0)
-        local = np.stack(np.unravel_index(rows.cells, (8, 8, 8)), axis=1)
-        change, low, high = rows.values.T
-        values = np.minimum(np.maximum(change, low), high).tolist()
-        keys = (tuple(key) for key in (corner + local).tolist())
-        return dict(zip(keys, values, strict=True))
-
 
 def _cast(rays: raycast.Rays, spread: float = 1.0) -> dict[Cell, float]:
     store = _Map()
     store.cast(rays, spread)
-    return store.cells()
+    return log_odds_of(store.blocks)
 
 
 @settings(max_examples=60)
@@ -94,7 +84,7 @@ def test_frames_equal_those_of_the_reference(seed: int, n: int, spread: float) -
         store.cast(rays, spread)
         evidence = cast_rays_reference(rays, spread)
         apply_evidence_reference(expected, evidence, -2.0, 3.5)
-    cells = store.cells()
+    cells = log_odds_of(store.blocks)
     assert cells.keys() == expected.keys()
     for cell, value in cells.items():
         # float32 against float64: three gains below 1 and their sums below 3, 2^-24 of each.

@@ -7,44 +7,17 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.core.geometry.se3 import make_transform
-from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud, join_clouds
+from recon.core.values import FREE, OCCUPIED, OccupancyGrid, join_clouds
 from recon.export.cloud import export_cloud
 from recon.map.drive.sequence import map_sequence
-from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSurface
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings, thin_rays
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
+from tests.map.occupancy.test_moving import CAR, HEIGHT_M, T_MAP_WORLD, look
 
-HEIGHT_M, WALL_M = 1.6, 20.0
-T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 GROUND = GroundSurface(np.full((60, 60), -HEIGHT_M), 1.0, (-15.0, -30.0))
-CAR_M = np.array([1.8, 1.4, 4.0])  # wide, high, long
-DEPTH_ERROR = 0.0015
-
-
-def _look(car_m: tuple[float, float] | None, z_m: float, seed: int) -> PointCloud:
-    """Points of a camera at z in a street that ends at a wall; the car's rear is at (x, z)."""
-    u, v = np.meshgrid(np.linspace(-0.7, 0.7, 210), np.linspace(-0.25, 0.25, 75))
-    rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3)
-    with np.errstate(divide="ignore"):
-        depth = np.minimum(WALL_M - z_m, np.where(rays[:, 1] > 0, HEIGHT_M / rays[:, 1], np.inf))
-    if car_m is not None:
-        depth = np.minimum(depth, _box_depth(rays, car_m[0], car_m[1] - z_m))
-    sigma = DEPTH_ERROR * depth**2
-    seen = depth + np.random.default_rng(seed).normal(size=len(depth)) * sigma
-    return PointCloud((rays * seen[:, None]).astype("f4"), sigma_m=sigma.astype("f4"))
-
-
-def _box_depth(rays: np.ndarray, x_m: float, z_m: float) -> np.ndarray:
-    """Depth at which rays meet the car; infinite where they miss it (slabs)."""
-    low = np.array([x_m - CAR_M[0] / 2, HEIGHT_M - CAR_M[1], z_m])
-    high = np.array([x_m + CAR_M[0] / 2, HEIGHT_M, z_m + CAR_M[2]])
-    with np.errstate(divide="ignore"):
-        ends = np.stack([low / rays, high / rays])
-    enter, leave = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
-    return np.where((enter < leave) & (enter > 0), enter, np.inf)
 
 
 def _grid(cars: list[tuple[float, float] | None], step_m: float = 0.0) -> OccupancyGrid:
@@ -54,7 +27,10 @@ def _grid(cars: list[tuple[float, float] | None], step_m: float = 0.0) -> Occupa
     for index, car in enumerate(cars):
         z_m = index * step_m
         pose = make_transform(np.eye(3), np.array([0.0, 0.0, z_m]))
-        builder.integrate(thin_rays(_look(car, z_m, index), settings).cloud(), pose)
+        # A street that ends at a wall; the car's rear is at (x, z).
+        boxes = [] if car is None else [((car[0], 0.0, car[1] + 2.1), CAR)]
+        cloud = look(boxes, z_m, index, wall_m=20.0)
+        builder.integrate(thin_rays(cloud, settings).cloud(), pose)
     return flatten(builder.voxels(), GROUND, GridSettings())
 
 
@@ -102,12 +78,6 @@ def test_a_car_that_stops_where_it_was_free_is_found_within_a_second() -> None:
     place = (9.0, 9.2), (-0.8, 0.8)
     assert (_cells(_grid([*[None] * 20, *stopped]), *place) == OCCUPIED).all()
     assert not (_cells(_grid([*[None] * 20, *stopped[:4]]), *place) == FREE).any()
-
-
-def test_what_stands_still_stays() -> None:
-    grid = _grid([*CROSSING, *[None] * 8])
-    wall = _cells(grid, (19.6, 20.4), (-6.0, 6.0))
-    assert (wall == OCCUPIED).any(axis=1).mean() > 0.95
 
 
 @pytest.mark.slow

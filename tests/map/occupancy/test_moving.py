@@ -29,10 +29,10 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 CAR, PERSON, POST, WIRE = (1.8, 1.4, 4.2), (0.5, 1.75, 0.4), (0.12, 4.0, 0.12), (12.0, 0.04, 0.04)
 
 
-def _depths(rays: np.ndarray, boxes: Sequence[Box], z_m: float) -> np.ndarray:
+def _depths(rays: np.ndarray, boxes: Sequence[Box], z_m: float, wall_m: float) -> np.ndarray:
     """Depth of the nearest of ground, end wall and boxes along each ray of unit depth."""
     with np.errstate(divide="ignore"):
-        depth = np.minimum(WALL_M - z_m, np.where(rays[:, 1] > 0, HEIGHT_M / rays[:, 1], np.inf))
+        depth = np.minimum(wall_m - z_m, np.where(rays[:, 1] > 0, HEIGHT_M / rays[:, 1], np.inf))
         for (x, up, z), (wide, high, long) in boxes:
             low = np.array([x - wide / 2, HEIGHT_M - up - high, z - z_m - long / 2])
             size = np.array([wide, high, long])
@@ -42,11 +42,11 @@ def _depths(rays: np.ndarray, boxes: Sequence[Box], z_m: float) -> np.ndarray:
     return depth
 
 
-def _look(boxes: Sequence[Box], z_m: float, seed: int) -> PointCloud:
+def look(boxes: Sequence[Box], z_m: float, seed: int, wall_m: float = WALL_M) -> PointCloud:
     """What a stereo camera at z sees, with the depth error of stereo."""
     u, v = np.meshgrid(np.linspace(-0.8, 0.8, 340), np.linspace(-0.3, 0.3, 130))
     rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3)
-    depth = _depths(rays, boxes, z_m)
+    depth = _depths(rays, boxes, z_m, wall_m)
     sigma = depth**2 * SIGMA_PX / FOCAL_BASELINE
     seen = depth + np.random.default_rng(seed).normal(size=len(depth)) * sigma
     cloud = PointCloud((rays * seen[:, None]).astype("f4"), sigma_m=sigma.astype("f4"))
@@ -68,7 +68,7 @@ def _drive(scenes: Sequence[Sequence[Box]], step_m: float = 0.5, aside: float = 
     for frame, boxes in enumerate(scenes):
         T = make_transform(np.eye(3), np.array([aside, 0.0, step_m * frame]))
         shifted = [((x - aside, up, z), size) for (x, up, z), size in boxes]
-        cloud = _look(shifted, step_m * frame, frame)
+        cloud = look(shifted, step_m * frame, frame)
         rays = thin_rays(cloud, CONFIG.occupancy)
         near = cloud.select(cloud.xyz[:, 2] < RANGE_M)
         builder.integrate(transform_cloud(near, T, frame="world"), rays.cloud(), T)

@@ -27,6 +27,7 @@ CAMERA = RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12)
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 VOXEL_M = CONFIG.fusion.voxel_m
 FRAMES = 14
+BEND = make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.0, 0.0, 0.31]))
 
 
 def _mapped(made: Map) -> Session:
@@ -73,13 +74,20 @@ def test_occupancy_is_that_of_the_run(tmp_path: Path) -> None:
         assert len(session.submaps) >= 3
         keep_map(made, tmp_path / "map.recon")
         before = join_occupancy(submap.occupancy for submap in session.submaps).voxels(0.2)
-    with Map.open(tmp_path / "map.recon") as kept:
-        assert [len(submap.occupancy) for submap in kept.session().submaps] == [0] * len(
-            kept.session().submaps
-        )
+        poses = session.trajectory.T_world_camera
+    with Map.open(tmp_path / "map.recon", read_only=False) as kept:
+        assert not any(len(submap.occupancy) for submap in kept.session().submaps)
+        # What only resuming needs is left out.
+        assert "state" not in kept.store.kinds()
+        assert kept.session().info.start == {}
+        np.testing.assert_array_equal(kept.session().trajectory.T_world_camera, poses)
         after = join_occupancy(one.occupancy for one in PlacedSubmaps(kept, CONFIG)).voxels(0.2)
+        kept.store.delete("submap_entry", (0, len(kept.session().submaps) - 1))
+        kept.commit()
     np.testing.assert_array_equal(before.keys, after.keys)
     np.testing.assert_array_equal(before.log_odds, after.log_odds)
+    with Map.open(tmp_path / "map.recon") as lacking, pytest.raises(FormatError, match="submaps"):
+        PlacedSubmaps(lacking, CONFIG)
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -88,8 +96,7 @@ def test_the_cloud_is_that_of_the_run(tmp_path: Path, closed: bool) -> None:
         session = _mapped(made)
         if closed:
             path = session.odometry.T_world_camera
-            bend = make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.0, 0.0, 0.31]))
-            path = np.concatenate([path[: FRAMES // 2], bend @ path[FRAMES // 2 :]])
+            path = np.concatenate([path[: FRAMES // 2], BEND @ path[FRAMES // 2 :]])
             session.set_loops({"closed": [], "refused": [], "T_world_camera": path})
         keep_map(made, tmp_path / "map.recon")
         before = _cloud(session)
@@ -105,32 +112,8 @@ def test_submaps_move_with_their_middle_frames() -> None:
         session = _mapped(made)
         assert session.corrections() is None
         path = session.odometry.T_world_camera
-        bend = make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.0, 0.0, 0.31]))
-        bent = np.stack([bend @ T if n % 2 else T for n, T in enumerate(path)])
+        bent = np.stack([BEND @ T if n % 2 else T for n, T in enumerate(path)])
         session.set_loops({"closed": [], "refused": [], "T_world_camera": bent})
         corrections = session.corrections()
         for entry, T in zip(session.submaps.entries, corrections, strict=True):
             np.testing.assert_allclose(T @ path[entry.middle], bent[entry.middle], atol=1e-9)
-
-
-def test_what_only_resuming_needs_is_left_out(tmp_path: Path) -> None:
-    with Map.temporary() as made:
-        session = _mapped(made)
-        keep_map(made, tmp_path / "map.recon")
-        path = session.trajectory
-    with Map.open(tmp_path / "map.recon") as kept:
-        assert "state" not in kept.store.kinds()
-        assert kept.session().info.start == {}
-        np.testing.assert_array_equal(kept.session().trajectory.T_world_camera, path.T_world_camera)
-
-
-def test_a_map_that_lacks_a_submap_is_refused(tmp_path: Path) -> None:
-    with Map.temporary() as made:
-        session = _mapped(made)
-        keep_map(made, tmp_path / "map.recon")
-        last = len(session.submaps) - 1
-    with Map.open(tmp_path / "map.recon", read_only=False) as kept:
-        kept.store.delete("submap_entry", (0, last))
-        kept.commit()
-    with Map.open(tmp_path / "map.recon") as kept, pytest.raises(FormatError, match="submaps"):
-        PlacedSubmaps(kept, CONFIG)
