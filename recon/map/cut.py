@@ -40,13 +40,10 @@ _BLOCK_BYTES: Final = 4 * 3 * BLOCK_EDGE**3
 
 @dataclass
 class Cut:
-    """Consecutive submaps that were cut into tiles.
+    """Submaps cut into tiles: the ``frames`` of each, and the attributes ``known`` in all.
 
-    Attributes:
-        frames: Number of frames of each.
-        known: Attributes of points that all have.
-        corners: Lowest and highest (plus one) x and y of the cells that each observed.
-        nbytes: What joining the parts of a kind in a tile takes.
+    ``corners`` are the lowest and highest (plus one) x and y of the cells that each observed;
+    ``nbytes`` what joining the parts of a kind in a tile takes.
     """
 
     frames: list[int] = field(default_factory=list)
@@ -106,11 +103,8 @@ class Cut:
 class Cutter:
     """Cuts submaps into tiles, each with the margin that its points and grid cells depend on.
 
-    Attributes:
-        edge_cells: Side of a tile in voxels; a power of two, at least 8.
-        edge_m: Side of a tile.
-        grid_margin_m: Margin of the occupancy.
-        limit_bytes: Largest size of a tile in memory; None = it cannot be smaller.
+    A tile is ``edge_cells`` voxels wide, a power of two, at least 8. ``limit_bytes`` is the largest
+    size of a tile in memory; None = it cannot be smaller.
     """
 
     def __init__(self, config: DriveSettings, T_map_world: Float64, halvings: int = 0) -> None:

@@ -67,10 +67,9 @@ class Tile:
 class Tiles:
     """A map cut into tiles, made by `of_submaps`; iterating gives them along the drive.
 
+    A tile is ``edge_cells`` voxels wide, a power of two, at least 8.
+
     Attributes:
-        config: The configuration.
-        edge_cells: Side of a tile in voxels; a power of two, at least 8.
-        edge_m: The same in metres.
         extent: Smallest x and y of the cells that submaps observed, and the largest plus one.
         submap_of_frame: int64 (N,), number of the submap of each frame; -1 between two drives.
     """
@@ -105,13 +104,9 @@ class Tiles:
     ) -> Tiles:
         """Cut the map of drives; tiles are halved until the fullest one fits into memory.
 
-        Args:
-            submaps: The submaps, in order; read again where tiles are halved.
-            config: The configuration.
-            T_map_world: float64 (4, 4), from world to map axes.
-            T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = none.
-            drives: Number of submaps of each drive, in order: what a later drive saw counts more.
-                Empty = all are of one.
+        Submaps are read again where tiles are halved. ``T_corrected_world``, float64 (S, 4, 4), is
+        a rigid correction of each; None = none. ``drives`` is the number of submaps of each drive,
+        in order: what a later one saw counts more; empty = all are of one.
         """
         halvings, tiles = 0, cls(config, T_map_world)
         while not tiles._take(tiles._cutter.cut(submaps, tiles._parts, T_corrected_world), drives):

@@ -22,13 +22,10 @@ ones are beyond."""
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Where the camera is, in the world of the map.
+    """Where the camera is, ``T_world_camera`` in the world of the map.
 
-    Attributes:
-        T_world_camera: float64 (4, 4).
-        corrected: float64 (6, 6), covariance of a step (translation in metres, rotation vector in
-            radians) in camera axes, without the drift since the last correction.
-        path_m: Path since the last correction.
+    ``corrected``, float64 (6, 6), is the covariance of a step (translation in metres, rotation
+    vector in radians) in camera axes, without the drift over the path since the last correction.
     """
 
     T_world_camera: Float64

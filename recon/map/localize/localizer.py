@@ -111,16 +111,12 @@ class _Confirmed:
 class Localizer:
     """Finds the frames of a drive in a map, which it does not change.
 
-    Visual odometry predicts each pose; features of the nearest views of the map, and its surfaces,
-    correct it, by their covariances. A pose is given out only while it is certain; where nothing
-    corrects it, that is as far as odometry drifts by so much, some metres. Where frames are matched
-    roughly, since time is short, one view corrects them; surfaces do only if none is found.
-
-    Args:
-        known: The places of the map.
-        surroundings: The surfaces of the map; None = they are not used.
-        frames: Least number of frames that must agree on the first fix.
-        among: bool (N,), the views that the first fix may use; None = all.
+    Visual odometry predicts each pose; features of the nearest views of the map, and its surfaces
+    (unless they are None), correct it, by their covariances. A pose is given out only while it is
+    certain; where nothing corrects it, that is as far as odometry drifts by so much, some metres.
+    Where frames are matched roughly, since time is short, one view corrects them; surfaces do only
+    if none is found. On the first fix at least ``frames`` must agree, by the views ``among`` (N,),
+    None = all.
     """
 
     def __init__(

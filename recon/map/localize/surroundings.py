@@ -183,14 +183,11 @@ _ICP_FLOOR_DEG: Final = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """How ICP would move the prior, and how the frame fits the map with and without it.
+    """How ICP would move the prior, and how the frame fits the map before and after.
 
-    Attributes:
-        step: float64 (6,), translation in metres and rotation vector in radians, in camera axes
-            of the prior; without the bias that all corrections share.
-        before: The frame against the map, at the prior.
-        after: The same at ICP's pose.
-        contrast: By how much the poses around ICP's fit worse, see `contrast`.
+    ``step``, float64 (6,), is a translation in metres and a rotation vector in radians, in camera
+    axes of the prior, without the bias that all corrections share. ``contrast`` is by how much the
+    poses around ICP's fit worse.
     """
 
     step: Float64

@@ -167,12 +167,10 @@ _WIDEST: Final = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """The frames of all drives of a map, in order.
+    """The frames of all drives of a map, in order, taken at ``T_map_camera`` (F, 4, 4).
 
-    Attributes:
-        settings: How rays become occupancy.
-        T_map_camera: float64 (F, 4, 4), where each frame was taken.
-        rays: Gives the kept rays of a frame by its number here.
+    ``rays`` gives the kept rays of a frame by its number here, ``settings`` how they become
+    occupancy.
     """
 
     settings: OccupancySettings

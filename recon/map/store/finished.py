@@ -26,12 +26,9 @@ from recon.map.submaps import Submap
 class CastSubmaps:
     """The submaps of a drive, each with occupancy made from its rays when it is read.
 
-    Attributes:
-        session: The drive.
-        settings: How to make it.
-        T_map_world: float64 (4, 4), from world to the axes of the occupancy; None = its own.
-        T_world_camera: float64 (N, 4, 4), from where rays are cast; None = the path by odometry.
-        without: Frames whose rays are not cast.
+    ``T_map_world`` is from world to the axes of the occupancy (None = its own); ``T_world_camera``,
+    float64 (N, 4, 4), from where rays are cast (None = the path by odometry); rays of the frames
+    ``without`` are not cast.
     """
 
     session: Session

@@ -51,13 +51,8 @@ _STATE: Final = "state"
 class SessionInfo:
     """What a session is a drive of.
 
-    Attributes:
-        source: Display name of the source.
-        description: What kind of source it is.
-        frames: Number of its frames.
-        config: The settings of the drive, as plain values.
-        versions: Versions of recon and its libraries.
-        start: What the run was started with, to resume it; empty in a finished map.
+    ``config`` are the settings of the drive as plain values, ``versions`` those of recon and its
+    libraries, ``start`` what the run was started with, to resume it; empty in a finished map.
     """
 
     source: str = ""
