@@ -13,7 +13,7 @@ from recon.street.materials import ROAD_HALF_M
 from recon.street.path import LANE_M, camera_poses, centre_line
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
-from recon.street.street import StreetWorld, build_street
+from recon.street.street import build_street
 
 RAILS = {"path": "straight", "sway": 0.0, "yaw_deg": 0.0, "pitch_deg": 0.0, "roll_deg": 0.0}
 
@@ -64,11 +64,6 @@ def test_poses_are_rigid_and_their_steps_have_the_length_of_the_speed():
 def test_another_seed_builds_another_street(street):
     other = build_street(StreetScene(seed=4, frames=4))
     assert len(other.soup) != len(street.world.soup)
-
-
-def test_the_ground_plane_gives_heights_above_the_road(box_world: StreetWorld):
-    plane = box_world.ground_plane(0)
-    assert np.allclose(plane, [0.0, -1.0, 0.0, 1.5])
 
 
 def test_map_axes_are_level_and_look_along_the_first_view(street):

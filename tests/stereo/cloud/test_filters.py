@@ -98,16 +98,6 @@ def frozen(xyz: np.ndarray) -> np.ndarray:
 CLOUD = frozen(np.random.default_rng(5).random((400, 3)))
 
 
-def test_read_only_arrays_are_taken_and_float32_comes_back() -> None:
-    xyz, means = open3d_clouds.voxel_downsample(CLOUD, frozen(CLOUD), 0.2)
-    assert (xyz.dtype, means.dtype) == (np.float32, np.float32)
-    assert open3d_clouds.estimate_normals(CLOUD, 10).dtype == np.float32
-    assert open3d_clouds.statistical_inliers(CLOUD, 10, 2.0).dtype == bool
-    assert open3d_clouds.radius_inliers(CLOUD, 3, 0.2).shape == (400,)
-    index, distance = open3d_clouds.nearest(CLOUD, CLOUD)
-    assert (index.dtype, distance.dtype) == (np.int32, np.float32)
-
-
 @pytest.mark.parametrize("width", [0, 1, 3, 4, 7])
 def test_attributes_of_any_width_follow_their_points(width: int) -> None:
     # An attribute that is linear in the position is averaged as the position is.

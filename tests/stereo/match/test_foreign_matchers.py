@@ -43,10 +43,6 @@ def image(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8)
 
 
-def pair(valid: np.ndarray | None = None) -> RectifiedPair:
-    return RectifiedPair(image(), image(), CAMERA, valid=valid)
-
-
 def altered(**fields: np.ndarray) -> Disparity:
     made = Disparity.from_values(np.full(SHAPE, 5.0))
     arrays = {name: getattr(made, name) for name in ("values", "confidence", "sigma_px", "reason")}
@@ -89,13 +85,6 @@ def test_a_drive_is_mapped_with_an_object() -> None:
     assert mine.ndisp is not None
 
 
-def test_a_matcher_of_others_is_reported_how_far_to_search() -> None:
-    mine = Flat()
-    make_matcher(mine, MatchingSettings()).match(pair())
-    assert mine.ndisp is not None
-    assert mine.ndisp >= 1
-
-
 @pytest.mark.parametrize(
     ("found", "words"),
     [
@@ -131,11 +120,13 @@ def test_an_error_inside_is_reported_with_its_matcher_and_kept_as_the_cause() ->
     assert isinstance(told.value.__cause__, ZeroDivisionError)
 
 
-def test_no_match_is_kept_where_there_is_no_image() -> None:
-    valid = np.ones(SHAPE, bool)
+def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named() -> None:
+    valid, mine = np.ones(SHAPE, bool), Flat()
     valid[:, :9] = False
-    found = make_matcher(Flat()).match(pair(valid))
+    found = make_matcher(mine).match(RectifiedPair(image(), image(), CAMERA, valid=valid))
     assert np.array_equal(found.valid, valid)
+    assert mine.ndisp is not None
+    assert mine.ndisp >= 1
 
 
 @pytest.mark.parametrize(("given", "word"), [(Flat, r"class.*Flat\(\)"), (7, "not a matcher.*int")])
@@ -180,18 +171,10 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("plugin")
-def test_a_registered_matcher_has_a_name() -> None:
+def test_a_registered_matcher_has_a_name_but_not_one_of_ours() -> None:
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
-
-
-@pytest.mark.usefixtures("plugin")
-def test_the_names_of_ours_cannot_be_taken() -> None:
     made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
     assert type(made) is MATCHERS["sad"]
-
-
-@pytest.mark.usefixtures("plugin")
-def test_an_unknown_name_lists_all_choices() -> None:
     with pytest.raises(SettingsError, match=r"unknown matcher.*'cencus'.*fails, flat.*sad, sgm"):
         recon.match(image(), image(), matcher="cencus")
 
