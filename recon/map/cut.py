@@ -1,4 +1,4 @@
-"""Submaps cut into the square tiles of a map, and what is known of those that were cut."""
+"""Submaps cut into the square tiles of a map, and the file that keeps the pieces by tile."""
 
 from __future__ import annotations
 

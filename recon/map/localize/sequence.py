@@ -1,4 +1,4 @@
-"""A whole drive, or a single pair, located in a map."""
+"""A whole drive located in a map, and its figures."""
 
 from __future__ import annotations
 

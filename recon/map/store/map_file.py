@@ -1,4 +1,4 @@
-"""The map: drives in one file that is opened, appended to, committed and closed."""
+"""The map on disk: drives in one file, which frames have a place in it, and what can be seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The poses and the health of the frames of a session, as records of a map."""
+"""Values as records of a map, checked where they are read: frames, rays, loops and links."""
 
 from __future__ import annotations
 

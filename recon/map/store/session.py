@@ -1,4 +1,4 @@
-"""A session of a map: what one drive put into it."""
+"""A session of a map: what one drive put into it, with its submaps and keyframes."""
 
 from __future__ import annotations
 

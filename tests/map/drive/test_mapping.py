@@ -1,4 +1,4 @@
-"""Maps of a real street: the road is free, the objects beside it are occupied."""
+"""A drive in the map: a real street, poses that are doubted, and matching behind the poses."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Surfaces of a map fix a pose where they can, and correct it where that is worth it."""
+
 from __future__ import annotations
 
 import numpy as np
