@@ -33,8 +33,7 @@ def mesh_frame(
     """Mesh the cloud of a frame as its camera saw it.
 
     Returns:
-        The surface in camera axes, None if none could be made; the share of the points that lie
-        on it, in [0, 1]; warnings.
+        The surface in camera axes, or None; the share of the points that lie on it; warnings.
     """
     try:
         mesh = reconstruct_view(frame.cloud, frame.pair.camera, settings)

@@ -35,19 +35,19 @@ def screened_poisson(
     samples_per_node: float,
     point_weight: float,
 ) -> tuple[Float32, Int32, Float32]:
-    """Return the closed surface through oriented points (N, 3) with unit normals, all finite.
+    """Return the closed surface through points (N, 3) with outward unit normals, all finite.
 
     Args:
         xyz: Metres.
-        normals: Outwards.
+        normals: Of the points.
         depth: Depth of the octree: its edge has 2^depth cells.
         scale: Edge of the octree, as a multiple of the longest side of the cloud.
         samples_per_node: Minimum number of points per octree cell; larger for noisy points.
         point_weight: Weight of interpolating the points relative to fitting the normals.
 
     Returns:
-        float32 (V, 3) vertices, int32 (F, 3) faces, and float32 (V,) point density around each
-        vertex, in octree levels (one level more = four times as dense).
+        Vertices (V, 3), faces (F, 3), and the point density around each vertex, in octree levels
+        (one level more = four times as dense).
     """
     # A single NaN can make MeshLab return nothing, or a surface that is wrong everywhere.
     if not (np.isfinite(xyz).all() and np.isfinite(normals).all()):

@@ -159,10 +159,7 @@ def epipolar_pictures(
 ) -> dict[str, bytes]:
     """Draw a pair with epipolar lines as recorded, and rectified with rows of the left image.
 
-    Args:
-        raw: Images, points (N, 2) and lines of these points, (M, 2) each, of both sides.
-        rectified: Images and points.
-        name: Of the pair, for the title.
+    ``raw`` has images, points (N, 2) and a line (M, 2) for each; ``rectified`` images and points.
     """
     images, pixels = rectified
     right = images[0].shape[1] - 1.0

@@ -40,8 +40,7 @@ def path_figure(
 ) -> bytes:
     """Draw the path in map axes from above; poses that are not trusted are marked.
 
-    ``radius_share``: with 95 % probability the camera was in a circle of this share of the path up
-    to there; 0 = not known.
+    Circles of ``radius_share`` of the path up to there say where the camera was with 95 %.
     """
     path = seen_from_above(estimate, T_map_world)
     lines: list[Line] = [(path, ESTIMATE_LINE)]

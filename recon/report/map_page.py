@@ -109,8 +109,7 @@ _SCALE_THRESHOLDS: Final = 2.0
 def write_map_errors(comparison: MapComparison, run: RunDirectory) -> None:
     """Write ``error.ply`` and ``missed.ply``, both in the axes of the reference.
 
-    The first is the map, coloured by the distance of each point to the reference; the second is
-    the reference, coloured by the distance to the map. ``quality`` is the distance in metres.
+    Map and reference are coloured by their distance to each other; ``quality`` is it in metres.
     """
     limit_m = _SCALE_THRESHOLDS * max(comparison.thresholds_m)
     cloud, reference = comparison.cloud, comparison.reference

@@ -174,8 +174,7 @@ def colour_grid(grid: OccupancyGrid) -> UInt8:
 def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
     """Colour a grid by comparison with ground truth (`GRID_ERRORS`); row 0 is the largest y.
 
-    An obstacle marked free is red, one marked unknown blue, a false obstacle orange, free ground
-    marked unknown green; unseen cells are grey. Each cell is a square of whole pixels.
+    Unseen cells are grey. Each cell is a square of whole pixels.
     """
     cells = grid_on_truth(grid, truth)
     image = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)

@@ -96,29 +96,17 @@ def test_antenna_and_times_between_frames_count(place: Place) -> None:
     assert placed.rms_m < 0.001
     assert placed.tilt_deg < 0.01
     assert not placed.warnings()
+    without = place(each_second(), antenna=(0.0, 0.0, 0.0)).T_survey_map - T_SURVEY_MAP
+    assert without[2, 3] == pytest.approx(ANTENNA[2], abs=0.05)
 
 
-def test_without_the_antenna_the_map_is_off_by_it(place: Place) -> None:
-    placed = place(each_second(), antenna=(0.0, 0.0, 0.0))
-    off = placed.T_survey_map[2, 3] - T_SURVEY_MAP[2, 3]
-    assert off == pytest.approx(ANTENNA[2], abs=0.05)
-
-
-def test_frames_that_are_not_trusted_do_not_count(place: Place) -> None:
+def test_frames_that_are_not_trusted_and_the_order_of_positions_do_not_count(place: Place) -> None:
     rows = positions(FROM_S + 0.05 + np.arange(0, 19.8, 0.1))
     assert place(rows, mapped(untrusted=(50, 51, 52))).rms_m < 0.01
-
-
-def test_positions_may_be_a_tum_file_and_in_any_order(place: Place) -> None:
-    rows = each_second()[::-1]
-    placed = place(np.column_stack([rows, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))]))
-    np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
-
-
-def test_the_first_drive_of_a_merged_map_counts(place: Place) -> None:
-    map_ = mapped()
+    # A TUM file; and a merged map, of which the first drive counts.
+    rows, map_ = each_second()[::-1], mapped()
     map_.begin(SessionInfo()).add_frame(np.eye(4), 0.0, OdometryHealth())
-    placed = place(each_second(), map_)
+    placed = place(np.column_stack([rows, np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))]), map_)
     np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
 
 

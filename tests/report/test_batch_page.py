@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
+from recon.report import style
 from recon.report.batch_page import batch_tables, sweep_figure, write_batch_page
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult, compare
@@ -69,20 +71,29 @@ def test_the_csv_has_every_figure_and_swept_setting(folder: Path) -> None:
     assert rows[10]["error"] == "<b>no images</b> | none"
 
 
-def test_the_table_for_people_leaves_out_columns_that_no_job_has(folder: Path) -> None:
-    head = (folder / "table.md").read_text().splitlines()[1]
-    assert "trajectory.t_rel_percent" in head
-    assert "map.f_score" not in head
-
-
-def test_a_bar_in_an_error_is_no_column(folder: Path) -> None:
+def test_the_table_for_people_leaves_out_what_no_job_has_and_keeps_its_columns(
+    folder: Path,
+) -> None:
     lines = [line for line in (folder / "table.md").read_text().splitlines() if line]
+    assert "trajectory.t_rel_percent" in lines[1]
+    assert "map.f_score" not in lines[1]
+    # A bar in an error is no column.
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines if line[0] == "|"}) == 1
 
 
-def test_a_sweep_is_drawn(folder: Path) -> None:
-    picture = np.asarray(Image.open(folder / "sweep.png").convert("L"))
-    assert picture.std() > 5
+def test_a_sweep_is_drawn_with_a_point_per_job_and_medians(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert np.asarray(Image.open(folder / "sweep.png").convert("L")).std() > 5
+    figures: list[Figure] = []
+    monkeypatch.setattr(style, "to_png", lambda figure: figures.append(figure) or b"")
+    jobs = [replace(one, figures={"seconds": float(n)}) for n, one in enumerate(results()[:6])]
+    sweep_figure([*jobs[:5], replace(jobs[5], figures={"frames": 40})])
+    (_, axes) = figures[0].axes
+    *points, medians = axes.lines
+    assert [list(line.get_ydata()) for line in points] == [[0.0, 2.0, 4.0], [1.0, 3.0]]
+    np.testing.assert_array_equal(medians.get_xydata(), [[0, 2], [1, 2]])
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["9", "11"]
 
 
 def test_jobs_of_each_command_have_a_table_and_panels_of_their_own(

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,26 +15,56 @@ from recon.core.values import (
     Disparity,
     DisparityTruth,
     PointCloud,
+    Reason,
     Trajectory,
 )
 from recon.evaluation.drive_errors import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 from recon.report.map_page import map_content, write_joined_page, write_map_page
 from recon.report.pair_page import write_pair_page
+from recon.report.style import REASON_COLOURS
 from recon.run.directory import RunDirectory
-from tests.report.pages import blocks, key_figures, map_html, pair_html, rows
+from tests.report.pages import blocks, images, key_figures, map_html, pair_html, rows
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 
-def test_page_of_a_drive_puts_the_main_figures_first(drive: SimpleNamespace) -> None:
-    figures = key_figures(map_html(drive))
-    assert figures["Path"] == "10.0 m"
-    assert figures["Drift (t_rel)"] == "0.62 %"
-    assert figures["Frames not trusted"] == "1 of 11"
-    assert figures["Mapping rate"] == "4.2 fps"
-    assert figures["Points in the map"] == "2,000"
-    assert "Triangles" not in figures
+MAX_BYTES = 12e6
+
+
+def test_page_of_a_drive_shows_all_that_the_run_has(drive: SimpleNamespace) -> None:
+    page = map_html(drive)
+    assert images(page) == {
+        "Occupancy grid", "Path from above", "Error along the path", "Health of the odometry",
+        "Input pair", "Disparity", "Depth", "Why pixels have no disparity", "Confidence",
+        "Time by stage",
+    }  # fmt: skip
+    assert key_figures(page) == {
+        "Path": "10.0 m", "Drift (t_rel)": "0.62 %", "Position error (ATE)": "0.41 m",
+        "Frames not trusted": "1 of 11", "Mapping rate": "4.2 fps", "Points in the map": "2,000",
+    }  # fmt: skip
+    shown = blocks(page)
+    assert '<div class="scene">' in shown["In 3-D"]
+    table = rows(shown["All figures"])
+    assert {("nested.a", "1, –"), ("fps", "4.25 frames/s")} <= set(table)
+    assert ("segments", "3 of 5 m") in rows(shown["Path against truth"])
+    assert "Stereo, frame 7" in page
+    assert 1e5 < len(page.encode()) < MAX_BYTES
+
+
+def test_page_of_a_pair_shows_all_that_the_run_has(view: SimpleNamespace) -> None:
+    page = pair_html(view)
+    shown = blocks(page)
+    assert {"Input pair", "Disparity", "Disparity error", "In 3-D"} <= shown.keys()
+    assert ("pixels compared", "1,440") in rows(shown["Disparity against truth"])
+    figures = key_figures(page)
+    assert figures["Pixels with a disparity"] == "75.0 %"
+    assert figures["Bad 2: off by more than 2 px"] == "10.0 %"
+    assert figures["Points"] == "2,000"
+    assert len(page.encode()) < MAX_BYTES
+    assert "baseline 0.5 m" in page
+    view.summary["up_to_scale"] = True
+    assert "every m in this report is one baseline" in pair_html(view)
 
 
 def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
@@ -102,12 +133,6 @@ def test_page_of_a_pair_without_any_disparity_is_made(
     assert "In 3-D" not in page
 
 
-def test_page_of_a_pair_up_to_scale_says_so(view: SimpleNamespace) -> None:
-    assert "baseline 0.5 m" in pair_html(view)
-    view.summary["up_to_scale"] = True
-    assert "every m in this report is one baseline" in pair_html(view)
-
-
 def test_truth_of_another_size_gives_no_error_map(view: SimpleNamespace) -> None:
     half = view.disparity.values[::2, ::2].copy()
     view.truth = DisparityTruth(half, np.isfinite(half))
@@ -128,7 +153,11 @@ def test_runs_leave_their_pages_and_images(
     assert re.search("Map of drive &lt;1&gt;(?s:.*)frame 5: lost(?s:.*)Versions", page)
     page = (tmp_path / "pair/report.html").read_text(encoding="utf-8")
     assert re.search("Stereo pair im0.png(?s:.*)a warning", page)
-    assert (tmp_path / "pair/disparity/disparity_colour.png").is_file()
+    folder = tmp_path / "pair/disparity"
+    names = {"disparity_colour.png", "confidence_colour.png", "reason_colour.png"}
+    assert {path.name for path in folder.iterdir()} == names
+    reasons = cv2.imread(str(folder / "reason_colour.png"))[:, :, ::-1]
+    np.testing.assert_array_equal(reasons[0, 0], REASON_COLOURS[Reason.BORDER])
 
 
 def test_drives_of_a_merged_map_are_named_in_its_page(

@@ -46,8 +46,7 @@ def test_colours_of_points_come_back_from_their_scale() -> None:
     named = [marker["colorscale"][place][1] for place in unpack(marker["color"])]
     assert named == ["rgb(10,20,30)", "rgb(200,100,0)"]
     assert marker["cmax"] == len(marker["colorscale"]) - 1
-    assert marker["colorscale"][0][0] == 0.0
-    assert marker["colorscale"][-1][0] == 1.0
+    assert [marker["colorscale"][n][0] for n in (0, -1)] == [0.0, 1.0]
 
 
 def test_coloured_cloud_can_also_be_shown_by_height(cloud: PointCloud) -> None:

@@ -28,15 +28,10 @@ class Plane:
 
 
 def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleMesh:
-    """Return the part of a mesh on one side of a plane, perhaps none; what crosses it is split.
+    """Return the part of a mesh above or below a plane, perhaps none; what crosses it is split.
 
     Two meshes of one surface, cut along the same plane, meet there without overlap: new vertices
     lie exactly in the plane. Their normals and colours are interpolated.
-
-    Args:
-        mesh: Any mesh.
-        plane: Where to cut.
-        keep_above: Keep the side of larger coordinates, else that of smaller ones.
     """
     away = mesh.vertices[:, plane.axis] - np.float32(plane.at_m)
     away = away if keep_above else -away
@@ -136,16 +131,10 @@ def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
 
 
 def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
-    """Fit a mesh to the border of its neighbour, cut along the same plane.
+    """Fit a mesh to the border (E, 2, 3) of its neighbour (`open_edges`), cut along the same plane.
 
     The vertices of the mesh move onto the border, and those of the border are inserted into the
-    mesh, so that both follow the same line.
-
-    Args:
-        mesh: The mesh.
-        plane: The plane of the cut.
-        border: float32 (E, 2, 3), the neighbour's `open_edges`.
-        reach_m: Widest gap that is closed.
+    mesh, so that both follow the same line; gaps wider than ``reach_m`` stay.
     """
     rows = np.flatnonzero(plane.holds(mesh.vertices))
     if not len(rows) or not len(border):
@@ -202,10 +191,7 @@ def _with_inserted(
 def _split_faces(
     faces: Int32, corners: Int32, edge: np.ndarray[tuple[int], np.dtype[np.int64]], new: Int32
 ) -> Int32:
-    """Split faces with new vertices on a boundary edge into fans around the opposite corner.
-
-    ``edge`` is the row of ``corners`` (`_open_corners`) of each new vertex, ascending.
-    """
+    """Split faces with new vertices on boundary edges, ascending, into fans."""
     kept = np.ones(len(faces), dtype=bool)
     fans = [faces[:0]]
     for row in np.unique(edge):
@@ -218,10 +204,7 @@ def _split_faces(
 
 
 def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
-    """Return boundary edges in a plane: int32 (E, 4).
-
-    First and last vertex in the order of the triangle, its third vertex, and its index.
-    """
+    """Return boundary edges in a plane, int32 (E, 4): ends, third vertex and number of the face."""
     number = np.repeat(np.arange(len(mesh.faces), dtype=np.int32), 3)
     turned = mesh.faces[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)
     inside = plane.holds(mesh.vertices)[turned[:, :2]].all(axis=1)

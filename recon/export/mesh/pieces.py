@@ -92,8 +92,7 @@ def export_mesh(
         settings: Settings of the mesh; ``target_faces`` is the total over all pieces.
         run: The run.
         cloud: A PLY file in it, for the MeshLab project.
-        threads: Pieces reconstructed at a time, at most four, since each needs memory; None = one
-            per core. Does not change results.
+        threads: Pieces made at a time, at most four: each needs memory; None = one per core.
     """
     at_once = min(threads or available_cores(), _MOST_AT_ONCE)
     points = _count(tiles, settings)

@@ -159,8 +159,7 @@ def trimmed_surface(
 ) -> TriangleMesh:
     """Return the Poisson surface of a cloud with unit normals, without what no points support.
 
-    Coordinates are equally precise everywhere. ``wrong`` says which vertices (V, 3) cannot be on a
-    surface.
+    ``wrong`` says which vertices (V, 3) cannot be on a surface.
     """
     vertices, faces, density = screened_poisson(
         cloud.xyz,
