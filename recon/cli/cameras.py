@@ -188,7 +188,7 @@ def rectify(
       recon rectify left.png right.png
     """
     with shared.one_line_errors():
-        from recon.commands.rectify import run_rectify
+        from recon.commands.calibrate import run_rectify
 
         run = run_rectify(
             left,
