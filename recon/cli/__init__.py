@@ -1,8 +1,8 @@
 """The command line: parse, build the configuration, call one story of `commands/`, print one table.
 
 `options.py` and `drive_options.py` have what several commands take: a dataclass is a group of
-options, which `takes_groups` spreads. `errors.py` says what an error looks like, `commands.py`
-what is a number; `tables.py` and `progress.py` print.
+options, which `takes_groups` spreads. `errors.py` says what an error looks like; `tables.py` and
+`progress.py` print.
 
 Nothing heavy is imported before a command runs, so ``recon --help`` answers at once.
 """
@@ -19,12 +19,12 @@ from recon import __version__
 from recon.cli import datasets, evaluate
 from recon.cli.batch import batch
 from recon.cli.cameras import board, calibrate, rectify
-from recon.cli.commands import Commands
 from recon.cli.errors import interrupt_on_signals, report_unforeseen
 from recon.cli.evaluate import paper
 from recon.cli.getting_started import demo, doctor, settings
 from recon.cli.live import live, localize
 from recon.cli.map import map_, merge, piece
+from recon.cli.options import Commands
 from recon.cli.pair import disparity, pair
 from recon.cli.products import export, mesh, occupancy
 from recon.cli.recording import audit, capture

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.commands import Commands
 from recon.cli.errors import one_line_errors
+from recon.cli.options import Commands
 from recon.cli.tables import print_datasets, print_json
 
 app = Commands(

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.commands import Commands
 from recon.cli.errors import one_line_errors
+from recon.cli.options import Commands
 from recon.cli.tables import print_evaluation, print_figures, print_json
 
 app = Commands(no_args_is_help=True, help="Compare results with ground truth.")

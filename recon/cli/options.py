@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from recon.commands.map_options import MapOptions
     from recon.map.sessions.measured import Survey
     from recon.run.progress import Progress
+from typer.core import TyperCommand
+
+from recon.core.text import refuse_other_numbers
 
 _KEYWORD: Final = inspect.Parameter.KEYWORD_ONLY
 Read = str | Callable[[Any], Mapping[str, Any]]
@@ -263,3 +266,28 @@ def _options_of(group: Any) -> list[inspect.Parameter]:
 def _setting_of(option: inspect.Parameter) -> Read | None:
     marks = getattr(option.annotation, "__metadata__", ())
     return next((mark.setting for mark in marks if hasattr(mark, "setting")), None)
+
+
+class Commands(typer.Typer):
+    """A program, or a part of one, whose options take ASCII decimals alone for numbers."""
+
+    def command(self, name: str | None = None, **how: Any) -> Callable[[Any], Any]:
+        """Return the decorator that makes a function a command, see `typer.Typer.command`."""
+        return super().command(name, cls=_Command, **how)
+
+
+class _Command(TyperCommand):
+    """A command that looks at the text of each number, see `recon.core.text`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        texts, _, _ = self.make_parser(ctx).parse_args([*args])
+        left = super().parse_args(ctx, args)
+        param: Any  # a class of typer's own
+        for param in self.params:
+            text = texts.get(param.name)
+            if isinstance(text, str) and isinstance(ctx.params.get(param.name), int | float):
+                try:
+                    refuse_other_numbers(text)
+                except ValueError as error:
+                    raise typer.BadParameter(str(error), ctx, param) from error
+        return left
