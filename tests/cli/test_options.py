@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,10 +11,13 @@ import typer
 from typer.testing import CliRunner
 
 from recon.cli import app, evaluate
-from recon.cli.drive_options import DriveOptions, StartInMap
-from recon.cli.options import Shared, takes_groups
+from recon.cli.drive_options import DriveOptions, StartInMap, read_start
+from recon.cli.options import Shared, survey_of, takes_groups
 from recon.commands.config import ReconConfig, load_config
+from recon.core.errors import SettingsError
 from recon.core.settings import setting_names
+from recon.map.localize.sequence import StartPose
+from recon.map.sessions.measured import Survey
 
 SEEN: list[ReconConfig] = []
 probe = typer.Typer()
@@ -71,3 +75,38 @@ def test_every_option_that_names_a_setting_names_one_that_there_is() -> None:
     named = [mark.setting for mark in marks if isinstance(getattr(mark, "setting", None), str)]
     assert len(named) > 50
     assert {*named} <= {*setting_names(ReconConfig)}
+
+
+def test_a_survey_is_positions_with_an_offset_and_a_system() -> None:
+    positions = Path("gnss.txt")
+    assert survey_of(None, None) is None
+    assert survey_of(positions, None) == Survey(positions, (0.0, 0.0, 0.0), None)
+    full = survey_of(positions, "-0.4,0,1", "EPSG:25832")
+    assert full == Survey(positions, (-0.4, 0.0, 1.0), "EPSG:25832")
+
+
+@pytest.mark.parametrize(
+    ("positions", "antenna", "crs", "where"),
+    [
+        (None, "0,0,1", None, "--antenna"),
+        (None, None, "EPSG:25832", "--crs"),
+        ("gnss.txt", "1,2", None, "--antenna"),
+        ("gnss.txt", "1,2,3,4", None, "--antenna"),
+        ("gnss.txt", "1,2,1e999", None, "--antenna"),
+        ("gnss.txt", "here", None, "--antenna"),
+    ],
+)
+def test_half_a_survey_is_refused(
+    positions: str | None, antenna: str | None, crs: str | None, where: str
+) -> None:
+    with pytest.raises(SettingsError, match=where):
+        survey_of(None if positions is None else Path(positions), antenna, crs)
+
+
+def test_a_drive_begins_at_a_pose_or_a_frame() -> None:
+    assert read_start(None) == (None, None)
+    assert read_start("7") == (None, 7)
+    assert read_start("12.5,-3,90") == (StartPose(12.5, -3.0, 90.0), None)
+    for text in ("1.5", "1,2", "1,2,3,4", "1,2,1e999", "there"):
+        with pytest.raises(SettingsError, match="--start"):
+            read_start(text)
