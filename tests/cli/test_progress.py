@@ -162,6 +162,7 @@ def test_the_bar_fits_the_terminal_and_what_counts_is_never_cut(
     assert f" 4.0 {unit}/s " in f"{last} "
     assert bad in last
     assert re.search(r" \d:\d\d:\d\d ", last) or width < 80
+    assert " 70 " not in last or width == 80  # what has no room is left out whole
 
 
 def test_frames_that_are_searched_are_not_called_untrusted() -> None:
