@@ -1,10 +1,11 @@
 """Sources of stereo pairs: one module per kind of input.
 
-- `source.py`: the base class of every source, and a part of one; `registry.py`: the kinds;
+- `source.py`: the base class of every source, which frames are pairs, a part of a drive;
+  `registry.py`: the kinds;
 - `kitti.py`, `listed.py` (EuRoC, TUM), `folders.py`, `video.py`, `bag.py`, `one_pair.py`,
   `synthetic.py`: one kind each, or two alike;
 - `images.py`: drives in image files, which `image_names.py` and `times.py` pair;
-- `frame_list.py`: which frames are pairs, and which of them are used; `calibration.py`;
+- `calibration.py`: which calibration is used;
 - `live.py`: a drive that arrives in its own time; `opencv_camera.py`; `bag_prior.py`;
 - `datasets.py`: public data sets and how they are fetched.
 """

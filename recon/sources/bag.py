@@ -18,12 +18,10 @@ from recon.io.cameras.ros import ROS_MODELS, check_shift, lens_of, rig_of_camera
 from recon.io.files import reading, resolved
 from recon.sources.bag_prior import read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
-from recon.sources.frame_list import pair_frames
 from recon.sources.image_names import find_partners, partner_names
-from recon.sources.one_pair import join_pair
 from recon.sources.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag, BagCameraInfo
 from recon.sources.settings import SourceSettings
-from recon.sources.source import ReadPrior, Recording
+from recon.sources.source import ReadPrior, Recording, join_pair, pair_frames
 from recon.sources.times import check_increasing, pair_stamps
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})

@@ -25,7 +25,6 @@ from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import resolved
 from recon.io.trajectory import FRAMES, read_frames
 from recon.sources.calibration import read_rig
-from recon.sources.frame_list import FrameList
 from recon.sources.image_names import find_partners, natural_key, partner_names, split_sides
 from recon.sources.images import (
     ImageFrame,
@@ -39,6 +38,7 @@ from recon.sources.images import (
     stamps_of,
 )
 from recon.sources.settings import SourceSettings
+from recon.sources.source import FrameList
 from recon.sources.times import (
     check_increasing,
     read_times_of_pairs,

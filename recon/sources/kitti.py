@@ -34,7 +34,6 @@ from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offs
 from recon.io.files import resolved
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
-from recon.sources.frame_list import FrameList
 from recon.sources.image_names import natural_key
 from recon.sources.images import (
     ImageFrame,
@@ -45,6 +44,7 @@ from recon.sources.images import (
     pair_named,
 )
 from recon.sources.settings import SourceSettings
+from recon.sources.source import FrameList
 from recon.sources.times import check_increasing, read_dates, read_times_of_pairs
 
 _RAW_CALIBRATION: Final = "calib_cam_to_cam.txt"

@@ -12,7 +12,6 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError, SourceError
 from recon.core.values import DisparityTruth, Rig, StereoPair
-from recon.core.values.arrays import UInt8
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import StrPath
@@ -21,9 +20,8 @@ from recon.io.images.image import MAX_MEGAPIXELS, eight_bits, find_white, read_l
 from recon.io.images.image_header import read_focal_length
 from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.sources.calibration import CALIBRATE, camera_of_numbers, check_given_once, read_rig
-from recon.sources.frame_list import pair_frames
 from recon.sources.settings import SourceSettings
-from recon.sources.source import StereoSource
+from recon.sources.source import StereoSource, join_pair, pair_frames
 
 UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
 LEAST_SIDE_PX: Final = 16  # smaller than this, an image does not hold the windows that are compared
@@ -94,15 +92,6 @@ def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIX
             expected=f"at least {LEAST_SIDE_PX} pixels a side",
         )
     return join_pair(images[0], images[1], name=Path(left).name)
-
-
-def join_pair(
-    left: UInt8, right: UInt8, timestamp_s: float = 0.0, index: int = 0, name: str = ""
-) -> StereoPair:
-    """Join two images of equal size; if only one is in colour, the other is converted."""
-    if left.ndim != right.ndim:
-        left, right = (p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in (left, right))
-    return StereoPair(left, right, timestamp_s, index, name)
 
 
 @dataclass(frozen=True, eq=False)

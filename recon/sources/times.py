@@ -18,7 +18,7 @@ from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.files import read_table, read_text, reader
 from recon.io.trajectory import read_tum
-from recon.sources.frame_list import FrameList, check_most
+from recon.sources.source import FrameList, check_most
 
 _STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+", re.ASCII)
 _SECONDS_DIGITS: Final = 10  # digits of a time in seconds since 1970, from 2001 to 2286

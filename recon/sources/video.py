@@ -17,10 +17,9 @@ from recon.core.values.arrays import UInt8
 from recon.io.files import resolved
 from recon.io.images.video import VIDEOS, VideoFile, open_video
 from recon.sources.calibration import read_rig
-from recon.sources.frame_list import pair_frames
 from recon.sources.image_names import find_partners
 from recon.sources.settings import SourceSettings
-from recon.sources.source import Recording
+from recon.sources.source import Recording, pair_frames
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})
 _LONGER: Final = 0.05

@@ -4,7 +4,7 @@
 
 - `rectify/rectifier.py`: both images are warped so that matching pixels share a row;
 - `match/registry.py`: the matchers by name; ours are `match/sad.py` and `match/sgm.py`;
-- `cloud/back_project.py`, `cloud/filters.py`: from disparities to points.
+- `cloud/back_project.py`: from disparities to points.
 
 The loops are in `kernels/`. `rectify/` also has what calibration and audit need of cameras: lenses,
 epipolar lines, matched features.

@@ -26,11 +26,16 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.run.progress import Stopwatch
-from recon.stereo.cloud.back_project import CloudSettings, back_project, remove_flying_edges
-from recon.stereo.cloud.filters import FilterSettings, filter_cloud
+from recon.stereo.cloud.back_project import (
+    CloudSettings,
+    FilterSettings,
+    back_project,
+    filter_cloud,
+    remove_flying_edges,
+)
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.range import HalfSizeMatcher
 from recon.stereo.match.registry import MatchingSettings, check_matcher, make_matcher, searched
+from recon.stereo.match.sad import HalfSizeMatcher
 from recon.stereo.rectify.features import check_inspection, inspect_pair
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 

@@ -21,7 +21,7 @@ from recon.map.store.records import Store
 from recon.map.store.session import Submaps
 from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles
-from recon.stereo.cloud.filters import filter_cloud
+from recon.stereo.cloud.back_project import filter_cloud
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 CONFIG = load_config(None, ["submaps.length_m=4", "submaps.tile_m=6.4", "fusion.min_count=2"])

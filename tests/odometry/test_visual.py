@@ -11,8 +11,7 @@ from recon.core.values import Disparity, RectifiedPair
 from recon.odometry.features import in_crowd
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
-from recon.stereo.match.range import HalfSizeMatcher
-from recon.stereo.match.sad import SadSettings
+from recon.stereo.match.sad import HalfSizeMatcher, SadSettings
 
 See = Callable[..., OdometryFrame]
 

@@ -1,6 +1,5 @@
 """Filtered point clouds with uncertainties, from disparity maps.
 
-- `back_project.py`: pixels that float between surfaces are dropped, disparities become points with
-  a depth error;
-- `filters.py`: thinning and outliers, by Open3D (`open3d_clouds.py`).
+`back_project.py`: pixels that float between surfaces are dropped, disparities become points with a
+depth error, which are thinned and filtered by Open3D (`open3d_clouds.py`).
 """

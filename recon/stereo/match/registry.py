@@ -20,8 +20,7 @@ from recon.stereo.match.protocol import (
     name_of,
     registered_names,
 )
-from recon.stereo.match.range import AutoRangeMatcher, estimate_ndisp
-from recon.stereo.match.sad import SadMatcher, SadSettings
+from recon.stereo.match.sad import AutoRangeMatcher, SadMatcher, SadSettings, estimate_ndisp
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 

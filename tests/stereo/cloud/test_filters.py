@@ -8,7 +8,12 @@ import pytest
 from recon.core.errors import ReconError, SettingsError, ShapeError
 from recon.core.values import PointCloud
 from recon.stereo.cloud import open3d_clouds
-from recon.stereo.cloud.filters import ANY_SCALE, FilterSettings, filter_cloud, voxel_downsample
+from recon.stereo.cloud.back_project import (
+    ANY_SCALE,
+    FilterSettings,
+    filter_cloud,
+    voxel_downsample,
+)
 
 OFF = FilterSettings()
 

@@ -11,7 +11,6 @@ import pytest
 
 from recon.core.values import Disparity, RectifiedPair
 from recon.io.middlebury import read_middlebury_scene, stand_in_camera
-from recon.stereo.match.range import AutoRangeMatcher, HalfSizeMatcher, estimate_ndisp
 from recon.stereo.match.registry import (
     MATCHERS,
     MatchingSettings,
@@ -19,7 +18,7 @@ from recon.stereo.match.registry import (
     searched,
     settings_of,
 )
-from recon.stereo.match.sad import SadSettings
+from recon.stereo.match.sad import AutoRangeMatcher, HalfSizeMatcher, SadSettings, estimate_ndisp
 from recon.stereo.match.search import usual_ndisp
 from recon.stereo.match.sgm import SgmSettings
 from recon.stereo.rectify.rectifier import to_grey
