@@ -112,8 +112,8 @@ class Cluster:
             if outcome.state == "broken" and number < job.retries:
                 others = {*self.workers} - {outcome.worker} if outcome.full else ()
                 give([job], number + 1, [*others])
-            else:
-                yield job, outcome
+            else:  # the log of a worker with a disk of its own lacks the tries of others
+                yield job, replace(outcome, tries=max(outcome.tries, number + 1))
             if len(tries) < _AT_ONCE // 2:
                 give(islice(waiting, _AT_ONCE // 2))
 
