@@ -77,8 +77,8 @@ def _lists(path: Path) -> bool:
 
 
 def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
-    if settings.left and settings.right:
-        return folder / settings.left, folder / settings.right
+    if (named := settings.named_in(folder)) is not None:
+        return named
     found = list_files(folder)
     if not found:
         raise SourceError(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
+from recon.core.errors import SourceError
 from recon.core.settings import Settings
 from recon.io.images.image import MAX_MEGAPIXELS
 
@@ -54,6 +56,19 @@ class SourceSettings(Settings):
     images. Negative = the left camera is late."""
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = "left-right"
     """Arrangement of the two views in the frames of one video."""
+
+    def named_in(self, folder: Path) -> tuple[Path, Path] | None:
+        """Return the left and right file that are named of a folder; None = neither is."""
+        if not (self.left or self.right):
+            return None
+        if not (self.left and self.right):
+            raise SourceError(
+                "only one of the two cameras is named",
+                where=folder,
+                got=f"--left {self.left}" if self.left else f"--right {self.right}",
+                hint="name them with --left and --right, or neither",
+            )
+        return folder / self.left, folder / self.right
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -156,8 +156,8 @@ def _find_videos(path: Path, settings: SourceSettings) -> list[Path]:
         return [path] if settings.right is None else [path, Path(settings.right)]
     if not path.is_dir():
         raise SourceError("file does not exist", where=path)
-    if settings.left and settings.right:
-        return [path / settings.left, path / settings.right]
+    if (named := settings.named_in(path)) is not None:
+        return list(named)
     names = list_videos(path)
     pairs = find_partners(names)
     if pairs:

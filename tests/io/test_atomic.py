@@ -83,6 +83,12 @@ def test_an_input_is_not_written_under_any_name(tmp_path: Path, link: str) -> No
         check_targets([tmp_path / "new", target.get(link, tmp_path / link)], [source])
 
 
+def test_a_new_file_and_one_that_is_not_read_may_be_written(tmp_path: Path) -> None:
+    for name in ("read", "other"):
+        (tmp_path / name).write_text("same content")
+    check_targets([tmp_path / "new", tmp_path / "other"], [tmp_path / "read", tmp_path / "gone"])
+
+
 def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="No such file"), atomic_path(tmp_path / "a.txt"):
         pass

@@ -123,6 +123,12 @@ def test_lists_and_videos_can_be_named_and_one_name_alone_is_not_enough(
     assert len(list(open_source(folder, kind, SourceSettings(**named)))) == 12
     with pytest.raises(SourceError, match="name them with --left and --right"):
         open_source(folder, kind, SourceSettings(**{side: named[side]}))
+    for view, name in (("port", names[0]), ("starboard", names[1])):
+        (folder / f"{view}{name[-4:]}").rename(folder / name)
+    assert len(open_source(folder, kind)) == 12
+    named = {"left": names[0], "right": names[1]}  # also of those that are found without a name
+    with pytest.raises(SourceError, match=rf"only one .*got --{side} {named[side]}.* --left and"):
+        open_source(folder, kind, SourceSettings(**{side: named[side]}))
 
 
 def test_two_videos_must_advance_alike(noise: list[StereoPair], tmp_path: Path) -> None:
