@@ -28,8 +28,7 @@ from recon.sources.source import StereoSource
 
 # Weight of the newest item in the displayed rate: steady enough to read, yet responsive.
 _RATE_WEIGHT: Final = 0.2
-_SLOW_S: Final = 10.0
-"""From which on an item has seconds, instead of a second items."""
+_SLOW_S: Final = 10.0  # from which on an item has seconds, instead of a second items
 
 
 def choose_viewer(
@@ -129,10 +128,8 @@ class ProgressBar:
         return f"{1.0 / self._seconds:.1f} {self._unit}/s" if self._seconds > 0 else ""
 
 
-_BAR: Final = range(5, 41)
-"""Cells of a bar; where there is less room there is none."""
-_NAME_SHARE: Final = 0.3
-"""Share of the line that a name gets at least, where it is that long."""
+_BAR: Final = range(5, 41)  # cells of a bar; where there is less room there is none
+_NAME_SHARE: Final = 0.3  # share of the line that a name gets at least, where it is that long
 
 
 class FittingColumn(ProgressColumn):

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from recon.commands.doctor import Check
 
 
-_MOST_JOBS: Final = 200
-"""More lines of a batch than these nobody reads."""
+_MOST_JOBS: Final = 200  # more lines of a batch than these nobody reads
 
 
 def print_json(content: Mapping[str, Any]) -> None:

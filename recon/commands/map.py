@@ -36,19 +36,12 @@ from recon.sources.source import StereoSource, check_source
 
 @dataclass(frozen=True, eq=False)
 class MapRun:
-    """The results of a run.
+    """The results of a run."""
 
-    Attributes:
-        mapped: The drive: its map, and what it cost.
-        made: What is left in memory of what was made of the map.
-        errors: Errors against the truth, as far as the source knows it.
-        summary: The figures of ``summary.json``.
-    """
-
-    mapped: MappedSequence
-    made: Products
-    errors: DriveErrors
-    summary: dict[str, Any]
+    mapped: MappedSequence  # the drive: its map, and what it cost
+    made: Products  # what is left in memory of what was made of the map
+    errors: DriveErrors  # errors against the truth, as far as the source knows it
+    summary: dict[str, Any]  # the figures of ``summary.json``
 
     @property
     def cloud(self) -> PointCloud:

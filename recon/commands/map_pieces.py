@@ -33,8 +33,7 @@ from recon.sources.source import SourcePart, StereoSource
 
 LEAD: Final = 20
 """Frames that a piece has in common with the one before: there its odometry gets going."""
-_LEAST: Final = 2 * LEAD
-"""Frames of the shortest piece, without its lead."""
+_LEAST: Final = 2 * LEAD  # frames of the shortest piece, without its lead
 _MOST: Final = 1000
 """Frames of the longest piece: what is lost with a worker, and the time that others wait for it."""
 _PLAN: Final = "pieces.json"

@@ -15,8 +15,7 @@ from recon.export.product import Made, Order
 from recon.io.models.ply import write_ply_tiles
 from recon.map.tiles import Tiles
 
-SAMPLE_POINTS: Final = 300_000
-"""Points of the fused cloud that are kept for display."""
+SAMPLE_POINTS: Final = 300_000  # points of the fused cloud that are kept for display
 _GROWTH: Final = 1.25
 _MUCH: Final = 0.02
 """Share of the points that can be left out without a word; a busy street has less."""

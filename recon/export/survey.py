@@ -15,16 +15,15 @@ from recon.io.models.las import check_inside, write_las
 from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, span_m
 from recon.map.verbs import Map
 
-_LARGEST_STRETCH: Final = 0.05
-"""By how much the path may be too long or short before it is said."""
+_LARGEST_STRETCH: Final = 0.05  # by how much the path may be too long or short before it is said
 
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
     """Where a map is in the coordinates of a survey."""
 
-    T_survey_map: Float64  # float64 (4, 4), rigid
-    misfit_m: Float64  # float64 (N,), distances of the measured positions from those of the map
+    T_survey_map: Float64  # (4, 4), rigid
+    misfit_m: Float64  # (N,), distances of the measured positions from those of the map
     span_m: float  # diagonal of the box around the positions
     scale: float  # how many times as far apart the positions are as those of the map
     left_out: int  # number of positions that contradict the others

@@ -27,12 +27,9 @@ from recon.map.settings import DriveSettings
 from recon.map.store.records import Store
 from recon.map.submaps import Submap
 
-FUSED: Final = "fused"
-"""Kind of the parts of the fused cloud in the tiles."""
-OCCUPANCY: Final = "occupancy"
-"""Kind of the parts of the occupancy."""
-_FILTER_MARGIN_M: Final = 1.0
-"""Least margin around a tile for the filters of the fused cloud."""
+FUSED: Final = "fused"  # kind of the parts of the fused cloud in the tiles
+OCCUPANCY: Final = "occupancy"  # kind of the parts of the occupancy
+_FILTER_MARGIN_M: Final = 1.0  # least margin around a tile for the filters of the fused cloud
 _LEAST_TILE_M: Final = 5.0
 _FUSED_BYTES: Final = 60
 _BLOCK_BYTES: Final = 4 * 3 * BLOCK_EDGE**3

@@ -18,14 +18,11 @@ from recon.core.settings import Settings
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, array_in
 
-_MIN_SIGMA_M: Final = 0.02
-"""Points more precise than this count as this precise: bounds the weight."""
-
+_MIN_SIGMA_M: Final = 0.02  # points more precise than this count as this precise: bounds the weight
 _MAX_SIGMA_M: Final = 0.6
 """Points less precise than this are left out: they would smear over voxels."""
 
-_NOMINAL_ERROR_PX: Final = 0.3
-"""Error of a good match, by which the range of fusion is found."""
+_NOMINAL_ERROR_PX: Final = 0.3  # error of a good match, by which the range of fusion is found
 
 
 class FusionSettings(Settings):
@@ -174,44 +171,34 @@ NORMAL: Final = slice(3, 6)
 CONFIDENCE: Final = 6
 VALUES: Final = 7
 KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")
-PRECISE_SIGMA_M: Final = 0.08
-"""Voxels at least this precise need one frame less."""
-
+PRECISE_SIGMA_M: Final = 0.08  # voxels at least this precise need one frame less
 _PLACED: Final = slice(0, 4)
 _MOST: Final = 1e20
 """Larger than any sum of weights, or of values by weight; sums of much larger ones overflow."""
-_LARGEST_M: Final = 1e3
-"""Larger than any voxel."""
+_LARGEST_M: Final = 1e3  # larger than any voxel
 _FARTHEST_CELL: Final = voxels.KEY_LIMIT - (voxels.KEY_LIMIT >> 4)
 """Voxels that are moved by loops still have a key."""
 _OFFSET: Final = slice(1, 4)
 _TURNED: Final = slice(4 + NORMAL.start, 4 + NORMAL.stop)
 _PLACE_BITS: Final = 12
 """Of weights and offsets: the mean of a voxel of 0.1 m moves by some µm at most."""
-_VALUE_BITS: Final = 8
-"""Of colours, normals and the rest: half a level of 255, a tenth of a degree."""
-_INFORMATION_BITS: Final = 16
-"""It decides which voxels are precise enough to be exported."""
+_VALUE_BITS: Final = 8  # of colours, normals and the rest: half a level of 255, a tenth of a degree
+_INFORMATION_BITS: Final = 16  # it decides which voxels are precise enough to be exported
 
 
 @dataclass(frozen=True, eq=False)
 class FusedPart:
-    """Sums per voxel, one row each, in the order in which voxels were first seen.
+    """Sums per voxel, one row each, in the order in which voxels were first seen."""
 
-    Attributes:
-        keys: int64 (N,), packed cells in world axes (`recon.core.kernels.voxels`), each once.
-        sums: float32 (N, 11): sum of weights; weighted sums of the offset from the voxel's centre
-            and of the values (colour, normal, confidence).
-        information: float32 (N,), sum over frames of the largest weight in each frame.
-        frames: int32 (N,), number of frames that saw the voxel.
-        known: Which of ``rgb``, ``normals``, ``sigma_m`` and ``confidence`` all clouds had; empty
-            where there was no cloud.
-    """
-
+    # int64 (N,), packed cells in world axes (`recon.core.kernels.voxels`), each once
     keys: NDArray[np.int64]
+    # float32 (N, 11): sum of weights; weighted sums of the offset from the voxel's centre and of
+    # the values (colour, normal, confidence)
     sums: Float32
-    information: Float32
-    frames: Int32
+    information: Float32  # (N,), sum over frames of the largest weight in each frame
+    frames: Int32  # int32 (N,), number of frames that saw the voxel
+    # Which of ``rgb``, ``normals``, ``sigma_m`` and ``confidence`` all clouds had; empty where
+    # there was no cloud
     known: tuple[str, ...] = KNOWABLE
 
     def __len__(self) -> int:

@@ -28,10 +28,8 @@ from recon.io.atomic import check_targets, exchange, take_lock, write_text
 from recon.io.files import read_text, reading, resolved
 
 RECORD: Final = "run.json"
-RECORD_BYTES: Final = 1 << 26
-"""Larger than any record: it lists the files of a run."""
-STARTED: Final = "map.recon"
-"""State file of a run that can be resumed: the map that it makes."""
+RECORD_BYTES: Final = 1 << 26  # larger than any record: it lists the files of a run
+STARTED: Final = "map.recon"  # state file of a run that can be resumed: the map that it makes
 _PARTIAL: Final = ".partial"
 _STATE: Final = ".state"
 _LOCK: Final = ".lock"

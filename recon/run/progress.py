@@ -58,8 +58,7 @@ class Silent(Progress):
     """Shows no progress."""
 
 
-SILENT = Silent()
-"""For runs that nobody watches."""
+SILENT = Silent()  # for runs that nobody watches
 
 
 class Stopwatch:

@@ -58,6 +58,8 @@ RECORDS: Final[dict[str, Alter]] = {
     "not UTF-8": replaced(b"\xff\xfe{}"),
     "nested": replaced(b"[" * 100_000),
     "no pose": replaced(b"{}"),
+}
+POSES: Final[dict[str, Alter]] = {
     "pose is null": pose(None),
     "pose is a word": pose("eye"),
     "pose is ragged": pose([[1, 0], [0]]),
@@ -87,6 +89,15 @@ def test_an_altered_record_is_refused(command: str, change: str, finished: Path)
     RECORDS[change](finished / "run.json")
     assert_refused(run(*COMMANDS[command]), "run")
     assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("change", POSES)
+def test_an_altered_pose_is_refused_where_the_record_alone_has_it(
+    change: str, finished: Path
+) -> None:
+    (finished / "map" / "map.recon").unlink()
+    POSES[change](finished / "run.json")
+    assert_refused(run(*COMMANDS["evaluate occupancy"]), "run.json")
 
 
 CONFIGS: Final[dict[str, Alter]] = {

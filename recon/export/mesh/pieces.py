@@ -39,10 +39,8 @@ SAMPLE_FACES: Final = 2_000_000
 _MOST_AT_ONCE: Final = 4
 _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
 """The four sides of a piece: (axis, 1 for the far side)."""
-_SEAM_M: Final = 0.15
-"""Widest gap that is closed where two pieces meet."""
-_BULGE_M: Final = 2.0
-"""How far a surface may go beyond the points that it is made of."""
+_SEAM_M: Final = 0.15  # widest gap that is closed where two pieces meet
+_BULGE_M: Final = 2.0  # how far a surface may go beyond the points that it is made of
 PieceKey = tuple[int, int]
 
 

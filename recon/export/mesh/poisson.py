@@ -33,11 +33,8 @@ OCTREE_SCALE = 1.1
 Point = tuple[float, float, float]
 
 
-_SAMPLES_PER_NODE: Final = 1.5
-"""Points that an octree cell should hold."""
-
-_NORMALS_NEIGHBOURS: Final = 20
-"""Neighbours for normals where the cloud has none."""
+_SAMPLES_PER_NODE: Final = 1.5  # points that an octree cell should hold
+_NORMALS_NEIGHBOURS: Final = 20  # neighbours for normals where the cloud has none
 
 
 class MeshSettings(Settings):

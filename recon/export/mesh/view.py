@@ -31,8 +31,7 @@ from recon.export.mesh.poisson import (
 
 COVERED_WITHIN: Final = 0.005
 """A point is covered if the mesh is no farther from it than this share of its depth."""
-LEAST_COVERAGE: Final = 0.8
-"""Share of the points of a pair that its mesh should cover."""
+LEAST_COVERAGE: Final = 0.8  # share of the points of a pair that its mesh should cover
 _DISPARITY_STEP: Final = 2.0
 """Pixels that a pixel of disparity counts for: what is trimmed as farther than two pixel spacings
 from the points (2.8 pixels) is then a step of 1.4 pixels of disparity or more."""

@@ -18,19 +18,15 @@ from recon.core.values.arrays import Float64, freeze
 AXES_MAP_WORLD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The turn from camera-like axes (right, down, forward) to map axes (forward, left, up)."""
 _UP_CAMERA: Final = np.array([0.0, -1.0, 0.0])
-_MAX_TILT_DEG: Final = 30.0
-"""Planes tilted more than this are no ground."""
+_MAX_TILT_DEG: Final = 30.0  # planes tilted more than this are no ground
 _MIN_TILT_DEG: Final = 3.0
 """The map is levelled only where the camera is tilted more than this: less is within the error of
 the measured ground, and of a road's own slope."""
 _MAX_RANGE_M: Final = 20.0
 """How far away the ground is looked for: farther points are too uncertain to level by."""
-_INLIER_M: Final = 0.05
-"""Distance to the plane of points that support it."""
-_MIN_INLIERS: Final = 500
-"""Points that must support the plane, after thinning to 20 000."""
-_TRIALS: Final = 300
-"""Random planes that are tried."""
+_INLIER_M: Final = 0.05  # distance to the plane of points that support it
+_MIN_INLIERS: Final = 500  # points that must support the plane, after thinning to 20 000
+_TRIALS: Final = 300  # random planes that are tried
 
 
 class AxesSettings(Settings):

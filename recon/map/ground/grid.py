@@ -26,8 +26,7 @@ FREE_HEIGHT_M: Final = 0.8
 hides what is behind it."""
 OCCUPIED_PROBABILITY: Final = 0.55
 """Voxels at least this probable are obstacles: a few hits, as OctoMap counts them, less misses."""
-FREE_PROBABILITY: Final = 0.35
-"""Voxels at most this probable are free."""
+FREE_PROBABILITY: Final = 0.35  # voxels at most this probable are free
 
 
 class GridSettings(Settings):

@@ -25,20 +25,15 @@ from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze
 from recon.core.values.grid import log_odds
 
 _BIN_M: Final = 0.05
-_DEEPEST_M: Final = 5.0
-"""Points farther below the path are not what the camera is carried on."""
+_DEEPEST_M: Final = 5.0  # points farther below the path are not what the camera is carried on
 _NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
-CELL_M: Final = 1.0
-"""Edge of a cell of the surface."""
+CELL_M: Final = 1.0  # edge of a cell of the surface
 WINDOW_M: Final = 0.3
 """Points this far from the expected height may be ground: also the largest step from one cell to
 the next."""
-MAX_TILT_DEG: Final = 35.0
-"""Points with normals tilted more are no ground."""
-MIN_POINTS: Final = 3
-"""Points that make a measured cell."""
-_MAX_GAP_M: Final = 4.0
-"""How far a height is carried over cells without points."""
+MAX_TILT_DEG: Final = 35.0  # points with normals tilted more are no ground
+MIN_POINTS: Final = 3  # points that make a measured cell
+_MAX_GAP_M: Final = 4.0  # how far a height is carried over cells without points
 
 
 class GroundSettings(Settings):
@@ -54,22 +49,17 @@ class GroundSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class GroundSurface:
-    """Height of the ground in map axes.
+    """Height of the ground in map axes."""
 
-    Attributes:
-        heights_m: float64 (rows, columns), z at the centre of each cell; NaN = unknown. Row 0 has
-            the smallest y, column 0 the smallest x.
-        cell_m: Edge of a cell.
-        origin_m: (x, y) of the outer corner of cell (0, 0).
-        camera_height_m: Height of the camera above the ground along the path; NaN = unknown.
-        drops_m: float64 (rows, columns), commonest height of the path above the points below it;
-            NaN = too few points, or no path. None = not measured.
-    """
-
+    # float64 (rows, columns), z at the centre of each cell; NaN = unknown. Row 0 has the smallest
+    # y, column 0 the smallest x.
     heights_m: Float64
-    cell_m: float
-    origin_m: tuple[float, float]
+    cell_m: float  # edge of a cell
+    origin_m: tuple[float, float]  # (x, y) of the outer corner of cell (0, 0)
+    # Height of the camera above the ground along the path; NaN = unknown
     camera_height_m: float = float("nan")
+    # float64 (rows, columns), commonest height of the path above the points below it; NaN = too few
+    # points, or no path. None = not measured.
     drops_m: Float64 | None = None
 
     def __post_init__(self) -> None:

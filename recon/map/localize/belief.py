@@ -13,8 +13,7 @@ from recon.places.places import drift_over
 
 MAX_SIGMA_M: Final = 0.15
 """Poses less certain than this are not given out: an error of 0.5 m is then beyond three sigmas."""
-MAX_SIGMA_DEG: Final = 1.0
-"""The same of the rotation."""
+MAX_SIGMA_DEG: Final = 1.0  # the same of the rotation
 _MAX_CHI2: Final = 22.5
 """Chi-square, with six degrees of freedom, above which a correction contradicts: 0.1 % of right
 ones are beyond."""

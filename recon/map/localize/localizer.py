@@ -31,16 +31,14 @@ from recon.places.loop import Loop, agreeing_loops
 from recon.places.places import path_lengths
 from recon.stereo.frame import FrameReconstructor
 
-_VIEWS: Final = 2
-"""Nearest views of the map that each frame is compared with."""
+_VIEWS: Final = 2  # nearest views of the map that each frame is compared with
 _SURFACES_EVERY: Final = 3
 """Frames between two corrections by surfaces, where features confirm the pose."""
 _SURE_SIGMA_M: Final = 0.5 * MAX_SIGMA_M
 """Poses that are more certain than this need not be compared with the map if time is short."""
 _LOST_SIGMA_M: Final = 0.05
 """Standard deviation of a motion without features, beside the drift over it."""
-_LOST_SIGMA_DEG: Final = 0.3
-"""That of its rotation."""
+_LOST_SIGMA_DEG: Final = 0.3  # that of its rotation
 
 
 class State(str, Enum):
@@ -61,27 +59,18 @@ class State(str, Enum):
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Where a frame is in a map.
+    """Where a frame is in a map."""
 
-    Attributes:
-        state: What is known.
-        T_world_camera: float64 (4, 4), in the world of the map; None unless it is tracked or
-            coasting.
-        covariance: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
-            in camera axes; None where there is no pose. While coasting it grows with the way.
-        views: Views of the map that confirm the pose.
-        inliers: Features that agree with them.
-        surfaces: Whether the surfaces of the map confirm and corrected the pose.
-        note: Why nothing is known, or confirmed.
-    """
-
-    state: State
+    state: State  # what is known
+    # float64 (4, 4), in the world of the map; None unless it is tracked or coasting
     T_world_camera: Float64 | None = None
+    # float64 (6, 6) of a step (translation in metres, rotation vector in radians) in camera axes;
+    # None where there is no pose. While coasting it grows with the way.
     covariance: Float64 | None = None
-    views: int = 0
-    inliers: int = 0
-    surfaces: bool = False
-    note: str = ""
+    views: int = 0  # views of the map that confirm the pose
+    inliers: int = 0  # features that agree with them
+    surfaces: bool = False  # whether the surfaces of the map confirm and corrected the pose
+    note: str = ""  # why nothing is known, or confirmed
 
     @property
     def sigma_m(self) -> float:
@@ -231,10 +220,8 @@ def localize_pair(
     return localizer.add(OdometryFrame(*reconstructor.match(pair)))
 
 
-_REMEMBERED: Final = 10
-"""Frames whose recognised places still count."""
-_NEIGHBOURS: Final = 3
-"""Views around a recognised place that must show it, too."""
+_REMEMBERED: Final = 10  # frames whose recognised places still count
+_NEIGHBOURS: Final = 3  # views around a recognised place that must show it, too
 
 
 class FirstFix:

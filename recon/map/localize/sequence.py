@@ -24,10 +24,8 @@ from recon.run.threads import look_ahead, serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
 
-START_WITHIN_M: Final = 10.0
-"""How far from the start that is given the first fix may be."""
-START_WITHIN_DEG: Final = 60.0
-"""How far its heading may be from the one that is given."""
+START_WITHIN_M: Final = 10.0  # how far from the start that is given the first fix may be
+START_WITHIN_DEG: Final = 60.0  # how far its heading may be from the one that is given
 
 
 @dataclass(frozen=True)

@@ -11,49 +11,35 @@ from recon.core.geometry.se3 import step_jacobian
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values.arrays import Bool, Float64
 
-MIN_POINTS = 10
-"""Least number of points in a cell with a surface."""
+MIN_POINTS = 10  # least number of points in a cell with a surface
 THIN_SHARE = 0.1
 """A cell is thin along an axis where its points spread by less than this share of its edge.
 
 Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
-NOISE_M = 0.02
-"""Standard deviation that is added to that of every surface."""
+NOISE_M = 0.02  # standard deviation that is added to that of every surface
 FAR_CHI2 = 9.0
 """Points three standard deviations from the surface of their cell count like those without one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Cells of a map, each with its mean and its surface.
+    """Cells of a map, each with its mean and its surface."""
 
-    Attributes:
-        edge_m: Edge of a cell.
-        keys: int64 (M,), packed cell indices, ascending.
-        means: float64 (M, 3), mean of the points in each cell.
-        information: float64 (M, 3, 3), inverse covariance along the thin axes, zero along the
-            others: a wall fixes one direction, a pole two, a bush none.
-    """
-
-    edge_m: float
-    keys: NDArray[np.int64]
-    means: Float64
+    edge_m: float  # edge of a cell
+    keys: NDArray[np.int64]  # int64 (M,), packed cell indices, ascending
+    means: Float64  # (M, 3), mean of the points in each cell
+    # float64 (M, 3, 3), inverse covariance along the thin axes, zero along the others: a wall fixes
+    # one direction, a pole two, a bush none
     information: Float64
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """How points fit surfaces.
+    """How points fit surfaces."""
 
-    Attributes:
-        overlap: Share of points that lie in a cell of the map.
-        residual_m: Median distance of points to the surface of their cell; NaN = no surface.
-        information: float64 (6, 6), of a step (translation in metres, rotation vector in radians)
-            of their frame.
-    """
-
-    overlap: float
-    residual_m: float
+    overlap: float  # share of points that lie in a cell of the map
+    residual_m: float  # median distance of points to the surface of their cell; NaN = no surface
+    # float64 (6, 6), of a step (translation in metres, rotation vector in radians) of their frame
     information: Float64
 
 

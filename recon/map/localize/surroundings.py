@@ -26,16 +26,11 @@ from recon.odometry.protocol import OdometryFrame
 from recon.odometry.window import covariance_of, distance_in_sigmas, step_covariance
 from recon.places.places import SIGMAS
 
-_VOXEL_M: Final = 0.3
-"""Edge of a voxel of the map of ICP."""
-_THRESHOLD_M: Final = 0.3
-"""Scale of the robust kernel; points pair up to thrice as far."""
-_SURFACE_M: Final = 1.0
-"""Edge of the cells in which surfaces are fitted to the map."""
-_RELOAD_M: Final = 10.0
-"""Way after which the points around the camera are read again."""
-_MIN_POINTS: Final = 300
-"""Frames with fewer points are not corrected."""
+_VOXEL_M: Final = 0.3  # edge of a voxel of the map of ICP
+_THRESHOLD_M: Final = 0.3  # scale of the robust kernel; points pair up to thrice as far
+_SURFACE_M: Final = 1.0  # edge of the cells in which surfaces are fitted to the map
+_RELOAD_M: Final = 10.0  # way after which the points around the camera are read again
+_MIN_POINTS: Final = 300  # frames with fewer points are not corrected
 _OFFSET_FRAMES: Final = 30
 """Corrections of poses that features confirm are averaged over as many frames and subtracted: their
 mean is the bias of stereo depth, not an error of the pose."""
@@ -164,21 +159,17 @@ def _fit(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> Fi
     return replace(fit, information=turn.T @ fit.information @ turn)
 
 
-_MIN_OVERLAP: Final = 0.5
-"""Least share of points that lie in a cell of the map."""
-_MIN_RESIDUAL_GAIN: Final = 0.02
-"""Least relative decrease of the median residual."""
+_MIN_OVERLAP: Final = 0.5  # least share of points that lie in a cell of the map
+_MIN_RESIDUAL_GAIN: Final = 0.02  # least relative decrease of the median residual
 _MIN_SHARE: Final = 0.1
 """Least Kalman gain, in the direction in which it is largest: with less, ICP knows no more than the
 prior."""
-_ICP_INDEPENDENCE: Final = 0.05
-"""Share of the points whose errors count as independent."""
+_ICP_INDEPENDENCE: Final = 0.05  # share of the points whose errors count as independent
 _MIN_CONTRAST: Final = 2.0 * math.log(1000.0)
 """Chi-square by which any pose that is wrong must fit worse: it is a thousand times less likely."""
 _ICP_FLOOR_M: Final = 0.02
 """Standard deviation of ICP's translation that more points do not improve."""
-_ICP_FLOOR_DEG: Final = 0.05
-"""That of its rotation."""
+_ICP_FLOOR_DEG: Final = 0.05  # that of its rotation
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,8 +38,7 @@ of trees 0.43 to 0.7, noise 1.
 """
 _GAP_CELLS: Final = 2
 """Pieces about which too little is known belong to a body that is no farther away."""
-_GAPS: Final = 3
-"""How many such gaps are crossed, one after the other."""
+_GAPS: Final = 3  # how many such gaps are crossed, one after the other
 _LEAST_LOOKS: Final = 2
 """Frames that must have looked through a cell without neighbours to compare it with."""
 _HALF: Final = np.array([s for s in product((-1, 0, 1), repeat=3) if s > (0, 0, 0)])
@@ -156,13 +155,10 @@ def _near(keys: NDArray[np.int64], body: Bool) -> Bool:
     return near
 
 
-_KEPT_FRAMES: Final = 64
-"""Frames whose rays stay in memory: neighbouring tiles need the same ones."""
+_KEPT_FRAMES: Final = 64  # frames whose rays stay in memory: neighbouring tiles need the same ones
 _FIRST_BLOCKS: Final = 256
-_BINS: Final = 128
-"""Directions on each axis, by which rays that may matter are chosen."""
-_WIDEST: Final = 1.5
-"""Largest slope of a ray against the optical axis that has a bin of its own."""
+_BINS: Final = 128  # directions on each axis, by which rays that may matter are chosen
+_WIDEST: Final = 1.5  # largest slope of a ray against the optical axis that has a bin of its own
 
 
 @dataclass(frozen=True, eq=False)

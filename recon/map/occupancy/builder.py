@@ -26,18 +26,12 @@ _LEAST_SIGMA_CELLS: Final = 0.1
 """Least standard deviation of a point, so that none outweighs all others in a mean."""
 _HIT_PROBABILITY: Final = 0.7
 """Occupancy of a voxel after one certain hit; OctoMap's, as the next three."""
-_MISS_PROBABILITY: Final = 0.4
-"""Occupancy of a voxel after one ray went through it."""
-MIN_PROBABILITY: Final = 0.12
-"""Lower clamp: keeps the map able to change."""
-MAX_PROBABILITY: Final = 0.97
-"""Upper clamp."""
-FREE_MARGIN_SIGMAS: Final = 2.0
-"""Free space ends this many standard deviations before the point."""
-SPREAD_SIGMAS: Final = 1.0
-"""Voxels within this many standard deviations of the point share its hit."""
-_MIN_POINTS: Final = 2
-"""Voxels with fewer points in a frame start no ray."""
+_MISS_PROBABILITY: Final = 0.4  # occupancy of a voxel after one ray went through it
+MIN_PROBABILITY: Final = 0.12  # lower clamp: keeps the map able to change
+MAX_PROBABILITY: Final = 0.97  # upper clamp
+FREE_MARGIN_SIGMAS: Final = 2.0  # free space ends this many standard deviations before the point
+SPREAD_SIGMAS: Final = 1.0  # voxels within this many standard deviations of the point share its hit
+_MIN_POINTS: Final = 2  # voxels with fewer points in a frame start no ray
 
 
 class OccupancySettings(Settings):

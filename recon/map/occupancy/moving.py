@@ -41,10 +41,8 @@ _PLACED: Final = 0.45
 """Standard deviation of a frame, in voxels, up to which a point is in its voxel or beside it."""
 _UNSURE: Final = _MOST / 2
 """Largest mean evidence around a voxel that may be of what moved beside it."""
-_INSIDE: Final = 8
-"""Voxels that touch one inside a surface."""
-GROWTH_CELLS: Final = 5
-"""Voxels through which what moved grows."""
+_INSIDE: Final = 8  # voxels that touch one inside a surface
+GROWTH_CELLS: Final = 5  # voxels through which what moved grows
 _AROUND: Final = np.array(list(product((-1, 0, 1), repeat=3)))
 """Steps to a cell itself and to those that touch it."""
 _BESIDE: Final = _AROUND[(_AROUND[:, 2] == 0) & _AROUND[:, :2].any(axis=1)]

@@ -162,15 +162,12 @@ def free_part(keys: Int32, log_odds: float) -> OccupancyPart:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Sums per cell over the hits of all frames, in the order in which cells were first hit.
+    """Sums per cell over the hits of all frames, in the order in which cells were first hit."""
 
-    Attributes:
-        keys: int64 (N,), packed cells in map axes (`recon.core.kernels.voxels`), each once.
-        sums: float32 (N, 4), sum of weights, and weighted sums of the offset from the centre of
-            the cell, in cells.
-    """
-
+    # int64 (N,), packed cells in map axes (`recon.core.kernels.voxels`), each once
     keys: NDArray[np.int64]
+    # float32 (N, 4), sum of weights, and weighted sums of the offset from the centre of the cell,
+    # in cells
     sums: Float32
 
     def __len__(self) -> int:

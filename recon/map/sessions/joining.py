@@ -32,10 +32,8 @@ from recon.places.fixes import Held
 from recon.places.loop import Loop, agreeing_loops
 from recon.places.places import path_lengths
 
-_INFORMATION: Final = 1e8
-"""Of what is the same: 0.1 mm and 0.1 mrad, as no covariance may be zero."""
-_FEWEST: Final = 5
-"""Links from which a scale is estimated, besides six parameters of the place."""
+_INFORMATION: Final = 1e8  # of what is the same: 0.1 mm and 0.1 mrad, as no covariance may be zero
+_FEWEST: Final = 5  # links from which a scale is estimated, besides six parameters of the place
 _LARGEST: Final = 0.02
 """Difference that drift explains: twice what odometry is expected to be off by in each drive."""
 _SIGMAS: Final = 4.0

@@ -29,8 +29,7 @@ from recon.odometry.health import expected_drift
 from recon.places.fixes import Fixes
 from recon.places.places import RECEIVER_M, SIGMAS, drift_at_end, fit_to_path
 
-LARGEST_MISFIT: Final = 0.01
-"""Misfit, as a share of the extent of the path, that drift may explain."""
+LARGEST_MISFIT: Final = 0.01  # misfit, as a share of the extent of the path, that drift may explain
 _LONGEST_ARM_M: Final = 100.0
 """The axes of a vehicle are known to a degree or so: an antenna farther away is off by metres."""
 _LEAST_SPAN_M: Final = 1.0
@@ -41,8 +40,7 @@ _FEWEST_TO_BEND: Final = 5
 _LEAST_BEND_M: Final = 0.1
 """Positions of so many places, and so far from a straight line, tell left from right."""
 _NAMED: Final = 3
-_LEAST_SIGMA_M: Final = 0.01
-"""However smooth positions are, no antenna is known better."""
+_LEAST_SIGMA_M: Final = 0.01  # however smooth positions are, no antenna is known better
 _SIGMA_OF_BEND: Final = 1.4826 / np.sqrt(6.0)
 """Standard deviation of errors, by the median of how far they are from a line through three."""
 
@@ -82,19 +80,13 @@ class Survey:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Positions that were measured during a drive, in the order of time.
-
-    Attributes:
-        position_m: float64 (N, 3), in the coordinates of the survey.
-        ours_m: float64 (N, 3), by the path, in map axes.
-        agree: bool (N,), False for positions that contradict most others.
-        stated_m: Standard deviation of a coordinate by the file; None = it does not say.
-    """
+    """Positions that were measured during a drive, in the order of time."""
 
     times_s: Float64
-    position_m: Float64
-    ours_m: Float64
-    agree: Bool
+    position_m: Float64  # (N, 3), in the coordinates of the survey
+    ours_m: Float64  # (N, 3), by the path, in map axes
+    agree: Bool  # (N,), False for positions that contradict most others
+    # Standard deviation of a coordinate by the file; None = it does not say
     stated_m: float | None = None
 
     @cached_property

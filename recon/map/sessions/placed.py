@@ -35,22 +35,17 @@ from recon.run.threads import side_by_side
 
 Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
 """Calls a function with each of several values, somewhere, and waits until all are done."""
-_SHARE: Final = 4
-"""Tasks for each process, so that none waits long for another."""
+_SHARE: Final = 4  # tasks for each process, so that none waits long for another
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedMap:
-    """What the drives of a map that share its axes observed, in tiles.
-
-    Attributes:
-        path_m: float64 (N, 3), positions of the camera, map axes; a row of NaN between two drives.
-        trusted: bool (N,), which of them are to be trusted, and have a place in the map.
-    """
+    """What the drives of a map that share its axes observed, in tiles."""
 
     tiles: Tiles
+    # float64 (N, 3), positions of the camera, map axes; a row of NaN between two drives
     path_m: Float64
-    trusted: Bool
+    trusted: Bool  # (N,), which of them are to be trusted, and have a place in the map
 
 
 def settings_of(session: Session) -> DriveSettings:

@@ -24,8 +24,7 @@ from recon.odometry.health import doubt_about, name_frames, stretches
 from recon.places.detector import KnownPlaces, KnownView
 from recon.run.directory import refuse_links
 
-MAP_FILE: Final = "map/map.recon"
-"""Where a finished run keeps its map."""
+MAP_FILE: Final = "map/map.recon"  # where a finished run keeps its map
 
 
 class MapFile:
@@ -201,8 +200,7 @@ class MapFile:
 _Stretch = tuple[int, int]
 """Number of a drive, and of a stretch of it."""
 _SURVEY: Final[_Stretch] = (-1, -1)
-_FEWEST_FIXES: Final = 2
-"""Measured positions that say where a stretch is, and which way it goes."""
+_FEWEST_FIXES: Final = 2  # measured positions that say where a stretch is, and which way it goes
 
 
 def _ties(

@@ -18,10 +18,8 @@ from recon.odometry.protocol import OdometryHealth
 from recon.places.loop import Loop
 
 FRAMES: Final = "frames"
-FARTHEST_M: Final = 1e5
-"""From the start: farther than any drive, or ray."""
-_SKEW: Final = 1e-3
-"""Of poses that were written with few digits."""
+FARTHEST_M: Final = 1e5  # from the start: farther than any drive, or ray
+_SKEW: Final = 1e-3  # of poses that were written with few digits
 _HEALTH: Final = tuple(f.name for f in fields(OdometryHealth))
 
 
@@ -60,8 +58,7 @@ def path_of(poses: Float64, times_s: Float64) -> Trajectory:
 
 
 RAYS: Final = "rays"
-RAY_BYTES: Final = 10
-"""Of one ray in a record; a frame has at most one for each pixel."""
+RAY_BYTES: Final = 10  # of one ray in a record; a frame has at most one for each pixel
 
 
 def rays_record(rays: RayCloud, grain: RayGrain) -> dict[str, Any]:

@@ -255,8 +255,7 @@ def _checksum(kind: str, name: str, text: str, *content: Bytes) -> int:
 
 
 Value = TypeVar("Value")
-_PLAIN_BYTES: Final = 64
-"""About what a number or a short text takes."""
+_PLAIN_BYTES: Final = 64  # about what a number or a short text takes
 
 
 class Cache:

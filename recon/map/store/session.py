@@ -40,8 +40,7 @@ AXES: Final = "axes"
 LOOPS: Final = "loops"
 BENT: Final = "T_world_camera"
 """The path of a drive after loops, links and measured positions; None = that of odometry."""
-ALONE: Final = "T_alone_camera"
-"""The same before links to other drives bent it."""
+ALONE: Final = "T_alone_camera"  # the same before links to other drives bent it
 NO_LOOPS: Final[Mapping[str, Any]] = {"closed": [], "refused": [], BENT: None}
 """What a map keeps of a drive without loops, if it keeps anything else with them."""
 _STATE: Final = "state"
@@ -252,8 +251,7 @@ class Session:
 SUBMAP: Final = "submap"
 ENTRY: Final = "submap_entry"
 _VOXEL_BYTES: Final = 60
-_CELL_BYTES: Final = 54
-"""Most of one cell: its values, its surface point, and a block of its own."""
+_CELL_BYTES: Final = 54  # most of one cell: its values, its surface point, and a block of its own
 
 
 @dataclass(frozen=True)

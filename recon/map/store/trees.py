@@ -22,8 +22,7 @@ _ZLIB: Final = "zlib"
 _ARRAY: Final = "array"
 _TREE: Final = "tree"
 _KINDS: Final = "biuf"
-_NARROW: Final = 16
-"""Arrays with at most this many columns are compressed column by column."""
+_NARROW: Final = 16  # arrays with at most this many columns are compressed column by column
 _INFLATED_PER_CHARACTER: Final = 32
 """Bytes of packed arrays for each character of the JSON, which names each frame and link."""
 

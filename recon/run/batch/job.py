@@ -32,42 +32,31 @@ from recon.run.run import SUMMARY, Run
 State = Literal["not run", "succeeded", "failed", "broken"]
 """``failed``: by its input, so that another try would fail too. ``broken``: by anything else."""
 LOGS: Final = "logs"
-_TAIL_BYTES: Final = 1 << 16
-"""At the end of a log, in which the last try is found."""
+_TAIL_BYTES: Final = 1 << 16  # at the end of a log, in which the last try is found
 _PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")
 _LOOK_S: Final = 0.2
 _OTHERS_S: Final = 90.0
-_LOG_S: Final = 10.0
-"""The log of a job has so many seconds between two of its frames."""
+_LOG_S: Final = 10.0  # the log of a job has so many seconds between two of its frames
 _LEAST_FREE_BYTES: Final = 32_000_000
-_INPUT: Final = (1, 2)
-"""Exit codes of bad input and of wrong usage."""
+_INPUT: Final = (1, 2)  # exit codes of bad input and of wrong usage
 _LONGEST: Final = 400
 
 
 @dataclass(frozen=True)
 class Job:
-    """One command of a batch, such as ``evaluate trajectory``, with a folder by its name.
-
-    Attributes:
-        words: The command line after ``recon``, without the result folder.
-        writes: Whether the command has an ``--out``; else what it prints is kept.
-        folder: Where relative paths of the command line begin.
-        timeout_s: Longest time of one try; None = any.
-        needs: What it takes of a worker that declares such resources (``threads``, ``memory``).
-        swept: The settings that a sweep gave it.
-    """
+    """One command of a batch, such as ``evaluate trajectory``, with a folder by its name."""
 
     name: str
     command: str
     source: str
-    words: tuple[str, ...]
-    writes: bool
-    folder: str
-    timeout_s: float | None = None
+    words: tuple[str, ...]  # the command line after ``recon``, without the result folder
+    writes: bool  # whether the command has an ``--out``; else what it prints is kept
+    folder: str  # where relative paths of the command line begin
+    timeout_s: float | None = None  # longest time of one try; None = any
     retries: int = 2
+    # What it takes of a worker that declares such resources (``threads``, ``memory``)
     needs: Mapping[str, float] = field(default_factory=dict)
-    swept: Mapping[str, Any] = field(default_factory=dict)
+    swept: Mapping[str, Any] = field(default_factory=dict)  # the settings that a sweep gave it
 
     def command_line(self, out: Path, *, resume: bool = False) -> list[str]:
         """Return the words after ``recon`` of a try, which may go on with what is in ``out``."""
@@ -87,21 +76,15 @@ class Job:
 
 @checked(frozen=True, config=ConfigDict(allow_inf_nan=False, extra="forbid"))
 class Outcome:
-    """How the last try of a job ended, as its log has it.
-
-    Attributes:
-        tries: How often the job was begun.
-        full: Whether a disk is full where it ran.
-        stale: Whether what it left is of no use: it went on with that, and failed.
-    """
+    """How the last try of a job ended, as its log has it."""
 
     state: State = "not run"
     error: str = ""
     seconds: float = 0.0
     worker: str = ""
-    tries: int = 0
-    full: bool = False
-    stale: bool = False
+    tries: int = 0  # how often the job was begun
+    full: bool = False  # whether a disk is full where it ran
+    stale: bool = False  # whether what it left is of no use: it went on with that, and failed
 
     def line(self) -> bytes:
         """Return it as a line of a log."""

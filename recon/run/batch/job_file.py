@@ -20,8 +20,7 @@ from recon.io.files import read_text, reading, resolved
 from recon.run.batch.job import LOGS
 
 SUFFIXES: Final = (".toml", ".yaml", ".yml")
-PLAN: Final = "jobs.json"
-"""The jobs of a batch, in its folder from the first moment."""
+PLAN: Final = "jobs.json"  # the jobs of a batch, in its folder from the first moment
 _PLAN_BYTES: Final = 1 << 28
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.=+-]{0,119}")
 _FILES: Final = frozenset(

@@ -27,8 +27,7 @@ _LEAST_SPREAD: Final = {
 """What is compared, drift and trust, by the last part of its name: what it differs by at least
 from drive to drive; negative where less is worse."""
 _SUMMARY_BYTES: Final = 1 << 26
-_LEAST_JOBS: Final = 4
-"""Fewer of one kind have no usual value."""
+_LEAST_JOBS: Final = 4  # fewer of one kind have no usual value
 #: The spread of a normal distribution from its median absolute deviation.
 _SIGMAS: Final = 1.4826
 #: Smallest spread, as a share of the median.
