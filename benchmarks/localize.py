@@ -31,12 +31,12 @@ from recon.commands.demo import demo_source
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64, UInt8
+from recon.map.drive.drive import Workspace
 from recon.map.drive.sequence import map_sequence
-from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import localize_sequence
 from recon.map.localize.surroundings import Surroundings
+from recon.map.map import Map
 from recon.map.store.map_file import MapViews
-from recon.map.verbs import Map
 from recon.odometry.kiss import select_points
 from recon.odometry.protocol import OdometryFrame
 from recon.places.detector import KnownPlaces, KnownView

@@ -30,8 +30,8 @@ from recon.core.geometry.se3 import transform_cloud
 from recon.core.values import OCCUPIED, OccupancyGrid, PointCloud, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
 from recon.evaluation.map import evaluate_map
+from recon.map.drive.drive import Workspace
 from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.map.drive.workspace import Workspace
 from recon.map.fusion import fusion_range_m
 from recon.map.ground.grid import flatten
 from recon.map.ground.surface import add_floors, estimate_ground_surface, find_floors

@@ -27,10 +27,10 @@ import psutil
 from recon.commands.config import load_config
 from recon.export.make import make
 from recon.export.product import Order
+from recon.map.map import Map
 from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
 from recon.map.store.map_file import MAP_FILE
-from recon.map.verbs import Map
 from recon.run.run import Run
 from tests.map.sessions.test_map_of_several_drives import _drive, _links, _poses
 

@@ -38,10 +38,10 @@ from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_trajectory
+from recon.map.map import Map
 from recon.map.sessions.joining import find_links
 from recon.map.sessions.measured import Survey
 from recon.map.store.session import SessionInfo
-from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import make_keyframe

@@ -50,8 +50,8 @@ from recon.io.models.ply import write_ply as write_ply
 from recon.io.trajectory import read_trajectory as read_trajectory
 from recon.map.drive.sequence import MappedSequence as MappedSequence
 from recon.map.drive.sequence import map_sequence as map_sequence
+from recon.map.map import Map as Map
 from recon.map.sessions.measured import Survey as Survey
-from recon.map.verbs import Map as Map
 from recon.rig.audit.audit import Audit as Audit
 from recon.sources.one_pair import PairInput as PairInput
 from recon.sources.registry import open_source as open_source

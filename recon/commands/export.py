@@ -15,10 +15,10 @@ from recon.io.files import StrPath, resolved
 from recon.io.models.las import SUFFIXES as SURVEYED
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
+from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.placed import PlacedMap, place_map, place_map_on
 from recon.map.store.map_file import MAP_FILE
-from recon.map.verbs import Map
 from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,

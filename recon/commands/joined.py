@@ -17,12 +17,12 @@ from recon.core.errors import ReconError
 from recon.export.make import make
 from recon.export.product import Order
 from recon.export.trajectories import export_sessions
+from recon.map.map import Map
 from recon.map.sessions.copying import check_session, copy_sessions, read_all
 from recon.map.sessions.joining import doubts_of_lengths, join_new
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.sessions.placed import place_map
 from recon.map.store.map_file import MAP_FILE
-from recon.map.verbs import Map
 from recon.report.map_page import write_joined_page
 from recon.run.finished import command_of_map
 from recon.run.run import Run, WholeRun

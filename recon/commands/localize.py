@@ -16,11 +16,11 @@ from recon.core.values import OccupancyGrid, StereoPair
 from recon.export.trajectories import export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
+from recon.map.drive.drive import Workspace
 from recon.map.drive.sequence import map_sequence
-from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
+from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
-from recon.map.verbs import Map
 from recon.report.localize_page import write_localize_page
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource

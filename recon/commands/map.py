@@ -20,12 +20,12 @@ from recon.evaluation.drive_errors import DriveErrors, compare_with_truth
 from recon.export.make import Products, make
 from recon.export.product import Order
 from recon.export.trajectories import export_paths
+from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.sequence import MappedSequence, check_map, map_sequence
-from recon.map.drive.workspace import Workspace
+from recon.map.map import Map
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
-from recon.map.verbs import Map
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings

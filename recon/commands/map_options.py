@@ -26,8 +26,8 @@ from recon.core.values import Trajectory
 from recon.export.make import USUAL
 from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_trajectory
-from recon.map.drive.workspace import ANEW, resuming, session_info
-from recon.map.verbs import Map
+from recon.map.drive.drive import ANEW, resuming, session_info
+from recon.map.map import Map
 from recon.run.batch.cluster import BatchOptions
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.machine import versions

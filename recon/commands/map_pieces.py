@@ -17,13 +17,13 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
 from recon.io.atomic import write_text
 from recon.io.files import read_text, reading, resolved
+from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import odometry_of
 from recon.map.drive.sequence import map_sequence
-from recon.map.drive.workspace import Workspace
+from recon.map.map import Map
 from recon.map.sessions.copying import join_parts
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
-from recon.map.verbs import Map
 from recon.run.batch.cluster import BatchOptions
 from recon.run.batch.job import Job
 from recon.run.batch.results import JobResult, work_off

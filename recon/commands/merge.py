@@ -14,11 +14,11 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, SettingsError
 from recon.io.files import resolved
 from recon.map.drive.sequence import check_map
+from recon.map.map import Map
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.measured import Survey
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
-from recon.map.verbs import Map
 from recon.run.finished import command_of_map, refuse_as_target
 from recon.run.run import Run
 from recon.sources.source import StereoSource

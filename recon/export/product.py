@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from recon.export.mesh.poisson import MeshSettings
+from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.placed import PlacedMap
-from recon.map.verbs import Map
 from recon.run.run import Run
 
 

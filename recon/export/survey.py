@@ -12,8 +12,8 @@ from recon.core.geometry.alignment import fit_points
 from recon.core.values.arrays import Float64
 from recon.export.product import Made, Order
 from recon.io.models.las import check_inside, write_las
+from recon.map.map import Map
 from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, span_m
-from recon.map.verbs import Map
 
 _LARGEST_STRETCH: Final = 0.05  # by how much the path may be too long or short before it is said
 

@@ -15,8 +15,8 @@ from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map.ground.axes import base_axes
 from recon.map.localize.sequence import LocalizedDrive, LocalizedFrame
 from recon.map.store.map_file import MapFile
-from recon.map.store.record_values import loop_in
 from recon.map.store.session import Session
+from recon.map.store.trees import loop_in
 from recon.places.loop import Loop
 from recon.run.directory import RunDirectory
 

@@ -14,7 +14,7 @@ from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
 from recon.odometry.settings import OdometrySettings
-from recon.run.memory import MemorySettings
+from recon.run.threads import MemorySettings
 from recon.stereo.cloud.back_project import FilterSettings
 from recon.stereo.frame import StereoSettings
 

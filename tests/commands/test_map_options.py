@@ -11,8 +11,8 @@ import pytest
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
+from recon.map.map import Map
 from recon.map.store.session import SessionInfo
-from recon.map.verbs import Map
 from recon.run.directory import STARTED, state_folder
 
 Begin = Callable[..., Path]

@@ -9,11 +9,11 @@ import pytest
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_pieces import LEAD, Piece, cut_drive
+from recon.map.drive.drive import Workspace, session_info
 from recon.map.drive.drive_odometry import odometry_of
 from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.map.drive.workspace import Workspace, session_info
+from recon.map.map import Map
 from recon.map.sessions.copying import join_parts
-from recon.map.verbs import Map
 from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
 from tests.scenery.film import Film, film

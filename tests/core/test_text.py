@@ -16,7 +16,7 @@ from recon.io.fields import parse_yaml
 from recon.io.files import read_table
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_frames
-from recon.run.memory import parse_size_mb
+from recon.run.threads import parse_size_mb
 from recon.sources.times import read_dates, read_stamped_names
 
 FOREIGN = ["1_0", "١٢", "1_0.5", "\uff11\uff12"]

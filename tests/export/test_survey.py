@@ -15,9 +15,9 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.export.survey import Georeference, georeference
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.store.session import SessionInfo
-from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.map.verbs import Map
+from recon.map.map import Map
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.flow.test_killed_runs import BREAKER, content

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import FormatError
-from recon.map.verbs import Map
+from recon.map.map import Map
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from recon.map.verbs import Map
+from recon.map.map import Map
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.flow.test_batch import below, wait_until

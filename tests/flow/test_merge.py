@@ -22,8 +22,8 @@ from recon.commands.merge import run_map_into, run_merge, run_remove
 from recon.core.errors import FormatError
 from recon.io.trajectory import read_trajectory
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.map import Map
 from recon.map.sessions.measured import Survey
-from recon.map.verbs import Map
 from recon.sources.source import SourcePart, StereoSource
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film

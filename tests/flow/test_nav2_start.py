@@ -20,9 +20,9 @@ from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_tum
+from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.records import Store
-from recon.map.verbs import Map
 from recon.sources.kitti import open_kitti
 from recon.sources.source import StereoSource
 from tests.flow.rooms import RoomSource

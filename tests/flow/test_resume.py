@@ -15,8 +15,8 @@ from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.map.drive.mapper import FrameResult
+from recon.map.map import Map
 from recon.map.store.records import Store
-from recon.map.verbs import Map
 from recon.run.progress import SILENT, Silent
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource

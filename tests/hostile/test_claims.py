@@ -14,8 +14,8 @@ import pytest
 
 from recon.core.values import RectifiedCamera
 from recon.io.models.octomap import read_octomap
+from recon.map.map import Map
 from recon.map.store.records import Store
-from recon.map.verbs import Map
 from tests.hostile.refusals import refusal
 
 MOST_BYTES: Final = 64_000_000

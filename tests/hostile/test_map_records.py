@@ -14,14 +14,14 @@ from recon.core.kernels.voxels import pack_keys
 from recon.core.values import RayCloud, RectifiedCamera
 from recon.map.fusion import FusedPart, join_fused
 from recon.map.kernels.clamped import CellRows
+from recon.map.map import Map
 from recon.map.occupancy.builder import OccupancySettings, ray_grain
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, join_occupancy
 from recon.map.store.map_file import MapViews
-from recon.map.store.record_values import Link
 from recon.map.store.records import Key, Store
 from recon.map.store.session import ALONE, BENT, SessionInfo
+from recon.map.store.trees import Link
 from recon.map.submaps import Submap
-from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import Fixes

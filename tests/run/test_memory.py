@@ -22,9 +22,9 @@ from recon.map.store.records import Store
 from recon.map.store.session import Submaps
 from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles
-from recon.run import memory
+from recon.run import threads
 from recon.run.machine import peak_memory_mb
-from recon.run.memory import MemorySettings, parse_size_mb
+from recon.run.threads import MemorySettings, parse_size_mb
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
@@ -91,9 +91,9 @@ def test_what_takes_more_than_the_limit_is_one_line(monkeypatch: pytest.MonkeyPa
     free, limited = MemorySettings(), MemorySettings(limit_mb=500)
     assert (free.submap_bytes, free.tile_bytes) == (None, None)
     assert 0 < (limited.submap_bytes or 0) < (limited.tile_bytes or 0) < limited.cache_bytes < 1e8
-    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 500.0)
+    monkeypatch.setattr(threads, "peak_memory_mb", lambda: 500.0)
     limited.check("frame 7")
-    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 512.0)
+    monkeypatch.setattr(threads, "peak_memory_mb", lambda: 512.0)
     free.check("frame 7")
     with pytest.raises(MemoryLimitError, match=r"^frame 7: .*got 512 MB.*at most 500 MB") as caught:
         limited.check("frame 7")
@@ -158,7 +158,7 @@ def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peaks = iter([400.0] * 6)
-    monkeypatch.setattr(memory, "peak_memory_mb", lambda: next(peaks, 600.0))
+    monkeypatch.setattr(threads, "peak_memory_mb", lambda: next(peaks, 600.0))
     drive, out = tmp_path / "drive", tmp_path / "run"
     write_kitti(SyntheticSource(STREET), drive)
     overrides = ["checkpoints.every_frames=4", "submaps.length_m=4", "memory.limit_mb=500"]

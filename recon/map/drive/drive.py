@@ -8,21 +8,27 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from threading import Condition, Thread
 from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import RegistrationError
+from recon.core.errors import FormatError, ReconError, RegistrationError
 from recon.core.values import RectifiedPair, Trajectory
+from recon.io.files import reading
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.mapper import FrameResult, Mapper
-from recon.map.drive.workspace import Workspace, resuming
+from recon.map.map import Map
 from recon.map.occupancy.builder import thin_rays
 from recon.map.settings import DriveSettings
+from recon.map.store.session import Session, SessionInfo
 from recon.odometry.protocol import OdometryFrame, OdometryResult
+from recon.run.machine import versions
+from recon.run.progress import Stopwatch
 from recon.run.threads import look_ahead, work_in_background
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
@@ -271,3 +277,52 @@ class MapBehind:
             self._source.note_unmatched()
         self._map_frame(*registered, matched)
         self._mapped += 1
+
+
+ANEW: Final = "start the run anew, without --resume"
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """What a drive is mapped with, none of which affects the result."""
+
+    # The map whose last session the drive goes on with, or which it becomes a session of; it must
+    # stay open as long as the result is used
+    map: Map = field(default_factory=Map.temporary)
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)  # times each stage
+    threads: int | None = None  # threads of the matcher; None = all cores
+
+    def session(self, source: StereoSource, config: DriveSettings) -> Session:
+        """Return the session of a drive: the last one of the map, or a new one."""
+        last = self.map.sessions[-1] if self.map.sessions else None
+        return self.map.begin(session_info(source, config)) if last is None else last
+
+
+@contextmanager
+def resuming(where: str | Path) -> Iterator[None]:
+    """Say in errors about an unfinished map that the run has to start anew."""
+    try:
+        with reading(where):
+            yield
+    except ReconError as error:
+        raise FormatError(error.what, where=where, got=error.got, hint=ANEW) from error
+
+
+def session_info(
+    source: StereoSource, config: DriveSettings, start: Mapping[str, Any] | None = None
+) -> SessionInfo:
+    """Return what a session is a drive of.
+
+    Args:
+        source: The source.
+        config: The settings.
+        start: What a run is started with, to resume it.
+    """
+    return SessionInfo(
+        source.name,
+        source.description,
+        len(source),
+        config.model_dump(mode="json"),
+        versions(),
+        start or {},
+    )

@@ -26,17 +26,16 @@ from recon.core.values import (
     join_voxels,
 )
 from recon.core.values.arrays import Bool, Float64
-from recon.map.drive.drive import Drive
+from recon.map.drive.drive import Drive, Workspace
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of
 from recon.map.drive.mapper import Mapper
-from recon.map.drive.workspace import Workspace
 from recon.map.fusion import fusion_range_m
+from recon.map.map import Map
 from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
-from recon.map.verbs import Map
 from recon.odometry.health import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
 from recon.run.progress import SILENT, Progress

@@ -13,7 +13,7 @@ from recon.core.errors import MappingError, RegistrationError
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.map.drive.workspace import Workspace
+from recon.map.drive.drive import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings

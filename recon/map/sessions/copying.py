@@ -17,9 +17,9 @@ from recon.map.sessions.joining import T_one_other, link_by_frame
 from recon.map.settings import DriveSettings
 from recon.map.store.finished import check_rays
 from recon.map.store.map_file import MapFile
-from recon.map.store.record_values import FRAMES, RAYS
 from recon.map.store.records import Key
 from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
+from recon.map.store.trees import FRAMES, RAYS
 from recon.map.submaps import Submap
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.places import path_lengths

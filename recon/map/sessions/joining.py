@@ -23,8 +23,8 @@ from recon.core.geometry.se3 import apply, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.map_file import MapFile, MapViews
-from recon.map.store.record_values import Link
 from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
+from recon.map.store.trees import Link
 from recon.odometry.health import stretches
 from recon.places.closure import DrivePath, Tie, join_drives
 from recon.places.detector import KnownPlaces, KnownView

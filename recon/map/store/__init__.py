@@ -4,7 +4,7 @@ From the map down to the file:
 
 - `map_file.py`: drives in one file, and which of their frames have a place in it;
 - `session.py`: what one drive keeps: path, health, axes, submaps, keyframes, rays, loops;
-- `record_values.py`: values as records of their kind; `trees.py`: records as JSON and bytes;
+- `trees.py`: values as records of their kind, and records as JSON and bytes;
 - `records.py`: trees of arrays under a kind and a key, with a cache of the last ones read;
 - `database.py`: the SQLite file, its commits, and what a full disk means.
 

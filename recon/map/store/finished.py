@@ -17,8 +17,8 @@ from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
-from recon.map.store.record_values import RAYS
 from recon.map.store.session import AXES, KEYFRAME, LOOPS, Session
+from recon.map.store.trees import RAYS
 from recon.map.submaps import Submap
 
 

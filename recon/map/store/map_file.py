@@ -17,9 +17,9 @@ from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.files import StrPath, reading
-from recon.map.store.record_values import LINKS, Link
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
+from recon.map.store.trees import LINKS, Link
 from recon.odometry.health import doubt_about, name_frames, stretches
 from recon.places.detector import KnownPlaces, KnownView
 from recon.run.directory import refuse_links

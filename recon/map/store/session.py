@@ -14,7 +14,8 @@ from recon.core.text import counted
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in
 from recon.io.files import reading
-from recon.map.store.record_values import (
+from recon.map.store.records import Store
+from recon.map.store.trees import (
     FRAMES,
     RAY_BYTES,
     RAYS,
@@ -24,9 +25,8 @@ from recon.map.store.record_values import (
     path_of,
     rays_in,
     rays_record,
+    value_in,
 )
-from recon.map.store.records import Store
-from recon.map.store.trees import value_in
 from recon.map.submaps import Submap
 from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth

@@ -9,14 +9,14 @@ import pytest
 
 from recon.core.errors import FormatError, MappingError
 from recon.core.geometry import se3
+from recon.map.drive.drive import Workspace
 from recon.map.drive.sequence import map_sequence
-from recon.map.drive.workspace import Workspace
 from recon.map.localize import localizer as localizer_file
 from recon.map.localize.localizer import Located, State
 from recon.map.localize.sequence import LocalizedDrive, StartPose, localize_sequence, open_localizer
+from recon.map.map import Map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import SessionInfo
-from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryFrame
 from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import StreetScene

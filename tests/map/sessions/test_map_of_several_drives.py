@@ -16,14 +16,14 @@ from recon.core.kernels.voxels import pack_keys
 from recon.core.values import PointCloud, RectifiedCamera, join_clouds, join_voxels
 from recon.core.values.arrays import Float64
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.map import Map
 from recon.map.occupancy.builder import ray_grain, thin_rays
 from recon.map.sessions.copying import check_session, copy_sessions
 from recon.map.sessions.joining import join_new, join_sessions, seen_before, shared_frames
 from recon.map.sessions.placed import PlacedSubmaps, place_map
-from recon.map.store.record_values import Link
 from recon.map.store.session import Session, SessionInfo
+from recon.map.store.trees import Link
 from recon.map.submaps import SubmapBuilder
-from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 from recon.places.fixes import Fixes
 from recon.places.loop import Loop

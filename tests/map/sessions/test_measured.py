@@ -13,10 +13,10 @@ from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.map import Map
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.joining import join_new, times_as_long
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
-from recon.map.verbs import Map
 from recon.places.loop import Loop
 from tests.map.sessions.test_map_of_several_drives import TRUE, _drive, _off_m
 

@@ -11,9 +11,9 @@ import pytest
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import MappingError
+from recon.map.map import Map
 from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import PlacedMap, place_map, place_map_on
-from recon.map.verbs import Map
 from tests.map.sessions.test_map_of_several_drives import TRUE, _drive, _links, _map
 
 SETTINGS = ["submaps.length_m=8", "submaps.tile_m=12.8", "fusion.min_count=1"]

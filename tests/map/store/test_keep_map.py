@@ -13,13 +13,13 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.map.fusion import FusedPart, join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.map import Map
 from recon.map.occupancy.builder import ray_grain, thin_rays
 from recon.map.occupancy.part import join_occupancy
 from recon.map.sessions.placed import PlacedSubmaps
 from recon.map.store.finished import keep_map
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
-from recon.map.verbs import Map
 from recon.odometry.protocol import OdometryHealth
 
 CONFIG = load_config(None, ["submaps.length_m=4"])

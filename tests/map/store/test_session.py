@@ -10,11 +10,11 @@ import pytest
 from recon.core.errors import FormatError, ShapeError
 from recon.core.geometry import se3
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera
+from recon.map.map import Map
 from recon.map.sessions.joining import path_up_to
 from recon.map.store.map_file import MapViews
-from recon.map.store.record_values import Link
 from recon.map.store.session import Session, SessionInfo
-from recon.map.verbs import Map
+from recon.map.store.trees import Link
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
