@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import cv2
 import numpy as np
@@ -23,6 +23,8 @@ _NORMALS_RADIUS_PX: Final = 3  # half width of the window that gives a point its
 
 class CloudSettings(Settings):
     """Which pixels become points."""
+
+    fixed: ClassVar = {"min_confidence": 0.0}
 
     remove_flying_edges: bool = Field(
         default=True,
