@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.values.arrays import Float64
 from recon.street.shapes import Material, Paint, TriangleSoup, boxes, merge, painted, quads
@@ -57,8 +56,6 @@ def draw_plan(width: float, rng: np.random.Generator) -> HousePlan:
     colours = _BRICKS if brick else _PLASTERS
     base = np.clip(np.array(colours[rng.integers(len(colours))]) + rng.normal(0, 0.03, 3), 0, 1)
     part = int(rng.integers(1, 2**30))
-    r, g, b = base.tolist()
-    wall = Paint(Material.BRICK if brick else Material.PLASTER, (r, g, b), part)
     return HousePlan(
         width=width,
         depth=float(rng.uniform(8.0, 11.0)),
@@ -67,7 +64,7 @@ def draw_plan(width: float, rng: np.random.Generator) -> HousePlan:
         window=(float(rng.uniform(0.95, 1.4)), float(rng.uniform(1.35, 1.7))),
         sill=float(rng.uniform(0.75, 0.95)),
         pitched=bool(rng.random() < 0.6),
-        wall=wall,
+        wall=Paint(Material.BRICK if brick else Material.PLASTER, tuple(base.tolist()), part),
         trim=Paint(Material.PLAIN, _TRIM[rng.integers(len(_TRIM))], part + 1),
         door=Paint(Material.DOOR, _DOORS[rng.integers(len(_DOORS))], part + 2),
         roof=Paint(Material.ROOF, _ROOFS[rng.integers(len(_ROOFS))], part + 3),
@@ -78,7 +75,9 @@ def house(plan: HousePlan, rng: np.random.Generator) -> TriangleSoup:
     """Build a house, in the axes described above."""
     holes, door = _openings(plan, rng)
     every = np.vstack([holes, door])
-    parts = [_facade(plan, every), _leaf(door, plan.door), _windows(holes, rng)]
+    x0, z0, x1, z1 = door.T
+    leaf = _upright(np.column_stack([x0, z0, x1 - x0, z1 - z0]), _REVEAL_M, plan.door)
+    parts = [_facade(plan, every), leaf, _windows(holes, rng)]
     parts += [_reveals(every, plan.trim), _ledges(plan, holes), _blind_walls(plan)]
     parts += [_gable(plan) if plan.pitched else _flat_roof(plan), _downpipe(plan, rng)]
     return merge(parts)
@@ -114,15 +113,7 @@ def _facade(plan: HousePlan, holes: Float64) -> TriangleSoup:
     column, row = gx[~in_hole], gz[~in_hole]
     low = np.column_stack([xs[column], zs[row]]) - _OVERLAP_M
     high = np.column_stack([xs[column + 1], zs[row + 1]]) + _OVERLAP_M
-    size, zero = high - low, np.zeros(len(low))
-    corners = np.column_stack([low[:, 0], zero, low[:, 1]])
-    along, up = np.column_stack([size[:, 0], zero, zero]), np.column_stack([zero, zero, size[:, 1]])
-    return quads(corners, along, up, plan.wall, low)
-
-
-def _leaf(door: Float64, paint: Paint) -> TriangleSoup:
-    x0, z0, x1, z1 = door[0]
-    return quads([x0, _REVEAL_M, z0], [x1 - x0, 0, 0], [0, 0, z1 - z0], paint)
+    return _upright(np.column_stack([low, high - low]), 0.0, plan.wall, low)
 
 
 def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
@@ -138,28 +129,28 @@ def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
     glass = Paint(Material.GLASS, (0.22, 0.25, 0.29))
     wood = Paint(Material.PLAIN, (0.86, 0.85, 0.82))
     panes = np.column_stack([x0, z0, w, h])
-    frames = _upright(bars, _REVEAL_M - 0.03, wood, np.repeat(parts, 6))
-    return merge([_upright(panes, _REVEAL_M, glass, parts), frames])
+    soup = merge([_upright(panes, _REVEAL_M, glass), _upright(bars, _REVEAL_M - 0.03, wood)])
+    part = np.concatenate([np.repeat(parts, 2), np.repeat(parts, 12)])
+    return replace(soup, part=part.astype(np.int32))
 
 
-def _upright(rectangles: Float64, y: float, paint: Paint, parts: NDArray[Any]) -> TriangleSoup:
+def _upright(
+    rectangles: Float64, y: float, paint: Paint, uv_origins: Any = (0.0, 0.0)
+) -> TriangleSoup:
     """Return rectangles (N, 4) of x, z, width and height, parallel to the facade."""
     x, z, width, height = rectangles.T
     zero = np.zeros(len(x))
     along, up = np.column_stack([width, zero, zero]), np.column_stack([zero, zero, height])
-    soup = quads(np.column_stack([x, zero + y, z]), along, up, paint)
-    return replace(soup, part=np.repeat(parts, 2).astype(np.int32))
+    return quads(np.column_stack([x, zero + y, z]), along, up, paint, uv_origins)
 
 
 def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
     x0, z0, x1, z1 = holes.T
     zero = np.zeros(len(holes))
-    inwards = [0.0, _REVEAL_M, 0.0]
-    low, high = np.stack([x0, zero, z0], axis=1), np.stack([x0, zero, z1], axis=1)
-    right = np.stack([x1, zero, z0], axis=1)
-    along, up = np.stack([x1 - x0, zero, zero], 1), np.stack([zero, zero, z1 - z0], 1)
+    low, high, right = (np.column_stack([x, zero, z]) for x, z in ((x0, z0), (x0, z1), (x1, z0)))
+    along, up = np.column_stack([x1 - x0, zero, zero]), np.column_stack([zero, zero, z1 - z0])
     sides = [(low, along), (high, along), (low, up), (right, up)]
-    return merge([quads(p, e, inwards, paint) for p, e in sides])
+    return merge([quads(p, e, [0.0, _REVEAL_M, 0.0], paint) for p, e in sides])
 
 
 def _ledges(plan: HousePlan, holes: Float64) -> TriangleSoup:
@@ -169,10 +160,10 @@ def _ledges(plan: HousePlan, holes: Float64) -> TriangleSoup:
     bands += [(z - 0.08, z + 0.08, 0.08) for z in levels]
     low = np.array([[0.0, -out, z0] for z0, _, out in bands])
     high = np.array([[w, 0.02, z1] for _, z1, _ in bands])
-    x0, z0, x1 = holes[:, 0], holes[:, 1], holes[:, 2]
+    x0, z0, x1, _ = holes.T
     flat = np.full(len(holes), 0.02)
-    under = np.stack([x0 - 0.08, flat - 0.14, z0 - 0.07], axis=1)
-    sills = boxes(under, np.stack([x1 + 0.08, flat, z0], axis=1), plan.trim)
+    under = np.column_stack([x0 - 0.08, flat - 0.14, z0 - 0.07])
+    sills = boxes(under, np.column_stack([x1 + 0.08, flat, z0]), plan.trim)
     return merge([boxes(low, high, plan.trim), sills])
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.values.arrays import Float64, Int32
 from recon.street.kernels.surface import SurfaceHits, fractal_noise, lattice_values
@@ -41,20 +40,14 @@ class Patch:
 
     uv: Float64  # (N, 2), metres on the surface
     spread: Float64  # (N, 2), footprint of the pixel along u and v
+    u: Float64  # (N,), the columns of both
+    v: Float64
+    du: Float64
+    dv: Float64
     height_m: Float64  # (N,), above the road
     grain: Float64  # (N,), noise of mean 0
     rgb: Float64  # (N, 3), base colour as displayed
     part: Int32  # (N,), number of the object
-
-    @property
-    def u(self) -> Float64:
-        """float64 (N,)."""
-        return self.uv[:, 0]
-
-    @property
-    def v(self) -> Float64:
-        """float64 (N,)."""
-        return self.uv[:, 1]
 
 
 Recipe = Callable[[Patch], Float64]
@@ -73,9 +66,10 @@ def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Fl
     for kind, recipe in RECIPES.items():
         which = order[ends[kind] : ends[kind + 1]]
         if len(which):
-            height = hits.xyz[which, 2]
-            uv, spread = hits.uv[which], hits.spread[which]
-            rgb[which] = recipe(Patch(uv, spread, height, grain[which], rgb[which], part[which]))
+            uv, spread, height_m = hits.uv[which], hits.spread[which], hits.xyz[which, 2]
+            columns = (uv[:, 0], uv[:, 1], spread[:, 0], spread[:, 1])
+            own = (height_m, grain[which], rgb[which], part[which])
+            rgb[which] = recipe(Patch(uv, spread, *columns, *own))
     return np.clip(rgb, 0.0, 1.0)
 
 
@@ -85,51 +79,59 @@ def _blend(rgb: Float64, paint: tuple[float, float, float], share: Float64) -> F
     return np.asarray(rgb * (1.0 - cover) + np.array(paint) ** GAMMA * cover)
 
 
-def _variation(patch: Patch, channel: int) -> Float64:
+def _variation(p: Patch, channel: int) -> Float64:
     """Return one random number in [-1, 1) per object."""
-    zero = np.zeros(len(patch.part), dtype=np.int64)
-    return lattice_values(patch.part, zero + channel, zero, 11)
+    return lattice_values(p.part, channel, 0, 11)
+
+
+def _toned(
+    p: Patch, tile: tuple[float, float], strength: float, seed: Any, bond: float = 0.0
+) -> Float64:
+    tone = tile_tone(p.uv, tile, p.spread, seed, bond)
+    return np.asarray(p.rgb * (1.0 + strength * tone)[:, None])
 
 
 def _asphalt(p: Patch) -> Float64:
     """Return tracks, patches, joints and worn markings; u is along the road, v to the left."""
-    v, spread_v = p.v, p.spread[:, 1]
+    u, v, du, dv = p.u, p.v, p.du, p.dv
     tracks = sum(np.exp(-(((v - c) / 0.35) ** 2)) for c in (-2.3, -0.8, 0.8, 2.3))
-    repairs = tile_tone(p.uv, (5.3, 2.1), p.spread, np.zeros(len(v), dtype=int))
+    repairs = tile_tone(p.uv, (5.3, 2.1), p.spread, 0)
     rgb = p.rgb * (1.0 - 0.12 * np.asarray(tracks) + 0.16 * np.round(repairs * 0.8))[:, None]
-    seam = v - 0.12 * np.sin(0.9 * p.u) - 0.05 * np.sin(3.1 * p.u)
-    tar = both(stripe(seam, 0.35, 0.40, spread_v), stripe(seam, -3.5, -3.46, spread_v))
-    across = p.u + 0.1 * np.sin(2.0 * v) + 0.04 * np.sin(7.0 * v)
-    tar = both(tar, stripes(across, 11.3, 0.04, p.spread[:, 0]))
-    rgb = _blend(rgb, (0.16, 0.16, 0.17), 0.7 * tar)
-    dashes = stripes(p.u, 6.0, 3.0, p.spread[:, 0]) * stripe(v, -0.07, 0.07, spread_v)
-    edges = stripe(np.abs(v), _LANE_HALF_M, _LANE_HALF_M + 0.1, spread_v)
-    bays = stripes(p.u, 6.0, 0.1, p.spread[:, 0])
-    bays = bays * stripe(np.abs(v), _LANE_HALF_M, ROAD_HALF_M, spread_v)
-    gutter = stripe(np.abs(v), ROAD_HALF_M - 0.25, ROAD_HALF_M, spread_v)
+    seam = v - 0.12 * np.sin(0.9 * u) - 0.05 * np.sin(3.1 * u)
+    tar = both(stripe(seam, 0.35, 0.40, dv), stripe(seam, -3.5, -3.46, dv))
+    across = u + 0.1 * np.sin(2.0 * v) + 0.04 * np.sin(7.0 * v)
+    rgb = _blend(rgb, (0.16, 0.16, 0.17), 0.7 * both(tar, stripes(across, 11.3, 0.04, du)))
+    dashes = stripes(u, 6.0, 3.0, du) * stripe(v, -0.07, 0.07, dv)
+    edges = stripe(np.abs(v), _LANE_HALF_M, _LANE_HALF_M + 0.1, dv)
+    bays = stripes(u, 6.0, 0.1, du) * stripe(np.abs(v), _LANE_HALF_M, ROAD_HALF_M, dv)
+    gutter = stripe(np.abs(v), ROAD_HALF_M - 0.25, ROAD_HALF_M, dv)
     rgb = _blend(rgb, (0.42, 0.41, 0.39), 0.6 * gutter)
     worn = np.clip(0.75 + 0.5 * p.grain, 0.0, 0.95)
     return _blend(rgb, (0.85, 0.85, 0.83), worn * both(both(dashes, edges), bays))
 
 
 def _paving(p: Patch) -> Float64:
-    tile = (0.6, 0.4)
-    tone = tile_tone(p.uv, tile, p.spread, np.zeros(len(p.uv), dtype=int), bond=0.5)
-    rgb = p.rgb * (1.0 + 0.16 * tone)[:, None]
-    return _blend(rgb, (0.25, 0.24, 0.22), 0.75 * tile_joints(p.uv, tile, 0.016, p.spread, 0.5))
+    joints = tile_joints(p.uv, (0.6, 0.4), 0.016, p.spread, 0.5)
+    return _blend(_toned(p, (0.6, 0.4), 0.16, 0, 0.5), (0.25, 0.24, 0.22), 0.75 * joints)
 
 
 def _kerb(p: Patch) -> Float64:
-    tone = tile_tone(p.uv, (1.0, 1.0), p.spread, np.zeros(len(p.uv), dtype=int))
-    rgb = p.rgb * (1.0 + 0.12 * tone)[:, None]
-    return _blend(rgb, (0.2, 0.2, 0.2), 0.8 * stripes(p.u, 1.0, 0.02, p.spread[:, 0]))
+    joints = stripes(p.u, 1.0, 0.02, p.du)
+    return _blend(_toned(p, (1.0, 1.0), 0.12, 0), (0.2, 0.2, 0.2), 0.8 * joints)
+
+
+def _roof(p: Patch) -> Float64:
+    joints = stripes(p.v, 0.35, 0.05, p.dv)
+    return _blend(_toned(p, (0.3, 0.35), 0.2, p.part, 0.5), (0.1, 0.08, 0.07), 0.6 * joints)
+
+
+def _metal(p: Patch) -> Float64:
+    return _blend(p.rgb, (0.75, 0.74, 0.7), 0.5 * stripes(p.v, 0.9, 0.05, p.dv))
 
 
 def _weather(p: Patch) -> Float64:
     foot = np.exp(-np.maximum(p.height_m, 0.0) / 0.5)
-    cell = np.stack([p.u, np.zeros_like(p.u)], axis=1)
-    narrow = np.stack([p.spread[:, 0], np.zeros_like(p.u)], axis=1)
-    streaks = tile_tone(cell, (0.37, 1.0), narrow, p.part)
+    streaks = tile_tone(p.uv * [1.0, 0.0], (0.37, 1.0), p.spread * [1.0, 0.0], p.part)
     return np.asarray((1.0 - 0.3 * foot) * (1.0 + 0.045 * streaks))
 
 
@@ -147,45 +149,33 @@ def _brick(p: Patch) -> Float64:
 
 def _glass(p: Patch) -> Float64:
     rgb = p.rgb * np.clip(1.0 + 0.5 * (p.v - 0.7), 0.5, 2.5)[:, None]
-    curtain = (_variation(p, 1) > 0.1) * stripe(p.u % 1.1, 0.0, 0.36, p.spread[:, 0])
-    folds = 0.5 + 0.25 * np.sin(p.u * 42.0) * np.exp(-((p.spread[:, 0] / 0.06) ** 2))
+    curtain = (_variation(p, 1) > 0.1) * stripe(p.u % 1.1, 0.0, 0.36, p.du)
+    folds = 0.5 + 0.25 * np.sin(p.u * 42.0) * np.exp(-((p.du / 0.06) ** 2))
     blind = 0.35 + 0.6 * _variation(p, 2)
-    blind = stripe(p.v, 1.5 - blind, 9.0, p.spread[:, 1]) * (_variation(p, 3) > 0.2)
+    blind = stripe(p.v, 1.5 - blind, 9.0, p.dv) * (_variation(p, 3) > 0.2)
     rgb = _blend(rgb, (0.75, 0.72, 0.66), np.asarray(curtain * folds))
     return _blend(rgb, (0.66, 0.64, 0.58), 0.8 * np.asarray(blind))
 
 
 def _door(p: Patch) -> Float64:
     u, v = p.u % 1.1, p.v
-    frame = 1.0 - stripe(np.abs(u - 0.55), 0.08, 0.45, p.spread[:, 0]) * (
-        1.0 - stripes(v, 0.75, 0.14, p.spread[:, 1])
-    )
+    frame = 1.0 - stripe(np.abs(u - 0.55), 0.08, 0.45, p.du) * (1.0 - stripes(v, 0.75, 0.14, p.dv))
     rgb = p.rgb * (0.7 + 0.45 * frame)[:, None]
-    slot = stripe(u, 0.4, 0.7, p.spread[:, 0]) * stripe(v, 1.02, 1.09, p.spread[:, 1])
+    slot = stripe(u, 0.4, 0.7, p.du) * stripe(v, 1.02, 1.09, p.dv)
     return _blend(rgb, (0.8, 0.75, 0.5), slot)
 
 
-def _roof(p: Patch) -> Float64:
-    tone = tile_tone(p.uv, (0.3, 0.35), p.spread, p.part, bond=0.5)
-    rgb = p.rgb * (1.0 + 0.2 * tone)[:, None]
-    return _blend(rgb, (0.1, 0.08, 0.07), 0.6 * stripes(p.v, 0.35, 0.05, p.spread[:, 1]))
-
-
 def _car_paint(p: Patch) -> Float64:
-    gaps = both(
-        stripe(np.abs(p.u + 0.25), 0.0, 0.012, p.spread[:, 0]),
-        stripe(np.abs(p.u - 0.80), 0.0, 0.012, p.spread[:, 0]),
-    )
-    trim = stripe(p.v, 0.5, 0.56, p.spread[:, 1])
+    gaps = both(*(stripe(np.abs(p.u - x), 0.0, 0.012, p.du) for x in (-0.25, 0.80)))
+    trim = stripe(p.v, 0.5, 0.56, p.dv)
     dirt = np.exp(-np.maximum(p.height_m - 0.2, 0.0) / 0.18)
     rgb = p.rgb * (1.0 - 0.35 * dirt)[:, None]
     return _blend(rgb, (0.06, 0.06, 0.06), 0.8 * both(gaps, trim))
 
 
 def _car_glass(p: Patch) -> Float64:
-    pillars = stripe(np.abs(p.u + 0.25), 0.0, 0.05, p.spread[:, 0])
-    pillars = both(pillars, stripe(p.v, 1.36, 9.0, p.spread[:, 1]))
-    cover = pillars[:, None]
+    pillars = stripe(np.abs(p.u + 0.25), 0.0, 0.05, p.du)
+    cover = both(pillars, stripe(p.v, 1.36, 9.0, p.dv))[:, None]
     dark = np.array([0.16, 0.18, 0.2]) ** GAMMA * np.exp(0.8 * p.grain)[:, None]
     dark = dark * (1.0 + 2.0 * np.clip(p.v - 1.0, 0.0, 0.5))[:, None]
     return np.asarray(dark * (1.0 - cover) + p.rgb * cover)
@@ -196,19 +186,12 @@ def _leaves(p: Patch) -> Float64:
     return np.asarray(p.rgb * (tint * [1.25, 1.1, 0.7] + (1.0 - tint) * [0.7, 0.85, 0.9]))
 
 
-def _metal(p: Patch) -> Float64:
-    seams = stripes(p.v, 0.9, 0.05, p.spread[:, 1])
-    return _blend(p.rgb, (0.75, 0.74, 0.7), 0.5 * seams)
-
-
 def _poster(p: Patch) -> Float64:
-    zero = np.zeros(len(p.uv), dtype=np.int64)
     tones = [tile_tone(p.uv, (0.23, 0.31), p.spread, p.part + k) for k in (0, 1, 2)]
     rgb = p.rgb * (1.0 + 0.3 * tones[0][:, None] + 0.3 * np.stack(tones, axis=1))
-    print_lines = stripes(p.v, 0.11, 0.03, p.spread[:, 1])
-    print_lines = print_lines * (lattice_values(np.floor(p.v / 0.11), p.part, zero, 3) > -0.3)
-    rgb = _blend(rgb, (0.12, 0.12, 0.14), 0.7 * np.asarray(print_lines))
-    return _blend(rgb, (0.88, 0.88, 0.86), 1.0 - stripe(p.u, 0.05, 50.0, p.spread[:, 0]))
+    printed = lattice_values(np.floor(p.v / 0.11), p.part, 0, 3) > -0.3
+    rgb = _blend(rgb, (0.12, 0.12, 0.14), 0.7 * (stripes(p.v, 0.11, 0.03, p.dv) * printed))
+    return _blend(rgb, (0.88, 0.88, 0.86), 1.0 - stripe(p.u, 0.05, 50.0, p.du))
 
 
 RECIPES: Final[dict[Material, Recipe]] = {
@@ -265,7 +248,7 @@ def both(a: Float64, b: Float64) -> Float64:
 
 
 def tile_tone(
-    uv: Float64, tile: tuple[float, float], spread: Float64, seed: NDArray[Any], bond: float = 0.0
+    uv: Float64, tile: tuple[float, float], spread: Float64, seed: Any, bond: float = 0.0
 ) -> Float64:
     """Return a random tone in [-1, 1) per tile, averaged if a pixel covers several.
 

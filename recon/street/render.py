@@ -18,7 +18,7 @@ from recon.core.errors import SettingsError
 from recon.core.geometry.projection import disparity_from_depth
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8, freeze
+from recon.core.values.arrays import Bool, Float32, Float64, UInt8, freeze
 from recon.street.kernels.surface import SurfaceHits, SurfaceTable, describe_hits
 from recon.street.materials import GAMMA, albedo, sky_colour
 from recon.street.shapes import TriangleSoup
@@ -96,10 +96,8 @@ class StreetCamera:
     def views(self, index: int) -> tuple[View, View]:
         """Return the left and right view of a frame, in street axes."""
         if not 0 <= index < len(self):
-            expected = f"0 to {len(self) - 1}"
-            raise SettingsError(
-                "no such frame", got=index, expected=expected, hint="raise `frames`"
-            )
+            known = f"0 to {len(self) - 1}"
+            raise SettingsError("no such frame", got=index, expected=known, hint="raise `frames`")
         return stereo_views(self.world.camera, self.world.T_street_camera[index])
 
     def _truth(self, index: int, depth_m: Float32) -> DisparityTruth:
@@ -114,14 +112,14 @@ class StreetCamera:
         return DisparityTruth(disparity_from_depth(depth_m, camera), nonocc.reshape(depth_m.shape))
 
     def _record(self, image: Float64, index: int, side: int) -> UInt8:
+        """Apply the sensor model to display values (H, W, 3) in [0, 1]."""
         settings = self.world.settings
-        return record(
-            image,
-            gain=settings.right_gain if side else 1.0,
-            offset_dn=settings.right_offset_dn if side else 0.0,
-            noise_dn=settings.noise_dn,
-            key=[settings.seed, 1000, index, side],
-        )
+        gain, offset_dn = (settings.right_gain, settings.right_offset_dn) if side else (1.0, 0.0)
+        levels = 255.0 * gain * image + offset_dn
+        if settings.noise_dn > 0:
+            rng = np.random.default_rng([settings.seed, 1000, index, side])
+            levels += settings.noise_dn * rng.standard_normal(levels.shape)
+        return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 
 _QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
@@ -131,34 +129,15 @@ _EXPOSURE: Final = 0.9
 
 def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
     """Render one view as float64 (H, W, 3), display values in [0, 1]."""
-    size = (view.height_px, view.width_px)
-    pixels = view.pixels()
+    size, pixels = (view.height_px, view.width_px), view.pixels()
     sample = stage.look(view.origin, view.directions(pixels), 1.0 / view.focal_px)
-    light = _expose(sample.rgb)
+    light = sample.rgb
     if smooth_edges:
         edge = _edges(sample, size)
-        light[edge] = _four_rays(stage, view, pixels[edge])
+        quarters = (pixels[edge, None, :] + np.array(_QUARTERS)).reshape(-1, 2)
+        four = stage.look(view.origin, view.directions(quarters), 0.5 / view.focal_px)
+        light[edge] = four.rgb.reshape(-1, 4, 3).mean(axis=1)
     return np.asarray(light ** (1.0 / GAMMA)).reshape(*size, 3)
-
-
-def record(
-    image: Float64, *, gain: float, offset_dn: float, noise_dn: float, key: list[int]
-) -> UInt8:
-    """Apply a sensor model to display values (H, W, 3) in [0, 1]; ``key`` seeds the noise."""
-    levels = 255.0 * gain * image + offset_dn
-    if noise_dn > 0:
-        levels += noise_dn * np.random.default_rng(key).standard_normal(levels.shape)
-    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
-
-
-def _expose(light: Float64) -> Float64:
-    return np.clip(_EXPOSURE * light, 0.0, 1.0)
-
-
-def _four_rays(stage: Stage, view: View, pixels: Float64) -> Float64:
-    quarters = (pixels[:, None, :] + np.array(_QUARTERS)).reshape(-1, 2)
-    sample = stage.look(view.origin, view.directions(quarters), 0.5 / view.focal_px)
-    return np.asarray(_expose(sample.rgb).reshape(-1, 4, 3).mean(axis=1))
 
 
 def _edges(sample: Sample, size: tuple[int, int]) -> Bool:
@@ -221,9 +200,9 @@ def stereo_views(camera: RectifiedCamera, T_scene_left: Float64) -> tuple[View, 
     """Return the left and right view of a rig with its left camera at ``T_scene_left``."""
     T_scene_right = T_scene_left.copy()
     T_scene_right[:3, 3] += camera.baseline_m * T_scene_left[:3, 0]
+    places = (T_scene_left, camera.cx_px), (T_scene_right, camera.cx_right_px)
     size = camera.width_px, camera.height_px
-    left = View(T_scene_left, camera.focal_px, (camera.cx_px, camera.cy_px), *size)
-    right = View(T_scene_right, camera.focal_px, (camera.cx_right_px, camera.cy_px), *size)
+    left, right = (View(T, camera.focal_px, (cx, camera.cy_px), *size) for T, cx in places)
     return left, right
 
 
@@ -238,7 +217,7 @@ _SHELTER_M: Final = 1.0  # a horizontal surface with an object this close above 
 class Sample(NamedTuple):
     """What rays hit."""
 
-    rgb: Float64  # (N, 3), linear light
+    rgb: Float64  # (N, 3), linear light as exposed, in [0, 1]
     normal: Float64  # (N, 3), shading normal; 0 for the sky
     label: NDArray[np.int64]  # (N,), differs between objects, materials, and shadow and light
 
@@ -258,7 +237,9 @@ class Stage:
         faces = self.rays.first_hit(origin, directions)
         hit = faces >= 0
         depth = np.full(len(directions), np.nan)
-        depth[hit] = plane_distance(self.table, faces[hit], origin, directions[hit])
+        normal = self.table.normal[faces[hit]]
+        height = np.einsum("nx,nx->n", self.table.anchor[faces[hit]] - origin, normal)
+        depth[hit] = height / np.einsum("nx,nx->n", directions[hit], normal)
         return depth
 
     def sees(self, origin: Float64, xyz: Float64) -> Bool:
@@ -280,7 +261,7 @@ class Stage:
         normal[hit] = hits.normal
         part, material = self.soup.part[met], self.soup.material[met]
         label[hit] = (part.astype(np.int64) * 32 + material) * 2 + lit
-        return Sample(rgb, normal, label)
+        return Sample(np.clip(_EXPOSURE * rgb, 0.0, 1.0), normal, label)
 
     def _light(self, points: SurfaceHits) -> tuple[Float64, Bool]:
         """Return irradiance (N, 3) at points, and whether the sun reaches them."""
@@ -298,12 +279,7 @@ class Stage:
 
 
 def make_stage(soup: TriangleSoup, to_sun: Float64, seed: int, threads: int = 0) -> Stage:
-    """Prepare a scene for rendering."""
-    return Stage(soup, surface_table(soup), RayScene(soup.vertices, threads), to_sun, seed)
-
-
-def surface_table(soup: TriangleSoup) -> SurfaceTable:
-    """Precompute each triangle, so that a hit costs only a few products."""
+    """Prepare a scene for rendering, each triangle so that a hit costs only a few products."""
     # The ray caster uses single precision; the planes must be exactly those that it hits.
     corners = soup.vertices.astype(np.float32).astype(np.float64)
     a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -312,20 +288,11 @@ def surface_table(soup: TriangleSoup) -> SurfaceTable:
     # Gradients of the two barycentric coordinates within the plane.
     gradients = np.stack([np.cross(e2, normal), np.cross(normal, e1)], axis=1)
     gradients /= squared[:, :, None]
-    return SurfaceTable(
-        anchor=a.copy(),
-        normal=normal / np.sqrt(squared),
-        to_uv=np.einsum("fkc,fkx->fcx", soup.uv[:, 1:] - soup.uv[:, :1], gradients),
-        uv=soup.uv[:, 0].copy(),
-        to_shading=np.einsum("fkc,fkx->fcx", soup.normals[:, 1:] - soup.normals[:, :1], gradients),
-        shading=soup.normals[:, 0].copy(),
+    to_uv, to_shading = (
+        np.einsum("fkc,fkx->fcx", each[:, 1:] - each[:, :1], gradients)
+        for each in (soup.uv, soup.normals)
     )
-
-
-def plane_distance(
-    table: SurfaceTable, faces: Int32, origin: Float64, directions: Float64
-) -> Float64:
-    """Return distances (N,) of rays to the planes of their triangles, in their units."""
-    normal = table.normal[faces]
-    height = np.einsum("nx,nx->n", table.anchor[faces] - origin, normal)
-    return np.asarray(height / np.einsum("nx,nx->n", directions, normal))
+    start = soup.uv[:, 0].copy(), soup.normals[:, 0].copy()
+    unit = normal / np.sqrt(squared)
+    table = SurfaceTable(a.copy(), unit, to_uv, start[0], to_shading, start[1])
+    return Stage(soup, table, RayScene(soup.vertices, threads), to_sun, seed)

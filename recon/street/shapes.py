@@ -25,8 +25,8 @@ def quads(
 
     ``uv_origins``, (2,) or (N, 2), are the texture coordinates of that corner in metres.
     """
-    p, u, v = np.broadcast_arrays(*np.atleast_2d(origins, edges_u, edges_v))
-    p, u, v = p.astype(np.float64), u.astype(np.float64), v.astype(np.float64)
+    edges = np.broadcast_arrays(*np.atleast_2d(origins, edges_u, edges_v))
+    p, u, v = (each.astype(np.float64) for each in edges)
     corners = np.stack([p, p + u, p + u + v, p + v], axis=1)
     a = np.broadcast_to(np.asarray(uv_origins, dtype=np.float64), (len(p), 2))
     du = np.stack([np.linalg.norm(u, axis=1), np.zeros(len(p))], axis=1)
@@ -51,12 +51,15 @@ def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint
     ``inset`` is that of the top at the back (-x), at the front (+x) and at each side.
     """
     (x0, y0, z0), (x1, y1, z1), (back, front, side) = low, high, inset
-    bottom = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]], dtype=np.float64)
-    xa, xb, ya, yb = x0 + back, x1 - front, y0 + side, y1 - side
-    top = np.array([[xa, ya, z1], [xb, ya, z1], [xb, yb, z1], [xa, yb, z1]], dtype=np.float64)
+
+    def rim(x0: float, x1: float, y0: float, y1: float, z: float) -> Float64:
+        corners = [[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z], [x0, y0, z]]
+        return np.array(corners, dtype=np.float64)
+
+    bottom, top = rim(x0, x1, y0, y1, z0), rim(x0 + back, x1 - front, y0 + side, y1 - side, z1)
     walls = []
-    for k, n in ((0, 1), (1, 2), (2, 3), (3, 0)):
-        corners = np.array([[bottom[k], bottom[n], top[n]], [bottom[k], top[n], top[k]]])
+    for k in range(4):
+        corners = band(bottom[k : k + 2], top[k : k + 2])
         walls.append(painted(corners, corners[..., [k % 2, 2]] + [FAR_UV * (k % 2), 0.0], paint))
     return merge(walls)
 
@@ -65,69 +68,60 @@ def cylinder(
     radii_m: tuple[float, float], height_m: float, paint: Paint, sides: int = 10
 ) -> TriangleSoup:
     """Return the lateral surface of an upright cone frustum at the origin, without caps."""
-    angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides + 1)], axis=1)
-    rise = np.array([0.0, 0.0, height_m])
-    low, high = ring * radii_m[0], ring * radii_m[1] + rise
-    around = angle * radii_m[0]
-    a, b = slice(None, -1), slice(1, None)
-    corners = _split(low[a], low[b], high[b], high[a])
-    normals = _split(ring[a], ring[b], ring[b], ring[a])
-    foot = np.stack([around, np.zeros(sides + 1)], axis=1)
-    head = np.stack([around, np.full(sides + 1, height_m)], axis=1)
-    return painted(corners, _split(foot[a], foot[b], head[b], head[a]), paint, normals)
+    angle, zero = np.linspace(0.0, 2.0 * np.pi, sides + 1), np.zeros(sides + 1)
+    ring = np.stack([np.cos(angle), np.sin(angle), zero], axis=1)
+    corners = band(ring * radii_m[0], ring * radii_m[1] + [0.0, 0.0, height_m])
+    foot, head = (np.stack([angle * radii_m[0], zero + v], axis=1) for v in (0.0, height_m))
+    return painted(corners, band(foot, head), paint, band(ring, ring))
 
 
 def disc(radius_m: float, paint: Paint, sides: int = 14) -> TriangleSoup:
     """Return a flat disc around the origin in the x-z plane."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
-    rim = radius_m * np.stack([np.cos(angle), np.zeros(sides + 1), np.sin(angle)], axis=1)
-    corners = np.stack([np.zeros((sides, 3)), rim[:-1], rim[1:]], axis=1)
-    return painted(corners, corners[..., [0, 2]], paint)
+    rim = np.stack([np.cos(angle), np.zeros(sides + 1), np.sin(angle)], axis=1)
+    return _fan(np.zeros(3), radius_m * rim, paint)
 
 
 def extrusion(profile: Any, width_m: float, paint: Paint) -> TriangleSoup:
     """Return a star-shaped profile (K, 2) of (x, z), extruded along y about y = 0, with caps."""
-    outline = np.asarray(profile, dtype=np.float64)
-    closed = np.vstack([outline, outline[:1]])
+    closed = np.asarray([*profile, profile[0]], dtype=np.float64)
     left = np.stack([closed[:, 0], np.full(len(closed), width_m / 2), closed[:, 1]], axis=1)
     right = left * [1.0, -1.0, 1.0]
-    steps = np.linalg.norm(np.diff(closed, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    a, b = slice(None, -1), slice(1, None)
-    mantle = _split(left[a], left[b], right[b], right[a])
+    along = np.cumsum([0.0, *np.linalg.norm(np.diff(closed, axis=0), axis=1)])
     # Far from the texture coordinates of the caps, so that patterns on the caps stay there.
     uv = [np.stack([FAR_UV + along, np.full(len(along), FAR_UV + y)], 1) for y in (0.0, width_m)]
-    parts = [painted(mantle, _split(uv[0][a], uv[0][b], uv[1][b], uv[1][a]), paint)]
-    for rim in (left, right):
-        middle = np.broadcast_to(rim[:-1].mean(axis=0), (len(outline), 3))
-        cap = np.stack([middle, rim[:-1], rim[1:]], axis=1)
-        parts.append(painted(cap, cap[..., [0, 2]], paint))
-    return merge(parts)
+    caps = [_fan(rim[:-1].mean(axis=0), rim, paint) for rim in (left, right)]
+    return merge([painted(band(left, right), band(*uv), paint), *caps])
 
 
-def bumpy_ball(
-    radii_m: Any, paint: Paint, *, bump: float, wavelength: float, seed: int, splits: int = 3
-) -> TriangleSoup:
+def _fan(middle: Float64, rim: Float64, paint: Paint) -> TriangleSoup:
+    """Return triangles from a point (3,) to a polyline (N, 3), parallel to the x-z plane."""
+    corners = np.stack([np.broadcast_to(middle, rim[1:].shape), rim[:-1], rim[1:]], axis=1)
+    return painted(corners, corners[..., [0, 2]], paint)
+
+
+def band(near: Float64, far: Float64) -> Float64:
+    """Return triangles (2·(N-1), 3, C) between two polylines (N, C)."""
+    first = np.stack([near[:-1], near[1:], far[1:]], axis=1)
+    return np.concatenate([first, np.stack([near[:-1], far[1:], far[:-1]], axis=1)])
+
+
+def bumpy_ball(radii_m: Any, paint: Paint, *, bump: float, wavelength: float) -> TriangleSoup:
     """Return an ellipsoid (semi-axes: 3) with bumps, such as the crown of a tree.
 
-    Height and wavelength of the bumps are fractions of the radius; ``splits`` is how often the
-    faces of an icosahedron are split in four.
+    Height and wavelength of the bumps are fractions of the radius; the paint's part seeds them.
     """
-    flat, places = _icosphere_corners(splits)
-    hills = value_noise(flat / wavelength, seed)
-    hills += 0.5 * value_noise(flat * (2.0 / wavelength), seed + 1)
+    flat, places = _icosphere_corners(3)
+    hills = value_noise(flat / wavelength, paint.part)
+    hills += 0.5 * value_noise(flat * (2.0 / wavelength), paint.part + 1)
     surface = flat * (1.0 + bump * hills)[:, None] * np.asarray(radii_m)
     corners = surface[places].reshape(-1, 3, 3)
-    return painted(corners, corners[..., :2].copy(), paint, _smooth_normals(corners, places))
-
-
-def _smooth_normals(corners: Float64, places: NDArray[np.int64]) -> Float64:
-    """Return normals (F, 3, 3), the area-weighted mean of all triangles that meet at a corner."""
+    # Normals are the area-weighted mean of all triangles that meet at a corner.
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros((int(places.max()) + 1, 3))
     np.add.at(total, places, np.repeat(flat, 3, axis=0))
-    return _unit(total)[places].reshape(-1, 3, 3)
+    normals = _unit(total)[places].reshape(-1, 3, 3)
+    return painted(corners, corners[..., :2].copy(), paint, normals)
 
 
 @cache
@@ -160,11 +154,6 @@ def _unit(v: NDArray[Any]) -> Float64:
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True), dtype=np.float64)
 
 
-def _split(a: Float64, b: Float64, c: Float64, d: Float64) -> Float64:
-    """Return two triangles per quad a b c d."""
-    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-
-
 class Material(IntEnum):
     """Kinds of surface; `recon.street.materials` has a recipe for each."""
 
@@ -193,10 +182,9 @@ class TriangleSoup:
     part: Int32  # (F,), number of the object
 
     def __post_init__(self) -> None:
-        freeze(self, "vertices", np.float64, (None, 3, 3))
         n = len(self.vertices)
-        freeze(self, "normals", np.float64, (n, 3, 3))
-        freeze(self, "uv", np.float64, (n, 3, 2))
+        for name, shape in (("vertices", (n, 3, 3)), ("normals", (n, 3, 3)), ("uv", (n, 3, 2))):
+            freeze(self, name, np.float64, shape)
         freeze(self, "rgb", np.float64, (n, 3))
         freeze(self, "material", np.uint8, (n,))
         freeze(self, "part", np.int32, (n,))
@@ -207,9 +195,8 @@ class TriangleSoup:
 
 def merge(soups: Iterable[TriangleSoup]) -> TriangleSoup:
     """Return all triangles of several soups, in order."""
-    parts = list(soups)
-    names = ("vertices", "normals", "uv", "rgb", "material", "part")
-    return TriangleSoup(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    parts = zip(*(vars(soup).values() for soup in soups), strict=True)
+    return TriangleSoup(*map(np.concatenate, parts))
 
 
 def move(soup: TriangleSoup, T_to_from: Float64) -> TriangleSoup:
@@ -217,6 +204,11 @@ def move(soup: TriangleSoup, T_to_from: Float64) -> TriangleSoup:
     vertices = se3.apply(T_to_from, soup.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
     normals = se3.rotate(T_to_from, soup.normals.reshape(-1, 3)).reshape(-1, 3, 3)
     return replace(soup, vertices=vertices, normals=normals)
+
+
+def at(x: float, y: float, z: float, turn_rad: float = 0.0) -> Float64:
+    """Return the transform that turns an object about z and moves it to a place."""
+    return se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, turn_rad])), np.array([x, y, z]))
 
 
 def painted(
@@ -227,17 +219,10 @@ def painted(
     Without ``normals`` they are flat-shaded.
     """
     n = len(vertices)
-    return TriangleSoup(
-        vertices=vertices,
-        normals=_flat_normals(vertices) if normals is None else normals,
-        uv=uv,
-        rgb=np.tile(np.array(paint.rgb, dtype=np.float64), (n, 1)),
-        material=np.full(n, paint.material, dtype=np.uint8),
-        part=np.full(n, paint.part, dtype=np.int32),
-    )
-
-
-def _flat_normals(vertices: Float64) -> Float64:
-    normal = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return np.repeat(normal[:, None, :], 3, axis=1)
+    if normals is None:
+        flat = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+        normals = np.repeat(flat[:, None, :], 3, axis=1)
+    rgb = np.tile(np.array(paint.rgb, dtype=np.float64), (n, 1))
+    material, part = np.full(n, paint.material, np.uint8), np.full(n, paint.part, np.int32)
+    return TriangleSoup(vertices, normals, uv, rgb, material, part)

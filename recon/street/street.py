@@ -18,7 +18,7 @@ from recon.street.materials import ROAD_HALF_M
 from recon.street.path import BEHIND_M, CentreLine, camera_poses, centre_line
 from recon.street.props import SECTION_M, SECTIONS
 from recon.street.settings import StreetScene, StreetSettings
-from recon.street.shapes import Material, Paint, TriangleSoup, merge, move, painted
+from recon.street.shapes import Material, Paint, TriangleSoup, at, band, merge, move, painted
 
 KERB_M: Final = 0.12  # pavement above road
 _WALL_M: Final = 8.2  # distance of facades from the centre line
@@ -104,8 +104,7 @@ def build_street(settings: StreetSettings) -> StreetWorld:
 
 def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> TriangleSoup:
     shifts = repeat_m * np.arange(-math.ceil(BEHIND_M / repeat_m), math.ceil(length_m / repeat_m))
-    along = [np.array([shift, 0.0, 0.0]) for shift in shifts]
-    return merge([move(period, se3.make_transform(np.eye(3), offset)) for offset in along])
+    return merge([move(period, at(shift, 0.0, 0.0)) for shift in shifts])
 
 
 def rig(settings: StreetSettings) -> RectifiedCamera:
@@ -153,8 +152,7 @@ def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Pain
         rims.append(np.column_stack([xy, np.full(len(along), height)]))
         across = lateral if edges[0][1] == edges[1][1] else height
         uvs.append(np.column_stack([along, np.full(len(along), across)]))
-    corners, uv = [_band(*pair) for pair in (rims, uvs)]
-    return painted(corners, uv, paint)
+    return painted(band(*rims), band(*uvs), paint)
 
 
 def _stations(road: CentreLine) -> Float64:
@@ -179,32 +177,25 @@ def _inside(road: CentreLine, side: float) -> bool:
     return road.loop_m is not None and side > 0
 
 
-def _band(near: Float64, far: Float64) -> Float64:
-    """Return triangles (2·(N-1), 3, C) between two polylines (N, C)."""
-    first = np.stack([near[:-1], near[1:], far[1:]], axis=1)
-    second = np.stack([near[:-1], far[1:], far[:-1]], axis=1)
-    return np.concatenate([first, second])
-
-
 def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    at, end = road.span_m
-    while at < end:
+    along, end = road.span_m
+    while along < end:
         width = float(rng.uniform(8.0, 15.0))
         setback = float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.8)]))
         gap = float(rng.uniform(5.0, 8.0)) if rng.random() < 0.22 else float(rng.uniform(0.0, 0.15))
-        if _room(road, side, at, width):
-            yield _stand(road, side, at, setback, width, rng)
-        at += width + gap
+        if _room(road, side, along, width):
+            yield _stand(road, side, along, setback, width, rng)
+        along += width + gap
 
 
 def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    at, end = road.span_m
-    end += 30.0 * (at < 0.0)
-    while at < end:
+    along, end = road.span_m
+    end += 30.0 * (along < 0.0)
+    while along < end:
         width = float(rng.uniform(11.0, 18.0))
-        if not _inside(road, side) and _room(road, side, at, width):
-            yield _stand(road, side, at, float(rng.uniform(20.0, 28.0)), width, rng)
-        at += width + float(rng.uniform(0.5, 3.0))
+        if not _inside(road, side) and _room(road, side, along, width):
+            yield _stand(road, side, along, float(rng.uniform(20.0, 28.0)), width, rng)
+        along += width + float(rng.uniform(0.5, 3.0))
 
 
 def _room(road: CentreLine, side: float, at_m: float, width_m: float) -> bool:
@@ -226,10 +217,9 @@ def _stand(
     """Return a house on one side, with its facade on a chord of the curve."""
     built = house(draw_plan(width_m, rng), rng)
     T = road.place(at_m + width_m / 2, side * (_WALL_M + setback_m), KERB_M)
-    half = se3.make_transform(np.eye(3), np.array([-width_m / 2, 0.0, 0.0]))
     if side < 0:
-        T = T @ se3.make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    return move(built, T @ half)
+        T = T @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    return move(built, T @ at(-width_m / 2, 0.0, 0.0))
 
 
 def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
@@ -240,16 +230,15 @@ def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Ite
         soup, jitter = props.car(rng), rng.normal(0.0, [0.25, 0.1, 0.02])
         T = road.place(float(bay) + 3.0 + jitter[0], side * _CAR_LANE_M + jitter[1])
         backwards = (side > 0) != (rng.random() < 0.1)
-        turn = se3.exp_so3(np.array([0.0, 0.0, jitter[2] + np.pi * backwards]))
-        yield move(soup, T @ se3.make_transform(turn, np.zeros(3)))
+        yield move(soup, T @ at(0.0, 0.0, 0.0, jitter[2] + np.pi * backwards))
 
 
 def _fences(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
     first, end = road.span_m
-    for at in np.arange(max(first, -18.0), end, SECTION_M + 0.6):
+    for along in np.arange(max(first, -18.0), end, SECTION_M + 0.6):
         section = SECTIONS[int(rng.integers(len(SECTIONS)))](rng)
         away = np.diag([1.0, side, 1.0, 1.0])
-        T = road.place(float(at), side * (ROAD_HALF_M + 1.5), KERB_M)
+        T = road.place(float(along), side * (ROAD_HALF_M + 1.5), KERB_M)
         yield move(section, T @ away)
 
 
@@ -257,15 +246,15 @@ def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[
     seedlings = [props.tree(rng) for _ in range(_SEEDLINGS)]
 
     def grow(at_m: float, lateral_m: float) -> TriangleSoup:
-        turn = se3.exp_so3(np.array([0.0, 0.0, float(rng.uniform(0.0, 2.0 * np.pi))]))
-        T = road.place(at_m, lateral_m, KERB_M) @ se3.make_transform(turn, np.zeros(3))
+        turn = at(0.0, 0.0, 0.0, float(rng.uniform(0.0, 2.0 * np.pi)))
+        T = road.place(at_m, lateral_m, KERB_M) @ turn
         return move(seedlings[int(rng.integers(_SEEDLINGS))], T)
 
     first, end = road.span_m
-    at = max(first, -10.0) + float(rng.uniform(0.0, 8.0))
-    while at < end:
-        yield grow(at, side * (ROAD_HALF_M + 0.75))
-        at += float(rng.uniform(9.0, 22.0))
+    along = max(first, -10.0) + float(rng.uniform(0.0, 8.0))
+    while along < end:
+        yield grow(along, side * (ROAD_HALF_M + 0.75))
+        along += float(rng.uniform(9.0, 22.0))
     for lateral in np.arange(1.0, 26.0, 3.2) if first < 0.0 else ():
         yield grow(end + 8.0 + float(rng.uniform(0.0, 4.0)), side * float(lateral))
 
@@ -275,19 +264,19 @@ def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Itera
     # Separate random streams, as the number of posts must not change the objects between them.
     lamps, rng = rng.spawn(2)
     first, end = road.span_m
-    for at in np.arange(max(first, -12.0) + 12.0 * (side > 0), end, 24.0):
-        yield move(props.lamp_post(side, lamps), road.place(float(at), kerb, KERB_M))
-    at = max(first, -8.0)
-    while at < end:
-        at += float(rng.uniform(2.5, 9.0))
+    for along in np.arange(max(first, -12.0) + 12.0 * (side > 0), end, 24.0):
+        yield move(props.lamp_post(side, lamps), road.place(float(along), kerb, KERB_M))
+    along = max(first, -8.0)
+    while along < end:
+        along += float(rng.uniform(2.5, 9.0))
         kind = rng.random()
         if kind < 0.3:
-            yield move(props.sign(rng), road.place(at, kerb, KERB_M))
+            yield move(props.sign(rng), road.place(along, kerb, KERB_M))
         elif kind < 0.6:
             for k in range(int(rng.integers(2, 5))):
-                yield move(props.bollard(rng), road.place(at + 1.5 * k, kerb, KERB_M))
+                yield move(props.bollard(rng), road.place(along + 1.5 * k, kerb, KERB_M))
         elif kind < 0.85:
-            yield move(props.bin_(rng), road.place(at, side * (_WALL_M - 0.6), KERB_M))
+            yield move(props.bin_(rng), road.place(along, side * (_WALL_M - 0.6), KERB_M))
         else:
-            T = road.place(at, side * (ROAD_HALF_M + 1.2), KERB_M)
+            T = road.place(along, side * (ROAD_HALF_M + 1.2), KERB_M)
             yield move(props.advertising_pillar(rng), T)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import Float64, Int32, kernel
 
@@ -209,7 +208,7 @@ def fractal_noise(
     return out
 
 
-def lattice_values(ix: NDArray[Any], iy: NDArray[Any], iz: NDArray[Any], seed: int) -> Float64:
+def lattice_values(ix: Any, iy: Any, iz: Any, seed: int) -> Float64:
     """Return random values in [-1, 1) of integer lattice points of any shape, plain numpy."""
     x, y, z = (np.asarray(k).astype(np.int64).astype(np.uint64) for k in (ix, iy, iz))
     offset = np.uint64(seed * _S % 2**64)
