@@ -303,7 +303,9 @@ def _groups(
     for name, field in type(drive).model_fields.items():
         value, paired = getattr(drive, name), getattr(pair, name)
         if isinstance(value, Settings):
-            inside.append((value, paired, f"{prefix}{name}.", field.description))
+            inside.append(
+                (value, paired, f"{prefix}{name}.", " ".join((field.description or "").split()))
+            )
         else:
             own.append(_entry(f"{prefix}{name}", field, value, paired))
     if own:

@@ -67,14 +67,12 @@ class PaperSettings(Settings):
 
     fixed: ClassVar = {"patch_px": 11}
 
-    as_printed: bool = Field(
-        default=False, description="Run the method as printed as well as the corrected one."
-    )
+    as_printed: bool = False
+    """Run the method as printed as well as the corrected one."""
     patches_px: tuple[Annotated[int, Field(ge=1, le=61)], ...] = Field(
-        default=tuple(range(3, 22, 2)),
-        min_length=1,
-        description="Patch sizes, and window sizes of the matcher `sad`, to compare; odd.",
+        tuple(range(3, 22, 2)), min_length=1
     )
+    """Patch sizes, and window sizes of the matcher `sad`, to compare; odd."""
 
     @field_validator("patches_px")
     @classmethod

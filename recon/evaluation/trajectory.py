@@ -29,26 +29,17 @@ MIN_PATH_M: Final = 1.0
 class TrajectoryRules(Settings):
     """Alignment and segments of a trajectory comparison."""
 
-    alignment: Literal["none", "origin", "se3", "sim3", "upright"] = Field(
-        default="se3",
-        description="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
-        "rigid with scale (sim3), or rigid where z is up in both (upright).",
-    )
+    alignment: Literal["none", "origin", "se3", "sim3", "upright"] = "se3"
+    """Alignment of the estimate: none, at the first pose (origin), rigid (se3), or rigid with scale
+    (sim3), or rigid where z is up in both (upright)."""
     lengths_m: tuple[Annotated[float, Field(ge=1e-6, le=1e9)], ...] | None = Field(
-        default=None,
-        min_length=1,
-        description="Lengths of the segments in metres; null = chosen by the length of the path.",
+        None, min_length=1
     )
-    step_frames: int | None = Field(
-        default=None,
-        ge=1,
-        le=1_000_000_000,
-        description="Frames between the starts of segments; null = chosen by the length of the "
-        "path.",
-    )
-    rpe_frames: int = Field(
-        default=1, ge=1, le=1_000_000_000, description="Frame distance of the RPE."
-    )
+    """Lengths of the segments in metres; null = chosen by the length of the path."""
+    step_frames: int | None = Field(None, ge=1, le=1_000_000_000)
+    """Frames between the starts of segments; null = chosen by the length of the path."""
+    rpe_frames: int = Field(1, ge=1, le=1_000_000_000)
+    """Frame distance of the RPE."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,33 +28,18 @@ _NOMINAL_ERROR_PX: Final = 0.3  # error of a good match, by which the range of f
 class FusionSettings(Settings):
     """How clouds are fused."""
 
-    voxel_m: float = Field(
-        0.1,
-        ge=0.001,
-        le=10.0,
-        description="Edge of a voxel. Half of it takes about four times the memory; scale it with "
-        "the scene.",
-    )
-    min_count: int = Field(
-        3,
-        ge=1,
-        le=1000,
-        description="Voxels seen by fewer frames are not exported, or by fewer than one less where "
-        "they are precise. Lower it for slow or sparse drives, raise it where noise is left.",
-    )
-    max_depth_error_m: float | None = Field(
-        0.25,
-        ge=1e-6,
-        le=100.0,
-        description="Points are fused up to the depth at which a matching error of 0.3 px makes "
-        "this error; none = all. Raise it to map farther and less precisely.",
-    )
-    remove_moving: bool = Field(
-        default=True,
-        description="Leave points of things that moved out of the cloud and the mesh: what was "
-        "there as a whole at one time and gone at another, by the rays of single frames "
-        "(occupancy.keep_rays). They are written to map/removed.ply.",
-    )
+    voxel_m: float = Field(0.1, ge=0.001, le=10.0)
+    """Edge of a voxel. Half of it takes about four times the memory; scale it with the scene."""
+    min_count: int = Field(3, ge=1, le=1000)
+    """Voxels seen by fewer frames are not exported, or by fewer than one less where they are
+    precise. Lower it for slow or sparse drives, raise it where noise is left."""
+    max_depth_error_m: float | None = Field(0.25, ge=1e-06, le=100.0)
+    """Points are fused up to the depth at which a matching error of 0.3 px makes this error; none =
+    all. Raise it to map farther and less precisely."""
+    remove_moving: bool = True
+    """Leave points of things that moved out of the cloud and the mesh: what was there as a whole at
+    one time and gone at another, by the rays of single frames (occupancy.keep_rays). They are
+    written to map/removed.ply."""
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:

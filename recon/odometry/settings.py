@@ -12,38 +12,19 @@ from recon.core.settings import Settings
 class PriorSettings(Settings):
     """How a path from other sensors is used (`recon map --prior`)."""
 
-    axes: Literal["auto", "camera", "body"] = Field(
-        "auto",
-        description="Axes of its poses: of the left camera (x right, y down, z forward), or of a "
-        "body (x forward, y left, z up) that turns with it and is near to it. auto = those in "
-        "which it explains what the cameras see on the first metres.",
-    )
-    max_gap_s: float = Field(
-        1.0,
-        ge=1e-6,
-        le=1e6,
-        description="Poses farther apart in time are not interpolated. Raise it for a slow "
-        "receiver.",
-    )
-    sigma_m: float = Field(
-        0.03,
-        ge=1e-6,
-        le=1e6,
-        description="Standard deviation of its motion from frame to frame. State here what your "
-        "sensor is worth: the cameras are believed where it is worse.",
-    )
-    sigma_share: float = Field(
-        0.03,
-        ge=0.0,
-        le=1000.0,
-        description="Share of the motion's length that is added to `sigma_m`.",
-    )
-    sigma_deg: float = Field(
-        0.5,
-        ge=1e-6,
-        le=360.0,
-        description="Standard deviation of its rotation from frame to frame.",
-    )
+    axes: Literal["auto", "camera", "body"] = "auto"
+    """Axes of its poses: of the left camera (x right, y down, z forward), or of a body (x forward,
+    y left, z up) that turns with it and is near to it. auto = those in which it explains what
+    the cameras see on the first metres."""
+    max_gap_s: float = Field(1.0, ge=1e-06, le=1000000.0)
+    """Poses farther apart in time are not interpolated. Raise it for a slow receiver."""
+    sigma_m: float = Field(0.03, ge=1e-06, le=1000000.0)
+    """Standard deviation of its motion from frame to frame. State here what your sensor is worth:
+    the cameras are believed where it is worse."""
+    sigma_share: float = Field(0.03, ge=0.0, le=1000.0)
+    """Share of the motion's length that is added to `sigma_m`."""
+    sigma_deg: float = Field(0.5, ge=1e-06, le=360.0)
+    """Standard deviation of its rotation from frame to frame."""
 
 
 OdometryName = Literal["visual", "kiss"]
@@ -57,16 +38,10 @@ def _name_today(name: object) -> object:
 class OdometrySettings(Settings):
     """Where the camera is in each frame."""
 
-    method: Annotated[OdometryName, BeforeValidator(_name_today)] = Field(
-        "visual",
-        description="visual = features followed from frame to frame; kiss = kiss-icp, which "
-        "registers the points that stereo measures well over time, to compare with.",
-    )
-    max_range_m: float = Field(
-        30.0,
-        ge=0.1,
-        le=10_000.0,
-        description="Points farther than this are not registered by kiss-icp (`kiss`, and "
-        "`recon localize`). Raise it with a wide baseline in open country.",
-    )
+    method: Annotated[OdometryName, BeforeValidator(_name_today)] = "visual"
+    """visual = features followed from frame to frame; kiss = kiss-icp, which registers the points
+    that stereo measures well over time, to compare with."""
+    max_range_m: float = Field(30.0, ge=0.1, le=10000.0)
+    """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
+    it with a wide baseline in open country."""
     prior: PriorSettings = PriorSettings()

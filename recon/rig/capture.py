@@ -41,49 +41,32 @@ _GAP_PERIODS: Final = 1.5
 class CaptureSettings(Settings):
     """Settings of a recording."""
 
-    width_px: int | None = Field(
-        default=None,
-        ge=16,
-        le=100_000,
-        description="Requested frame width. none = the driver's default.",
-    )
-    height_px: int | None = Field(
-        default=None, ge=16, le=100_000, description="Requested frame height; with width_px."
-    )
-    rate_hz: float | None = Field(
-        default=None,
-        ge=1e-3,
-        le=1e6,
-        description="Requested frame rate. none = the driver's default.",
-    )
-    lock_exposure: bool = Field(
-        default=True,
-        description="Lock exposure and white balance if the driver supports it. Turn it off where "
-        "the light changes during the drive.",
-    )
+    width_px: int | None = Field(None, ge=16, le=100000)
+    """Requested frame width. none = the driver's default."""
+    height_px: int | None = Field(None, ge=16, le=100000)
+    """Requested frame height; with width_px."""
+    rate_hz: float | None = Field(None, ge=0.001, le=1000000.0)
+    """Requested frame rate. none = the driver's default."""
+    lock_exposure: bool = True
+    """Lock exposure and white balance if the driver supports it. Turn it off where the light
+    changes during the drive."""
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
-        default="left-right", description="Arrangement of the views in the frames of one device."
+        "left-right"
     )
-    suffix: Literal["png", "jpg"] = Field(
-        default="png", description="File format: png = lossless, jpg = for a slow disk."
-    )
+    """Arrangement of the views in the frames of one device."""
+    suffix: Literal["png", "jpg"] = "png"
+    """File format: png = lossless, jpg = for a slow disk."""
 
 
 class RecordingSettings(CaptureSettings):
     """The settings of one recording, and when it ends."""
 
-    frames: int | None = Field(
-        default=None, ge=1, le=1_000_000_000, description="Stop after this many pairs."
-    )
-    seconds: float | None = Field(
-        default=None, ge=1e-3, le=1e9, description="Stop after this many seconds."
-    )
-    preview_every: int | None = Field(
-        default=None,
-        ge=1,
-        le=1_000_000_000,
-        description="Update preview.jpg every N pairs. None = no preview.",
-    )
+    frames: int | None = Field(None, ge=1, le=1_000_000_000)
+    """Stop after this many pairs."""
+    seconds: float | None = Field(None, ge=0.001, le=1_000_000_000.0)
+    """Stop after this many seconds."""
+    preview_every: int | None = Field(None, ge=1, le=1_000_000_000)
+    """Update preview.jpg every N pairs. None = no preview."""
 
 
 @dataclass(frozen=True, eq=False)

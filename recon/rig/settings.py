@@ -17,16 +17,10 @@ class AuditSettings(Settings):
 
     fixed: ClassVar = {"frames": 300}
 
-    quick: bool = Field(
-        default=True,
-        description="Whether `recon map`, `pair` and `disparity` start with a quick audit. Off "
-        "saves a second.",
-    )
-    baseline_m: tuple[Metres, Metres] = Field(
-        default=(0.01, 2.0),
-        description="Smallest and largest plausible baseline, in metres. Widen it for an unusual "
-        "rig.",
-    )
+    quick: bool = True
+    """Whether `recon map`, `pair` and `disparity` start with a quick audit. Off saves a second."""
+    baseline_m: tuple[Metres, Metres] = Field((0.01, 2.0))
+    """Smallest and largest plausible baseline, in metres. Widen it for an unusual rig."""
 
 
 class AuditedSettings(StereoSettings):
@@ -43,23 +37,15 @@ class CalibrationSettings(Settings):
 
     fixed: ClassVar = {"bootstrap": 500, "depths_m": [2.0, 5.0, 10.0, 20.0]}
 
-    model: LensKind = Field(
-        default="radtan",
-        description="Lens model: radtan (radial and tangential, most lenses), rational (wide "
-        "angle) or fisheye (150 degrees or more).",
-    )
-    radial_terms: Literal[2, 3] = Field(
-        default=3,
-        description="Number of radial coefficients of radtan: k1 k2, or k1 k2 k3. 2 where the "
-        "corners of the images hold no board, or for programs that know no k3.",
-    )
-    working_m: float | None = Field(
-        default=None,
-        ge=1e-3,
-        le=1e6,
-        description="Distance for which the verdict is made, in metres; none = where the expected "
-        "error of matching is 2 % of the distance.",
-    )
+    model: LensKind = "radtan"
+    """Lens model: radtan (radial and tangential, most lenses), rational (wide angle) or fisheye
+    (150 degrees or more)."""
+    radial_terms: Literal[2, 3] = 3
+    """Number of radial coefficients of radtan: k1 k2, or k1 k2 k3. 2 where the corners of the
+    images hold no board, or for programs that know no k3."""
+    working_m: float | None = Field(None, ge=0.001, le=1000000.0)
+    """Distance for which the verdict is made, in metres; none = where the expected error of
+    matching is 2 % of the distance."""
 
 
 class CalibratedSettings(StereoSettings):

@@ -145,13 +145,9 @@ _CACHE_BYTES: Final = 100_000_000
 class MemorySettings(Settings):
     """How much memory a run may take."""
 
-    limit_mb: float | None = Field(
-        None,
-        ge=1.0,
-        le=1e9,
-        description="Largest resident memory of the process, in 10⁶ bytes; none = no limit. "
-        "Submaps and tiles are made smaller to meet it, so results may differ by rounding.",
-    )
+    limit_mb: float | None = Field(None, ge=1.0, le=1_000_000_000.0)
+    """Largest resident memory of the process, in 10⁶ bytes; none = no limit. Submaps and tiles are
+    made smaller to meet it, so results may differ by rounding."""
 
     @property
     def submap_bytes(self) -> int | None:

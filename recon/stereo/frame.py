@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from pydantic import Field
 from typing_extensions import Self
 
 from recon.core.settings import Settings
@@ -152,11 +151,9 @@ class StereoSettings(Settings):
     rectification: RectificationSettings = RectificationSettings()
     matching: MatchingSettings = MatchingSettings()
     cloud: CloudSettings = CloudSettings()
-    filters: FilterSettings = Field(
-        default=FilterSettings(),
-        description="Filters of the cloud of one frame, in this order; none turns one off. "
-        "Fusion thins and cleans the clouds of a drive anyway.",
-    )
+    filters: FilterSettings = FilterSettings()
+    """Filters of the cloud of one frame, in this order; none turns one off. Fusion thins and cleans
+    the clouds of a drive anyway."""
 
     def with_matcher(self, matcher: str | Matcher | None) -> Self:
         """Return the settings with another matcher, by name or as an object; None = unchanged.

@@ -24,30 +24,24 @@ class StreetSettings(Settings):
 
     fixed: ClassVar = {"turn_deg_per_100m": 20.0}
 
-    seed: int = Field(
-        default=0, ge=0, lt=2**31, description="Seed of the street: another one, another street."
-    )
-    frames: int = Field(
-        default=40, ge=1, le=2000, description="Number of stereo pairs, a metre apart."
-    )
-    path: Literal["curve", "straight", "block"] = Field(
-        default="curve",
-        description="Shape of the street; block = repeated laps around a block, for loops.",
-    )
-    width_px: int = Field(
-        default=640, ge=16, le=8192, description="Image width. Take that of your rig to try it."
-    )
-    height_px: int = Field(default=240, ge=16, le=8192, description="Image height.")
-    focal_px: float = Field(default=360.0, ge=1.0, le=100_000.0, description="Focal length.")
-    baseline_m: float = Field(
-        default=0.54, ge=0.001, le=5.0, description="Distance between the cameras."
-    )
-    camera_height_m: float = Field(
-        default=1.65, ge=0.3, le=4.0, description="Height of the cameras above the road."
-    )
-    pitch_deg: float = Field(
-        default=1.0, ge=-30.0, le=30.0, description="Pitch of the mounted rig; positive = down."
-    )
+    seed: int = Field(0, ge=0, lt=2**31)
+    """Seed of the street: another one, another street."""
+    frames: int = Field(40, ge=1, le=2000)
+    """Number of stereo pairs, a metre apart."""
+    path: Literal["curve", "straight", "block"] = "curve"
+    """Shape of the street; block = repeated laps around a block, for loops."""
+    width_px: int = Field(640, ge=16, le=8192)
+    """Image width. Take that of your rig to try it."""
+    height_px: int = Field(240, ge=16, le=8192)
+    """Image height."""
+    focal_px: float = Field(360.0, ge=1.0, le=100000.0)
+    """Focal length."""
+    baseline_m: float = Field(0.54, ge=0.001, le=5.0)
+    """Distance between the cameras."""
+    camera_height_m: float = Field(1.65, ge=0.3, le=4.0)
+    """Height of the cameras above the road."""
+    pitch_deg: float = Field(1.0, ge=-30.0, le=30.0)
+    """Pitch of the mounted rig; positive = down."""
 
 
 class StreetScene(StreetSettings):

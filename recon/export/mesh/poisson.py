@@ -40,70 +40,30 @@ _NORMALS_NEIGHBOURS: Final = 20  # neighbours for normals where the cloud has no
 class MeshSettings(Settings):
     """How a surface is reconstructed and trimmed."""
 
-    depth: int | None = Field(
-        default=None,
-        ge=4,
-        le=12,
-        description="Octree depth; none = chosen by cell_spacings, up to max_depth. Each step "
-        "halves the cells.",
-    )
-    cell_spacings: float = Field(
-        default=1.5,
-        ge=0.1,
-        le=20,
-        description="Widest octree cell, in point spacings; noise in smaller ones becomes ripples. "
-        "Raise it for a smoother surface.",
-    )
-    max_depth: int = Field(
-        default=10,
-        ge=4,
-        le=12,
-        description="Largest depth that is chosen automatically: bounds time and memory.",
-    )
-    point_weight: float = Field(
-        default=4.0,
-        ge=0,
-        le=1000.0,
-        description="Weight of the points against their normals. Lower is smoother.",
-    )
-    trim_density_quantile: float = Field(
-        default=0.01,
-        ge=0,
-        lt=1,
-        description="Share of the vertices cut off as least supported; 0 keeps all.",
-    )
-    max_distance_spacings: float | None = Field(
-        default=2.0,
-        ge=0.01,
-        le=1e6,
-        description="Farthest a vertex may lie from the points, in local point spacings; "
-        "none = keep all. Lower it to keep holes open.",
-    )
-    min_component_faces: int = Field(
-        default=100,
-        ge=1,
-        le=1_000_000_000,
-        description="Connected pieces with fewer faces are dropped. Raise it against crumbs.",
-    )
-    target_faces: int | None = Field(
-        default=None,
-        ge=4,
-        le=1_000_000_000,
-        description="Simplify to about so many faces; none = do not. For viewers and other "
-        "programs with a limit.",
-    )
-    tile_m: float = Field(
-        default=50.0,
-        ge=2 * OVERLAP_M,
-        le=10_000.0,
-        description="Edge of the tiles in which the map of a drive is meshed. Smaller ones take "
-        "less memory.",
-    )
-    free_space: bool = Field(
-        default=True,
-        description="Remove surfaces in space that the cameras of a drive saw to be free. Off "
-        "keeps what moved through.",
-    )
+    depth: int | None = Field(None, ge=4, le=12)
+    """Octree depth; none = chosen by cell_spacings, up to max_depth. Each step halves the cells."""
+    cell_spacings: float = Field(1.5, ge=0.1, le=20)
+    """Widest octree cell, in point spacings; noise in smaller ones becomes ripples. Raise it for a
+    smoother surface."""
+    max_depth: int = Field(10, ge=4, le=12)
+    """Largest depth that is chosen automatically: bounds time and memory."""
+    point_weight: float = Field(4.0, ge=0, le=1000.0)
+    """Weight of the points against their normals. Lower is smoother."""
+    trim_density_quantile: float = Field(0.01, ge=0, lt=1)
+    """Share of the vertices cut off as least supported; 0 keeps all."""
+    max_distance_spacings: float | None = Field(2.0, ge=0.01, le=1000000.0)
+    """Farthest a vertex may lie from the points, in local point spacings; none = keep all. Lower it
+    to keep holes open."""
+    min_component_faces: int = Field(100, ge=1, le=1_000_000_000)
+    """Connected pieces with fewer faces are dropped. Raise it against crumbs."""
+    target_faces: int | None = Field(None, ge=4, le=1_000_000_000)
+    """Simplify to about so many faces; none = do not. For viewers and other programs with a limit.
+    """
+    tile_m: float = Field(50.0, ge=2 * OVERLAP_M, le=10000.0)
+    """Edge of the tiles in which the map of a drive is meshed. Smaller ones take less memory."""
+    free_space: bool = True
+    """Remove surfaces in space that the cameras of a drive saw to be free. Off keeps what moved
+    through."""
 
 
 def reconstruct_mesh(

@@ -63,7 +63,7 @@ class JobList(Settings):
 
     job: list[Entry] = Field(min_length=1)
     sweep: dict[str, Annotated[list[_Value], Field(min_length=1)]] = Field({})
-    folder: str = Field("")
+    folder: str = ""
 
     def combinations(self) -> Iterator[dict[str, Any]]:
         """Yield the settings of each combination of the sweep; one without any if there is none."""

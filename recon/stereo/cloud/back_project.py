@@ -26,37 +26,18 @@ class CloudSettings(Settings):
 
     fixed: ClassVar = {"min_confidence": 0.0}
 
-    remove_flying_edges: bool = Field(
-        default=True,
-        description="Drop pixels that float between a foreground and its background. Turn it off "
-        "to see what the matcher found.",
-    )
-    min_range_m: float = Field(
-        default=0.1,
-        ge=0,
-        le=1e6,
-        description="Nearest depth kept. Set it to hide a bonnet or gripper.",
-    )
-    max_range_m: float | None = Field(
-        default=30.0,
-        ge=1e-6,
-        le=1e6,
-        description="Farthest depth kept; none = no limit. The error of a depth grows with its "
-        "square.",
-    )
-    max_relative_sigma: float | None = Field(
-        default=0.1,
-        ge=1e-6,
-        le=1e6,
-        description="Largest standard deviation of a depth kept, as a share of it; none = no "
-        "limit. Smaller for fewer, more certain points.",
-    )
-    stride: int = Field(
-        default=1,
-        ge=1,
-        le=16,
-        description="Every n-th row and column is used. Raise it for speed with large images.",
-    )
+    remove_flying_edges: bool = True
+    """Drop pixels that float between a foreground and its background. Turn it off to see what the
+    matcher found."""
+    min_range_m: float = Field(0.1, ge=0, le=1000000.0)
+    """Nearest depth kept. Set it to hide a bonnet or gripper."""
+    max_range_m: float | None = Field(30.0, ge=1e-06, le=1000000.0)
+    """Farthest depth kept; none = no limit. The error of a depth grows with its square."""
+    max_relative_sigma: float | None = Field(0.1, ge=1e-06, le=1000000.0)
+    """Largest standard deviation of a depth kept, as a share of it; none = no limit. Smaller for
+    fewer, more certain points."""
+    stride: int = Field(1, ge=1, le=16)
+    """Every n-th row and column is used. Raise it for speed with large images."""
 
 
 def back_project(
@@ -162,27 +143,14 @@ _RADIUS_NEIGHBOURS: Final = 2
 class FilterSettings(Settings):
     """Which filters are applied to a cloud, in this order; none turns one off."""
 
-    voxel_m: float | None = Field(
-        default=None,
-        ge=1e-6,
-        le=1e6,
-        description="Edge of the voxels that points are averaged in. Set it for fewer points.",
-    )
-    statistical_neighbours: int | None = Field(
-        default=None,
-        ge=1,
-        le=100,
-        description="Neighbours of the statistical outlier filter, which drops points that are "
-        "farther from them than most. Several times as slow as the others; for one pair, or a "
-        "map with noise in the air.",
-    )
-    radius_m: float | None = Field(
-        default=None,
-        ge=1e-6,
-        le=1e6,
-        description="Points with fewer than two others within this radius are dropped. About "
-        "three voxels; larger drops larger islands.",
-    )
+    voxel_m: float | None = Field(None, ge=1e-06, le=1000000.0)
+    """Edge of the voxels that points are averaged in. Set it for fewer points."""
+    statistical_neighbours: int | None = Field(None, ge=1, le=100)
+    """Neighbours of the statistical outlier filter, which drops points that are farther from them
+    than most. Several times as slow as the others; for one pair, or a map with noise in the air."""
+    radius_m: float | None = Field(None, ge=1e-06, le=1000000.0)
+    """Points with fewer than two others within this radius are dropped. About three voxels; larger
+    drops larger islands."""
 
 
 ANY_SCALE: Final = FilterSettings(statistical_neighbours=20)

@@ -30,37 +30,21 @@ class OnnxSettings(Settings):
     The number of inputs and their channels are read from the network.
     """
 
-    model: Path | None = Field(default=None, description="The network, an .onnx file.")
-    width_px: int | None = Field(
-        default=None,
-        ge=1,
-        le=10_000,
-        description="Width at which the network matches; images are resized. none = its own, or "
-        "that of the images, widened to a multiple of 32. Smaller is faster.",
-    )
-    height_px: int | None = Field(
-        default=None,
-        ge=1,
-        le=10_000,
-        description="Height at which it matches; with width_px or not at all.",
-    )
-    mean: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
-        default=(0.0,), description="Taken from grey levels in [0, 1]; one number, or per channel."
-    )
-    std: tuple[Annotated[float, Field(ge=1e-6, le=1e6)], ...] = Field(
-        default=(1.0,),
-        description="Divides what is left; one number, or per channel. 1/255 makes "
-        "levels in [0, 255].",
-    )
-    output: int = Field(
-        default=-1, ge=-1000, le=1000, description="Which output is the disparity; -1 = the last."
-    )
-    output_scale: float = Field(
-        default=1.0,
-        ge=-1e6,
-        le=1e6,
-        description="Pixels per unit of the output; -1 where it is a flow to the left.",
-    )
+    model: Path | None = None
+    """The network, an .onnx file."""
+    width_px: int | None = Field(None, ge=1, le=10000)
+    """Width at which the network matches; images are resized. none = its own, or that of the
+    images, widened to a multiple of 32. Smaller is faster."""
+    height_px: int | None = Field(None, ge=1, le=10000)
+    """Height at which it matches; with width_px or not at all."""
+    mean: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field((0.0,))
+    """Taken from grey levels in [0, 1]; one number, or per channel."""
+    std: tuple[Annotated[float, Field(ge=1e-6, le=1e6)], ...] = Field((1.0,))
+    """Divides what is left; one number, or per channel. 1/255 makes levels in [0, 255]."""
+    output: int = Field(-1, ge=-1000, le=1000)
+    """Which output is the disparity; -1 = the last."""
+    output_scale: float = Field(1.0, ge=-1000000.0, le=1000000.0)
+    """Pixels per unit of the output; -1 where it is a flow to the left."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:

@@ -42,19 +42,12 @@ _SGBM_BLOCK_PX: Final = 3
 class OpencvSettings(SearchSettings):
     """Settings of `opencv-bm` (``cv2.StereoBM``) and `opencv-sgbm` (``cv2.StereoSGBM``)."""
 
-    pad: bool = Field(
-        default=False,
-        description="Widen the images by repeating their edges, so that every pixel is searched "
-        "as far as the right image reaches. false = OpenCV as it comes, without a strip at the "
-        "left as wide as the range, which scoring then fills by a guess.",
-    )
-    block_px: OddInt | None = Field(
-        default=None,
-        ge=1,
-        le=255,
-        description="Width of the window; odd. none = 9 for `opencv-bm` (at least 5), 3 for "
-        "`opencv-sgbm`.",
-    )
+    pad: bool = False
+    """Widen the images by repeating their edges, so that every pixel is searched as far as the
+    right image reaches. false = OpenCV as it comes, without a strip at the left as wide as the
+    range, which scoring then fills by a guess."""
+    block_px: OddInt | None = Field(None, ge=1, le=255)
+    """Width of the window; odd. none = 9 for `opencv-bm` (at least 5), 3 for `opencv-sgbm`."""
 
 
 class OpencvMatcher:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from pydantic import Field, InstanceOf, field_serializer
+from pydantic import InstanceOf, field_serializer
 
 from recon.core.errors import SettingsError
 from recon.core.settings import Settings
@@ -36,11 +36,9 @@ MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
 class MatchingSettings(Settings):
     """Which matcher, and the settings of each."""
 
-    matcher: str | InstanceOf[Matcher] = Field(
-        default="sad",
-        description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one that an "
-        "installed package registers; in Python also a matcher of your own.",
-    )
+    matcher: str | InstanceOf[Matcher] = "sad"
+    """Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one that an installed package
+    registers; in Python also a matcher of your own."""
     sad: SadSettings = SadSettings()
     sgm: SgmSettings = SgmSettings()
     opencv: OpencvSettings = OpencvSettings()

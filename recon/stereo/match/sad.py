@@ -76,13 +76,9 @@ SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0
 class SadSettings(MeasuredSettings):
     """Settings of the SAD matcher."""
 
-    window_px: OddInt = Field(
-        default=11,
-        ge=1,
-        le=55,
-        description="Edge of the square window; odd. Smaller keeps thin things and sharp edges, "
-        "larger is denser where texture is weak.",
-    )
+    window_px: OddInt = Field(11, ge=1, le=55)
+    """Edge of the square window; odd. Smaller keeps thin things and sharp edges, larger is denser
+    where texture is weak."""
     uniqueness_percent: UniquenessPercent = 2
 
 

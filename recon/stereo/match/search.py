@@ -60,20 +60,12 @@ UniquenessPercent = Annotated[
 class SearchSettings(Settings):
     """Which disparities are searched."""
 
-    min_disparity_px: int = Field(
-        default=0,
-        ge=-4096,
-        le=4096,
-        description="First disparity searched; negative for cameras that converge.",
-    )
-    ndisp: int | None = Field(
-        default=None,
-        ge=3,
-        le=4096,
-        description="Number of disparities searched (OpenCV: rounded up to a multiple of 16). "
-        "none = what the calibration says, or else as far as each pair needs. Time and memory "
-        "grow with it; what is nearer than its last disparity is not found.",
-    )
+    min_disparity_px: int = Field(0, ge=-4096, le=4096)
+    """First disparity searched; negative for cameras that converge."""
+    ndisp: int | None = Field(None, ge=3, le=4096)
+    """Number of disparities searched (OpenCV: rounded up to a multiple of 16). none = what the
+    calibration says, or else as far as each pair needs. Time and memory grow with it; what is
+    nearer than its last disparity is not found."""
 
     def ndisp_for(self, camera: RectifiedCamera) -> int:
         """Return the number of disparities to search in the images of a camera."""

@@ -67,26 +67,14 @@ _MEMORY_BYTES: Final = 1536 << 20
 class SgmSettings(MeasuredSettings):
     """Settings of the semi-global matcher."""
 
-    window_px: OddInt = Field(
-        default=5,
-        ge=1,
-        le=31,
-        description="Edge of the square window; odd. Larger suppresses noise and widens edges.",
-    )
-    p1: float = Field(
-        default=16.0,
-        gt=0.0,
-        le=255.0,
-        description="Penalty of a step of one disparity along a path, as a mean cost of one pixel. "
-        "Smaller where most surfaces are slanted.",
-    )
-    p2: float = Field(
-        default=50.0,
-        gt=0.0,
-        le=1000.0,
-        description="Penalty of a larger step along a path, as a mean cost of one pixel. Larger is "
-        "smoother, and fills more of what is plain; smaller keeps thin things.",
-    )
+    window_px: OddInt = Field(5, ge=1, le=31)
+    """Edge of the square window; odd. Larger suppresses noise and widens edges."""
+    p1: float = Field(16.0, gt=0.0, le=255.0)
+    """Penalty of a step of one disparity along a path, as a mean cost of one pixel. Smaller where
+    most surfaces are slanted."""
+    p2: float = Field(50.0, gt=0.0, le=1000.0)
+    """Penalty of a larger step along a path, as a mean cost of one pixel. Larger is smoother, and
+    fills more of what is plain; smaller keeps thin things."""
 
     @model_validator(mode="before")
     @classmethod

@@ -37,21 +37,12 @@ _OUT_OF_PROPORTION: Final = 20.0
 class RectificationSettings(Settings):
     """Rectification of raw images."""
 
-    alpha: float | None = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="Zoom of the rectified views: 0 = only valid pixels, 1 = all source pixels, "
-        "none = OpenCV's default. Raise it where the borders matter. No effect on rectified "
-        "input.",
-    )
-    field_of_view_deg: float | None = Field(
-        default=None,
-        ge=10,
-        le=150,
-        description="Horizontal field of view of the rectified views, in place of alpha. none = by "
-        "alpha; 0 of a fisheye keeps the resolution at its centre, at most 120 degrees.",
-    )
+    alpha: float | None = Field(0.0, ge=0, le=1)
+    """Zoom of the rectified views: 0 = only valid pixels, 1 = all source pixels, none = OpenCV's
+    default. Raise it where the borders matter. No effect on rectified input."""
+    field_of_view_deg: float | None = Field(None, ge=10, le=150)
+    """Horizontal field of view of the rectified views, in place of alpha. none = by alpha; 0 of a
+    fisheye keeps the resolution at its centre, at most 120 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
