@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,21 +13,10 @@ from recon.core.geometry.projection import depth_sigma
 from recon.core.values import Disparity, RectifiedCamera, Rig, StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64
 from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.rig.audit.corrections import BentLenses, estimate_lenses
-from recon.rig.audit.findings import (
-    Finding,
-    Verdict,
-    find_calibration_faults,
-    find_geometry_faults,
-    find_image_faults,
-    find_range_faults,
-    find_series_faults,
-    find_turn_faults,
-    verdict_of,
-)
-from recon.rig.audit.measures import Gaps, find_gaps
+from recon.rig.audit.findings import Finding, Measured, Verdict, find_faults, verdict_of
+from recon.rig.audit.measures import find_gaps
 from recon.rig.audit.row_alignment import RowAlignment, correct_rig
-from recon.rig.audit.sample import Geometry, Look, Sample, measure_geometry, take_sample
+from recon.rig.audit.sample import Look, measure_geometry, take_sample
 from recon.rig.audit.seen_motion import SeenMotion, measure_turn, turn_figures
 from recon.rig.settings import AuditedSettings
 from recon.run.run import plain
@@ -95,28 +83,15 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     Of the configuration, ``audit``, ``rectification`` and ``matching`` are used.
     """
     check_source(source)
-    settings = config.audit
     rectifier = Rectifier(source.calibration, config.rectification)
     camera = rectifier.camera
-    sample = take_sample(source, rectifier, settings, quick=quick)
+    sample = take_sample(source, rectifier, quick=quick)
     geometry = measure_geometry(sample, camera)
-    gaps = find_gaps(source)
-    reach_px = _reach_px(camera, config.matching)
     motion = None if quick else _measure_motion(source, config, geometry.alignment)
-    turn = None if motion is None else motion.turn
-    findings = [
-        *find_image_faults(sample, config.matching.matcher),
-        *find_series_faults(sample, gaps),
-        *find_geometry_faults(geometry, source),
-        *_turn_faults(source.calibration, motion, camera),
-        *find_range_faults(geometry, reach_px, camera),
-        *find_calibration_faults(sample, source.calibration, camera, settings.baseline_m),
-    ]
-    findings.sort(key=lambda finding: not finding.fatal)
-    figures = _figures(source, sample, geometry, gaps, camera)
-    if turn is not None:
-        figures["rig_by_motion"] = turn_figures(turn, camera)
+    measured = Measured(source, camera, sample, geometry, find_gaps(source), motion)
+    findings = find_faults(measured, config, _reach_px(camera, config.matching))
     verdict, looks = verdict_of(findings), tuple(sample.looks)
+    figures = _figures(measured)
     return Audit(verdict, tuple(findings), figures, geometry.alignment, motion, looks)
 
 
@@ -135,42 +110,22 @@ def correct_calibration(
             where=source.name,
             hint="record scenes with more texture, or recalibrate the cameras",
         )
-    lenses = _bent_lenses(source.calibration, audit.motion)
+    lenses = None if audit.motion is None else audit.motion.bent_lenses(source.calibration)
     if lenses is None:
         rig, turn = _corrected_turn(source.calibration, audit.alignment, audit, config)
     else:
         rig, turn = lenses.calibration, lenses.turn
-    pitch, yaw, roll, enlarged = turn.tolist()
+    pitch_deg, yaw_deg, roll_deg = np.degrees(turn[:3]).tolist()
     figures = {
-        "pitch_deg": float(np.degrees(pitch)),
-        "yaw_deg": float(np.degrees(yaw)),
-        "roll_deg": float(np.degrees(roll)),
-        "focal_percent": -100.0 * enlarged,
+        "pitch_deg": pitch_deg,
+        "yaw_deg": yaw_deg,
+        "roll_deg": roll_deg,
+        "focal_percent": -100.0 * float(turn[3]),
         "lenses_px": None if lenses is None else list(lenses.moved_px),
         "row_error_before_px": audit.alignment.rms_px,
     }
     write_recon_calibration(path, rig, figures)
     return {**figures, "calibration": str(path)}
-
-
-def _bent_lenses(rig: Rig, motion: SeenMotion | None) -> BentLenses | None:
-    """Return what the lenses bend; None if they do not, or are for a board to calibrate.
-
-    The latter are those of images that are rectified here.
-    """
-    if motion is None or not isinstance(rig, RectifiedCamera):
-        return None
-    return estimate_lenses(motion.tracks_as_recorded(rig), rig)
-
-
-def _turn_faults(rig: Rig, motion: SeenMotion | None, camera: RectifiedCamera) -> Iterable[Finding]:
-    """Return a right camera that is turned, unless lenses that bend explain it better."""
-    turn = None if motion is None else motion.turn
-    found = list(find_turn_faults(turn, camera))
-    lenses = _bent_lenses(rig, motion) if found else None
-    if turn is None or lenses is None:
-        return found
-    return find_turn_faults(replace(turn, values=np.append(lenses.turn, 0.0)), camera)
 
 
 def _corrected_turn(
@@ -219,9 +174,9 @@ def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None
     return own.min_disparity_px + own.ndisp_for(camera)
 
 
-def _figures(
-    source: StereoSource, sample: Sample, geometry: Geometry, gaps: Gaps, camera: RectifiedCamera
-) -> dict[str, Any]:
+def _figures(measured: Measured) -> dict[str, Any]:
+    source, sample, gaps = measured.source, measured.sample, measured.gaps
+    geometry, camera, motion = measured.geometry, measured.camera, measured.motion
     sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
     gains = np.concatenate([np.zeros(0), *sample.gains])
     return {
@@ -248,6 +203,7 @@ def _figures(
         "field_of_view_deg": camera.field_of_view_deg,
         "speed_m_per_s": float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else None,
         **_alignment_figures(geometry.alignment, geometry.disparity_px, camera),
+        **({"rig_by_motion": turn_figures(motion.turn, camera)} if motion and motion.turn else {}),
     }
 
 
@@ -257,13 +213,14 @@ def _alignment_figures(
     """Return row errors, disparities, and the depth error if columns are as accurate as rows."""
     if alignment is None:
         return {}
+    pitch_deg, _, roll_deg, _ = np.degrees(alignment.turn).tolist()
     figures = {
         "row_error_mean_px": alignment.mean_px,
         "row_error_spread_px": alignment.spread_px,
         "row_error_rms_px": alignment.rms_px,
         "row_noise_px": alignment.residual_px,
-        "mend_pitch_deg": float(np.degrees(alignment.pitch_rad)),
-        "mend_roll_deg": float(np.degrees(alignment.roll_rad)),
+        "mend_pitch_deg": pitch_deg,
+        "mend_roll_deg": roll_deg,
     }
     if not len(disparity_px):
         return figures

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from recon.core.text import counted
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
+from recon.core.values.arrays import Float64
 from recon.rig.audit.corrections import RightTurn
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample
-from recon.rig.audit.seen_motion import turn_figures
+from recon.rig.audit.seen_motion import SeenMotion, turn_figures
+from recon.rig.settings import AuditedSettings
 from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]
+Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
+_FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "size", "baseline"}
 _SIDES = ("left", "right")
 _SWAPPED_SHARE: Final = 0.8  # share of negative disparities from which the cameras count as swapped
 _ROW_PX: Final = 0.75  # rms row error above which it is reported
@@ -35,12 +39,16 @@ _NEAR_SHARE: Final = 0.02
 _FAR_PX: Final = 1.5  # a scene with a smaller median disparity is too far for the baseline
 _MAX_SPEED_M_PER_S: Final = 70.0  # a higher apparent speed means that the baseline is wrong
 _TEXTS: Final = {
+    "unreadable": "{error}",
+    "size error": "{error}",
     "black": "the {side} camera shows nothing: its images are uniform, at grey level {mean:.0f} of "
     "255; check its cable, its lens cap and its exposure (16-bit images must fill their range)",
     "gain": "the right camera is {gain:.2f} times as bright as the left one; give both the same "
     "fixed exposure and gain{other}",
     "blur": "the {side} camera is blurred: sharpness {worse:.2f}, the other {better:.2f}; focus it "
     "or clean its lens",
+    "blur both": "both cameras are blurred: sharpness {left:.2f} and {right:.2f}, expected above "
+    f"{_SHARPNESS:g}; focus them, expose shorter, or halve the image size",
     "duplicates": "{repeated} of {steps} repeat the previous one; the recorder wrote frames twice, "
     "or the rig stood still: drop them, or record at the cameras' own rate",
     "frozen": "the {side} camera is frozen for {run} while the other goes on; it hung or lost "
@@ -80,6 +88,18 @@ class Finding:
     text: str  # description and advice, for people
 
 
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What an audit measured of a drive."""
+
+    source: StereoSource
+    camera: RectifiedCamera  # the rectified one
+    sample: Sample
+    geometry: Geometry
+    gaps: Gaps
+    motion: SeenMotion | None  # None if it was not measured
+
+
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
     """Return good without findings, not usable with a fatal one, else usable."""
     if any(finding.fatal for finding in findings):
@@ -87,28 +107,44 @@ def verdict_of(findings: Sequence[Finding]) -> Verdict:
     return "usable" if findings else "good"
 
 
-def _fatal(code: str, **figures: object) -> Finding:
-    return Finding(code, True, _TEXTS[code].format(**figures))
+def find_faults(measured: Measured, config: AuditedSettings, reach_px: int | None) -> list[Finding]:
+    """Return all problems, fatal ones first; ``reach_px`` is the largest disparity if fixed."""
+    sample, camera, rig = measured.sample, measured.camera, measured.source.calibration
+    found = [
+        *_of_images(sample, config.matching.matcher),
+        *_of_series(sample, measured.gaps),
+        *_of_geometry(measured.geometry, measured.source),
+        *of_turn(rig, measured.motion, camera),
+        *_of_range(measured.geometry.disparity_px, reach_px, camera),
+        *_of_calibration(sample, rig, camera, config.audit.baseline_m),
+    ]
+    findings = []
+    for key, own in found:
+        code = key.split()[0]  # what follows tells texts of one code apart
+        text = _TEXTS[key].format(**own)
+        findings.append(Finding(code, own.get("fatal", code in _FATAL), text))
+    return sorted(findings, key=lambda finding: not finding.fatal)
 
 
-def _warning(code: str, **figures: object) -> Finding:
-    return Finding(code, False, _TEXTS[code].format(**figures))
-
-
-def find_image_faults(sample: Sample, matcher: str | Matcher) -> Iterator[Finding]:
-    """Yield problems of single images: unreadable, black, blurred, of unequal brightness."""
+def _of_images(sample: Sample, matcher: str | Matcher) -> Found:
     if sample.broken is not None:
-        code = "size" if "size" in sample.broken.what else "unreadable"
-        yield Finding(code, True, str(sample.broken))
+        key = "size error" if "size" in sample.broken.what else "unreadable"
+        yield key, {"error": sample.broken}
     for side in _blank_sides(sample):
         mean = np.median([pair[side] for pair in sample.brightness_dn])
-        yield _fatal("black", side=_SIDES[side], mean=mean)
-    yield from _find_blur(sample)
+        yield "black", {"side": _SIDES[side], "mean": mean}
+    if sample.sharpness:
+        left, right = np.median(sample.sharpness, axis=0)
+        worse, better = min(left, right), max(left, right)
+        if worse < _SHARPNESS_RATIO * better:
+            yield "blur", {"side": _SIDES[int(right < left)], "worse": worse, "better": better}
+        elif better < _SHARPNESS:
+            yield "blur both", {"left": left, "right": right}
     gains = np.concatenate([np.zeros(0), *sample.gains])
     gain = float(np.median(gains)) if len(gains) >= MIN_FEATURES else 1.0
     if not 1 / _GAIN < gain < _GAIN:
         # The census transform of sgm compares grey levels only with their neighbours.
-        yield _warning("gain", gain=gain, other="" if matcher == "sgm" else ", or match with sgm")
+        yield "gain", {"gain": gain, "other": "" if matcher == "sgm" else ", or match with sgm"}
 
 
 def _blank_sides(sample: Sample) -> list[int]:
@@ -117,80 +153,65 @@ def _blank_sides(sample: Sample) -> list[int]:
     return [side for side in range(2) if len(blank) and blank[:, side].mean() >= 0.5]
 
 
-def _find_blur(sample: Sample) -> Iterator[Finding]:
-    if not sample.sharpness:
-        return
-    left, right = np.median(sample.sharpness, axis=0)
-    worse, better = min(left, right), max(left, right)
-    if worse < _SHARPNESS_RATIO * better:
-        yield _warning("blur", side=_SIDES[int(right < left)], worse=worse, better=better)
-    elif better < _SHARPNESS:
-        text = f"both cameras are blurred: sharpness {left:.2f} and {right:.2f}, expected above "
-        text += f"{_SHARPNESS:g}; focus them, expose shorter, or halve the image size"
-        yield Finding("blur", False, text)
-
-
-def find_series_faults(sample: Sample, gaps: Gaps) -> Iterator[Finding]:
-    """Yield problems of the sequence: repeated frames, frozen cameras, gaps."""
-    repeats = sample.repeats
+def _of_series(sample: Sample, gaps: Gaps) -> Found:
+    repeats, blank = sample.repeats, _blank_sides(sample)
     if repeats.steps and repeats.both > _REPEATED_SHARE * repeats.steps:
-        steps = counted(repeats.steps, "frame")
-        yield _warning("duplicates", repeated=repeats.both, steps=steps)
-    blank = _blank_sides(sample)
+        yield "duplicates", {"repeated": repeats.both, "steps": counted(repeats.steps, "frame")}
     for side, run in enumerate(repeats.frozen):
         # A camera with uniform images would count as frozen, too.
         if run >= _FROZEN_FRAMES and side not in blank:
-            yield _fatal("frozen", side=_SIDES[side], run=counted(run, "frame"))
+            yield "frozen", {"side": _SIDES[side], "run": counted(run, "frame")}
     if gaps.count:
-        yield _warning("gaps", places=counted(gaps.count, "place"), gaps=gaps)
+        yield "gaps", {"places": counted(gaps.count, "place"), "gaps": gaps}
 
 
-def find_geometry_faults(geometry: Geometry, source: StereoSource) -> Iterator[Finding]:
-    """Yield problems of the geometry: swapped cameras, delays, row errors."""
+def _of_geometry(geometry: Geometry, source: StereoSource) -> Found:
     swapped, lag, skew = geometry.swapped_share, geometry.lag, geometry.skew
     if swapped >= _SWAPPED_SHARE:
-        yield _fatal("swapped", percent=100 * swapped)
+        yield "swapped", {"percent": 100 * swapped}
     if lag:
-        late, frames = "right" if lag > 0 else "left", counted(abs(lag), "frame")
-        yield _fatal("lag", late=late, frames=frames, in_step=_in_step(source, lag))
+        shift = source.shift_of(lag)
+        in_step = f"--set source.shift_frames={shift} pairs the images that belong together"
+        yield (
+            "lag",
+            {
+                "late": "right" if lag > 0 else "left",
+                "frames": counted(abs(lag), "frame"),
+                "in_step": "pair the images by timestamp" if shift is None else in_step,
+            },
+        )
     elif skew is not None and abs(skew[0]) > max(_SKEW_FRAMES, 4 * skew[1]):
-        yield _warning("skew", skew=skew[0])
+        yield "skew", {"skew": skew[0]}
     rows = geometry.alignment
     if rows is None and geometry.pairs:
-        yield _warning("features", matched=geometry.matched)
+        yield "features", {"matched": geometry.matched}
     elif rows is not None and rows.rms_px > _ROW_PX:
-        pitch, roll = np.degrees([rows.pitch_rad, rows.roll_rad])
-        severity = _fatal if rows.rms_px > _BAD_ROW_PX else _warning
-        yield severity("rows", rows=rows, pitch=pitch, roll=roll)
+        pitch, _, roll, _ = np.degrees(rows.turn)
+        fatal = rows.rms_px > _BAD_ROW_PX
+        yield "rows", {"fatal": fatal, "rows": rows, "pitch": pitch, "roll": roll}
 
 
-def _in_step(source: StereoSource, lag: int) -> str:
-    shift = source.shift_of(lag)
-    if shift is None:
-        return "pair the images by timestamp"
-    return f"--set source.shift_frames={shift} pairs the images that belong together"
-
-
-def find_turn_faults(turn: RightTurn | None, camera: RectifiedCamera) -> Iterator[Finding]:
-    """Yield a right camera that is turned about the vertical, as the motion shows it."""
-    if turn is None:
+def of_turn(rig: Rig, motion: SeenMotion | None, camera: RectifiedCamera) -> Found:
+    """Yield a right camera turned about the vertical, unless bent lenses explain it better."""
+    turn = None if motion is None else motion.turn
+    if motion is None or turn is None or not (found := list(_of_yaw(turn, camera))):
         return
+    lenses = motion.bent_lenses(rig)
+    if lenses is not None:
+        found = list(_of_yaw(replace(turn, values=np.append(lenses.turn, 0.0)), camera))
+    yield from found
+
+
+def _of_yaw(turn: RightTurn, camera: RectifiedCamera) -> Found:
     figures = turn_figures(turn, camera)
     off, sigma = figures["disparity_px"]["value"], figures["disparity_px"]["sigma"]
     if abs(off) > max(_DISPARITY_PX, 4 * sigma):
         depths = ", ".join(f"{p:+.1f} % at {z} m" for z, p in figures["depth_percent"].items())
-        yaw = figures["yaw_deg"]["value"]
-        yield _warning("yaw", off=-off, limit=1.96 * sigma, depths=depths, yaw=yaw)
+        own = {"off": -off, "limit": 1.96 * sigma, "depths": depths}
+        yield "yaw", {**own, "yaw": figures["yaw_deg"]["value"]}
 
 
-def find_range_faults(
-    geometry: Geometry, reach_px: int | None, camera: RectifiedCamera
-) -> Iterator[Finding]:
-    """Yield scenes that are too near or too far for the rig.
-
-    ``reach_px`` is the largest disparity that will be searched, if that is fixed.
-    """
-    disparity_px = geometry.disparity_px
+def _of_range(disparity_px: Float64, reach_px: int | None, camera: RectifiedCamera) -> Found:
     if len(disparity_px) < MIN_FEATURES:
         return
     scale = camera.focal_px * camera.baseline_m
@@ -200,27 +221,27 @@ def find_range_faults(
     if reach_px and near > _NEAR_SHARE:
         reach_m = scale / (reach_px + camera.doffs_px)
         most = int(np.ceil(np.quantile(columns_px, 0.98) / 16) * 16)
-        yield _warning("near", percent=100 * near, reach_px=reach_px, reach_m=reach_m, most=most)
+        reach = {"reach_px": reach_px, "reach_m": reach_m, "most": most}
+        yield "near", {"percent": 100 * near, **reach}
     middle = float(np.median(disparity_px))
     if 0 < middle < _FAR_PX:
-        depth_m, baseline_m = scale / middle, camera.baseline_m
-        yield _warning("far", depth_m=depth_m, middle=middle, baseline_m=baseline_m)
+        own = {"depth_m": scale / middle, "middle": middle}
+        yield "far", {**own, "baseline_m": camera.baseline_m}
 
 
-def find_calibration_faults(
+def _of_calibration(
     sample: Sample, rig: Rig, camera: RectifiedCamera, baseline_m: tuple[float, float]
-) -> Iterator[Finding]:
-    """Yield implausible calibration: image size, baseline outside of the plausible ones."""
-    for side, (x, y), (width, height) in _centres(rig):
-        off = np.abs(np.array([x, y]) / (width, height) - 0.5)
-        if off.max() > LARGEST_CENTRE_OFFSET:
-            yield _fatal("size", side=side, x=x, y=y, width=width, height=height)
+) -> Found:
+    for side, centre, size in _centres(rig):
+        if np.abs(np.array(centre) / size - 0.5).max() > LARGEST_CENTRE_OFFSET:
+            own = dict(zip(("x", "y", "width", "height"), (*centre, *size), strict=True))
+            yield "size", {"side": side, **own}
             break
     shortest, longest = baseline_m
     speed = float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else 0.0
     if not shortest <= camera.baseline_m <= longest or speed > _MAX_SPEED_M_PER_S:
         moving = f", with which the rig moves at {speed:.0f} m/s" if speed > 0 else ""
-        yield _fatal("baseline", baseline_m=camera.baseline_m, moving=moving)
+        yield "baseline", {"baseline_m": camera.baseline_m, "moving": moving}
 
 
 def _centres(rig: Rig) -> list[tuple[str, tuple[float, float], tuple[int, int]]]:

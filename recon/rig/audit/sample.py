@@ -24,7 +24,6 @@ from recon.rig.audit.measures import (
     track,
 )
 from recon.rig.audit.row_alignment import RowAlignment, align_rows, count_aligned
-from recon.rig.settings import AuditSettings
 from recon.sources.source import StereoSource
 from recon.stereo.rectify.features import (
     NO_FEATURES,
@@ -106,9 +105,7 @@ class Sample:
     broken: ReconError | None = None  # the error that ended the sampling, if any
 
 
-def take_sample(
-    source: StereoSource, rectifier: Rectifier, settings: AuditSettings, *, quick: bool
-) -> Sample:
+def take_sample(source: StereoSource, rectifier: Rectifier, *, quick: bool) -> Sample:
     """Sample a drive; an error of a pair ends the sampling and is kept in ``broken``."""
     stretches = plan_stretches(len(source), FRAMES, quick=quick)
     centres = plan_centres(stretches, quick=quick)

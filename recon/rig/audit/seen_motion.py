@@ -26,7 +26,13 @@ from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
 from recon.odometry.window import TrackWindow
-from recon.rig.audit.corrections import MIN_WINDOWS, RightTurn, estimate_turn
+from recon.rig.audit.corrections import (
+    MIN_WINDOWS,
+    BentLenses,
+    RightTurn,
+    estimate_lenses,
+    estimate_turn,
+)
 from recon.rig.audit.rig_fit import StereoTracks
 from recon.rig.audit.sample import plan_stretches
 from recon.run.threads import serial_algebra
@@ -60,6 +66,15 @@ class SeenMotion:
             for K, R, seen in zip(recorded, rotations, self.views.matrices, strict=True)
         )
         return tuple(_mapped(part, left, right) for part in self.tracks)
+
+    def bent_lenses(self, rig: Rig) -> BentLenses | None:
+        """Return what the lenses bend; None if they do not.
+
+        Lenses of images that are rectified here are for a board to calibrate: None too.
+        """
+        if not isinstance(rig, RectifiedCamera):
+            return None
+        return estimate_lenses(self.tracks_as_recorded(rig), rig)
 
 
 def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> SeenMotion | None:

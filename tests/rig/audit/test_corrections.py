@@ -13,7 +13,6 @@ from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.odometry.window import TrackWindow
 from recon.rig.audit import rig_fit
-from recon.rig.audit.audit import _turn_faults
 from recon.rig.audit.corrections import (
     BentLenses,
     RightTurn,
@@ -24,6 +23,7 @@ from recon.rig.audit.corrections import (
     turned_places,
     turning,
 )
+from recon.rig.audit.findings import of_turn
 from recon.rig.audit.rig_fit import RigCorrection, StereoTracks
 from recon.rig.audit.seen_motion import SeenMotion
 from recon.stereo.rectify.lens import rays_of
@@ -183,4 +183,4 @@ def test_what_bent_lenses_explain_better_is_no_turn(
 ) -> None:
     yaw = RightTurn(np.array([0.0, 1.0 / CAMERA.focal_px, 0.0, 0.0, 0.0]), 1e-12 * np.eye(5), 12)
     motion = SeenMotion(yaw, tuple(drive(left, right)), None)
-    assert [found.code for found in _turn_faults(CAMERA, motion, CAMERA)] == codes
+    assert [code for code, _ in of_turn(CAMERA, motion, CAMERA)] == codes
