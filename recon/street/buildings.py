@@ -78,9 +78,18 @@ def house(plan: HousePlan, rng: np.random.Generator) -> TriangleSoup:
     x0, z0, x1, z1 = door.T
     leaf = _upright(np.column_stack([x0, z0, x1 - x0, z1 - z0]), _REVEAL_M, plan.door)
     parts = [_facade(plan, every), leaf, _windows(holes, rng)]
-    parts += [_reveals(every, plan.trim), _ledges(plan, holes), _blind_walls(plan)]
-    parts += [_gable(plan) if plan.pitched else _flat_roof(plan), _downpipe(plan, rng)]
-    return merge(parts)
+    w, d, h = plan.width, plan.depth, plan.eaves
+    feet, along = [[0, 0, 0], [w, 0, 0], [0, d, 0]], [[0, d, 0], [0, d, 0], [w, 0, 0]]
+    blind_walls = quads(feet, along, [0, 0, h], plan.wall)
+    parts += [_reveals(every, plan.trim), _ledges(plan, holes), blind_walls]
+    if plan.pitched:
+        parts.append(_gable(plan))
+    else:
+        flat = quads([0, 0, h], [w, 0, 0], [0, d, 0], plan.trim)
+        parts += [flat, boxes([0, 0.02, h], [w, 0.25, h + 0.7], plan.wall)]
+    x = 0.15 if rng.random() < 0.5 else w - 0.25
+    zinc = Paint(Material.METAL, (0.42, 0.43, 0.44), int(rng.integers(2**30)))
+    return merge([*parts, boxes([x, -0.1, 0.0], [x + 0.1, -0.01, h], zinc)])
 
 
 def _openings(plan: HousePlan, rng: np.random.Generator) -> tuple[Float64, Float64]:
@@ -167,12 +176,6 @@ def _ledges(plan: HousePlan, holes: Float64) -> TriangleSoup:
     return merge([boxes(low, high, plan.trim), sills])
 
 
-def _blind_walls(plan: HousePlan) -> TriangleSoup:
-    w, d, h = plan.width, plan.depth, plan.eaves
-    feet, along = [[0, 0, 0], [w, 0, 0], [0, d, 0]], [[0, d, 0], [0, d, 0], [w, 0, 0]]
-    return quads(feet, along, [0, 0, h], plan.wall)
-
-
 def _gable(plan: HousePlan) -> TriangleSoup:
     w, d, h, out = plan.width, plan.depth, plan.eaves + 0.05, 0.35
     rise = 0.42 * d
@@ -182,15 +185,3 @@ def _gable(plan: HousePlan) -> TriangleSoup:
     back = quads([0, d + out, foot], [w, 0, 0], [0, -d / 2 - out, climb], plan.roof)
     corners = np.array([[[x, 0, h], [x, d, h], [x, d / 2, h + rise]] for x in (0.0, w)])
     return merge([front, back, painted(corners, corners[..., 1:].copy(), plan.wall)])
-
-
-def _flat_roof(plan: HousePlan) -> TriangleSoup:
-    w, d, h = plan.width, plan.depth, plan.eaves
-    parapet = boxes([0, 0.02, h], [w, 0.25, h + 0.7], plan.wall)
-    return merge([quads([0, 0, h], [w, 0, 0], [0, d, 0], plan.trim), parapet])
-
-
-def _downpipe(plan: HousePlan, rng: np.random.Generator) -> TriangleSoup:
-    x = 0.15 if rng.random() < 0.5 else plan.width - 0.25
-    zinc = Paint(Material.METAL, (0.42, 0.43, 0.44), int(rng.integers(2**30)))
-    return boxes([x, -0.1, 0.0], [x + 0.1, -0.01, plan.eaves], zinc)

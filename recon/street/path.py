@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from recon.core.geometry import se3
 from recon.core.values.arrays import Float64
 from recon.street.settings import CORNER_M, StreetScene
+from recon.street.shapes import at
 
 LANE_M = -1.55  # the car keeps to the right of the centre line
 _STEP_M = 0.25
@@ -52,12 +53,7 @@ class CentreLine:
     def place(self, along_m: float, lateral_m: float, height_m: float = 0.0) -> Float64:
         """Return ``T_street_object`` of an object at that position that faces along the road."""
         x, y = self.points(np.array([along_m]), np.array([lateral_m]))[0]
-        turn = se3.exp_so3(np.array([0.0, 0.0, self.heading(along_m)]))
-        return se3.make_transform(turn, np.array([x, y, height_m]))
-
-    def bends(self, from_m: float, to_m: float) -> bool:
-        """Return whether any part of a stretch lies on a corner."""
-        return abs(self.heading(to_m) - self.heading(from_m)) > 1e-6
+        return at(x, y, height_m, self.heading(along_m))
 
     def _in_lap(self, along_m: Any) -> Any:
         """Return distances within one lap; the end of the lap does not wrap to its start."""
@@ -71,7 +67,10 @@ def centre_line(settings: StreetScene, length_m: float) -> CentreLine:
     if settings.path == "block":
         return _block(*settings.block_m)
     along = np.arange(-_BEFORE_M, length_m + _STEP_M, _STEP_M)
-    heading = _heading(along, settings)
+    rate = math.radians(settings.turn_deg_per_100m) / 100.0
+    # A real road is not a perfect arc but winds slightly around it.
+    winding = rate * along + 0.35 * rate * 18.0 * np.sin(along / 18.0)
+    heading = np.zeros_like(along) if settings.path == "straight" else winding
     xy = _walk(along, heading)
     last = float(along[-1]) - _BARE_M
     span = (-BEHIND_M, last) if settings.repeat_m is None else (0.0, settings.repeat_m)
@@ -82,15 +81,6 @@ def _walk(along_m: Float64, heading_rad: Float64) -> Float64:
     middle = 0.5 * (heading_rad[:-1] + heading_rad[1:])
     steps = np.diff(along_m)[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1)
     return np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-
-
-def _heading(along_m: Float64, settings: StreetScene) -> Float64:
-    if settings.path == "straight":
-        return np.zeros_like(along_m)
-    rate = math.radians(settings.turn_deg_per_100m) / 100.0
-    # A real road is not a perfect arc but winds slightly around it.
-    winding = 0.35 * rate * 18.0 * np.sin(along_m / 18.0)
-    return np.asarray(rate * along_m + winding)
 
 
 def _block(length_m: float, width_m: float) -> CentreLine:
@@ -123,8 +113,8 @@ def _camera_pose(along_m: float, settings: StreetScene, road: CentreLine) -> Flo
     tilt = math.radians(0.15) * settings.sway * math.sin(along_m / 4.3 + 2.0 * phase)
     heave = 0.015 * settings.sway * math.sin(along_m / 2.7 + 3.0 * phase)
     T = road.place(along_m, LANE_M + drift, settings.camera_height_m + heave)
-    T[:3, :3] = T[:3, :3] @ se3.exp_so3(np.array([0.0, 0.0, math.atan(slope)])) @ R_STREET_LEVEL
+    R = T[:3, :3] @ se3.exp_so3(np.array([0.0, 0.0, math.atan(slope)])) @ R_STREET_LEVEL
     yaw, pitch, roll = np.radians([settings.yaw_deg, settings.pitch_deg, settings.roll_deg])
     for turn in ((0.0, yaw, 0.0), (-pitch - nod, 0.0, 0.0), (0.0, 0.0, roll + tilt)):
-        T[:3, :3] = T[:3, :3] @ se3.exp_so3(np.array(turn))
-    return T
+        R = R @ se3.exp_so3(np.array(turn))
+    return se3.make_transform(R, T[:3, 3])

@@ -106,9 +106,9 @@ class StreetCamera:
         known = np.flatnonzero(np.isfinite(depth_m))
         rays = left.directions(left.pixels()[known])
         xyz = left.origin + depth_m.ravel()[known, None].astype(np.float64) * rays
-        seen = right.inside(right.project(xyz)) & self.stage.sees(right.origin, xyz)
+        hidden = self.stage.rays.blocked(right.origin, xyz - right.origin, far=_SIGHT)
         nonocc = np.zeros(depth_m.size, dtype=np.bool_)
-        nonocc[known] = seen
+        nonocc[known] = right.inside(right.project(xyz)) & ~hidden
         return DisparityTruth(disparity_from_depth(depth_m, camera), nonocc.reshape(depth_m.shape))
 
     def _record(self, image: Float64, index: int, side: int) -> UInt8:
@@ -241,10 +241,6 @@ class Stage:
         height = np.einsum("nx,nx->n", self.table.anchor[faces[hit]] - origin, normal)
         depth[hit] = height / np.einsum("nx,nx->n", directions[hit], normal)
         return depth
-
-    def sees(self, origin: Float64, xyz: Float64) -> Bool:
-        """Return bool (N,), whether the line of sight from ``origin`` to each point is free."""
-        return ~self.rays.blocked(origin, xyz - origin, far=_SIGHT)
 
     def look(self, origin: Float64, directions: Float64, pixel: float) -> Sample:
         """Trace rays of unit depth, where a pixel is ``pixel`` wide, and shade what they hit."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise, repeat
 from typing import Final
 
 import numpy as np
@@ -29,10 +30,7 @@ _SEEDLINGS: Final = 5
 
 @dataclass(frozen=True, eq=False)
 class StreetWorld:
-    """A street, a rig and its path: everything that an image depends on.
-
-    Street axes: x along the street at its start, y left, z up, road at 0.
-    """
+    """A street, a rig and its path: everything that an image depends on. Axes: see `path`."""
 
     settings: StreetScene
     soup: TriangleSoup  # the scene, street axes
@@ -54,15 +52,11 @@ class StreetWorld:
         """True poses of the left camera; the first is the identity."""
         poses = self.T_world_street @ self.T_street_camera
         poses[0] = np.eye(4)
-        times = np.arange(self.settings.frames) / self.settings.frame_rate_hz
-        return Trajectory(poses, times)
+        return Trajectory(poses, np.arange(len(poses)) / self.settings.frame_rate_hz)
 
     @property
     def T_map_world(self) -> Float64:
-        """float64 (4, 4); map axes: x forward along the first view, y left, z exactly up.
-
-        The origin is that of the world, the first left camera.
-        """
+        """float64 (4, 4); map axes: x along the first view, y left, z up; origin of the world."""
         forward = self.T_street_camera[0][:3, 2] * [1.0, 1.0, 0.0]
         forward /= np.linalg.norm(forward)
         up = np.array([0.0, 0.0, 1.0])
@@ -70,10 +64,7 @@ class StreetWorld:
         return se3.make_transform(R_map_street @ self.T_street_camera[0][:3, :3], np.zeros(3))
 
     def ground_plane(self, index: int) -> Float64:
-        """Return float64 (4,): ``a·x + b·y + c·z + d`` is how high a point is above the road.
-
-        The point is in the axes of a left camera.
-        """
+        """Return float64 (4,), see `SyntheticFrame.ground_plane`."""
         return np.array(self.T_street_camera[index][2])
 
 
@@ -117,29 +108,26 @@ def rig(settings: StreetSettings) -> RectifiedCamera:
 def _sun(seed: int) -> Float64:
     """Return direction to the sun: high and to one side of the street, so that one row is lit."""
     rng = np.random.default_rng([seed, 99])
-    azimuth = rng.choice([-1.0, 1.0]) * rng.uniform(1.1, 2.3)
-    climb = rng.uniform(0.75, 1.0)
+    azimuth, climb = rng.choice([-1.0, 1.0]) * rng.uniform(1.1, 2.3), rng.uniform(0.75, 1.0)
     level = np.cos(climb)
     return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(climb)])
 
 
 def _ground(road: CentreLine) -> TriangleSoup:
     a, top = ROAD_HALF_M, KERB_M
-    grey = Paint(Material.ASPHALT, (0.40, 0.40, 0.41))
-    strips = [_strip(road, ((-a, 0.0), (a, 0.0)), grey)]
+    strips = [_strip(road, ((-a, 0.0), (a, 0.0)), Paint(Material.ASPHALT, (0.40, 0.40, 0.41)))]
     stone = Paint(Material.KERB, (0.58, 0.57, 0.55))
     slabs = Paint(Material.PAVING, (0.56, 0.54, 0.51))
     grass = Paint(Material.GRASS, (0.33, 0.38, 0.20))
     for side in (1.0, -1.0):
-        b, c, d = side * (a + 0.15), side * (_WALL_M + 3.0), side * 60.0
-        strips += [
-            _strip(road, ((side * a, 0.0), (side * a, top)), stone),
-            _strip(road, ((side * a, top), (b, top)), stone),
-            _strip(road, ((b, top), (c, top)), slabs),
-        ]
-        inside = _inside(road, side)
-        beside = _yard(road, c, grass) if inside else _strip(road, ((c, top), (d, top)), grass)
-        strips.append(beside)
+        wall = side * (_WALL_M + 3.0)
+        rims = [(side * a, 0.0), (side * a, top), (side * (a + 0.15), top), (wall, top)]
+        paints = [stone, stone, slabs]
+        if not _inside(road, side):
+            rims, paints = [*rims, (side * 60.0, top)], [*paints, grass]
+        strips += map(_strip, repeat(road), pairwise(rims), paints)
+        if _inside(road, side):
+            strips.append(_yard(road, wall, grass))
     return merge(strips)
 
 
@@ -184,7 +172,7 @@ def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator
         setback = float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.8)]))
         gap = float(rng.uniform(5.0, 8.0)) if rng.random() < 0.22 else float(rng.uniform(0.0, 0.15))
         if _room(road, side, along, width):
-            yield _stand(road, side, along, setback, width, rng)
+            yield _stand(road, along + width / 2, side * (_WALL_M + setback), width, rng)
         along += width + gap
 
 
@@ -194,7 +182,8 @@ def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterat
     while along < end:
         width = float(rng.uniform(11.0, 18.0))
         if not _inside(road, side) and _room(road, side, along, width):
-            yield _stand(road, side, along, float(rng.uniform(20.0, 28.0)), width, rng)
+            lateral_m = side * (_WALL_M + float(rng.uniform(20.0, 28.0)))
+            yield _stand(road, along + width / 2, lateral_m, width, rng)
         along += width + float(rng.uniform(0.5, 3.0))
 
 
@@ -203,21 +192,17 @@ def _room(road: CentreLine, side: float, at_m: float, width_m: float) -> bool:
     if road.span_m[0] < 0.0:
         return True
     end_m = at_m + width_m
-    return end_m <= road.span_m[1] and not (_inside(road, side) and road.bends(at_m, end_m))
+    bends = abs(road.heading(end_m) - road.heading(at_m)) > 1e-6
+    return end_m <= road.span_m[1] and not (_inside(road, side) and bends)
 
 
 def _stand(
-    road: CentreLine,
-    side: float,
-    at_m: float,
-    setback_m: float,
-    width_m: float,
-    rng: np.random.Generator,
+    road: CentreLine, middle_m: float, lateral_m: float, width_m: float, rng: np.random.Generator
 ) -> TriangleSoup:
     """Return a house on one side, with its facade on a chord of the curve."""
     built = house(draw_plan(width_m, rng), rng)
-    T = road.place(at_m + width_m / 2, side * (_WALL_M + setback_m), KERB_M)
-    if side < 0:
+    T = road.place(middle_m, lateral_m, KERB_M)
+    if lateral_m < 0:
         T = T @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return move(built, T @ at(-width_m / 2, 0.0, 0.0))
 
@@ -237,9 +222,8 @@ def _fences(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator
     first, end = road.span_m
     for along in np.arange(max(first, -18.0), end, SECTION_M + 0.6):
         section = SECTIONS[int(rng.integers(len(SECTIONS)))](rng)
-        away = np.diag([1.0, side, 1.0, 1.0])
         T = road.place(float(along), side * (ROAD_HALF_M + 1.5), KERB_M)
-        yield move(section, T @ away)
+        yield move(section, T @ np.diag([1.0, side, 1.0, 1.0]))
 
 
 def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:

@@ -16,8 +16,8 @@ from recon.core.values.arrays import Bool, Float32, Float64, Int32
 from recon.street.render import StreetCamera
 from recon.street.street import StreetWorld
 
+# Surfaces this far beyond the range are included, as a map may place them slightly nearer.
 _BEYOND_M: Final = 2.0
-"""Surfaces this far beyond the range are included, as a map may place them slightly nearer."""
 _COMPACT_AT: Final = 4_000_000
 _SLICE_M: Final = 0.05
 _QUARTERS: Final = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
@@ -72,9 +72,9 @@ def true_occupancy(
         seen.add(cells[away <= range_m + _BEYOND_M], frames=0)
         columns.add(cells[near & low] * [1, 1, 0])
     keys, frames = seen.counts()
-    raster, known = _raster(*columns.counts(), least_frames)
+    corner, known = _raster(*columns.counts(), least_frames)
     return OccupancyTruth(
-        grid=footprint(world, T @ world.T_world_street, band_m, (*raster, resolution_m)),
+        grid=_footprint(world, T @ world.T_world_street, band_m, corner, known.shape, resolution_m),
         seen=known,
         keys=keys,
         frames=frames.astype(np.int32),
@@ -85,10 +85,8 @@ def true_occupancy(
     )
 
 
-def _raster(
-    columns: Int32, frames: NDArray[np.int64], least: int
-) -> tuple[tuple[Int32, tuple[int, int]], Bool]:
-    """Return the smallest raster (corner, shape) of columns (N, 3), and which were seen enough."""
+def _raster(columns: Int32, frames: NDArray[np.int64], least: int) -> tuple[Int32, Bool]:
+    """Return the corner of the smallest raster of columns (N, 3), and which were seen enough."""
     if len(columns) == 0:
         raise EvaluationError("no surface of the street is in view and in range")
     corner = columns[:, :2].min(axis=0)
@@ -96,7 +94,7 @@ def _raster(
     known = np.zeros((height, width), dtype=np.bool_)
     enough = columns[frames >= least, :2] - corner
     known[enough[:, 1], enough[:, 0]] = True
-    return (corner, (height, width)), known
+    return corner, known
 
 
 def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64:
@@ -131,18 +129,19 @@ class _Counter:
         return unpack_keys(self._keys), self._frames
 
 
-def footprint(
+def _footprint(
     world: StreetWorld,
     T_map_street: Float64,
     band_m: tuple[float, float],
-    raster: tuple[Int32, tuple[int, int], float],
+    low: Int32,
+    shape: tuple[int, ...],
+    resolution_m: float,
 ) -> OccupancyGrid:
     """Return OCCUPIED where a surface lies in the height band, else FREE.
 
-    Objects taller than the band, such as houses, are hollow. ``raster`` has the smallest column
-    and row (in cells from the map origin), the number of rows and columns, the size of a cell.
+    ``low`` is the first column and row. Objects taller than the band, such as houses, are hollow.
     """
-    low, (rows, columns), resolution_m = raster
+    rows, columns = shape
     origin = (float(low[0] * resolution_m), float(low[1] * resolution_m))
     vertices = se3.apply(T_map_street, world.soup.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
     ends = vertices[..., :2].min(axis=1), vertices[..., :2].max(axis=1)

@@ -12,8 +12,8 @@ import numpy as np
 
 from recon.core.kernels.compiled import Float64, Int32, kernel
 
+# Beyond this ratio of its sides a footprint is widened instead of lengthened.
 MAX_STRETCH: Final = 24.0
-"""Beyond this ratio of its sides a footprint is widened instead of lengthened."""
 _MIN_COSINE: Final = 1.0 / 400.0
 
 
@@ -43,10 +43,7 @@ class SurfaceHits(NamedTuple):
 def describe_hits(
     table: SurfaceTable, faces: Int32, origin: Float64, directions: Float64, pixel: float
 ) -> SurfaceHits:
-    """Describe the points in which rays of unit depth pierce the planes of the triangles they meet.
-
-    ``pixel`` is the width of a pixel at unit depth (``1 / focal_px``).
-    """
+    """Describe where rays of unit depth pierce their triangles; ``pixel`` is ``1 / focal_px``."""
     n = len(faces)
     xyz, normals, uvs = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2))
     widths, smears, spreads = np.empty(n), np.empty((n, 3)), np.empty((n, 2))
@@ -175,11 +172,10 @@ def fractal_noise(
 ) -> Float64:
     """Return fractal value noise (N,), averaged over the footprint of a pixel.
 
-    A pixel that looks along a surface covers a long strip of it. Blurring by the long side
-    (``smear``, of any length) would wipe the texture off every road, so the strip is sampled along
-    its length and each sample is blurred by the short side only. ``wavelength`` is the lattice
-    spacing of the coarsest octave; each other one has half the spacing of the one before, and
-    ``gain`` times its amplitude. The mean is 0, the standard deviation about 0.3.
+    The strip that a pixel covers is sampled along its long side (``smear``), each sample blurred by
+    the short side (``width``) only: else roads lose their texture. ``wavelength`` is the lattice
+    spacing of the coarsest octave; each other one has half of it and ``gain`` times the amplitude.
+    The mean is 0, the standard deviation about 0.3.
     """
     out = np.empty(len(width))
     key = np.uint64(seed)
