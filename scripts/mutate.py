@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Final
 
 ROOT: Final = Path(__file__).parents[1]
-TESTS: Final = {"commands": ("commands", "flow"), "run": ("run", "flow")}
+TESTS: Final = {"commands": ("commands", "flow"), "rig": ("rig", "commands")}
 """Rooms whose tests are in other folders than their own, too."""
 OTHER: Final[dict[type[ast.AST], tuple[str, str]]] = {
     ast.Add: ("+", "-"),
