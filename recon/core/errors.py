@@ -16,14 +16,9 @@ _LONGEST: Final = 300  # letters of a value in a message: content from outside m
 
 
 class ReconError(Exception):
-    """An error that a user can act on, described in one line.
+    """An error that a user can act on, in one line: ``where: what (got …, expected …); hint``.
 
-    Args:
-        what: What is wrong, in a few words.
-        where: The file, frame or setting concerned.
-        got: The value found.
-        expected: A value that would be valid.
-        hint: What to do about it.
+    ``where`` is the file, frame or setting concerned; ``hint`` says what to do about it.
     """
 
     def __init__(
@@ -43,7 +38,6 @@ class ReconError(Exception):
         super().__init__(self._line())
 
     def but(self, **parts: Any) -> Self:
-        """Return the same error with other ``where``, ``got``, ``expected`` or ``hint``."""
         own = {name: getattr(self, name) for name in ("where", "got", "expected", "hint")}
         return type(self)(self.what, **{**own, **parts})
 

@@ -39,11 +39,10 @@ def minimise(
     min_gain: float,
     damping: float = 1e-3,
 ) -> State:
-    """Minimise a cost by damped Gauss-Newton steps, each of which must lower it.
+    """Minimise a cost, finite at ``start``, by damped Gauss-Newton steps that each must lower it.
 
-    The cost of ``start`` is finite. ``rounds`` is the largest number of steps tried, ``min_gain``
-    the relative decrease below which a step is the last, ``damping`` the first, relative to the
-    diagonal of the normal equations.
+    At most ``rounds`` steps are tried; one that gains less than ``min_gain`` of it is the last.
+    ``damping`` is the first, relative to the diagonal of the normal equations.
     """
     state, lowest, linear = start, problem.cost(start), problem.linearise(start)
     for _ in range(rounds):

@@ -15,11 +15,7 @@ _NO_HIT = np.uint32(0xFFFFFFFF)
 
 
 class RayScene:
-    """Triangles (F, 3, 3) for ray casting, by so many threads; 0 = one per core.
-
-    Open3D computes in single precision and returns only the triangle; for an exact distance,
-    intersect the ray with the plane of that triangle in double precision.
-    """
+    """Triangles (F, 3, 3) for ray casting in single precision; ``threads`` 0 = one per core."""
 
     def __init__(self, triangles: NDArray[Any], threads: int = 0) -> None:
         corners = np.asarray(triangles)
@@ -48,11 +44,7 @@ class RayScene:
         return np.asarray(found.numpy(), dtype=np.float32)
 
     def blocked(self, origins: NDArray[Any], reaches: NDArray[Any], far: float = 1.0) -> Bool:
-        """Return bool (N,): whether a triangle intersects the segment from ``origin`` to its reach.
-
-        Origins are (3,) or (N, 3), reaches (N, 3). The segment ends at the share ``far`` of its
-        reach; below 1 this ignores the surface there.
-        """
+        """Return bool (N,), whether segments from (3,) or (N, 3) to part of their reaches hit."""
         rays = _rays(origins, reaches)
         hit = self._scene.test_occlusions(rays, tfar=far, nthreads=self._threads)
         return np.asarray(hit.numpy(), dtype=np.bool_)

@@ -23,10 +23,9 @@ from recon.core.text import refuse_other_numbers
 
 
 class Settings(BaseModel):
-    """Immutable settings of one stage.
+    """Immutable settings of one stage, without effect of environment variables.
 
-    Subclasses give each field a default, a unit in its name, a ``Field`` with its bounds, and a
-    docstring below it. Equal settings give equal results: environment variables have no effect.
+    Each field has a default, a unit in its name, a ``Field`` with its bounds, and a docstring.
     """
 
     model_config = ConfigDict(

@@ -12,10 +12,7 @@ from typing import Final
 
 
 def counted(number: int, one: str, many: str = "", *, form: str = "") -> str:
-    """Return a number of things, such as ``1 frame``, ``2 frames`` or, signed, ``-1 frame``.
-
-    ``form`` is how the number is written, such as ``,`` for commas between thousands.
-    """
+    """Return a number, written in a ``form``, of things: ``1 frame``, ``2 frames``."""
     return f"{number:{form}} {one if abs(number) == 1 else many or one + 's'}"
 
 
@@ -70,10 +67,7 @@ _ENDING: Final = re.compile(rf"_({'|'.join(_UNITS)})$")
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a figure by its name, such as ``live.latency_ms.p50``, or its group's.
-
-    It is "" for numbers of things, shares and texts.
-    """
+    """Return the unit of a figure by its name, such as ``live.latency_ms.p50``; "" = has none."""
     for part in reversed(re.split(r"[. ]", name)):
         ending = _ENDING.search(part)
         if ending or part in _NAMED_UNITS:

@@ -8,7 +8,7 @@ import os
 import secrets
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -37,9 +37,15 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         temporary.replace(target)
         _sync(target.parent)
     except OSError as error:
-        raise _output_error(target, error) from error
+        raise OutputError(
+            "cannot write the file",
+            where=target,
+            got=error.strerror or type(error).__name__,
+            hint="check that the folder is writable and the disk is not full",
+        ) from error
     finally:
-        _remove(temporary)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def check_targets(targets: Iterable[Path], inputs: Iterable[Path] = ()) -> None:
@@ -64,10 +70,7 @@ def _file_of(path: Path) -> tuple[int, int] | None:
 
 
 def exchange(new: Path, old: Path) -> None:
-    """Exchange two folders in one step, so that ``old`` is at no moment missing or half new.
-
-    Where the system cannot, the old one is moved aside first.
-    """
+    """Exchange two folders in one step; where the system cannot, the old one is moved aside."""
     done = -1
     if sys.platform == "linux":
         rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
@@ -109,22 +112,6 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
-def _remove(temporary: Path) -> None:
-    try:
-        temporary.unlink(missing_ok=True)
-    except OSError:
-        return
-
-
-def _output_error(target: Path, error: OSError) -> OutputError:
-    return OutputError(
-        "cannot write the file",
-        where=target,
-        got=error.strerror or type(error).__name__,
-        hint="check that the folder is writable and the disk is not full",
-    )
-
-
 def is_locked(path: Path) -> bool:
     """Return whether a process holds the lock on a file, which need not exist."""
     try:
@@ -141,10 +128,9 @@ def is_locked(path: Path) -> bool:
 
 
 def take_lock(path: Path, what: str, *, where: Path, hint: str) -> int:
-    """Lock a file, which is created with its folders; closing the returned handle releases it.
+    """Lock a file until the returned handle is closed; ``what`` is who else holds the lock.
 
-    So does the end of the process. The file may be removed while it is locked. In the error,
-    ``what`` is who else holds the lock.
+    It is created with its folders, and may be removed while it is locked.
     """
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -46,9 +46,7 @@ def download(
 ) -> None:
     """Download a file of that size, if it is known, or the rest of one that an earlier call began.
 
-    What is there is kept beside ``path`` with its version at the server, and continued if the
-    server still has that one. A connection that breaks off is opened again, up to five times in a
-    row without a byte.
+    A connection that breaks off is opened again, up to five times in a row without a byte.
     """
     part, tries = path.with_name(path.name + ".part"), 0
     while True:
@@ -119,7 +117,6 @@ def _written(part: Path, begin: int, response: http.client.HTTPResponse) -> Iter
 
 
 def _open(address: str, asked: Mapping[str, str]) -> Any:
-    """Open an address, of http or https alone; returns its `http.client.HTTPResponse`."""
     try:
         scheme = urlsplit(address).scheme
     except ValueError:  # such as half an IPv6 address
@@ -166,7 +163,6 @@ def _need_room(folder: Path, size: int) -> None:
 
 
 def _version_begun(part: Path) -> str:
-    """Return the version of a download that was begun; "" = not known."""
     file = _version_file(part)
     version = file.read_text(errors="replace") if file.is_file() else ""
     return version if version.isascii() and version.isprintable() else ""

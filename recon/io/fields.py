@@ -33,10 +33,7 @@ _OPENCV_TAG: Final = re.compile(r"!!opencv-[a-z-]+")
 
 
 class Fields:
-    """A mapping from a file; to be used inside of `reading`, which names the file in errors.
-
-    The ``prefix`` is the path of the mapping in the file, such as ``left.``.
-    """
+    """A mapping from a file, for use inside of `reading`; ``prefix`` is its path (``left.``)."""
 
     def __init__(self, values: Mapping[str, Any], prefix: str = "") -> None:
         self._values, self._prefix = values, prefix
@@ -45,28 +42,22 @@ class Fields:
         return name in self._values
 
     def get(self, name: str) -> Any:
-        """Return the value of a field, of any type."""
         if name not in self._values:
             got = ", ".join(str(key) for key in self._values) or "nothing"
             raise FormatError(f"calibration has no {self._prefix + name!r}", got=got)
         return self._values[name]
 
     def below(self, name: str) -> Fields:
-        """Return the mapping in a field."""
         value = self.get(name)
         if not isinstance(value, Mapping):
             raise self._wrong(name, value, "a mapping")
         return Fields(value, f"{self._prefix}{name}.")
 
     def text(self, name: str) -> str:
-        """Return the value of a field as text."""
         return str(self.get(name))
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> Float64:
-        """Return the value as float64 of that shape; None = a list of any length.
-
-        A text is split into its numbers, also where it is a matrix such as ``[1 0; 0 1]``.
-        """
+        """Return float64 of that shape (None = a list); a text such as ``[1 0; 0 1]`` is split."""
         value = self.get(name)
         parts = value.strip("[] ").replace(";", " ").split() if isinstance(value, str) else value
         try:
@@ -83,11 +74,9 @@ class Fields:
         return array.reshape(shape)
 
     def number(self, name: str) -> float:
-        """Return the value as one number."""
         return float(self.numbers(name, (1,))[0])
 
     def count(self, name: str) -> int:
-        """Return the value as one positive integer."""
         value = self.number(name)
         if value != int(value) or value < 1:
             raise self._wrong(name, value, "a positive integer")

@@ -47,10 +47,7 @@ _EVAL3_SCENES: Final = frozenset({
 
 @dataclass(frozen=True)
 class Layout:
-    """Stems of the two images of a scene and of the true disparity of each.
-
-    The truth is PFM where a ``calib.txt`` is expected, else grey: ``levels`` per pixel.
-    """
+    """Stems of images and of their truth (PFM if ``calibrated``, else ``levels`` per pixel)."""
 
     left: str
     right: str
@@ -76,16 +73,13 @@ class MiddleburyScene:
     """One scene with all data of its folder.
 
     Attributes:
-        name: Name of the folder.
         generation: Layout of the folder: "2005" includes 2006, and "2014" includes MiddEval3.
-        pair: The rectified images.
-        camera: The camera, or None if none is published: 2001, 2003, and 2005 or 2006 without
-            ``dmin.txt``. Matching can then use a `stand_in_camera`.
+        camera: None if none is published: 2001, 2003, and 2005 or 2006 without ``dmin.txt``.
+            Matching can then use a `stand_in_camera`.
         truth: True disparity of the left image, or None if the folder has none.
         ndisp: Number of disparities to search, or None if it is not published.
         isint: True if results are rounded to whole pixels before comparison.
-        full_size_factor: Full-size pixels, in which the benchmark counts, per pixel of these
-            images.
+        full_size_factor: Full-size pixels, in which the benchmark counts, per pixel of these.
     """
 
     name: str
@@ -182,10 +176,7 @@ class Units(NamedTuple):
 
 
 def units_of(layout: Layout, width_px: int, height_px: int, folder: Path) -> Units:
-    """Return the units of a scene; scenes of 2001 and 2003 are told apart by their width.
-
-    In the truth of 2003 to 2006, a level is a pixel of the full size.
-    """
+    """Return the units of a scene; scenes of 2001 and 2003 are told apart by their width."""
     if layout.calibrated:
         return Units("2014", None, _factor_of_2014(folder, width_px))
     if layout == _2005:
@@ -210,11 +201,7 @@ def _factor_of_2014(folder: Path, width_px: int) -> float:
 
 @dataclass(frozen=True)
 class MiddleburyCalib:
-    """The content of a ``calib.txt``, in metres.
-
-    ``doffs_px`` is as in the file, None = not there; that of the camera is the difference of its
-    rounded principal points. ``isint``: the truth is in whole pixels, so results are rounded.
-    """
+    """The content of a ``calib.txt``, in metres; ``doffs_px`` is as in the file, if there."""
 
     camera: RectifiedCamera
     isint: bool = False
@@ -262,8 +249,7 @@ def nominal_camera_2005(
 ) -> RectifiedCamera:
     """Return the nominal camera of a 2005 or 2006 scene, of that many full-size pixels per pixel.
 
-    The images are cropped so that disparities are too small by ``dmin`` full-size pixels. The
-    principal point is unknown and assumed at the image centre.
+    Disparities are too small by ``dmin`` full-size pixels; the principal point is assumed central.
     """
     camera = stand_in_camera(width_px, height_px)
     return replace(
@@ -275,10 +261,7 @@ def nominal_camera_2005(
 
 
 def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
-    """Return a camera for uncalibrated images: its width as focal length, a baseline of 1.
-
-    It is valid for matching; depth has an unknown scale.
-    """
+    """Return a camera for matching alone, not for depth: focal length = width, baseline 1."""
     cx_px, cy_px = (width_px - 1) / 2, (height_px - 1) / 2
     return RectifiedCamera(float(width_px), cx_px, cy_px, cx_px, 1.0, width_px, height_px, ndisp)
 

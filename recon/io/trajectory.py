@@ -34,12 +34,8 @@ HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
 def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
     """Read a KITTI or TUM trajectory, recognised by the number of columns (12 or 8).
 
-    Args:
-        path: The text file.
-        timestamps_s: float64 (N,), the times for a KITTI file; TUM files contain theirs.
-
-    Raises:
-        FormatError: The file is damaged, or has another number of poses than times.
+    TUM files contain their times; ``timestamps_s``, float64 (N,), are those of a KITTI file. A file
+    that is damaged, or has another number of poses than times, is a `FormatError`.
     """
     table, lines = read_table(path, (12, 8))
     if table.shape[1] == 12:
@@ -55,11 +51,7 @@ def holds_times(path: StrPath) -> bool:
 
 @reader
 def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
-    """Read poses of the left camera, one row-major 3×4 matrix per line.
-
-    The rotations are re-orthonormalised, as they are printed with few digits. Without times, pose
-    ``i`` gets ``i`` seconds.
-    """
+    """Read poses, a row-major 3×4 matrix per line; without times, pose ``i`` gets ``i`` seconds."""
     return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
 
 
@@ -98,7 +90,12 @@ def _from_kitti(
     poses[:, :3, :] = table.reshape(-1, 3, 4)
     poses[:, 3, 3] = 1.0
     for pose, line in zip(poses, lines, strict=True):
-        _check_rotation(pose[:3, :3], f"{path}:{line}")
+        R = pose[:3, :3]
+        orthonormal = np.allclose(R @ R.T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
+        if not orthonormal or np.linalg.det(R) < 0:
+            what = "pose is not a rigid transform"
+            expected = "a row-major 3x4 matrix of rotation and translation"
+            raise FormatError(what, where=f"{path}:{line}", expected=expected)
     return Trajectory(np.stack([orthonormalise(pose) for pose in poses]), times)
 
 
@@ -130,13 +127,6 @@ def check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
         )
 
 
-def _check_rotation(rotation: Float64, where: str) -> None:
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
-    if not orthonormal or np.linalg.det(rotation) < 0:
-        expected = "a row-major 3x4 matrix of rotation and translation"
-        raise FormatError("pose is not a rigid transform", where=where, expected=expected)
-
-
 @dataclass(frozen=True)
 class CapturedFrame:
     """A pair of images, relative to the folder of their list, and their times."""
@@ -147,16 +137,12 @@ class CapturedFrame:
     right_s: float
 
     def line(self) -> str:
-        """Return this frame as a line, with the newline."""
         return f"{self.left},{self.right},{self.left_s:.6f},{self.right_s:.6f}\n"
 
 
 @reader
 def read_frames(path: StrPath) -> list[CapturedFrame]:
-    """Read ``frames.csv``: the image pairs of a recording with their times.
-
-    A line is written after both of its images, so a pair is complete once its line exists.
-    """
+    """Read ``frames.csv``: pairs with their times; a line is written after both of its images."""
     lines = enumerate(read_text(path).splitlines(), start=1)
     frames = [_parse(line, f"{path}:{n}") for n, line in lines if line and line[0] != "#"]
     if not frames:

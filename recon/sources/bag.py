@@ -32,15 +32,7 @@ _LISTED: Final = 20  # most topics in a description
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class BagSource(Recording):
-    """A drive in a bag, which does not say which poses are true; messages are read one at a time.
-
-    Attributes:
-        topics: Left and right image topic.
-        pairs: Indices of the left and the right message of each pair.
-        left_s: float64 (M,), timestamps of all left messages.
-        recorded_ns: int64 (M,) and (K,), recording times of the left and right messages.
-        stamped: Whether timestamps are those of the headers, not of the recording.
-    """
+    """A drive in a bag; messages are read one at a time."""
 
     bag: Bag
     topics: tuple[str, str]
@@ -51,7 +43,6 @@ class BagSource(Recording):
 
     @cached_property
     def files(self) -> Sequence[Path]:
-        """The calibration file, then those of the recording."""
         inside = (
             sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
             for path in self.bag.paths
@@ -60,17 +51,14 @@ class BagSource(Recording):
 
     @cached_property
     def stamps_s(self) -> Float64:
-        """float64 (N,), times of the left images of the pairs."""
         return self.left_s[[left for left, _ in self.pairs]]
 
     def read_prior(self, name: str) -> ReadPrior:
-        """Read the motion by other sensors from a TUM file or, if there is none, a topic."""
         if Path(name).is_file():
             return super().read_prior(name)
         return read_topic(self.bag, name, self.topics[0], stamped=self.stamped)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Read the pairs from number ``start`` on, without reading the messages before."""
         if start >= len(self):
             return
         # One reader per camera, so that pairs with messages far apart need no buffer.
@@ -83,7 +71,6 @@ class BagSource(Recording):
             yield join_pair(left, right, stamp_s, index, f"{self.topics[0]}, pair {index}")
 
     def _images(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
-        """Yield the wanted images of one camera, given by their indices in order."""
         images = self.bag.images(self.topics[side], wanted, self.recorded_ns[side])
         for target, image in zip(wanted, images, strict=True):
             where = f"{self.bag.paths[0]}: {self.topics[side]}, message {target}"
@@ -150,20 +137,17 @@ def _stamps(
     times: dict[str, NDArray[np.int64]], topics: tuple[str, str], path: Path
 ) -> tuple[tuple[Float64, Float64], str]:
     """Return the times of the messages of both cameras; of recording if the headers have none."""
-    empty = next((topic for topic in topics if not len(times[topic])), None)
-    if empty is not None:
-        raise SourceError("topic has no message", where=path, got=empty)
+    for topic in topics:
+        if not len(times[topic]):
+            raise SourceError("topic has no message", where=path, got=topic)
     stamped = all((times[topic][:, 1] != 0).all() for topic in topics)
-    left, right = (
-        (times[topic][:, 1 if stamped else 0] * _S).astype(np.float64) for topic in topics
-    )
+    left, right = ((times[topic][:, int(stamped)] * _S).astype(np.float64) for topic in topics)
     for topic, stamps in zip(topics, (left, right), strict=True):
         check_increasing(stamps, f"{path}: {topic}")
     return (left, right), "" if stamped else ", recording times as the headers have none"
 
 
 def _rig_of_infos(bag: Bag, topics: tuple[str, str], path: Path) -> Rig:
-    """Return the rig that the CameraInfo messages of two image topics describe."""
     infos = [_info_topic(bag, topic) for topic in topics]
     if None in infos:
         raise SourceError(
@@ -177,10 +161,7 @@ def _rig_of_infos(bag: Bag, topics: tuple[str, str], path: Path) -> Rig:
 
 
 def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
-    """Return the left and right image topic, by the settings or by name, and a note on others.
-
-    Of several pairs, rectified ones are preferred, then uncompressed ones, then alphabetical order.
-    """
+    """Return both topics by the settings, else the best pair by name, and a note on others."""
     if settings.left or settings.right:
         return _named(bag, settings), ""
     images = [
@@ -188,22 +169,18 @@ def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str],
         for topic in bag.topics.values()
         if topic.kind in _IMAGES and topic.messages and "depth" not in topic.name.lower()
     ]
-    pairs = [
-        (left, right)
+    ranked = sorted(
+        (not _is_rectified(left), bag.topics[left].kind == COMPRESSED, left, right)
         for left, right in find_partners(images)
         if bag.topics[left].kind == bag.topics[right].kind
-    ]
-    if not pairs:
+    )
+    if not ranked:
         raise SourceError(
             "recording has no image topics of a left and a right camera",
             where=bag.paths[0],
             got=bag.list_topics(_IMAGES) or "no image topic",
             hint="name them with --left and --right",
         )
-    ranked = sorted(
-        (not _is_rectified(left), bag.topics[left].kind == COMPRESSED, left, right)
-        for left, right in pairs
-    )
     best, *others = [(left, right) for *_, left, right in ranked]
     also = ", ".join(left for left, _ in others)
     return best, f" (also there: {also}; choose with --left)" if also else ""
@@ -233,7 +210,6 @@ def _info_topic(bag: Bag, image_topic: str) -> str | None:
 
 
 def _is_rectified(image_topic: str) -> bool:
-    """Return whether a topic has rectified images, according to ROS naming conventions."""
     return "rect" in image_topic.removesuffix("/compressed").rsplit("/", 1)[-1]
 
 
@@ -264,13 +240,9 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
                 got=f"focal length {info.P[0, 0]:g} px",
                 hint="name a calibration file with --calib",
             )
-    if rectified:
-        return _rectified(left, right, where)
-    cameras = [(_camera(info, where), info.R) for info in (left, right)]
-    return rig_of_camera_infos(cameras[0], cameras[1], right.P, where)
-
-
-def _rectified(left: BagCameraInfo, right: BagCameraInfo, where: Path) -> RectifiedCamera:
+    if not rectified:
+        cameras = [(_camera(info, where), info.R) for info in (left, right)]
+        return rig_of_camera_infos(cameras[0], cameras[1], right.P, where)
     check_shift(right.P, float(left.P[0, 3]), where)
     baseline_m = (left.P[0, 3] - right.P[0, 3]) / left.P[0, 0]
     size = (left.width_px, left.height_px)

@@ -21,10 +21,9 @@ _S: Final = 1e-9
 
 
 def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadPrior:
-    """Read the poses of a topic with odometry, poses or transforms.
+    """Read a topic with odometry, poses or transforms, as poses of the camera of ``image_topic``.
 
-    The static transforms of the recording, if they connect the two, turn the poses into those of
-    the camera of ``image_topic``. ``stamped``: by the stamps of headers, not of the recording.
+    That takes static transforms that connect the two. ``stamped``: by the stamps of headers.
     """
     where = f"{bag.paths[0]}: {name}"
     if name not in bag.topics or bag.topics[name].kind not in POSES:
@@ -65,7 +64,6 @@ def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], l
 
 
 def _path_of(poses: list[BagPose], where: str, *, stamped: bool) -> Trajectory:
-    """Return the poses in order of time, each time once."""
     stamps = [pose.stamp_ns if stamped else pose.recorded_ns for pose in poses]
     times_ns, first = np.unique(stamps, return_index=True)
     for pose in poses:

@@ -70,10 +70,7 @@ def check_given_once(calibration: object, settings: SourceSettings) -> None:
 def camera_of_numbers(
     settings: SourceSettings, size: tuple[int, int], **instead: float
 ) -> RectifiedCamera:
-    """Return the camera of rectified images (width, height) by the numbers in the settings.
-
-    Where they have none, those of ``instead`` count; the principal point is else the middle.
-    """
+    """Return the camera of rectified images (width, height) by settings, else ``instead``."""
     numbers = {**instead, **settings.numbers}
     focal_px, baseline_m = numbers.get("focal_px"), numbers.get("baseline_m")
     if focal_px is None or baseline_m is None:
@@ -113,10 +110,7 @@ def find_calibration(folder: Path) -> Path | None:
 
 
 def as_rectified(rig: Rig) -> Rig:
-    """Convert two raw cameras that are already rectified; return any other rig unchanged.
-
-    Rectifying such a pair again would resample every image for nothing.
-    """
+    """Convert raw cameras that are rectified already, so that no image is resampled for nothing."""
     if isinstance(rig, RectifiedCamera) or not _is_rectified(rig):
         return rig
     left, right = rig.left, rig.right

@@ -208,7 +208,6 @@ def _receive(
 
 
 def _published(address: str, kind: str, work: Path) -> str:
-    """Return the hash in a file of the owners, whose first word it is."""
     download(address, work / _HASH)
     word, *_ = read_text(work / _HASH, _HASH_BYTES).split() or [""]
     if not (word.isalnum() and word.isascii()):
@@ -274,12 +273,10 @@ def verify_part(name: str, folder: Path) -> dict[str, Any]:
 
 
 def _facts(path: Path) -> list[Any]:
-    """Return the size in bytes and the SHA-256 of a file."""
     return [path.stat().st_size, _digest(path, "sha256").partition(":")[2]]
 
 
 def _digest(path: Path, kind: str) -> str:
-    """Return the hash of a file with its kind, such as ``sha256:…``."""
     digest = hashlib.new(kind, usedforsecurity=False)
     with path.open("rb") as file:
         while piece := file.read(_MEGABYTE):
@@ -288,7 +285,6 @@ def _digest(path: Path, kind: str) -> str:
 
 
 def _recorded_files(place: Path) -> dict[str, list[Any]]:
-    """Return the facts of each file of a fetched part, by its path."""
     with reading(place / RECORD):
         files = json.loads(read_text(place / RECORD, _RECORD_BYTES))["files"]
         return {str(name): list(facts) for name, facts in files.items()}

@@ -178,10 +178,7 @@ def _pair_by_stamp(
 
 
 def _by_name(left: list[Path], right: list[Path]) -> _Frames | None:
-    """Return frames by names that are equal or differ only in the side.
-
-    None if most images have no partner, so that their names say nothing.
-    """
+    """Return frames by names equal but for the side; None if most images have no partner."""
     rights = {path.stem: path for path in right}
     frames: _Frames = []
     for path in left:
@@ -216,14 +213,12 @@ def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Fr
 
 
 def _with_times(found: _Pairing, path: Path) -> _Pairing:
-    """Return the pairs with the times of a file, which win over those in names."""
     stamps_s = read_times_of_pairs(path, found.listing)
     how = f"{found.how}, times of {_TIMES}"
     return found._replace(stamps_s=stamps_s, how=how, texts=(path,))
 
 
 def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:
-    """Return timestamps of the pairs, and a note if they are assumed."""
     if found.stamps_s is not None and settings.rate_hz is None:
         return found.stamps_s, ""
     rate_hz = settings.rate_hz or DEFAULT_RATE_HZ

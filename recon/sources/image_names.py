@@ -50,7 +50,6 @@ def partner_names(name: str) -> list[str]:
 
 
 def _replaced(name: str, left: str, right: str) -> list[str]:
-    """Return a name with the mark of the left side replaced by that of the right one."""
     matches = list(re.finditer(_bounded(left), name))
     if not matches:
         return []
@@ -97,10 +96,7 @@ def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class ImagePairs:
-    """Left and right images, in natural order; ``by_order`` = paired so, as names gave no clue.
-
-    ``lonely`` files are left out, as they have no partner.
-    """
+    """Left and right images, in natural order; ``lonely`` ones have no partner and are left out."""
 
     pairs: tuple[tuple[Path, Path], ...]
     by_order: bool
@@ -160,10 +156,7 @@ def _by_name(side: Sequence[Path]) -> dict[_Key, Path]:
 
 
 def _by_numbers(side: Sequence[Path]) -> dict[_Key, Path]:
-    """Return images by those numbers in their names that vary within the side.
-
-    Names with more or fewer numbers than most are left out.
-    """
+    """Return images by the numbers that vary in their names; odd counts of them are left out."""
     numbers = {path: tuple(int(word) for word in re.findall(_DIGITS, path.stem)) for path in side}
     usual = Counter(len(each) for each in numbers.values()).most_common(1)[0][0]
     numbers = {path: each for path, each in numbers.items() if len(each) == usual}

@@ -39,17 +39,14 @@ class ImageSource(Recording):
 
     @cached_property
     def files(self) -> Sequence[Path]:
-        """Calibration and other text files, then the images."""
         images = (path for frame in self.images for path in (frame.left, frame.right))
         return [*self.texts, *images]
 
     @cached_property
     def stamps_s(self) -> Float64:
-        """float64 (N,), times of the left images."""
         return stamps_of(self.images)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Read the pairs from number ``start`` on."""
         for index in range(start, len(self.images)):
             frame = self.images[index]
             left, right = (self._read(path) for path in (frame.left, frame.right))
@@ -88,11 +85,7 @@ def stamps_of(frames: Sequence[ImageFrame]) -> Float64:
 def pair_listed(
     lists: Sequence[Sequence[tuple[float, Path]]], settings: SourceSettings, where: Path
 ) -> tuple[list[ImageFrame], FrameList]:
-    """Pair two lists of images by time; returns the frames that the settings choose.
-
-    Each list has time and file of the images of a camera, in order of time. A listed image that is
-    missing has no partner.
-    """
+    """Pair lists of time and file, by time; a listed image that is missing has no partner."""
     for one in lists:
         check_most(sum(path.is_file() for _, path in one), len(one), where)
     stamps = [np.array([stamp for stamp, _ in one]) for one in lists]

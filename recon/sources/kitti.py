@@ -64,45 +64,35 @@ def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSou
     images, listing = _list_pairs(views[0], views[1], settings)
     times, time_files = _read_times(folder, listing, settings)
     rig, calibration_files = _read_rig([folder / "calib.txt"], settings, pair, images[0][0])
-    texts = (*calibration_files, *time_files, _find_poses(folder))
+    truth, pose_files = _read_truth(folder, times, listing, pair[0])
     return ImageSource(
         name=resolved(folder).name,
         description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}{listing}",
         calibration=rig,
         images=[ImageFrame(*both, float(t)) for both, t in zip(images, times, strict=True)],
         listing=listing,
-        truth=_read_truth(folder, times, listing, pair[0]),
-        texts=tuple(text for text in texts if text is not None),
+        truth=truth,
+        texts=(*calibration_files, *time_files, *pose_files),
     )
 
 
 def _choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
     """Return the grey pair of cameras, or the colour pair if only that is complete."""
-    pairs = (GREY_CAMERAS, COLOUR_CAMERAS)
-    for pair in pairs:
-        if all((folder / pattern.format(camera)).is_dir() for camera in pair):
-            return pair
-    for left, right in pairs:
-        for here, missing in ((left, right), (right, left)):
-            if (folder / pattern.format(here)).is_dir():
-                raise SourceError(
-                    "folder of the other camera is missing",
-                    where=folder,
-                    got=pattern.format(here),
-                    expected=f"{pattern.format(missing)} as well",
-                )
     names = [pattern.format(camera) for camera in range(4)]
-    raise SourceError(
-        "folder has no images in KITTI's layout",
-        where=folder,
-        expected=f"{names[0]} and {names[1]}, or {names[2]} and {names[3]}",
-    )
+    there = [camera for camera, name in enumerate(names) if (folder / name).is_dir()]
+    for pair in (GREY_CAMERAS, COLOUR_CAMERAS):
+        if set(pair) <= set(there):
+            return pair
+    if there:
+        what, expected = "folder of the other camera is missing", f"{names[there[0] ^ 1]} as well"
+        raise SourceError(what, where=folder, got=names[there[0]], expected=expected)
+    expected = f"{names[0]} and {names[1]}, or {names[2]} and {names[3]}"
+    raise SourceError("folder has no images in KITTI's layout", where=folder, expected=expected)
 
 
 def _list_pairs(
     left: Path, right: Path, settings: SourceSettings
 ) -> tuple[list[tuple[Path, Path]], FrameList]:
-    """Return the left and right image of each frame, paired by equal names."""
     names = [{path.name for path in list_images(folder)} for folder in (left, right)]
     frames = [
         (left / name if name in names[0] else None, right / name if name in names[1] else None)
@@ -114,7 +104,6 @@ def _list_pairs(
 def _read_times(
     folder: Path, listing: FrameList, settings: SourceSettings
 ) -> tuple[Float64, tuple[Path, ...]]:
-    """Return times of the frames in seconds, and their file; no file if a rate is given."""
     if settings.rate_hz is not None:
         return np.array(listing.kept) / settings.rate_hz, ()
     path = folder / "times.txt"
@@ -146,10 +135,12 @@ def _read_rig(
 
 def _read_truth(
     folder: Path, times: Float64, listing: FrameList, camera: int
-) -> SequenceTruth | None:
-    path = _find_poses(folder)
+) -> tuple[SequenceTruth | None, tuple[Path, ...]]:
+    drive = resolved(folder)
+    places = (drive / "poses.txt", drive.parent.parent / "poses" / f"{drive.name}.txt")
+    path = next((place for place in places if place.is_file()), None)
     if path is None:
-        return None
+        return None, ()
     poses = read_kitti_poses(path).T_world_camera
     lines = listing.lines(len(poses))
     if lines is None:
@@ -163,13 +154,7 @@ def _read_truth(
     # KITTI's poses are those of camera 0, which need not be the left camera of this pair.
     offset = read_kitti_offset(calibration, camera) if calibration.exists() else np.eye(4)
     left = poses[lines] @ invert(offset)
-    return SequenceTruth(Trajectory(invert(left[0]) @ left, times))
-
-
-def _find_poses(folder: Path) -> Path | None:
-    path = resolved(folder)
-    candidates = (path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt")
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return SequenceTruth(Trajectory(invert(left[0]) @ left, times)), (path,)
 
 
 def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:

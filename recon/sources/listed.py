@@ -34,13 +34,7 @@ from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.image_names import find_partners
 from recon.sources.images import ImageSource, image_size, is_image, pair_listed, stamps_of
 from recon.sources.settings import SourceSettings
-from recon.sources.times import (
-    check_increasing,
-    check_seconds,
-    read_stamped_names,
-    read_tum_truth,
-    truth_at,
-)
+from recon.sources.times import check_seconds, read_stamped_names, read_tum_truth, truth_at
 
 _TRUTH: Final = "state_groundtruth_estimate0"
 
@@ -91,11 +85,9 @@ def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
 
 
 def _read_tum_list(path: Path) -> list[tuple[float, Path]]:
-    listed = [(stamp, path.parent / name) for stamp, name in read_stamped_names(path)]
-    stamps_s = np.array([stamp for stamp, _ in listed])
-    check_increasing(stamps_s, str(path))
-    check_seconds(stamps_s, path)
-    return listed
+    entries = read_stamped_names(path)
+    check_seconds(np.array([stamp for stamp, _ in entries]), path)
+    return [(stamp, path.parent / name) for stamp, name in entries]
 
 
 def is_euroc(folder: Path) -> bool:
@@ -132,9 +124,7 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
 def _read_euroc_list(view: Path) -> list[tuple[float, Path]]:
     if not view.is_dir():
         raise SourceError("folder of a camera is missing", where=view)
-    path = view / "data.csv"
-    entries = read_stamped_names(path, unit_s=NS)
-    check_increasing(np.array([stamp for stamp, _ in entries]), str(path))
+    entries = read_stamped_names(view / "data.csv", unit_s=NS)
     return [(stamp, view / "data" / name) for stamp, name in entries]
 
 
@@ -155,7 +145,6 @@ def _read_euroc_rig(
 def _read_euroc_truth(
     root: Path, left: Path, stamps_s: Float64
 ) -> tuple[SequenceTruth | None, str]:
-    """Return the truth at the times of the frames, and a note if it does not cover them all."""
     path, sensor = root / _TRUTH / "data.csv", left / "sensor.yaml"
     if not (path.is_file() and sensor.is_file()):
         return None, ""

@@ -23,16 +23,10 @@ _PATIENCE_S: Final = 0.2  # how long to wait for a pair before asking whether to
 
 
 class LiveSource(DerivedSource):
-    """The pairs of a source when they are due, read by a thread.
+    """The pairs of a source when they are due, read by a thread; of those that wait, the newest.
 
-    Where the consumer is not ready, one pair waits, and the next takes its place: the older one is
-    dropped.
-
-    Args:
-        source: A recording, or cameras.
-        rate: How many times as fast as recorded it is played; None = pairs are due when they were
-            taken, by the clock of `time.monotonic`.
-        stopped: Asked now and then; True ends the drive.
+    ``rate`` is how many times as fast as recorded it is played; None = pairs are due when they were
+    taken, by `time.monotonic`. Where ``stopped()`` is True the drive ends.
     """
 
     live = True
@@ -58,11 +52,9 @@ class LiveSource(DerivedSource):
         self.dropped = 0
 
     def __len__(self) -> int:
-        """Return the number of pairs, if none is dropped."""
         return len(self.source)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Yield the pairs as they arrive, those that are not dropped; once."""
         Thread(target=self._play, args=(start,), name="live", daemon=True).start()
         try:
             while (pair := self._take()) is not None:
@@ -71,11 +63,9 @@ class LiveSource(DerivedSource):
             self._ended = True
 
     def hurried(self) -> bool:
-        """Return whether the next pair waits already."""
         return bool(self._waiting)
 
     def note_unmatched(self) -> None:
-        """Count a pair that there is no time to match."""
         self._unmatched += 1
 
     def note_located(self, index: int) -> None:
@@ -83,7 +73,6 @@ class LiveSource(DerivedSource):
         self._latency_s.append(time.monotonic() - self._due_s[index])
 
     def figures(self) -> dict[str, Any]:
-        """Return what was late and what was left out."""
         latency_ms = 1e3 * np.array(self._latency_s or [np.nan])
         p50, p95 = np.percentile(latency_ms, (50, 95)).tolist()
         known = bool(self._latency_s)
@@ -100,7 +89,6 @@ class LiveSource(DerivedSource):
         return {"live": live}
 
     def warnings(self) -> list[str]:
-        """Return what was left out, in words."""
         lines = []
         if self._unmatched:
             what = "only tracked, not matched: the map lacks what they saw"
@@ -110,7 +98,6 @@ class LiveSource(DerivedSource):
         return lines
 
     def _play(self, start: int) -> None:
-        """Hand over each pair when it is due."""
         begun_s, first_s = time.monotonic(), None
         try:
             for pair in self.source.frames(start):
@@ -138,7 +125,6 @@ class LiveSource(DerivedSource):
             self._news.notify()
 
     def _take(self) -> StereoPair | None:
-        """Wait for the next pair; None = there is none any more."""
         with self._news:
             while not (self._waiting or self._ended or self._stopped()):
                 self._news.wait(_PATIENCE_S)

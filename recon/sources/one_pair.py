@@ -38,14 +38,12 @@ class OnePair(StereoSource):
 
     @cached_property
     def name(self) -> str:
-        """Name of the pair."""
         return self.pair.name
 
     def __len__(self) -> int:
         return 1
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Yield the pair, or nothing from any later start."""
         yield from (self.pair,)[start:]
 
 
@@ -69,10 +67,7 @@ def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
 
 
 def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> StereoPair:
-    """Read the two images of a pair; if only one is in colour, the other is converted.
-
-    16-bit images are scaled to 8 bits, both alike, by the brightest pixel.
-    """
+    """Read two images; of two 16-bit ones both are scaled to 8 bits by the brightest pixel."""
     levels = [read_levels(path, max_megapixels) for path in (left, right)]
     white = find_white(levels)
     images = [eight_bits(each, white) for each in levels]
@@ -96,15 +91,10 @@ def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIX
 
 @dataclass(frozen=True, eq=False)
 class PairInput:
-    """One pair with its calibration and ground truth.
+    """One pair with its calibration and, if known, the true disparity of its rectified left view.
 
-    Attributes:
-        pair: The images.
-        calibration: Calibration of the two cameras.
-        files: Files that the pair was read from.
-        truth: True disparity of the rectified left view, if known.
-        notes: What the camera was taken from, where there is no calibration file; for warnings.
-        up_to_scale: True if the baseline is unknown and counts as 1 m.
+    ``notes`` say what the camera was taken from where there is no calibration file; with
+    ``up_to_scale`` the baseline is unknown and counts as 1 m.
     """
 
     pair: StereoPair
@@ -126,15 +116,8 @@ def read_pair_input(
 ) -> PairInput:
     """Read two images with their calibration; without one the pair is rectified.
 
-    Args:
-        left: Left image.
-        right: Right image.
-        calibration: Any file that `read_calibration` understands.
-        known: Numbers of the camera, if depth is wanted without a calibration file; the focal
-            length may be that in the EXIF data of the left image, and without a baseline the cloud
-            is up to scale. The result has notes on both.
-        metres_per_unit: Unit of the translation in an OpenCV file.
-        max_megapixels: Refuse larger images, in 10⁶ pixels.
+    Of ``known`` numbers of the camera, the focal length may be that in the EXIF data of the left
+    image, and without a baseline the cloud is up to scale: notes say so.
     """
     if known is not None:
         check_given_once(calibration, known)
@@ -154,7 +137,6 @@ def read_pair_input(
 
 
 def _with_camera(given: PairInput, known: SourceSettings) -> PairInput:
-    """Return the pair with a camera from what is known of it, and from EXIF data."""
     height_px, width_px = given.pair.left.shape[:2]
     notes, instead = [], {"baseline_m": 1.0}
     if known.focal_px is None:

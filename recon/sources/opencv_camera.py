@@ -55,10 +55,7 @@ class Camera:
         return float(rate) if rate > 0 else float("nan")
 
     def grab(self) -> float | None:
-        """Grab the next frame without decoding it; returns its time in seconds, None = the end.
-
-        That of the driver, on the machine's monotonic clock; of a file, its position.
-        """
+        """Grab the next frame without decoding it; returns its time in seconds, None = the end."""
         if not self._capture.grab():
             return None
         now_s = time.monotonic()
@@ -75,10 +72,7 @@ class Camera:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def lock(self, exposure: float | None) -> float | None:
-        """Fix white balance and exposure, in the driver's unit; None = keep the current one.
-
-        Returns the fixed exposure; None = not supported by the driver.
-        """
+        """Fix white balance and exposure (None = the current); returns it, None = not supported."""
         if not self.live:
             return None
         value = self._capture.get(cv2.CAP_PROP_EXPOSURE) if exposure is None else exposure
@@ -89,7 +83,6 @@ class Camera:
         return float(value) if held else None
 
     def close(self) -> None:
-        """Release the device."""
         self._capture.release()
 
     def _ask(self, size: tuple[int, int] | None, rate_hz: float | None) -> None:

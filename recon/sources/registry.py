@@ -51,12 +51,7 @@ others."""
 def open_source(
     path: StrPath, kind: str | None = None, settings: SourceSettings | None = None
 ) -> StereoSource:
-    """Open a folder or file as a source of stereo pairs.
-
-    Args:
-        path: The folder or file.
-        kind: A name of `KINDS`; None = recognise it by its files.
-        settings: What cannot be derived from its files.
+    """Open a folder or file as a source of stereo pairs, of a kind of `KINDS`; None = by its files.
 
     Raises:
         SourceError: The path is missing, empty, of an unknown kind, or gives no pairs.

@@ -70,14 +70,7 @@ class BagPose(NamedTuple):
 
 
 class Bag:
-    """A recording in one or more files.
-
-    Args:
-        paths: ROS 1 files that belong together, or one folder or file of ROS 2.
-
-    Attributes:
-        topics: All topics, by name.
-    """
+    """A recording: files of ROS 1 that belong together, or one folder or file of ROS 2."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.paths = tuple(paths)
@@ -94,7 +87,6 @@ class Bag:
         self.topics = self._find_topics()
 
     def list_topics(self, kinds: Sequence[str]) -> str:
-        """List the topics of some types with their message counts, for error messages."""
         return ", ".join(
             f"{topic.name} ({topic.messages})"
             for topic in sorted(self.topics.values(), key=lambda topic: topic.name)
@@ -113,10 +105,7 @@ class Bag:
     def images(
         self, topic: str, wanted: Sequence[int], recorded_ns: NDArray[np.int64]
     ) -> Iterator[UInt8]:
-        """Decode the messages of a topic with these increasing numbers.
-
-        ``recorded_ns`` is when all of its messages were recorded: reading begins at the first one.
-        """
+        """Decode messages of increasing numbers; ``recorded_ns`` is when all were recorded."""
         start_ns = int(recorded_ns[wanted[0]])
         position = int(np.searchsorted(recorded_ns, start_ns))
         messages = self._messages([topic], start_ns)
@@ -131,23 +120,13 @@ class Bag:
             yield _decode(self._parse(found[2], topic), where)
 
     def camera_info(self, topic: str) -> BagCameraInfo:
-        """Read the first message of a ``CameraInfo`` topic."""
         for _, _, content in self._messages([topic]):
             message = self._parse(content, topic)
             # ROS 1 has upper-case field names.
-            matrix = {
-                name: np.array(getattr(message, name if self._ros1 else name.lower()))
-                for name in "DKRP"
-            }
-            return BagCameraInfo(
-                int(message.width),
-                int(message.height),
-                str(message.distortion_model),
-                matrix["D"].astype(np.float64),
-                matrix["K"].reshape(3, 3),
-                matrix["R"].reshape(3, 3),
-                matrix["P"].reshape(3, 4),
-            )
+            names = "DKRP" if self._ros1 else "dkrp"
+            D, K, R, P = (np.array(getattr(message, name), np.float64) for name in names)
+            size, model = (int(message.width), int(message.height)), str(message.distortion_model)
+            return BagCameraInfo(*size, model, D, K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
         raise FormatError("topic has no message", where=self.paths[0], got=topic)
 
     def frame_id(self, topic: str) -> str:
@@ -232,7 +211,6 @@ class Bag:
 
 
 def _decode(message: Any, where: str) -> UInt8:
-    """Decode an image message, raw or compressed."""
     if hasattr(message, "format"):
         return decode_image(message.data.tobytes(), where)
     return pixels_of_ros_image(

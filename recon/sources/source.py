@@ -97,17 +97,11 @@ class StereoSource(ABC):
         return f"{type(self).__name__}({self.name}, pairs: {len(self)}, {self.description})"
 
     def lines(self, count: int) -> list[int] | None:
-        """Return the line of each pair, from 0, in a file of ``count`` lines, one per frame.
-
-        None = the file has too few lines.
-        """
+        """Return the line of each pair in a file of one per frame; None = it has too few lines."""
         return list(range(len(self))) if count >= len(self) else None
 
     def shift_of(self, pairs: int) -> int | None:
-        """Return ``source.shift_frames`` with right images of so many pairs later than now.
-
-        None = the source does not have this setting.
-        """
+        """Return ``source.shift_frames`` for right images of so many pairs later; None = none."""
         return None
 
     def read_prior(self, name: str) -> ReadPrior:
@@ -168,28 +162,23 @@ class Recording(StereoSource):
 
     @cached_property
     def left_out(self) -> int:
-        """Number of images without a partner."""
         return sum(self.listing.alone)
 
     def __len__(self) -> int:
         return len(self.listing.kept)
 
     def lines(self, count: int) -> list[int] | None:
-        """Return the line of each pair in a file with one line per frame; see `FrameList.lines`."""
         return self.listing.lines(count)
 
     def shift_of(self, pairs: int) -> int:
-        """Return ``source.shift_frames`` with right images of so many pairs later than now."""
         chosen = self.listing.chosen
         return self.listing.shift + pairs * (1 if chosen is None else chosen.step)
 
     def warnings(self) -> list[str]:
-        """Return how many images were left out, in words."""
         out = self.left_out
         return [f"{counted(out, 'image')} without a partner: left out"] if out else []
 
     def figures(self) -> dict[str, Any]:
-        """Return how many images were left out."""
         return {"frames_left_out": self.left_out}
 
 
@@ -208,10 +197,7 @@ class DerivedSource(StereoSource):
 
 
 class SourcePart(DerivedSource):
-    """The pairs of a source from ``first`` on, up to but not including ``last``.
-
-    Of these the first ``lead`` belong to the part before: they only lead the odometry.
-    """
+    """Pairs ``first`` to ``last - 1`` of a source, of which ``lead`` only lead the odometry."""
 
     def __init__(self, source: StereoSource, first: int, last: int, lead: int = 0) -> None:
         super().__init__(source)
@@ -222,7 +208,6 @@ class SourcePart(DerivedSource):
         return self.last - self.first
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Yield the pairs from number ``start`` of the part on."""
         return islice(self.source.frames(self.first + start), len(self) - start)
 
 
@@ -269,7 +254,6 @@ class FrameList:
 
     @property
     def kept(self) -> Sequence[int]:
-        """Positions of the pairs that are used."""
         return self.used(self.paired)
 
     def used(self, of_pairs: Sequence[Item]) -> list[Item]:
@@ -346,7 +330,6 @@ def pair_frames(
 def _shift_right(
     frames: Sequence[tuple[Left | None, Right | None]], by: int, where: Path
 ) -> Sequence[tuple[Left | None, Right | None]]:
-    """Return the frames with the right images of so many frames later."""
     if not by:
         return frames
     whole = [k for k, (left, right) in enumerate(frames) if left is not None and right is not None]

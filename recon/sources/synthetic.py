@@ -24,11 +24,8 @@ from recon.street.truth import true_occupancy, true_surface
 class SyntheticSource(StereoSource):
     """A rendered drive through a synthetic street, with complete ground truth.
 
-    The street is built on first use; images are rendered while iterating.
-
-    Args:
-        settings: Street, rig and trajectory.
-        surface_range_m: Depth up to which a visible surface is part of the true surface.
+    The street is built on first use; images are rendered while iterating. A visible surface is part
+    of the true surface up to a depth of ``surface_range_m``.
     """
 
     name: str
@@ -43,7 +40,6 @@ class SyntheticSource(StereoSource):
 
     @cached_property
     def world(self) -> StreetWorld:
-        """The street."""
         return build_street(self.settings)
 
     @cached_property
@@ -53,7 +49,6 @@ class SyntheticSource(StereoSource):
 
     @cached_property
     def calibration(self) -> RectifiedCamera:
-        """The rectified camera."""
         return self.world.camera
 
     @property
@@ -71,23 +66,14 @@ class SyntheticSource(StereoSource):
         return self.settings.frames
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Render the pairs from number ``start`` on."""
         return (self.camera.pair(index) for index in range(start, len(self)))
 
     def frame(self, index: int) -> SyntheticFrame:
-        """Return one pair with depth, disparity, pose and ground.
-
-        Raises:
-            SettingsError: There is no such frame.
-        """
+        """Return one pair with depth, disparity, pose and ground, or raise a `SettingsError`."""
         return self.camera.render(index)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
-        """Return the true disparity of one frame; NaN = sky.
-
-        Raises:
-            SettingsError: There is no such frame.
-        """
+        """Return the true disparity of a frame, NaN = sky, or raise a `SettingsError`."""
         return self.camera.disparity_truth(index)
 
     def occupancy_truth(
@@ -99,7 +85,6 @@ class SyntheticSource(StereoSource):
         least_frames: int = 3,
         T_map_world: Float64 | None = None,
     ) -> OccupancyTruth:
-        """Return the true obstacles, and which of them were seen; see `true_occupancy`."""
         return true_occupancy(
             self.camera,
             resolution_m=resolution_m,

@@ -34,12 +34,7 @@ def read_times(path: Path, frames: int) -> Float64:
 
 
 def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
-    """Return float64 (N,), the increasing times of pairs in a ``times.txt``; see `FrameList.lines`.
-
-    A line per frame has its time in seconds, or, as for DSO, its number, time and exposure.
-    """
-    if not path.exists():
-        raise SourceError("file does not exist", where=path)
+    """Return the increasing times of pairs: seconds, or number, seconds and exposure."""
     table, lines = read_table(path, (1, 3))
     seconds = table[:, table.shape[1] // 2]
     chosen = listing.lines(len(table))
@@ -58,11 +53,7 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
 
 @reader
 def read_dates(path: Path) -> Float64:
-    """Read KITTI raw's ``timestamps.txt``: a date and a time of day per line.
-
-    Returns:
-        float64 (N,), seconds since 1970, which a double resolves to 0.2 µs.
-    """
+    """Read KITTI raw's date and time of day per line: float64 (N,), seconds since 1970."""
     lines = enumerate(read_text(path).splitlines(), start=1)
     return np.array([_parse_date(s.strip(), f"{path}:{n}") for n, s in lines if s.strip()])
 
@@ -82,10 +73,7 @@ def _parse_date(text: str, where: str) -> float:
 
 @reader
 def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, str]]:
-    """Read time in seconds and file name of each line of TUM's ``rgb.txt`` or EuRoC's ``data.csv``.
-
-    Spaces or a comma separate the two; ``#`` starts a comment. EuRoC's ``unit_s`` is 1e-9.
-    """
+    """Read time [s] and file of each line of TUM's ``rgb.txt`` or EuRoC's ``data.csv`` (1e-9 s)."""
     entries = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
@@ -93,6 +81,7 @@ def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, 
             entries.append(_parse_entry(words, unit_s, f"{path}:{number}"))
     if not entries:
         raise FormatError("file lists no images", where=path)
+    check_increasing(np.array([stamp for stamp, _ in entries]), str(path))
     return entries
 
 
@@ -142,10 +131,7 @@ def stamp_of_name(stem: str) -> float | None:
 
 
 def stamps_of_names(stems: Sequence[str]) -> Float64 | None:
-    """Return float64 (N,), the seconds in all file names of a camera; None = a name has none.
-
-    Counters, such as KITTI's ``0000000123``, are no times.
-    """
+    """Return the seconds in all file names of a camera; None = one has none, or counts."""
     stamps = [stamp_of_name(stem) for stem in stems]
     if any(stamp is None for stamp in stamps) or _are_counters(stems):
         return None
@@ -153,11 +139,7 @@ def stamps_of_names(stems: Sequence[str]) -> Float64 | None:
 
 
 def _are_counters(stems: Sequence[str]) -> bool:
-    """Return whether names with as many digits as a timestamp count frames.
-
-    Today's times have no leading zero. Those of a clock that starts at 0 may have one, but are
-    many of their units (ms, µs or ns) apart, and no camera is timed in whole seconds.
-    """
+    """Return whether names with as many digits as a timestamp count frames."""
     if any("." in stem for stem in stems) or not stems[0].startswith("0"):
         return False
     steps = np.diff([int(stem) for stem in stems])

@@ -36,11 +36,9 @@ class VideoSource(Recording):
 
     @cached_property
     def files(self) -> Sequence[Path]:
-        """The calibration, then the videos."""
         return [*self.texts, *(video.path for video in self.videos)]
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Decode the pairs from number ``start`` on."""
         last_s, numbers = -np.inf, self.numbers[start:]
         views = zip(numbers, self._views(numbers), strict=True) if numbers else ()
         for index, ((number, _), (stamp_s, left, right)) in enumerate(views, start=start):
@@ -92,11 +90,11 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
     videos = open_videos(_find_videos(path, settings))
     frames = zip_longest(range(videos[0].frames), range(videos[-1].frames))
     numbers, listing = pair_frames(list(frames), settings, path)
-    size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
+    size = view_size(videos[0], settings) if len(videos) == 1 else videos[0].size_px
     home = path if path.is_dir() else resolved(path).parent
     rig, texts = read_rig(settings, home, size)
     rate_hz = settings.rate_hz or videos[0].rate_hz
-    layout = f"{settings.side_by_side} in one video" if len(videos) == 1 else "two videos"
+    layout = "two videos" if len(videos) == 2 else f"{settings.side_by_side} in one video"
     return VideoSource(
         name=resolved(path).name,
         description=f"{layout}, {rate_hz:g} Hz, paired frame by frame{listing}",
@@ -135,7 +133,7 @@ def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
             got=f"{video.width_px}x{video.height_px}",
             hint="for two videos: recon map LEFT --right RIGHT",
         )
-    width_px, height_px = _size(video)
+    width_px, height_px = video.size_px
     return (width_px, height_px // 2) if stacked else (width_px // 2, height_px)
 
 
@@ -145,10 +143,6 @@ def split_views(image: UInt8, settings: SourceSettings) -> tuple[UInt8, UInt8]:
     first, second = (np.ascontiguousarray(view) for view in np.split(image, 2, axis=axis))
     swapped = settings.side_by_side in {"right-left", "bottom-top"}
     return (second, first) if swapped else (first, second)
-
-
-def _size(video: VideoFile) -> tuple[int, int]:
-    return video.width_px, video.height_px
 
 
 def _find_videos(path: Path, settings: SourceSettings) -> list[Path]:
@@ -174,7 +168,7 @@ def _find_videos(path: Path, settings: SourceSettings) -> list[Path]:
 
 def _check_alike(left: VideoFile, right: VideoFile) -> None:
     both: dict[str, tuple[object, object]] = {
-        "sizes": ("{}x{}".format(*_size(left)), "{}x{}".format(*_size(right))),
+        "sizes": ("{}x{}".format(*left.size_px), "{}x{}".format(*right.size_px)),
         "frame rates": (round(left.rate_hz, 2), round(right.rate_hz, 2)),
     }
     if abs(left.frames - right.frames) > _LONGER * max(left.frames, right.frames):

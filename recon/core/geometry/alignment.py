@@ -34,7 +34,6 @@ class Similarity:
         freeze(self, "T_to_from", np.float64, (4, 4))
 
     def move(self, trajectory: Trajectory) -> Trajectory:
-        """Return the trajectory in the other frame."""
         poses = trajectory.T_world_camera.copy()
         poses[:, :3, 3] *= self.scale
         return Trajectory(self.T_to_from @ poses, trajectory.timestamps_s)
@@ -61,11 +60,7 @@ def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Simil
 
 
 def fit_upright(from_m: Float64, to_m: Float64) -> Similarity:
-    """Return the least-squares rigid transform between points (N, 3) of two frames whose z is up.
-
-    Each point counts with the one three metres above it. The points of a straight street alone,
-    such as positions by GNSS, would leave the roll about it to noise, and a map on its side.
-    """
+    """Return the least-squares rigid transform between points (N, 3) of frames whose z is up."""
     return fit_points(np.vstack([from_m, from_m + _UP_M]), np.vstack([to_m, to_m + _UP_M]))
 
 
@@ -102,26 +97,18 @@ def _distances_m(from_m: Float64, to_m: Float64, chosen: NDArray[Any]) -> Float6
 
 
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
-    """Return the rigid transform that brings a trajectory closest to another, pose by pose.
-
-    Each pose contributes its centre and the ends of its axes, as long as mapped points are
-    typically away: the centres of a nearly straight street leave the rotation about it to noise.
-    """
+    """Return the rigid transform between trajectories that fits centres and axes of their poses."""
     return fit_points(_axes_m(from_path), _axes_m(to_path))
 
 
 def _axes_m(path: Trajectory) -> Float64:
-    """Return float64 (N · 4, 3): centre and axis ends of each camera."""
     poses = path.T_world_camera
     tips = np.swapaxes(poses[:, :3, :3], 1, 2) * _AXIS_M + poses[:, None, :3, 3]
     return np.concatenate([poses[:, None, :3, 3], tips], axis=1).reshape(-1, 3)
 
 
 def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
-    """Return poses (N, 4, 4) at given times, between the poses before and after each.
-
-    Outside the time range of the trajectory it is the first or last pose.
-    """
+    """Return poses (N, 4, 4) at given times; outside of the trajectory, its first or last pose."""
     times = trajectory.timestamps_s
     after = np.clip(np.searchsorted(times, stamps_s), 1, max(1, len(times) - 1))
     after = np.minimum(after, len(times) - 1)
@@ -145,10 +132,7 @@ def pose_between(first: Float64, second: Float64, share: float) -> Float64:
 
 
 def nearest_sorted(numbers: NDArray[Any], others: NDArray[Any]) -> Int32:
-    """Return int32 (N,): for each number the index of the nearest of the others (M ≥ 1, sorted).
-
-    Of two that are equally near, it is the first.
-    """
+    """Return int32 (N,), the index of the nearest of sorted others (M ≥ 1); of two, the first."""
     after = np.clip(np.searchsorted(others, numbers), 0, len(others) - 1)
     before = np.maximum(after - 1, 0)
     earlier = np.abs(numbers - others[before]) <= np.abs(others[after] - numbers)

@@ -23,10 +23,7 @@ def unproject(
 def project(
     xyz: NDArray[Any], camera: RectifiedCamera
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return columns, rows and left-to-right disparity (N,) of points (N, 3) in camera axes.
-
-    Points at or behind the camera plane give NaN.
-    """
+    """Return columns, rows and disparity (N,) of points (N, 3), camera axes; behind it NaN."""
     z = np.where(xyz[:, 2] > 0, xyz[:, 2], np.nan)
     u = camera.focal_px * xyz[:, 0] / z + camera.cx_px
     v = camera.focal_px * xyz[:, 1] / z + camera.cy_px
@@ -41,10 +38,7 @@ def map_pixels(H: Float64, pixels: NDArray[Any]) -> Float64:
 
 
 def depth_from_disparity(disparity_px: NDArray[Any], camera: RectifiedCamera) -> Float32:
-    """Return the depth along the optical axis, ``Z = f·b / (d + doffs)``, float32.
-
-    It is NaN where the disparity is unknown (NaN) or not in front of the camera.
-    """
+    """Return ``Z = f·b / (d + doffs)``, float32; NaN where d is NaN or Z is not in front."""
     shifted = np.asarray(disparity_px, dtype=np.float64) + camera.doffs_px
     # A depth that overflows float32 is infinite.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

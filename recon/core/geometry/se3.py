@@ -81,10 +81,7 @@ def exp_so3(w: NDArray[Any]) -> Float64:
 
 
 def log_so3(R: NDArray[Any]) -> Float64:
-    """Return the rotation vector (3,), radians, of a rotation matrix; inverse of `exp_so3` up to π.
-
-    At π the sign of the axis is ambiguous; either may be returned.
-    """
+    """Return the rotation vector (3,), radians, of a rotation matrix; at π with either sign."""
     sine_axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = float(np.linalg.norm(sine_axis)), 0.5 * (float(np.trace(R)) - 1.0)
     if cosine > 0.0:
@@ -165,10 +162,7 @@ def rotation_from_quaternion(xyzw: NDArray[Any]) -> Float64:
 
 
 def quaternion_from_rotation(rotation: NDArray[Any]) -> Float64:
-    """Return the unit quaternion (4,) of a rotation matrix (3, 3), with ``w ≥ 0``.
-
-    By eigenvectors, which are accurate at all angles; the formula with the trace divides by almost
-    zero near 180 degrees.
+    """Return the unit quaternion (4,) of a rotation matrix, ``w ≥ 0``, accurate at all angles.
 
     Ref: Bar-Itzhack, New method for extracting the quaternion from a rotation matrix, 2000.
     """
@@ -181,15 +175,8 @@ def quaternion_from_rotation(rotation: NDArray[Any]) -> Float64:
     return -xyzw if xyzw[3] < 0 else xyzw
 
 
-def _rigid(rotation: list[list[int]]) -> Float64:
-    T = np.eye(4)
-    T[:3, :3] = rotation
-    return T
-
-
-_OF_CAMERA: Final = _rigid([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-_OF_MAP: Final = _rigid([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
-
+_OF_CAMERA: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+_OF_MAP: Final = np.array([[0.0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 T_YUP_FRAME: Final[Mapping[Frame, Float64]] = MappingProxyType(
     {"camera": _OF_CAMERA, "world": _OF_CAMERA, "map": _OF_MAP}
 )

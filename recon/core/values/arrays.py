@@ -21,10 +21,7 @@ Bool = NDArray[np.bool_]
 def frozen_array(
     name: str, value: Any, dtype: DTypeLike, shape: tuple[int | None, ...]
 ) -> NDArray[Any]:
-    """Check an array and return a read-only view of it; a length of None is any.
-
-    Nothing is converted: float64 in place of float32 is an error.
-    """
+    """Check an array without converting it, and return a read-only view; length None is any."""
     if not isinstance(value, np.ndarray):
         got, expected = type(value).__name__, _field_text(dtype, shape)
         raise ShapeError(f"{name} is not an array", got=got, expected=expected)
@@ -61,10 +58,7 @@ def array_in(
 
 
 def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Float32:
-    """Convert what a caller gives, any array of real numbers, to float32 (H, W).
-
-    Masked elements become NaN. Where a ``shape`` is given, a single number is allowed too: ().
-    """
+    """Convert real numbers to float32 (H, W), masked ones to NaN; with a ``shape`` also ()."""
     try:
         given = values if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
     except ValueError as error:  # rows of different lengths

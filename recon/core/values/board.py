@@ -93,13 +93,11 @@ class CalibrationBoard:
 
 
 def parse_board(text: str) -> CalibrationBoard:
-    """Parse the text form of a board.
+    """Parse the text form of a board; lengths are in mm, cm, m or in, bare numbers in metres.
 
     ``chess:9x6:25mm`` has 9 by 6 inner corners and squares of 25 mm;
-    ``charuco:8x6:30mm:22mm:5x5_100`` has 8 by 6 squares of 30 mm, with 22 mm markers of the
-    dictionary ``5x5_100`` (defaults: three quarters of a square, and that dictionary), and
-    ``:legacy`` behind it is OpenCV's layout before 4.6. Lengths are in mm, cm, m or in; a bare
-    number is in metres. Without a square size, see `CalibrationBoard.metric`.
+    ``charuco:8x6:30mm:22mm:5x5_100`` has 8 by 6 squares and 22 mm markers of that dictionary
+    (defaults: three quarters of a square, 5x5_100); ``:legacy`` is OpenCV's layout before 4.6.
     """
     kind, *parts = [part.strip() for part in text.strip().split(":")]
     if kind.lower() not in ("chess", "charuco") or not parts:

@@ -37,8 +37,6 @@ class CameraIntrinsics:
         matrix: float64 (3, 3), the camera matrix in pixels; pixel centres are at integers.
         distortion: float64 (N,). Pinhole: OpenCV's order (k1 k2 p1 p2 k3 …), empty = none;
             fisheye: always four (k1 k2 k3 k4).
-        width_px: Image width.
-        height_px: Image height.
         model: ``pinhole`` projects by the tangent of the angle to the optical axis, ``fisheye``
             by the angle itself (also called equidistant, or Kannala-Brandt).
     """
@@ -78,11 +76,8 @@ class CameraIntrinsics:
 class StereoCalibration:
     """Two raw cameras and their relative pose.
 
-    Attributes:
-        left: The left camera.
-        right: The right camera.
-        T_right_left: float64 (4, 4); ``xyz_right = apply(T_right_left, xyz_left)``, metres
-            (OpenCV's ``R`` and ``T``).
+    ``T_right_left`` is float64 (4, 4), metres (OpenCV's ``R`` and ``T``):
+    ``xyz_right = apply(T_right_left, xyz_left)``.
     """
 
     left: CameraIntrinsics
@@ -113,13 +108,8 @@ class RectifiedCamera:
     """A rectified stereo camera: rows aligned, one focal length, x axes along the baseline.
 
     Attributes:
-        focal_px: Focal length of both views.
-        cx_px: Column of the principal point of the left view.
+        cx_px: Column of the principal point of the left view; that of the right is ``cx_right_px``.
         cy_px: Row of the principal point of both views.
-        cx_right_px: Column of the principal point of the right view.
-        baseline_m: Distance between the camera centres.
-        width_px: Image width.
-        height_px: Image height.
         ndisp: Number of disparities to search, as given by the calibration file, or None.
     """
 
@@ -175,7 +165,6 @@ class RectifiedCamera:
 
     @property
     def right_matrix(self) -> Float64:
-        """float64 (3, 3) pinhole matrix of the right view."""
         matrix = self.matrix
         matrix[0, 2] = self.cx_right_px
         return matrix

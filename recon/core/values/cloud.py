@@ -87,13 +87,9 @@ def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointClou
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A surface of triangles.
+    """A surface: vertices float32 (V, 3), metres; faces int32 (F, 3), counter-clockwise outside.
 
-    Attributes:
-        vertices: float32 (V, 3), metres.
-        faces: int32 (F, 3), counter-clockwise seen from outside.
-        normals: float32 (V, 3) unit vectors, or None.
-        rgb: uint8 (V, 3), or None.
+    ``normals``, float32 (V, 3) unit vectors, and ``rgb``, uint8 (V, 3), may be None.
     """
 
     vertices: Float32
@@ -148,7 +144,6 @@ class RayCloud:
         return len(self.places)
 
     def cloud(self) -> PointCloud:
-        """Return the end points as a cloud; ``count`` is the number of averaged points."""
         return PointCloud(
             self.places * np.float32(self.unit_m),
             sigma_m=self.sigma_m.astype(np.float32),

@@ -27,10 +27,8 @@ def log_odds(probability: float) -> float:
 class OccupancyVoxels:
     """The observed voxels of a 3-D map; voxels that are not listed are unknown.
 
-    Attributes:
-        keys: int32 (N, 3); voxel ``k`` spans ``[k, k + 1) · resolution_m`` on each axis of the map.
-        log_odds: float32 (N,), natural logarithm; above 0 = occupied.
-        resolution_m: Edge length of a voxel.
+    ``keys`` is int32 (N, 3): voxel ``k`` spans ``[k, k + 1) · resolution_m`` on each axis of the
+    map; ``log_odds`` is float32 (N,), natural logarithm, above 0 = occupied.
     """
 
     keys: Int32
@@ -50,7 +48,6 @@ class OccupancyVoxels:
         return len(self.keys)
 
     def select(self, which: Bool) -> OccupancyVoxels:
-        """Return the voxels of a boolean mask (N,)."""
         return OccupancyVoxels(self.keys[which], self.log_odds[which], self.resolution_m)
 
     @property
@@ -72,11 +69,8 @@ def join_voxels(parts: Iterable[OccupancyVoxels], resolution_m: float) -> Occupa
 class OccupancyGrid:
     """A 2-D occupancy grid in map axes, with the conventions of ROS.
 
-    Attributes:
-        cells: int8 (rows, columns): FREE, OCCUPIED or UNKNOWN; row 0 has the smallest y,
-            column 0 the smallest x.
-        resolution_m: Cell size.
-        origin_m: (x, y) of the outer corner of cell (0, 0).
+    ``cells`` is int8 (rows, columns) of FREE, OCCUPIED or UNKNOWN, from the smallest y and x on;
+    ``origin_m`` is (x, y) of the outer corner of cell (0, 0).
     """
 
     cells: NDArray[np.int8]

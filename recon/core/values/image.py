@@ -30,8 +30,7 @@ class StereoPair:
     """Two images taken at the same time, as delivered by a source.
 
     Attributes:
-        left: uint8 (H, W) grey or (H, W, 3) RGB.
-        right: The same shape as ``left``.
+        left, right: uint8 (H, W) grey or (H, W, 3) RGB, of one size.
         timestamp_s: Time of exposure.
         index: Number of the frame in its source.
         name: Name shown to the user: the file name of the left image.
@@ -69,14 +68,10 @@ class RectifiedPair:
     Slices of other images are copied: kernels would be compiled anew for their layout.
 
     Attributes:
-        left: uint8 (H, W), grey.
-        right: uint8 (H, W), grey.
-        camera: Geometry of both views.
-        left_rgb: uint8 (H, W, 3) colour of the left view, or None where the source is grey.
-        right_rgb: The same of the right view.
+        left, right: uint8 (H, W), grey.
+        left_rgb, right_rgb: uint8 (H, W, 3) colour, or None where the source is grey.
         valid: bool (H, W), False where rectification had no source pixel; None = all valid.
-        timestamp_s: Time of exposure.
-        index: Number of the frame in its source.
+        timestamp_s, index: Those of the `StereoPair`.
     """
 
     left: UInt8
@@ -162,15 +157,14 @@ class Disparity:
         confidence: ArrayLike = ASSUMED_CONFIDENCE,
         sigma_px: ArrayLike = ASSUMED_SIGMA_PX,
     ) -> Self:
-        """Build a disparity map from a bare array, such as the output of another program.
+        """Build a disparity map from a bare array (H, W), such as the output of another program.
 
-        NaN, infinite, zero and negative values are no match; their reason is AMBIGUOUS. The
+        NaN, infinite, zero, negative and masked values are no match; their reason is AMBIGUOUS. The
         defaults are measured with OpenCV's matchers on MiddEval3 at quarter size: 90 to 92 % of
         the disparities they keep are within a pixel, and 68 % within a quarter.
 
         Args:
-            values: (H, W) of any real dtype, ``x_left - x_right`` in pixels. Masked elements of a
-                masked array are no match.
+            values: (H, W) of any real dtype, ``x_left - x_right`` in pixels.
             confidence: A number or (H, W), in [0, 1]: how probable it is that a match is right.
             sigma_px: A number or (H, W), above 0: standard deviation of the matches, pixels.
 
@@ -221,7 +215,6 @@ class Disparity:
 
 
 def _where(mask: Bool, inside: Float32, outside: float) -> Float32:
-    """Return float32 (H, W): ``inside`` (N,) where the mask is True, else a constant."""
     filled = np.full(mask.shape, outside, dtype=np.float32)
     filled[mask] = inside
     return filled

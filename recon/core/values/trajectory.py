@@ -16,12 +16,9 @@ from recon.core.values.arrays import Float64, freeze
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of the left camera.
+    """Poses of the left camera, float64 (N, 4, 4), metres, and not decreasing times, float64 (N,).
 
-    Attributes:
-        T_world_camera: float64 (N, 4, 4), metres;
-            ``xyz_world = apply(T_world_camera, xyz_camera)``.
-        timestamps_s: float64 (N,), not decreasing.
+    ``xyz_world = apply(T_world_camera, xyz_camera)``.
     """
 
     T_world_camera: Float64
@@ -62,5 +59,4 @@ class Trajectory:
 
     @property
     def path_length_m(self) -> float:
-        """Length of the whole path."""
         return float(self.distances_m[-1]) if len(self) else 0.0

@@ -46,16 +46,10 @@ class DisparityTruth:
 
     @classmethod
     def from_values(cls, values: ArrayLike, nonocc: ArrayLike | None = None) -> Self:
-        """Build a ground truth from a bare array.
+        """Build a ground truth from an array (H, W), any real dtype, pixels; above 0 = known.
 
-        Args:
-            values: (H, W) of any real dtype, pixels; NaN, infinite, zero and negative values are
-                unknown.
-            nonocc: bool (H, W), True where both cameras see the point, or the levels of a mask of
-                Middlebury, 255 there; None = both see everything.
-
-        Raises:
-            ShapeError: An array has the wrong shape or dtype.
+        ``nonocc`` is bool (H, W), True where both cameras see the point, or the levels of a mask of
+        Middlebury, 255 there; None = both see everything. Others are a `ShapeError`.
         """
         found = float_map("truth", values)
         known = np.isfinite(found) & (found > 0)

@@ -46,23 +46,14 @@ def read_calibration(
     """Read the calibration of images of one size from a file of any supported format.
 
     Supported are our own YAML, KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt`` (its rectified or
-    raw cameras, according to the image size), Middlebury's ``calib.txt``, OpenCV's ``FileStorage``
-    files, ROS CameraInfo (either of the two files; the other is expected in the same folder), and
-    kalibr's camera chain.
-
-    Args:
-        path: The file.
-        width_px: Image width; None = that of the file, which KITTI's and some of OpenCV's lack.
-        height_px: Image height.
-        metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
-        cameras: Left and right camera of a KITTI file; None = the grey pair if it has one.
-
-    Returns:
-        A `RectifiedCamera` if the images are already rectified.
+    raw ``cameras``, according to the image size; None = the grey pair if it has one), Middlebury's
+    ``calib.txt``, OpenCV's ``FileStorage`` files (translation in so many ``metres_per_unit``), ROS
+    CameraInfo (either of the two files; the other is expected in the same folder), and kalibr's
+    camera chain. Rectified images give a `RectifiedCamera`.
 
     Raises:
         FormatError: The file is missing, damaged or of an unknown format, or it does not contain
-            the image size and none is given.
+            the image size (KITTI's and some of OpenCV's do not) and none is given.
         CalibrationError: The calibration cannot give depth, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)

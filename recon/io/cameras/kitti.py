@@ -36,11 +36,7 @@ _RAW_LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE | r
 def read_kitti_calib(
     path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int] = GREY_CAMERAS
 ) -> RectifiedCamera:
-    """Read the rectified camera of one stereo pair, from either kind of file.
-
-    ``P = K·[I | t]`` with ``t`` relative to camera 0. The baseline is the distance of the two
-    cameras along x, so it holds for the colour pair too.
-    """
+    """Read the rectified camera of one stereo pair from either kind of file."""
     left, right = (_projection(path, camera) for camera in cameras)
     if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
         raise CalibrationError(
@@ -48,6 +44,7 @@ def read_kitti_calib(
             hint="a rectified pair shares them; rectify the images first",
         )
     check_unsized((float(left[0, 2]), float(left[1, 2])), width_px, height_px, path)
+    # ``t`` is relative to camera 0, also of the colour pair.
     baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
     return RectifiedCamera.from_matrices(left, right, baseline_m, width_px, height_px)
 
@@ -76,7 +73,6 @@ def list_kitti_cameras(path: StrPath) -> frozenset[int]:
 
 
 def _projection(path: StrPath, camera: int) -> Float64:
-    """Read float64 (3, 4), the projection matrix of one camera."""
     rows = {int(number): row for number, row in _LINE.findall(read_text(path))}
     name = f"P{camera}"
     if camera not in rows:
@@ -129,6 +125,5 @@ def _camera(fields: Fields, camera: int, size: tuple[int, ...]) -> CameraIntrins
 
 
 def _pose(fields: Fields, camera: int) -> Float64:
-    """Return ``T_camera_camera0``."""
     rotation = fields.numbers(f"R_{camera:02d}", (3, 3))
     return make_transform(rotation, fields.numbers(f"T_{camera:02d}", (3,)))

@@ -54,12 +54,9 @@ def read_opencv_calibration(
 ) -> StereoCalibration:
     """Read two raw cameras (``M1 D1 M2 D2``, or ``cameraMatrix1`` …) and their pose (``R T``).
 
-    Args:
-        path: One file, or the first of OpenCV's pair: if it has no ``R``, the file beside it that
-            has ``extrinsics`` in place of ``intrinsics`` in its name is read too.
-        size_px: (width, height) of the images, for files that do not state it.
-        metres_per_unit: Unit of ``T`` in metres: 0.001 for millimetres, or the square size if the
-            board was calibrated with squares of size 1.
+    Of OpenCV's pair, a file without ``R``, the file with ``extrinsics`` in place of ``intrinsics``
+    in its name is read too. ``size_px`` (width, height) is for files that do not state it;
+    ``metres_per_unit`` is the unit of ``T``, such as the square size of a board of squares of 1.
     """
     nodes = read_file_storage(path)
     stated = _size(nodes)
@@ -98,10 +95,7 @@ def read_opencv_calibration(
 
 
 def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
-    """Write one YAML file for OpenCV's ``FileStorage``, ``T`` in metres, atomically.
-
-    OpenCV defines no key for the lens model; fisheye cameras are marked by ``distortion_model``.
-    """
+    """Write one YAML file for OpenCV's ``FileStorage``, ``T`` in metres, atomically."""
     models = {calibration.left.model, calibration.right.model}
     if len(models) > 1:
         raise CalibrationError("an OpenCV file cannot store two lens models", where=path)
@@ -119,7 +113,6 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
 
 
 def _model(nodes: Nodes) -> LensModel | None:
-    """Return the lens model named in a file, if any."""
     named = {str(nodes[name]).lower() for name in _MODEL if name in nodes}
     if not named:
         return None
@@ -170,7 +163,6 @@ def _camera(
 
 
 def _size(nodes: Nodes) -> tuple[int, int] | None:
-    """Return image width and height, if the file states them."""
     width, height, both = (_find(nodes, names) for names in (_WIDTH, _HEIGHT, _SIZE))
     if width is not None and height is not None:
         return int(width), int(height)
@@ -181,12 +173,8 @@ def _size(nodes: Nodes) -> tuple[int, int] | None:
 
 @reader
 def read_file_storage(path: StrPath) -> Nodes:
-    """Read what is at the top level of a file: numbers, lists and matrices of them, and texts.
-
-    They are float64 () or (N,), the data of a matrix row by row. OpenCV's own parser is not used:
-    on content from outside it overflows its stack, does not end, or allocates whatever size a
-    matrix claims.
-    """
+    """Read the top level: texts, and numbers as float64 () or (N,), matrices row by row."""
+    # OpenCV's own parser overflows its stack, does not end, or allocates what a matrix claims.
     text = read_text(path, SMALL_FILE_BYTES)
     try:
         nodes = _parse(text, path)
@@ -211,7 +199,6 @@ def _parse(text: str, path: StrPath) -> Any:
 
 
 def _xml_node(element: ET.Element) -> Any:
-    """Return a list or text, and a mapping for a matrix."""
     data = element.find("data")
     if data is not None:
         return {"data": (data.text or "").split()}

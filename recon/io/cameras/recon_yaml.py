@@ -33,10 +33,7 @@ _RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
 def write_recon_calibration(
     path: StrPath, calibration: Rig, quality: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a calibration atomically; `read_recon_calibration` restores it bit by bit.
-
-    Figures of its ``quality`` are stored with it as plain values, and not read back.
-    """
+    """Write a calibration atomically; figures of its ``quality`` are not read back."""
     content = {"format": MARK, "version": _VERSION, **_content(calibration)}
     if quality:
         content["quality"] = dict(quality)

@@ -63,11 +63,7 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
 
 @reader
 def read_camera_info(path: StrPath) -> StereoCalibration:
-    """Read a rig from either of its two files; the other is found by its name.
-
-    The pose of the right camera follows from the two rectifying rotations and
-    ``P[0, 3] = -fx · baseline``.
-    """
+    """Read a rig from either of its two files; its pose follows from ``R`` and ``P[0, 3]``."""
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
@@ -84,11 +80,7 @@ def rig_of_camera_infos(
     P_right: Float64,
     where: StrPath,
 ) -> StereoCalibration:
-    """Return the rig of two CameraInfos, from files or messages (``where``: file or topic).
-
-    Each camera has its rectifying rotation (3, 3); ``P_right`` is the projection matrix (3, 4) of
-    the rectified right one.
-    """
+    """Return the rig of cameras and their rectifying rotations (3, 3); ``P_right`` is (3, 4)."""
     check_shift(P_right, 0.0, where)
     offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
     with reading(where):
@@ -97,10 +89,7 @@ def rig_of_camera_infos(
 
 
 def check_shift(P_right: Float64, left_shift: float, where: StrPath) -> None:
-    """Check that the projection matrix (3, 4) of the right camera contains a baseline.
-
-    ``left_shift`` is ``P[0, 3]`` of the left camera, usually 0.
-    """
+    """Check that the right ``P`` (3, 4) has a baseline; ``left_shift`` is the left ``P[0, 3]``."""
     shift = float(P_right[0, 3]) - left_shift
     if shift < 0:
         return
@@ -141,10 +130,7 @@ def write_camera_info(
     rotations: tuple[Float64, Float64],
     rectified: RectifiedCamera,
 ) -> tuple[Path, Path]:
-    """Write the two files of a rig (`camera_info_paths`), each atomically.
-
-    The rotations (3, 3) are those from the raw axes of each camera to the rectified axes.
-    """
+    """Write both files of a rig, each atomically; rotations (3, 3) lead to rectified axes."""
     paths = camera_info_paths(path)
     cameras = (calibration.left, calibration.right)
     shifts = (0.0, -rectified.focal_px * rectified.baseline_m)
@@ -203,7 +189,6 @@ def _kalibr_camera(fields: Fields, path: StrPath) -> CameraIntrinsics:
 def _camera(
     fields: Fields, models: Models, name: str, coefficients: str, path: StrPath
 ) -> CameraIntrinsics:
-    """Return the camera of ``resolution``, ``intrinsics`` and the field of coefficients."""
     model, distortion = lens_of(models, name, fields.numbers(coefficients), path)
     width, height = fields.numbers("resolution", (2,))
     matrix = pinhole_matrix(*fields.numbers("intrinsics", (4,)))
@@ -242,10 +227,7 @@ def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
 
 @reader
 def read_euroc_truth(path: StrPath) -> Trajectory:
-    """Read the true ``T_world_body``: ``time [ns], x y z, qw qx qy qz``, and more columns.
-
-    The world is the frame of the motion capture.
-    """
+    """Read the true ``T_world_body``: ``time [ns], x y z, qw qx qy qz``, and more columns."""
     # Position and quaternion, with or without velocity and biases.
     table, _ = read_table(path, (17, 8))
     poses = [make_transform(rotation_from_quaternion(row[[5, 6, 7, 4]]), row[1:4]) for row in table]

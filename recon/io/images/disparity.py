@@ -26,13 +26,10 @@ def read_disparity(path: StrPath) -> Float32:
 
 @reader
 def read_pfm(path: StrPath) -> Float32:
-    """Read a grey PFM file.
+    """Read a grey PFM file: float32 (H, W), first row at the top; NaN where it has ±inf or NaN.
 
     The sign of the scale gives the byte order. Its magnitude is ignored, as in Middlebury's own
     reader: their files have 1/255 there, but the values are pixels.
-
-    Returns:
-        float32 (H, W), first row at the top; NaN where the file has ±inf or NaN.
 
     Raises:
         FormatError: The file is missing, truncated, not a PFM, or a colour PFM.
@@ -76,10 +73,7 @@ def write_pfm(path: StrPath, values: Float32) -> None:
 
 @reader
 def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
-    """Read a disparity stored as grey levels of 8 or 16 bits: float32 (H, W), NaN where it is 0.
-
-    The scale is in levels per pixel: 256 in KITTI; 4, 8 or 16 in Middlebury.
-    """
+    """Read grey levels, so many per pixel (256 in KITTI): float32 (H, W), NaN where it is 0."""
     levels = read_grey_levels(path)
     if levels.dtype == np.uint8 and scale > 255:
         raise FormatError("disparity image has 8 bits", expected="16 bits")
@@ -89,10 +83,7 @@ def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
 
 
 def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0) -> None:
-    """Write a disparity, float32 (H, W), as a 16-bit PNG atomically; for ``scale`` see above.
-
-    A disparity that would round to 0, unknown, becomes level 1, as in KITTI's own writer.
-    """
+    """Write ``scale · disparity``, at least 1, as 16-bit grey levels, atomically; 0 = NaN."""
     frozen_array("values", values, np.float32, (None, None))
     known = np.isfinite(values)
     levels = np.rint(np.where(known, values, 0).astype(np.float64) * scale)

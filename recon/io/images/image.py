@@ -55,20 +55,15 @@ _ENCODINGS: Final[dict[str, tuple[int, int, int | None]]] = {
 def read_image(
     path: StrPath, white: int = FULL_WHITE, max_megapixels: float = MAX_MEGAPIXELS
 ) -> UInt8:
-    """Read an image for display or matching: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
+    """Read PNG, JPEG, PGM, PPM, BMP or TIFF: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    16-bit images are scaled to 8 bits, linearly. An alpha channel is dropped. The EXIF orientation
-    is ignored: a calibration refers to the pixels as the sensor recorded them.
-
-    Args:
-        path: PNG, JPEG, PGM, PPM, BMP or TIFF, recognised by content.
-        white: The 16-bit value that becomes 255, see `find_white`; the same for all images of a
-            drive.
-        max_megapixels: Refuse larger images, in 10⁶ pixels.
+    16 bits are scaled to 8, linearly: ``white``, the same for all images of a drive (`find_white`),
+    becomes 255. An alpha channel is dropped. The EXIF orientation is ignored: a calibration refers
+    to the pixels as the sensor recorded them.
 
     Raises:
-        FormatError: The file is missing, empty, truncated, not an image, too large, or has
-            floating-point pixels.
+        FormatError: The file is missing, empty, truncated, not an image, has more than
+            ``max_megapixels`` (10⁶ pixels), or floating-point pixels.
     """
     return eight_bits(read_levels(path, max_megapixels), white)
 
@@ -82,10 +77,7 @@ def eight_bits(levels: NDArray[Any], white: int = FULL_WHITE) -> UInt8:
 
 
 def find_white(images: Iterable[NDArray[Any]]) -> int:
-    """Return the largest value that the sensor of some images can give: 2^n - 1, 8 to 16 bits.
-
-    Cameras of 10, 12 or 14 bits often store their values unscaled in 16 bits.
-    """
+    """Return the largest value of a sensor of 8 to 16 bits, 2^n - 1; values may be unscaled."""
     brightest = max((int(image.max()) for image in images if image.size), default=FULL_WHITE)
     return int(2 ** max(8, brightest.bit_length()) - 1)
 
@@ -156,11 +148,8 @@ def write_image(path: StrPath, image: NDArray[Any]) -> None:
 
 @contextmanager
 def silent_opencv() -> Iterator[None]:
-    """Stop OpenCV from logging to standard error what we raise as an exception anyway.
-
-    The log level is shared by all threads, hence the lock.
-    """
-    log = cv2.utils.logging
+    """Stop OpenCV from logging to standard error what we raise as an exception anyway."""
+    log = cv2.utils.logging  # whose level all threads share
     with _LOG_LEVEL_LOCK:
         before = log.getLogLevel()
         log.setLogLevel(log.LOG_LEVEL_SILENT)
@@ -204,8 +193,7 @@ def pixels_of_ros_image(
 ) -> UInt8:
     """Decode the bytes (N,) of a ROS image message: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    Each row of the ``shape`` (H, W) is ``step`` bytes long. 16-bit pixels are scaled over their
-    full range to 8 bits, as in image files.
+    Rows are ``step`` bytes long. 16-bit pixels are scaled over their full range to 8 bits.
 
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """

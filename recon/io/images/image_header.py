@@ -51,10 +51,7 @@ _DIAGONAL_35MM: Final = math.hypot(36.0, 24.0)
 
 
 def check_image_bytes(content: bytes) -> None:
-    """Check that the content of a file is a complete image of a supported format.
-
-    For TIFF only the format is checked: its decoder does reject truncated files.
-    """
+    """Check that the content is a complete image; of TIFF the decoder does, not this."""
     if content.startswith(_PNG_START):
         _check_png(content)
     elif content.startswith(_JPEG_START):

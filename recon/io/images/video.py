@@ -26,16 +26,17 @@ _COUNT_TOLERANCE: Final = 2
 
 @dataclass(frozen=True)
 class VideoFile:
-    """A video file as its container describes it, checked against its packets.
-
-    The size is that of a frame as recorded; an orientation tag is ignored.
-    """
+    """A video file as its container and packets describe it; an orientation tag is ignored."""
 
     path: Path
     frames: int
     width_px: int
     height_px: int
     rate_hz: float
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        return self.width_px, self.height_px
 
     def pick(self, numbers: Iterable[int]) -> Iterator[tuple[float, UInt8]]:
         """Yield frames of increasing numbers: seconds from the start, and uint8 (H, W, 3) RGB."""
@@ -90,7 +91,6 @@ def open_video(path: StrPath) -> VideoFile:
 
 
 def _count(path: Path) -> int:
-    """Return the number of packets; a video stream has one per frame."""
     with _opened(path) as capture:
         capture.set(cv2.CAP_PROP_FORMAT, -1)  # raw packets, not decoded
         count = 0

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError, OutputError, SettingsError
 from recon.core.geometry.se3 import T_YUP_FRAME
 from recon.core.values import TriangleMesh
-from recon.core.values.arrays import Int32, UInt8
+from recon.core.values.arrays import UInt8
 from recon.core.values.cloud import Frame
 from recon.io.atomic import atomic_path, write_bytes
 from recon.io.files import StrPath, reader
@@ -40,15 +40,10 @@ _UNLIT: Final = "KHR_materials_unlit"
 
 
 def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
-    """Write a mesh atomically.
+    """Write a mesh atomically, as .ply, .obj, .stl or .glb by the suffix of the file.
 
     PLY is binary with float vertices. PLY, OBJ and GLB keep normals and colours; STL has neither.
-    GLB is glTF 2.0 in one file.
-
-    Args:
-        path: The file; its suffix (.ply, .obj, .stl or .glb) gives the format.
-        mesh: The mesh.
-        frame: Axes of its vertices, so that GLB viewers show it upright; None = unknown.
+    GLB is glTF 2.0 in one file, which viewers show upright if the ``frame`` of the axes is known.
 
     Raises:
         OutputError: The suffix is unknown, the mesh has no face, or the file cannot be written.
@@ -80,10 +75,9 @@ def check_mesh_formats(formats: Sequence[str]) -> None:
 
 
 def join_meshes(path: StrPath, parts: Sequence[tuple[Path, int, int]]) -> None:
-    """Join the meshes of several PLY files into one PLY, with at most two in memory.
+    """Join PLY meshes with the same fields, at most two in memory, into one PLY, atomically.
 
-    Each of the ``parts``, at least one, is a file and its numbers of vertices and faces; all have
-    the same fields. The file is written atomically.
+    Each of the ``parts``, at least one, is a file and its numbers of vertices and faces.
     """
     files, vertices, faces = zip(*parts, strict=True)
     starts = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)
@@ -140,24 +134,18 @@ def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
 
 def _read_ply(path: StrPath) -> TriangleMesh:
     _, tables = read_tables(path, ["vertex", "face"])
-    vertex, faces = tables.get("vertex"), _faces(tables.get("face"))
-    if vertex is None or faces is None or len(faces) == 0:
+    vertex, face = tables.get("vertex"), tables.get("face", np.zeros(0))
+    name = next((name for name in _INDICES if name in (face.dtype.names or ())), None)
+    if vertex is None or name is None or len(face) == 0:
         raise FormatError("the PLY file has no faces: it is a point cloud")
+    faces = face[name].astype(np.int32)
     return TriangleMesh(positions_of(vertex), faces, normals_of(vertex), colours_of(vertex))
 
 
-def _faces(table: Table | None) -> Int32 | None:
-    for name in _INDICES:
-        if table is not None and name in (table.dtype.names or ()):
-            return table[name].astype(np.int32)
-    return None
-
-
 def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
-    """Write a mesh as GLB with float vertices, without changing its coordinates.
+    """Write a GLB with float vertices; its node is turned to glTF's y up if the frame is known.
 
-    The y axis of glTF is up, so the node of the mesh is rotated upright if the frame is known. Its
-    colours are linear: sRGB is converted, to 16 bits to keep dark tones distinct.
+    Colours of glTF are linear: sRGB is converted, to 16 bits to keep dark tones distinct.
 
     Ref: Khronos Group, "glTF 2.0 specification", sections 3.6 (buffers), 3.7 (meshes), 4.4 (GLB).
     """
@@ -224,6 +212,5 @@ def _described(arrays: list[NDArray[Any]]) -> tuple[list[dict[str, Any]], list[d
 
 
 def _chunk(kind: bytes, content: bytes, filler: bytes) -> bytes:
-    """Return one chunk of the container, padded to a multiple of four bytes."""
     content += filler * (-len(content) % 4)
     return struct.pack("<I4s", len(content), kind) + content

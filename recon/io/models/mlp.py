@@ -84,7 +84,6 @@ def _add_photo(group: ET.Element, photo: Photo, project: Path) -> None:
 
 
 def _rows(T: Float64) -> str:
-    """Return a matrix as MeshLab writes it, one row per line."""
     return "\n" + "".join(" ".join(f"{x:g}" for x in row) + " \n" for row in T)
 
 

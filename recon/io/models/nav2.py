@@ -33,10 +33,7 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s
 
 
 def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
-    """Write ``path.pgm``, ``path.wld`` for a GIS, and ``path.yaml``, each atomically.
-
-    The path has no suffix, such as ``map/grid``; those of the image and the YAML are returned.
-    """
+    """Write ``path.pgm``, ``path.wld`` for a GIS and ``path.yaml``, each atomically."""
     stem = Path(path)
     image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
     rows, columns = grid.cells.shape
@@ -120,7 +117,6 @@ def _fields(path: Path) -> dict[str, Any]:
 
 @reader
 def _read_pgm(path: Path) -> UInt8:
-    """Read a binary 8-bit PGM, uint8 (rows, columns)."""
     content = read_bytes(path)
     header = _PGM_HEADER.match(content)
     if header is None or int(header[3]) != 255:

@@ -57,10 +57,7 @@ _MOST_GROWTH: Final = 64
 def write_octomap_tiles(
     path: StrPath, tiles: Iterable[OccupancyVoxels], depth: int, resolution_m: float
 ) -> tuple[Path, Path]:
-    """Write ``path.bt`` and ``path.ot`` from tiles of a map, with one tile in memory at a time.
-
-    Every cube with a side of ``2^depth`` cells (depth 1 to 15) lies in one tile.
-    """
+    """Write ``path.bt`` and ``.ot`` from tiles of whole cubes of side ``2^depth``, in turn."""
     stem = Path(path)
     binary, full = (stem.with_name(f"{stem.name}.{end}") for end in ("bt", "ot"))
     with (
@@ -77,10 +74,7 @@ def write_octomap_tiles(
 
 @dataclass
 class _Node:
-    """A node of the tree above the cubes, or the root of a cube.
-
-    The branch of a node has its own bytes; that of a cube has none, they are in the temporary file.
-    """
+    """A node above the cubes, or the root of a cube, whose bytes are in the temporary file."""
 
     cube: Cube  # its index among the cubes of its size
     branch: Branch
@@ -220,7 +214,6 @@ def _expand(leaves: Leaves) -> tuple[Int32, NDArray[np.intp]]:
 
 
 def _read_header(file: IO[bytes]) -> tuple[int, float]:
-    """Read the number of nodes and the cell size; leave the file just after the header."""
     first = file.readline(200).strip()
     if first != _FULL_TREE:
         raise FormatError("not an .ot OctoMap file", got=first[:40])
@@ -279,10 +272,7 @@ def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
 
 
 def join_branches(children: dict[int, Branch]) -> Branch:
-    """Return the parent node of branches by their index 0 to 7: its own bytes; theirs follow.
-
-    Bit 0 of the index is x, bit 1 y, bit 2 z.
-    """
+    """Return the parent node of branches by index: bit 0 is x, bit 1 y, bit 2 z."""
     value = max(child.value for child in children.values())
     kinds = {child.kind for child in children.values()}
     nodes = 1 + sum(child.nodes for child in children.values())
@@ -303,7 +293,6 @@ def _parents_kind(kinds: _Index, begin: _Index) -> _Index:
 
 
 def _encode_full(codes: list[_Index], values: list[Float32], begins: list[_Index]) -> bytes:
-    """Encode every node as its value and one bit per child."""
     everywhere = [np.ones(len(code), dtype=np.bool_) for code in codes]
     places = _places(everywhere, begins, 5)
     out = np.zeros(5 * sum(map(len, codes)), np.uint8)

@@ -18,8 +18,15 @@ from recon.io.files import StrPath
 
 def write_mesh(path: StrPath, mesh: TriangleMesh) -> None:
     """Write OBJ or STL, chosen by the suffix."""
+    surface = _surface(mesh.vertices, mesh.faces)
+    if mesh.normals is not None:
+        normals = np.array(mesh.normals, dtype=np.float64)
+        surface.vertex_normals = o3d.utility.Vector3dVector(normals)
+    if mesh.rgb is not None:
+        surface.vertex_colors = o3d.utility.Vector3dVector(mesh.rgb.astype(np.float64) / 255)
     with _quiet():
-        written = o3d.io.write_triangle_mesh(Path(path), _legacy(mesh))
+        surface.compute_triangle_normals()
+        written = o3d.io.write_triangle_mesh(Path(path), surface)
     if not written:
         raise OutputError("Open3D could not write the mesh", where=path)
 
@@ -30,19 +37,18 @@ def read_mesh(path: StrPath) -> TriangleMesh:
         mesh = o3d.io.read_triangle_mesh(Path(path))
     if not mesh.has_triangles():
         raise FormatError("the file has no triangles that Open3D can read", where=path)
+    normals = np.asarray(mesh.vertex_normals).astype(np.float32)
+    rgb = np.rint(np.asarray(mesh.vertex_colors) * 255).astype(np.uint8)
     return TriangleMesh(
         vertices=np.asarray(mesh.vertices).astype(np.float32),
         faces=np.asarray(mesh.triangles).astype(np.int32),
-        normals=_normals(mesh),
-        rgb=_colours(mesh),
+        normals=normals if mesh.has_vertex_normals() else None,
+        rgb=rgb if mesh.has_vertex_colors() else None,
     )
 
 
 def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32, Int32]:
-    """Label the connected components of a mesh.
-
-    The result is int32 (F,), component of each face, and int32 (C,), faces of each component.
-    """
+    """Return int32 (F,), the connected component of each face, and int32 (C,), their sizes."""
     with _quiet():
         labels, sizes, _ = _surface(vertices, faces).cluster_connected_triangles()
     return np.asarray(labels).astype(np.int32), np.asarray(sizes).astype(np.int32)
@@ -75,29 +81,6 @@ def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
         o3d.utility.Vector3dVector(np.array(vertices, dtype=np.float64)),
         o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),
     )
-
-
-def _legacy(mesh: TriangleMesh) -> Any:
-    surface = _surface(mesh.vertices, mesh.faces)
-    if mesh.normals is not None:
-        normals = np.array(mesh.normals, dtype=np.float64)
-        surface.vertex_normals = o3d.utility.Vector3dVector(normals)
-    if mesh.rgb is not None:
-        surface.vertex_colors = o3d.utility.Vector3dVector(mesh.rgb.astype(np.float64) / 255)
-    surface.compute_triangle_normals()
-    return surface
-
-
-def _normals(mesh: Any) -> Float32 | None:
-    if not mesh.has_vertex_normals():
-        return None
-    return np.asarray(mesh.vertex_normals).astype(np.float32)
-
-
-def _colours(mesh: Any) -> NDArray[np.uint8] | None:
-    if not mesh.has_vertex_colors():
-        return None
-    return np.asarray(np.rint(np.asarray(mesh.vertex_colors) * 255), dtype=np.uint8)
 
 
 def _quiet() -> Any:

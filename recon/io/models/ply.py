@@ -13,13 +13,7 @@ from recon.core.errors import FormatError
 from recon.core.values import Frame, PointCloud
 from recon.core.values.arrays import Float32, UInt8
 from recon.io.files import StrPath, reader
-from recon.io.models.ply_tables import (
-    PlyHeader,
-    Table,
-    read_tables,
-    write_table_stream,
-    write_tables,
-)
+from recon.io.models.ply_tables import Table, read_tables, write_table_stream, write_tables
 
 _XYZ: Final = ("x", "y", "z")
 _NORMAL: Final = ("nx", "ny", "nz")
@@ -44,19 +38,11 @@ def write_ply(
     quality: Float32 | None = None,
     ascii: bool = False,  # noqa: A002 - what the format calls it
 ) -> None:
-    """Write a cloud atomically, binary little endian unless ``ascii``.
+    """Write a cloud atomically, binary little endian, or text with the same values if ``ascii``.
 
-    Positions and normals are float, colours uchar; ``quality`` is the confidence; sigma, weight and
-    count are written under their names if the cloud has them. The frame is a comment.
-
-    Args:
-        path: The file.
-        cloud: The cloud.
-        quality: float32 (N,), written as ``quality`` instead of the confidence.
-        ascii: Write text (larger and slower, with the same values).
-
-    Raises:
-        OutputError: The file cannot be written.
+    Positions and normals are float, colours uchar; ``quality``, float32 (N,), is the confidence
+    unless it is given; sigma, weight and count are written under their names if the cloud has them.
+    The frame is a comment. A file that cannot be written is an `OutputError`.
     """
     rated = cloud if quality is None else replace(cloud, confidence=quality)
     write_tables(path, {"vertex": _table(rated)}, [_FRAME + cloud.frame], ascii=ascii)
@@ -74,13 +60,11 @@ def write_ply_tiles(path: StrPath, clouds: Iterable[PointCloud], *, frame: Frame
 
 @reader
 def read_ply(path: StrPath) -> PointCloud:
-    """Read the vertices of a cloud or mesh, in ascii or binary, float or double.
+    """Read the vertices of a cloud or mesh, in ascii or binary, float or double; it may be empty.
 
     Points with a non-finite coordinate are dropped; organised clouds mark their gaps that way.
-    ``quality`` (or ``confidence``) becomes the confidence if all values lie in [0, 1].
-
-    Returns:
-        The cloud, in the frame named in the file, else ``camera``. It may be empty.
+    ``quality`` (or ``confidence``) becomes the confidence if all values lie in [0, 1]. The frame is
+    that named in the file, else ``camera``.
 
     Raises:
         FormatError: The file is missing, truncated, not a PLY, has no x, y, z, has points none of
@@ -98,7 +82,7 @@ def read_ply(path: StrPath) -> PointCloud:
         confidence=_confidence(vertex),
         weight=_scalar(vertex, "weight", np.float32),
         count=_scalar(vertex, "count", np.int32),
-        frame=_frame(header),
+        frame=next((f for c in header.comments for f in _FRAMES if c == _FRAME + f), "camera"),
     )
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     if len(cloud) and not finite.any():
@@ -190,8 +174,3 @@ def _confidence(vertex: Table) -> NDArray[np.float32] | None:
         if values is not None and ((values >= 0) & (values <= 1)).all():
             return values
     return None
-
-
-def _frame(header: PlyHeader) -> Frame:
-    named = (f for comment in header.comments for f in _FRAMES if comment == _FRAME + f)
-    return next(named, "camera")

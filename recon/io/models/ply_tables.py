@@ -51,10 +51,7 @@ def list_length(name: str) -> str:
 
 @reader
 def read_tables(path: StrPath, wanted: Sequence[str]) -> tuple[PlyHeader, dict[str, Table]]:
-    """Read the header and those of the wanted elements that the file has.
-
-    Whatever follows the last of them is not read.
-    """
+    """Read the header and the wanted elements that the file has; what follows them is not read."""
     with Path(path).open("rb") as stream:
         header = _read_header(stream)
         tables: dict[str, Table] = {}
@@ -86,11 +83,7 @@ def write_tables(
 
 
 def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[Table]]]) -> None:
-    """Write elements whose rows arrive in parts, binary little endian, atomically.
-
-    Each element has its total number of rows, and tables of one dtype; one is held at a time, but
-    the first of each is taken before the header is written.
-    """
+    """Write elements, each of so many rows and tables of one dtype, one at a time, atomically."""
     begun = {name: iter(tables) for name, (_, tables) in elements.items()}
     first = {name: next(tables) for name, tables in begun.items()}
     head = _header([(name, rows, first[name].dtype) for name, (rows, _) in elements.items()])
@@ -168,7 +161,6 @@ def _write_rows(stream: IO[bytes], table: Table) -> None:
 
 
 def _read_header(stream: IO[bytes]) -> PlyHeader:
-    """Parse the header and leave the stream just after it."""
     if stream.readline(8).strip() != b"ply":
         raise FormatError("not a PLY file: it does not start with 'ply'")
     encoding, comments = "", []
