@@ -15,8 +15,7 @@ from typing import Generic, TypeVar
 State = TypeVar("State")
 Linear = TypeVar("Linear")
 
-_MORE, _LESS = 10.0, 0.1
-"""Factors of the damping after a step that fails, and after one that succeeds."""
+_MORE, _LESS = 10.0, 0.1  # factors of the damping after a step that fails or succeeds
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
 
 

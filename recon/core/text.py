@@ -53,16 +53,14 @@ def _check(text: str | bytes) -> None:
         raise ValueError(f"not a decimal number: {plain!r}")
 
 
-_UNITS: Final = {
+_UNITS: Final = {  # by what the names of figures end in
     "deg_per_100m": "°/100 m", "m_per_s": "m/s", "percent": "%", "deg": "°", "px": "px",
     "mb": "MB", "hz": "Hz", "ms": "ms", "mm": "mm", "cm": "cm", "m": "m", "s": "s",
 }  # fmt: skip
-"""What the names of figures end in."""
-_NAMED_UNITS: Final = {
+_NAMED_UNITS: Final = {  # of names that do not end in it
     "bad": "%", "invalid": "%", "d1": "%", "infinite": "%",
     "seconds": "s", "seconds_per_frame": "s", "fps": "frames/s",
 }  # fmt: skip
-"""Figures whose names do not tell it."""
 _ENDING: Final = re.compile(rf"_({'|'.join(_UNITS)})$")
 
 

@@ -128,10 +128,7 @@ def is_locked(path: Path) -> bool:
 
 
 def take_lock(path: Path, what: str, *, where: Path, hint: str) -> int:
-    """Lock a file until the returned handle is closed; ``what`` is who else holds the lock.
-
-    It is created with its folders, and may be removed while it is locked.
-    """
+    """Lock a file, made with its folders, until the handle closes; ``what`` is who else has it."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)

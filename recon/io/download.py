@@ -210,10 +210,9 @@ def unpack(
 ) -> None:
     """Unpack a zip or tar archive, of which only what is ``below`` a folder, into a folder.
 
-    Nothing is written outside of the folder, and no link at all: a link that stays in the archive
-    is left out, any other refuses the archive. A later archive may replace files of an earlier
-    one. Files with a suffix in ``without`` are left out; with ``zips``, archives in the archive
-    are unpacked beside themselves, and left out.
+    Nothing is written outside of it, and no link: one that stays in the archive is left out, any
+    other refuses it. Files with a suffix in ``without`` are left out; with ``zips``, archives in it
+    are unpacked in their place.
     """
     most_bytes = _SMALL_BYTES + _MOST_GROWTH * archive.stat().st_size
     with naming(archive):

@@ -137,8 +137,7 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
 def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[int]]:
     """Read rows of numbers separated by spaces or commas; ``#`` starts a comment.
 
-    All rows have the same of the permitted numbers of columns. The result is float64 (N, C),
-    finite, N ≥ 1, and the line number of each row, counted from 1.
+    Returns float64 (N, C), finite, N ≥ 1, C one of ``columns``, and the line of each row, from 1.
     """
     rows: list[list[float]] = []
     lines: list[int] = []

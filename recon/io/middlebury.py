@@ -247,10 +247,7 @@ def _read_calib(path: Path, units: Units, width_px: int, height_px: int) -> Midd
 def nominal_camera_2005(
     width_px: int, height_px: int, dmin_px: float, factor: float
 ) -> RectifiedCamera:
-    """Return the nominal camera of a 2005 or 2006 scene, of that many full-size pixels per pixel.
-
-    Disparities are too small by ``dmin`` full-size pixels; the principal point is assumed central.
-    """
+    """Return the camera of 2005 or 2006; disparities are ``dmin_px`` full-size pixels too small."""
     camera = stand_in_camera(width_px, height_px)
     return replace(
         camera,
@@ -277,8 +274,7 @@ def _read_truth(
 ) -> DisparityTruth | None:
     """Read the truth of the left image, and which pixels both cameras see.
 
-    That is what a mask says; without one, where the true disparities of both images agree; without
-    a right one, everywhere.
+    By a mask, else where the true disparities of both images agree, else everywhere.
     """
     values = _read_disparity(folder, layout.truth_left, levels, shape)
     if values is None:

@@ -21,10 +21,7 @@ _S: Final = 1e-9
 
 
 def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadPrior:
-    """Read a topic with odometry, poses or transforms, as poses of the camera of ``image_topic``.
-
-    That takes static transforms that connect the two. ``stamped``: by the stamps of headers.
-    """
+    """Read poses of a topic, as the camera's if static transforms connect them to its images."""
     where = f"{bag.paths[0]}: {name}"
     if name not in bag.topics or bag.topics[name].kind not in POSES:
         raise SourceError(

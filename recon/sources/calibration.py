@@ -38,8 +38,7 @@ def read_rig(
 ) -> tuple[Rig, tuple[Path, ...]]:
     """Return the calibration that the settings name or give in numbers, else that of a folder.
 
-    Also the files it was read from. ``size`` is image width and height; ``cameras`` are those to
-    take from a KITTI file, else grey if it has that pair.
+    Also its files. ``size`` is width and height; ``cameras`` are those of a KITTI file, else grey.
     """
     check_given_once(settings.calibration, settings)
     if settings.numbers:

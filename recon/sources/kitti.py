@@ -53,8 +53,7 @@ _RAW_CALIBRATION: Final = "calib_cam_to_cam.txt"
 def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSource:
     """Open a drive of the odometry benchmark, the grey images if it has both kinds.
 
-    Images may be deleted: those without a partner are left out, and the lines of times.txt and
-    poses.txt are found by the numbers in the names.
+    Where images were deleted, lines of times.txt and poses.txt are found by numbers in the names.
     """
     if not folder.is_dir():
         raise SourceError("folder does not exist", where=folder)

@@ -100,10 +100,7 @@ def _root(folder: Path) -> Path:
 
 
 def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
-    """Open a drive; its images are paired by timestamp.
-
-    The ground truth is interpolated to the timestamps; it is used only if it covers every frame.
-    """
+    """Open a drive; its images are paired by timestamp, its ground truth is interpolated."""
     root = _root(folder)
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
     frames, listing = pair_listed([_read_euroc_list(view) for view in views], settings, root)

@@ -21,10 +21,7 @@ _MANUAL: Final = 1
 
 
 class Camera:
-    """A device by number or path (``0``, ``/dev/video0``), or a video file, which is not ``live``.
-
-    Width, height and frames per second are requested of a device; None = unchanged.
-    """
+    """A device (``0``, ``/dev/video0``), asked for size and rate, or a video file, not ``live``."""
 
     def __init__(
         self, device: str, size: tuple[int, int] | None = None, rate_hz: float | None = None

@@ -307,8 +307,7 @@ def pair_frames(
 ) -> tuple[list[tuple[Left, Right]], FrameList]:
     """Return the pairs that are used, of frames in order with a left and right image (or None).
 
-    The settings say by how many frames the right images were taken later. ``names`` are those of
-    the frames without suffix.
+    ``names`` are those of the frames without suffix.
     """
     alone_right = sum(left is None and right is not None for left, right in frames)
     # A listed frame without any image counts as one, on the left.

@@ -24,8 +24,7 @@ from recon.street.truth import true_occupancy, true_surface
 class SyntheticSource(StereoSource):
     """A rendered drive through a synthetic street, with complete ground truth.
 
-    The street is built on first use; images are rendered while iterating. A visible surface is part
-    of the true surface up to a depth of ``surface_range_m``.
+    Surfaces seen up to a depth of ``surface_range_m`` are part of the true surface.
     """
 
     name: str

@@ -100,8 +100,7 @@ def truth_at(
 ) -> tuple[SequenceTruth | None, str]:
     """Return the true pose of the left camera at some times; the first one is the identity.
 
-    The path is ``T_world_body``; no ``T_body_camera`` = the identity. If it does not cover all
-    times, there is no truth, and a note that says so.
+    The path is ``T_world_body``. If it does not cover all times, there is a note instead.
     """
     covered = (stamps_s >= path.timestamps_s[0]) & (stamps_s <= path.timestamps_s[-1])
     if not covered.all():
@@ -179,7 +178,7 @@ def pair_stamps(
     """Return frames in order of time: the indices of left and right image, None = missing.
 
     Images of two increasing series are a pair if each is the nearest of the other, within the
-    tolerance. A recording of which most has no partner is refused.
+    tolerance.
     """
     to_right, to_left = nearest_sorted(left_s, right_s), nearest_sorted(right_s, left_s)
     mutual = to_left[to_right] == np.arange(len(left_s))

@@ -17,16 +17,11 @@ LensModel = Literal["pinhole", "fisheye"]
 LARGEST_CENTRE_OFFSET: Final = 0.25
 """Offset of a principal point from the image centre, relative to the image size, above which the
 calibration is hardly of these images: at half the calibrated size it is 0.5."""
-_FOCAL_SIZES: Final = (0.01, 1000.0)
-"""Focal lengths in sizes of an image: it sees 179 degrees with the shortest, 0.06 with the longest.
-"""
-_MOST_SIZES: Final = 100.0
-"""Distance of a principal point from the image centre, in sizes of the image, that no crop has."""
+_FOCAL_SIZES: Final = (0.01, 1000.0)  # focal lengths in image sizes: to see 179 and 0.06 degrees
+_MOST_SIZES: Final = 100.0  # of a principal point from the centre, in image sizes: no crop has it
 _LARGEST_PX: Final = 1_000_000
-_BASELINE_M: Final = (1e-6, 1e4)
-"""Shorter and longer baselines than any, also in units that are not metres."""
-_MOST_DISTORTION: Final = 1e6
-"""Larger than any coefficient; those of the rational model reach hundreds."""
+_BASELINE_M: Final = (1e-6, 1e4)  # shorter and longer than any, also in other units than metres
+_MOST_DISTORTION: Final = 1e6  # larger than any; coefficients of the rational model reach hundreds
 
 
 @dataclass(frozen=True, eq=False)

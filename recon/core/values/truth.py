@@ -189,18 +189,14 @@ class OccupancyMetrics:
 class DisparityMetrics:
     """Errors of a disparity map, over the pixels whose true disparity is known."""
 
-    # for each threshold in pixels (key), share of all pixels (per cent) whose value has a larger
-    # error
-    bad: dict[float, float]
+    bad: dict[float, float]  # share of all pixels (per cent) off by more than so many (key)
     invalid: float  # share of all pixels (per cent) without a value
     avgerr_px: float  # mean absolute error of the pixels with a value
     rms_px: float  # root mean square error of the pixels with a value
     pixels: int  # number of pixels compared
-    # percentiles (key: per cent) of the absolute error of the pixels with a value: Middlebury's
-    # A50, A90, A95 and A99
+    # percentiles (key) of the absolute error of pixels with a value: Middlebury's A50 to A99
     quantiles_px: dict[int, float] = field(default_factory=dict)
-    # share of all pixels (per cent) whose value has an error above 3 pixels and above 5 % of the
-    # true disparity: KITTI's D1
+    # share of all pixels (per cent) off by more than 3 pixels and 5 % of the truth: KITTI's D1
     d1: float = float("nan")
 
 
@@ -212,8 +208,6 @@ class DepthMetrics:
     median_m: float  # median absolute error of the depth
     rms_m: float  # root mean square error of the depth
     median_percent: float  # median absolute error, per cent of the true depth
-    # share of the pixels (per cent) with an error above 5 % of the true depth
-    over_5_percent: float
-    # share of the pixels (per cent) whose disparity gives no finite depth; they count in the median
-    # and in ``over_5_percent``, but not in ``mean_m`` and ``rms_m``
+    over_5_percent: float  # share of the pixels (per cent) off by more than 5 % of the depth
+    # share of the pixels (per cent) without a finite depth: not in ``mean_m`` and ``rms_m``
     infinite: float

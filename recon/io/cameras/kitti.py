@@ -95,10 +95,7 @@ def _centre_m(projection: Float64) -> Float64:
 
 @reader
 def read_kitti_rig(path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int]) -> Rig:
-    """Read the cameras of one stereo pair, rectified or raw according to the image size.
-
-    Rectified images (``_sync`` drives) are smaller than raw ones (``_extract`` drives). A file
-    without sizes (``calib.txt``) is of rectified images.
+    """Read a stereo pair: rectified if the images have that size or there is none, else raw.
 
     Ref: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, section 4.
     """

@@ -166,10 +166,7 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
 
 @reader
 def read_kalibr(path: StrPath) -> StereoCalibration:
-    """Read ``cam0`` as the left and ``cam1`` as the right camera of kalibr's camera chain.
-
-    Ref: Kalibr's wiki, "Yaml formats": ``T_cn_cnm1`` maps points of camera n-1 to camera n.
-    """
+    """Read kalibr's camera chain; ``T_cn_cnm1`` maps points of camera n-1 to camera n."""
     fields = Fields(read_yaml(path))
     right = fields.below("cam1")
     T_right_left = orthonormalise(right.numbers("T_cn_cnm1", (4, 4)))

@@ -59,12 +59,7 @@ def read_pfm(path: StrPath) -> Float32:
 
 
 def write_pfm(path: StrPath, values: Float32) -> None:
-    """Write a grey little-endian PFM file, float32 (H, W), atomically; NaN becomes inf.
-
-    Raises:
-        ShapeError: The array has another dtype or shape.
-        OutputError: The file cannot be written.
-    """
+    """Write float32 (H, W) as a grey little-endian PFM file, atomically; NaN becomes inf."""
     frozen_array("values", values, np.float32, (None, None))
     height, width = values.shape
     rows = np.where(np.isnan(values), np.float32(np.inf), values)[::-1]

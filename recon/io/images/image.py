@@ -130,10 +130,7 @@ def read_grey_levels(path: StrPath) -> NDArray[Any]:
 
 
 def write_image(path: StrPath, image: NDArray[Any]) -> None:
-    """Write an image, uint8 or uint16, grey (H, W) or RGB (H, W, 3), atomically.
-
-    The suffix gives the format: .png, .tif, .tiff, .jpg, .jpeg, .pgm (grey) or .ppm (colour).
-    """
+    """Write uint8 or uint16, (H, W) or RGB (H, W, 3), atomically, in the format of the suffix."""
     suffix = Path(path).suffix.lower()
     _check_writable(path, suffix, image)
     pixels = image if image.ndim == 2 else swap_red_and_blue(image)

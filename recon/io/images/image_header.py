@@ -131,15 +131,12 @@ def _check_bmp(content: bytes) -> None:
 
 
 def stated_size(content: bytes) -> tuple[int, int] | None:
-    """Return the width and height that the header of an image states; None if it states none.
-
-    The readers of Pillow are called directly: `PIL.Image.open` has a limit of its own.
-    """
+    """Return the width and height that a header states; None = a damaged or unknown one."""
     reader = next((kind for start, kind in _READERS.items() if content.startswith(start)), None)
     try:
         if is_tiff(content):
             width, height = _tiff_size(content)
-        elif reader is not None:
+        elif reader is not None:  # `PIL.Image.open` has a limit of its own
             width, height = reader(BytesIO(content)).size
         else:
             return None
@@ -165,11 +162,7 @@ class ExifFocal:
 
 
 def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal | None:
-    """Read the focal length of a photograph: from its sensor data, or else the 35 mm equivalent.
-
-    The size may be less than the camera's if the image was made smaller. None = the file does not
-    say, or is no image.
-    """
+    """Read the focal length of a photograph by its sensor or 35 mm equivalent; None = unknown."""
     try:
         with reading(path), Image.open(path) as image:
             tags: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_IFD)

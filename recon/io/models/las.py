@@ -31,9 +31,8 @@ def write_las(
     """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
 
     Positions are rounded to millimetres; colours, and the standard deviation of the depth as the
-    extra dimension ``sigma``, are written where the clouds have them. One cloud is in memory at a
-    time; ``T_to_from`` (4, 4) leads from their frame to the coordinates of the file, whose system
-    is ``crs``. The number of points is returned.
+    extra dimension ``sigma``, are written where the clouds have them. ``T_to_from`` (4, 4) leads to
+    the coordinates of the file, in the system ``crs``. The number of points is returned.
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """

@@ -75,10 +75,7 @@ def check_mesh_formats(formats: Sequence[str]) -> None:
 
 
 def join_meshes(path: StrPath, parts: Sequence[tuple[Path, int, int]]) -> None:
-    """Join PLY meshes with the same fields, at most two in memory, into one PLY, atomically.
-
-    Each of the ``parts``, at least one, is a file and its numbers of vertices and faces.
-    """
+    """Join PLY files, each with its numbers of vertices and faces, into one, atomically."""
     files, vertices, faces = zip(*parts, strict=True)
     starts = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)
 

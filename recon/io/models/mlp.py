@@ -40,9 +40,8 @@ def write_mlp(
 ) -> None:
     """Write a MeshLab project of layers (label and file, which must exist), atomically.
 
-    File paths are relative to the project, so the folder can be moved as a whole. MeshLab opens a
-    project with y up and looks along -z, so the layers are rotated if their frame is known. The
-    camera of a photo is at the origin of the frame ``camera``.
+    Paths are relative to it. MeshLab opens it with y up and looks along -z, so layers are turned if
+    their frame is known. The camera of a photo is at the origin of the frame ``camera``.
     """
     T = _IDENTITY if frame is None else T_YUP_FRAME[frame]
     project = ET.Element("MeshLabProject")

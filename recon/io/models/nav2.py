@@ -83,10 +83,7 @@ def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
 
 
 def _world_file(grid: OccupancyGrid) -> str:
-    """Return size and turn of a pixel, and x and y of the centre of the first one, line by line.
-
-    Ref: https://gdal.org/en/stable/drivers/raster/wld.html
-    """
+    """Return size and turn of a pixel, and the centre of the first: gdal.org, raster/wld.html."""
     side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
     centre = (x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
     return "".join(f"{_shortest(number)}\n" for number in (side_m, 0, 0, -side_m, *centre))

@@ -127,10 +127,9 @@ def _tree(nodes: list[_Node], depth: int) -> _Node | None:
 def _write_tree(
     file: IO[bytes], root: _Node | None, pieces: IO[bytes], resolution_m: float, *, binary: bool
 ) -> None:
-    nodes = 0
+    kind, nodes = _BINARY_TREE if binary else _FULL_TREE, 0
     if root is not None:
         nodes = root.branch.pruned_nodes if binary else root.branch.nodes
-    kind = _BINARY_TREE if binary else _FULL_TREE
     file.write(kind + _HEADER.format(nodes, resolution_m).encode())
     if root is not None:
         _write_node(file, root, pieces, binary=binary)

@@ -57,10 +57,7 @@ def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32
 def decimate(
     vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
 ) -> tuple[Float32, Int32]:
-    """Collapse edges until about ``target_faces`` are left, preserving shape and border.
-
-    Ref: Garland & Heckbert, "Surface simplification using quadric error metrics", 1997.
-    """
+    """Collapse edges until about ``target_faces`` are left (Garland & Heckbert, 1997)."""
     with _quiet():
         smaller = _surface(vertices, faces).simplify_quadric_decimation(
             target_faces, boundary_weight=3.0
@@ -69,10 +66,8 @@ def decimate(
         raise MeshingError(
             "decimation left no face", got=f"target of {counted(target_faces, 'face')}"
         )
-    return (
-        np.asarray(smaller.vertices).astype(np.float32),
-        np.asarray(smaller.triangles).astype(np.int32),
-    )
+    vertices, faces = np.asarray(smaller.vertices), np.asarray(smaller.triangles)
+    return vertices.astype(np.float32), faces.astype(np.int32)
 
 
 def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:

@@ -49,11 +49,7 @@ def write_ply(
 
 
 def write_ply_tiles(path: StrPath, clouds: Iterable[PointCloud], *, frame: Frame) -> int:
-    """Write several clouds into one file, in the format of `write_ply`.
-
-    The clouds, of which one is in memory at a time, have that frame and the same fields. The
-    number of points is returned.
-    """
+    """Write clouds of that frame with the same fields, one at a time; returns their points."""
     nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
     return write_table_stream(path, "vertex", map(_table, clouds), [_FRAME + frame], nothing)
 

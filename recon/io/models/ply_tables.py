@@ -98,10 +98,9 @@ def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[
 def write_table_stream(
     path: StrPath, name: str, tables: Iterable[Table], comments: Sequence[str], empty: Table
 ) -> int:
-    """Write one element whose rows arrive in parts, binary little endian, atomically.
+    """Write one element whose rows arrive in parts, ``empty`` if there are none, atomically.
 
-    One table is held at a time, and all get the dtype of the first; ``empty`` is written if there
-    is none. The number of rows, which is returned, is filled into the header at the end.
+    All tables get the dtype of the first. The number of rows is filled into the header at the end.
     """
     dtype: np.dtype[Any] | None = None
     rows = 0
