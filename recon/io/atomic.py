@@ -16,8 +16,7 @@ from typing import Final
 from recon.core.errors import OutputError, SettingsError
 from recon.io.files import special_kind
 
-_RENAME_EXCHANGE: Final = 2
-"""Flag of Linux's renameat2; with absolute paths its folders do not matter."""
+_RENAME_EXCHANGE: Final = 2  # flag of Linux's renameat2, here with absolute paths
 
 
 @contextmanager

@@ -25,13 +25,11 @@ from recon.io.atomic import write_text
 from recon.io.files import naming, reading
 
 _PIECE_BYTES: Final = 1_000_000
-#: Some servers refuse the name of the library.
-_AGENT: Final = "recon-datasets/1"
+_AGENT: Final = "recon-datasets/1"  # some servers refuse the name of the library
 _TRIES: Final = 5
 _PAUSE_S: Final = 1.0
 _TIMEOUT_S: Final = 60.0
-#: What a server says that is too busy, or is started again.
-_PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
+_PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})  # busy, or starting again
 
 OnBytes = Callable[[int, int | None], None]
 """Receives the number of bytes that are there and, if it is known, of those to come in all."""
@@ -181,8 +179,7 @@ def _forget(part: Path) -> None:
     _version_file(part).unlink(missing_ok=True)
 
 
-#: Images and clouds hardly shrink in an archive; what grows by more than this fills the disk.
-_MOST_GROWTH: Final = 50
+_MOST_GROWTH: Final = 50  # images and clouds hardly shrink; what grows by more fills the disk
 _SMALL_BYTES: Final = 100_000_000
 _LEAST_BYTES: Final = 4096  # what an entry takes of a disk, however small it is
 _RESOURCE_FORKS: Final = "__MACOSX"

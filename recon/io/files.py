@@ -22,8 +22,7 @@ StrPath = str | PathLike[str]
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-#: Larger than any calibration or configuration: other files are not read to the end.
-SMALL_FILE_BYTES: Final = 1 << 22
+SMALL_FILE_BYTES: Final = 1 << 22  # more than any calibration or configuration has
 _LONGEST_REASON: Final = 120
 _NO_DATA: Final = "begin lines that are no data with #"
 FOLDER: Final = "a folder"

@@ -26,8 +26,7 @@ CALIBRATE: Final = (
     "name one with --calib FILE; of rectified images --focal PX and --baseline M are enough"
 )
 """What to do where a source lacks a calibration."""
-_WIDEST_DEG: Final = 165.0
-"""Flat images see no more: a pixel at the side would be 60 times as wide as in the middle."""
+_WIDEST_DEG: Final = 165.0  # flat images see no more: pixels at the side would be 60 times as wide
 
 
 def read_rig(

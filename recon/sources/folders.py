@@ -156,8 +156,7 @@ def _pair_as_listed(folder: Path, settings: SourceSettings) -> _Pairing:
         folder,
     )
     stamps_s = np.array([frames[k].left_s for k in listing.kept])
-    how = f"paired according to {FRAMES}"
-    return _Pairing(pairs, listing, stamps_s, how, (folder / FRAMES,))
+    return _Pairing(pairs, listing, stamps_s, f"paired according to {FRAMES}", (folder / FRAMES,))
 
 
 def _pair_by_stamp(

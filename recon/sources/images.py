@@ -19,8 +19,7 @@ from recon.sources.settings import SourceSettings
 from recon.sources.source import FrameList, Recording, check_most, join_pair, pair_frames
 from recon.sources.times import pair_stamps
 
-_WHITE_SAMPLE: Final = 8
-"""Frames, spread over a drive of 16-bit images, that its white is taken from."""
+_WHITE_SAMPLE: Final = 8  # frames, over a drive of 16-bit images, that its white is taken from
 
 
 class ImageFrame(NamedTuple):

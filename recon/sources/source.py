@@ -224,8 +224,7 @@ Item = TypeVar("Item")
 Left = TypeVar("Left")
 Right = TypeVar("Right")
 
-_ONE_RATE: Final = 2 / 3
-"""Share of the frames that have both images, from which two cameras have one rate."""
+_ONE_RATE: Final = 2 / 3  # share of frames with both images, from which cameras have one rate
 
 
 @dataclass(frozen=True)
@@ -276,13 +275,10 @@ class FrameList:
         return replace(self, chosen=chosen)
 
     def lines(self, count: int) -> list[int] | None:
-        """Return the line of each pair, from 0, in a file of one line per frame (``times.txt``).
+        """Return the line of each pair, from 0, in a file of one per frame; None = too few lines.
 
         One line per pair fits at once, whether of all pairs or of those used. Else names that are
-        counters give the line, so that it stays the right one where images are missing; else the
-        position does, and further lines are ignored.
-
-        None = the file has too few lines.
+        counters give the line, so that it stays right where images are missing, or the position.
         """
         of_pairs = self._lines_of_all(count)
         if of_pairs is None:

@@ -23,8 +23,7 @@ from recon.sources.source import FrameList, check_most
 _STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+", re.ASCII)
 _SECONDS_DIGITS: Final = 10  # digits of a time in seconds since 1970, from 2001 to 2286
 _LONGEST_STEP_S: Final = 60.0  # longest usual time between two frames of a drive
-_CLOCK_STEPS: Final = 10
-"""Least step of padded numbers that are a clock: 10 ms, or less in finer units."""
+_CLOCK_STEPS: Final = 10  # least step of padded numbers that are a clock: 10 ms or finer
 
 
 @reader

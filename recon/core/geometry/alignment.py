@@ -19,8 +19,7 @@ _IN_ONE_PLACE: Final = 1e-12
 _ENDS: Final = 24
 """Points between which lines are tried: of 276 some have two good ends, if half of all are good."""
 _SIGMA_OF_MEDIAN: Final = 1.4826
-_SIGMAS: Final = 4.0
-"""Of ten thousand points with normal errors, none to speak of is farther away than this."""
+_SIGMAS: Final = 4.0  # hardly one of ten thousand normal errors is larger
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +77,8 @@ def find_agreeing(from_m: Float64, to_m: Float64, allowed_m: float) -> Bool:
     first, second = ends[np.stack(np.triu_indices(len(ends), 1))]
     apart_m = np.linalg.norm(from_m[first] - from_m[second], axis=1)
     far = apart_m >= 0.5 * apart_m.max()
-    tried = [
-        _distances_m(from_m, to_m, np.array(pair))
-        for pair in zip(first[far], second[far], strict=True)
-    ]
+    pairs = np.stack([first[far], second[far]], axis=1)
+    tried = [_distances_m(from_m, to_m, pair) for pair in pairs]
     best_m = min(tried, key=lambda distances_m: float(np.median(distances_m)))
     for _ in range(2):  # two points alone carry their own errors
         limit_m = max(allowed_m, _SIGMAS * _SIGMA_OF_MEDIAN * float(np.median(best_m)))
@@ -116,12 +113,8 @@ def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
     span = np.where(times[after] > times[before], times[after] - times[before], 1.0)
     shares = np.clip((stamps_s - times[before]) / span, 0.0, 1.0)
     poses = trajectory.T_world_camera
-    return np.stack(
-        [
-            pose_between(poses[i], poses[j], float(share))
-            for i, j, share in zip(before, after, shares, strict=True)
-        ]
-    )
+    steps = zip(before, after, shares, strict=True)
+    return np.stack([pose_between(poses[i], poses[j], float(share)) for i, j, share in steps])
 
 
 def pose_between(first: Float64, second: Float64, share: float) -> Float64:

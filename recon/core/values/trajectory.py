@@ -33,9 +33,8 @@ class Trajectory:
 
     def __repr__(self) -> str:
         seconds = self.timestamps_s[-1] - self.timestamps_s[0] if len(self) else 0.0
-        return (
-            f"Trajectory({counted(len(self), 'pose')}, {self.path_length_m:.4g} m, {seconds:.4g} s)"
-        )
+        poses = counted(len(self), "pose")
+        return f"Trajectory({poses}, {self.path_length_m:.4g} m, {seconds:.4g} s)"
 
     def select(self, frames: NDArray[Any]) -> Self:
         """Return the poses of some frames, by numbers or bool (N,)."""

@@ -108,20 +108,15 @@ def check_shift(P_right: Float64, left_shift: float, where: StrPath) -> None:
 def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
     """Read a camera, its rectifying rotation (3, 3) and its projection matrix (3, 4)."""
     fields = Fields(read_yaml(path))
-    matrix, coefficients, rotation, projection = (
-        fields.below(name)
-        for name in (
-            "camera_matrix",
-            "distortion_coefficients",
-            "rectification_matrix",
-            "projection_matrix",
-        )
-    )
+
+    def data(name: str, *shape: int) -> Float64:
+        return fields.below(name).numbers("data", shape or None)
+
     name = fields.text("distortion_model")
-    model, distortion = lens_of(ROS_MODELS, name, coefficients.numbers("data"), path)
+    model, distortion = lens_of(ROS_MODELS, name, data("distortion_coefficients"), path)
     size = fields.count("image_width"), fields.count("image_height")
-    camera = CameraIntrinsics(matrix.numbers("data", (3, 3)), distortion, *size, model)
-    return camera, rotation.numbers("data", (3, 3)), projection.numbers("data", (3, 4))
+    camera = CameraIntrinsics(data("camera_matrix", 3, 3), distortion, *size, model)
+    return camera, data("rectification_matrix", 3, 3), data("projection_matrix", 3, 4)
 
 
 def write_camera_info(

@@ -20,8 +20,7 @@ from recon.io.files import SMALL_FILE_BYTES, StrPath, read_bytes, reader, readin
 from recon.io.images.image_header import check_image_bytes, is_tiff, stated_size
 
 FULL_WHITE: Final = 65535
-MAX_MEGAPIXELS: Final = 100.0
-"""Larger images are refused before they are decoded, unless more is asked for."""
+MAX_MEGAPIXELS: Final = 100.0  # larger images are refused, unless more is asked for
 _PIXEL_BYTES: Final = 16  # more than a pixel takes in any file
 _LOG_LEVEL_LOCK: Final = Lock()
 _GREY_ONLY: Final = frozenset({".pgm"})

@@ -20,8 +20,7 @@ _EXTRA: Final = "survey"
 _COLOURED: Final = 7  # point format with colours, of LAS 1.4
 _STEP_M: Final = 0.001
 _MARGIN_DEG: Final = 6.0  # systems are used as far outside their area as a zone of UTM is wide
-_LARGEST_STRETCH: Final = 2.0
-"""Of a metre on the ground: that of Mercator's projection at 60 degrees north."""
+_LARGEST_STRETCH: Final = 2.0  # of a metre on the ground: Mercator's at 60 degrees north
 _FULL_COLOUR: Final = 257  # colours have 16 bits: 255 becomes 65535
 
 

@@ -29,14 +29,12 @@ from recon.io.models.ply_tables import (
 )
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
-#: Both names are in use for this property of a face.
-_INDICES: Final = ("vertex_indices", "vertex_index")
+_INDICES: Final = ("vertex_indices", "vertex_index")  # both names are in use
 _COMPONENTS: Final = {"float32": 5126, "uint32": 5125, "uint16": 5123}
 _KINDS: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 _MATTE: Final = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-#: Colours taken from images already include the lighting.
-_UNLIT: Final = "KHR_materials_unlit"
+_UNLIT: Final = "KHR_materials_unlit"  # colours of images already include the lighting
 
 
 def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:

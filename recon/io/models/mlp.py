@@ -20,8 +20,7 @@ from recon.io.atomic import write_text
 from recon.io.files import StrPath, resolved
 
 _IDENTITY: Final = np.eye(4)
-_SENSOR_MM: Final = 36.0
-"""Width of the sensor that MeshLab's cameras have in millimetres; only ratios to it matter."""
+_SENSOR_MM: Final = 36.0  # width of the sensor of MeshLab's cameras; only ratios to it matter
 
 
 @dataclass(frozen=True)

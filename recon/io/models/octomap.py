@@ -30,8 +30,7 @@ from recon.io.files import StrPath, reader, reading
 from recon.io.kernels.octree import Leaves, TreeWalk, begin_walk, find_leaves
 
 DEPTH: Final = 16
-KEY_LIMIT: Final = 1 << (DEPTH - 1)
-"""Cell indices of an OctoMap lie in ``[-KEY_LIMIT, KEY_LIMIT)`` on each axis."""
+KEY_LIMIT: Final = 1 << (DEPTH - 1)  # cell indices lie in [-KEY_LIMIT, KEY_LIMIT) on each axis
 FREE, OCCUPIED, INNER = 1, 2, 3
 #: Level of the largest leaf accepted; a larger one would expand to too many cells for memory.
 _COARSEST: Final = DEPTH - 8
@@ -50,8 +49,7 @@ _DAMAGED: Final = "the OctoMap is truncated or damaged"
 _NODE: Final = np.dtype([("log_odds", "<f4"), ("children", "u1")])
 _LONGEST_HEADER_LINES: Final = 100
 _FEW_CELLS: Final = 1 << 22
-_MOST_GROWTH: Final = 64
-"""Cells for each node of a piece that is larger: a leaf of five bytes can claim 16 million."""
+_MOST_GROWTH: Final = 64  # cells per node of a larger piece: five bytes can claim 16 million
 
 
 def write_octomap_tiles(
