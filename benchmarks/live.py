@@ -33,8 +33,7 @@ from altered_drives import alterations, write_kitti
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.demo import demo_source
 from recon.core.values import Trajectory
-from recon.evaluation.segments import associate
-from recon.evaluation.trajectory import evaluate_trajectory
+from recon.evaluation.trajectory import associate, evaluate_trajectory
 from recon.io.trajectory import read_tum
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry

@@ -24,23 +24,30 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32
 from recon.evaluation.disparity import evaluate_disparity
-from recon.evaluation.drive_errors import LEAST_FRAMES, occupancy_view
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.map_comparison import (
+    LEAST_FRAMES,
     MapComparison,
     ReferenceFrame,
     add_within_reach,
     doubt_axes,
+    doubts_of_file,
+    map_of_run,
+    occupancy_view,
     place_by_icp,
     place_cloud,
     possible_frames,
     read_mapped_cloud,
 )
-from recon.evaluation.map_of_run import doubts_of_file, map_of_run
 from recon.evaluation.middlebury.score import curve_figures, dense_map, named_figures
 from recon.evaluation.occupancy import evaluate_occupancy
-from recon.evaluation.segments import TOLERANCE_S, associate, interpolation_warnings
-from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
+from recon.evaluation.trajectory import (
+    TOLERANCE_S,
+    TrajectoryRules,
+    associate,
+    compare_paths,
+    interpolation_warnings,
+)
 from recon.io.atomic import check_targets
 from recon.io.files import naming
 from recon.io.images.disparity import read_disparity, read_pfm
@@ -49,9 +56,8 @@ from recon.io.models.nav2 import read_nav2
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
-from recon.report.map_page import write_map_errors
+from recon.report.map_page import write_map_errors, write_trajectory_page
 from recon.report.style import colour_grid_errors
-from recon.report.trajectory_page import write_trajectory_page
 from recon.run.directory import recorded_files
 from recon.run.finished import CLOUD, GRID, OCTOMAP, command_of_map
 from recon.run.run import Run, plain
@@ -99,7 +105,7 @@ def run_evaluate_trajectory(
             write_tum(run.path("estimate_aligned_tum.txt"), comparison.estimate)
             write_tum(run.path("truth_tum.txt"), comparison.truth)
             with run.report(summary):
-                write_trajectory_page(TrajectoryRun(estimate, truth, comparison, summary), run)
+                write_trajectory_page(comparison, (estimate.name, truth.name), summary, run)
             inputs = [path for path in (estimate, truth, times) if path is not None]
             run.finish(summary, source=str(estimate), inputs=inputs)
     return summary
@@ -160,15 +166,15 @@ def run_evaluate_map(
     with naming(f"{run}, {reference}"):
         if icp:
             reach_m, frames = max(thresholds_m), possible_frames(mapped, frame, align_to)
-            placed, moved, frame = place_by_icp(mapped, truth, frames, align_to, reach_m)
+            placed, moved = place_by_icp(mapped, truth, frames, align_to, reach_m)
         else:
-            frame = frame or "camera"
-            placed, moved = place_cloud(mapped, frame, align_to)
+            placed, moved = place_cloud(mapped, frame or "camera", align_to)
         truth = replace(truth, frame=placed.cloud.frame)
         by_threshold = [plain(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
     beyond = add_within_reach(placed, truth, by_threshold)
     aligned = icp or align_to is not None
-    doubts = doubt_axes(placed, truth, by_threshold[0], frame, aligned=aligned)
+    axes = moved.get("reference_frame", frame or "camera")
+    doubts = doubt_axes(placed, truth, by_threshold[0], axes, aligned=aligned)
     summary = {
         **by_threshold[0],
         **moved,

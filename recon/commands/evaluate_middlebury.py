@@ -13,15 +13,13 @@ from recon.evaluation.middlebury.bench import (
     Bench,
     SceneDone,
     SceneFigures,
-    check_names,
-    read_result,
-    summarise_scenes,
-)
-from recon.evaluation.middlebury.scenes import (
     check_folder,
+    check_names,
     find_results,
     find_scenes,
+    read_result,
     read_scored_scene,
+    summarise_scenes,
 )
 from recon.evaluation.middlebury.score import Figures
 from recon.io.files import StrPath

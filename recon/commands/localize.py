@@ -21,7 +21,7 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
-from recon.report.localize_page import write_localize_page
+from recon.report.map_page import write_localize_page
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
 from recon.sources.source import DerivedSource, StereoSource

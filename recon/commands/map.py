@@ -16,7 +16,7 @@ from recon.commands.map_pieces import begun_in_pieces, map_pieces, pieces_of
 from recon.core.errors import ClusterError, MemoryLimitError, OutputError, ReconError
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
-from recon.evaluation.drive_errors import DriveErrors, compare_with_truth
+from recon.evaluation.map_comparison import DriveErrors, compare_with_truth
 from recon.export.make import Products, make
 from recon.export.product import Order
 from recon.export.trajectories import export_paths

@@ -1,9 +1,9 @@
-"""Errors of disparity maps, with the measures of Middlebury and KITTI."""
+"""Errors of disparity maps, as Middlebury and KITTI measure them, and of their confidences."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,8 +21,7 @@ from recon.core.values.arrays import Bool, Float32, Float64, float_map
 
 THRESHOLDS_PX: Final = (0.5, 1.0, 2.0, 4.0)
 _QUANTILES: Final = (50, 90, 95, 99)
-_D1_PX: Final = 3.0
-_D1_SHARE: Final = 0.05
+_D1_PX, _D1_SHARE = 3.0, 0.05
 _DEPTH_SHARE: Final = 0.05
 
 
@@ -78,15 +77,8 @@ def evaluate_depth(
 ) -> DepthMetrics:
     """Compare the depth of a disparity map with the true depth.
 
-    Args:
-        estimate: A disparity, or its values: (H, W), pixels, not finite = none.
-        truth: Ground truth at the same size, or its values as `DisparityTruth.from_values` takes
-            them.
-        camera: The camera at that size.
-        occluded: Whether to include pixels that only the left camera sees.
-
-    Raises:
-        EvaluationError: The sizes differ, or no pixel has a known truth.
+    Estimate, truth, ``occluded`` and errors are those of `evaluate_disparity`; the camera is that
+    of images of their size.
     """
     values, true = _compared(estimate, truth, occluded=occluded)
     true_m = depth_from_disparity(true, camera).astype(np.float64)
@@ -105,7 +97,7 @@ def evaluate_depth(
 
 
 def values_of(estimate: Disparity | ArrayLike) -> Float32:
-    """Return the values of an estimate: float32 (H, W), pixels."""
+    """Return the values of an estimate: float32 (H, W)."""
     return estimate.values if isinstance(estimate, Disparity) else float_map("estimate", estimate)
 
 
@@ -126,11 +118,8 @@ def _compared(
 def compared_pixels(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
     """Return bool (H, W), the pixels that are compared: those whose truth is known."""
     if values.shape != truth.values.shape:
-        raise EvaluationError(
-            "disparity and truth differ in size",
-            got=f"disparity {values.shape}",
-            expected=f"{truth.values.shape}",
-        )
+        got, expected = f"disparity {values.shape}", f"{truth.values.shape}"
+        raise EvaluationError("disparity and truth differ in size", got=got, expected=expected)
     counted = np.isfinite(truth.values) & (truth.nonocc | occluded)
     if not counted.any():
         raise EvaluationError("no pixel has a known truth to compare with")
@@ -147,3 +136,94 @@ def _quantile(numbers: Float64, percent: int) -> float:
         return float("nan")
     rank = max(1, -(-len(numbers) * percent // 100))
     return float(np.partition(numbers, rank - 1)[rank - 1])
+
+
+_BINS: Final = 10  # equal bins of confidence between 0 and 1
+_STEPS: Final = 100  # points of a sparsification curve
+
+
+class Reliability(NamedTuple):
+    """Reliability diagram: share of correct pixels for each level of confidence."""
+
+    confidence: Float64  # (B,), mean confidence in the bin; NaN = empty bin
+    right: Float64  # (B,), share of correct pixels in the bin; NaN = empty bin
+    pixels: Float64  # (B,), number of pixels in the bin
+
+    @property
+    def calibration_error(self) -> float:
+        """Expected calibration error in [0, 1]: mean ``|confidence - right|`` over all pixels."""
+        gaps = np.nan_to_num(np.abs(self.confidence - self.right))
+        return float(np.average(gaps, weights=self.pixels))
+
+
+class Sparsification(NamedTuple):
+    """Sparsification curve: share of wrong pixels left as the least confident ones are removed."""
+
+    removed: Float64  # (N,), share of removed pixels, from 0 to below 1
+    wrong: Float64  # (N,), share of wrong pixels among the rest, if removed by confidence
+    best: Float64  # (N,), the same if the wrong pixels are removed first: the optimum
+
+    @property
+    def ause(self) -> float:
+        """Area between the two curves in [0, 1]; 0 = the confidence ranks pixels perfectly."""
+        return float(np.mean(self.wrong - self.best))
+
+
+def measure_reliability(
+    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0
+) -> Reliability:
+    """Compare confidence with the share of pixels, occluded ones too, that are within the limit.
+
+    Ref: C. Guo et al., "On calibration of modern neural networks", ICML 2017, section 2.
+    """
+    both, error_px = _pixels(estimate, truth)
+    confidence = estimate.confidence[both]
+    right = error_px <= limit_px
+    place = np.minimum((confidence.astype(np.float64) * _BINS).astype(np.int64), _BINS - 1)
+    pixels = np.bincount(place, minlength=_BINS).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        return Reliability(
+            confidence=np.bincount(place, weights=confidence, minlength=_BINS) / pixels,
+            right=np.bincount(place, weights=right, minlength=_BINS) / pixels,
+            pixels=pixels,
+        )
+
+
+def measure_sparsification(
+    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0
+) -> Sparsification:
+    """Remove the least confident pixels step by step; equal ones in proportion.
+
+    Ref: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV
+    2018, section 4 (sparsification, AUSE).
+    """
+    both, error_px = _pixels(estimate, truth)
+    wrong = (error_px > limit_px).astype(np.float64)
+    removed = np.arange(_STEPS) / _STEPS
+    kept = np.maximum(np.ceil((1 - removed) * wrong.size).astype(np.int64), 1)
+    return Sparsification(
+        removed=removed,
+        wrong=np.cumsum(_shared_by_equals(estimate.confidence[both], wrong))[kept - 1] / kept,
+        best=np.cumsum(np.sort(wrong))[kept - 1] / kept,
+    )
+
+
+def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
+    """Return the share of the pixels, in [0, 1], whose error is within some standard deviations."""
+    both, error_px = _pixels(estimate, truth)
+    return float(np.mean(error_px < sigmas * estimate.sigma_px[both]))
+
+
+def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
+    """Return wrong pixels in order of decreasing confidence, averaged over equal confidences."""
+    _, group, size = np.unique(-confidence, return_inverse=True, return_counts=True)
+    share = np.bincount(group, weights=wrong) / size
+    return np.asarray(np.repeat(share, size), dtype=np.float64)
+
+
+def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Bool, Float64]:
+    """Return bool (H, W), the pixels with a value and a known truth, and their errors (N,)."""
+    both = estimate.valid & compared_pixels(estimate.values, truth, occluded=True)
+    if not both.any():
+        raise EvaluationError("no pixel has both a disparity and a known truth")
+    return both, np.abs(estimate.values[both].astype(np.float64) - truth.values[both])

@@ -58,9 +58,8 @@ def evaluate_map(
 def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> Bool:
     """Return which points are within the heights, relative to the path, that the reference covers.
 
-    A LiDAR sees little above its own height, a camera sees tree tops: points there can be neither
-    confirmed nor refuted. The range is that of the whole reference, so that points floating above
-    a road still count. The path is in the frame of both clouds (y of a camera points down).
+    A LiDAR sees little above its own height: points there can be neither confirmed nor refuted.
+    The range is that of the whole reference, so that points floating above a road still count.
     """
     low_m, high_m = np.percentile(_heights_m(reference.xyz, path), _BAND_PERCENT)
     heights_m = _heights_m(cloud.xyz, path)
@@ -77,14 +76,13 @@ def _heights_m(xyz: Float32, path: Trajectory) -> Float64:
 def register_cloud(
     cloud: PointCloud, reference: PointCloud, reach_m: float
 ) -> tuple[Float64, float]:
-    """Align a cloud to a reference by ICP: ``T_reference_cloud``, and the share of matched points.
+    """Align a cloud to a reference by `icp`; only the errors of its shape are left.
 
-    This removes errors in the pose of the whole map and leaves the errors of its shape. The cloud
-    may be off by less than ten times ``reach_m``, the largest distance of partners at the end.
+    The cloud may be off by less than ten times ``reach_m``, the distance of partners at the end.
     """
     _check(cloud, reference, reach_m)
-    thinned = [_thinned(one, reach_m / 2) for one in (cloud, reference)]
-    return icp(thinned[0], thinned[1], (10 * reach_m, 3 * reach_m, reach_m))
+    xyz, reference_xyz = (_thinned(one, reach_m / 2) for one in (cloud, reference))
+    return icp(xyz, reference_xyz, (10 * reach_m, 3 * reach_m, reach_m))
 
 
 def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
@@ -105,11 +103,8 @@ def _check(cloud: PointCloud, reference: PointCloud, threshold_m: float) -> None
         if len(points) == 0:
             raise EvaluationError(f"the {name} cloud is empty")
     if cloud.frame != reference.frame:
-        raise EvaluationError(
-            "the clouds are in different frames",
-            got=f"{cloud.frame} and {reference.frame}",
-            hint="transform one of them first",
-        )
+        got, hint = f"{cloud.frame} and {reference.frame}", "transform one of them first"
+        raise EvaluationError("the clouds are in different frames", got=got, hint=hint)
     if not (np.isfinite(threshold_m) and threshold_m > 0):
         raise EvaluationError("the threshold is not positive", got=f"{threshold_m:g} m")
 
@@ -149,10 +144,8 @@ def icp(
             found = registration.registration_icp(source, target, reach_m, T, estimation, criteria)
             T, fitness = np.asarray(found.transformation).copy(), float(found.fitness)
             if fitness == 0 or not np.isfinite(T).all():
-                raise RegistrationError(
-                    "ICP found no corresponding points",
-                    expected=f"clouds within {reach_m:g} m of each other",
-                )
+                expected = f"clouds within {reach_m:g} m of each other"
+                raise RegistrationError("ICP found no corresponding points", expected=expected)
     there, back = np.eye(4), np.eye(4)
     there[:3, 3], back[:3, 3] = centre, -centre
     return there @ T @ back, fitness

@@ -1,11 +1,12 @@
-"""The map of a run beside a reference cloud: in its axes, with a warning where they seem wrong."""
+"""The map of a run beside a reference cloud, in its axes; and a drive beside its source's truth."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -13,16 +14,29 @@ from recon.core.errors import EvaluationError, RegistrationError, SettingsError
 from recon.core.geometry.alignment import fit_paths
 from recon.core.geometry.se3 import angle_rad, invert, transform_cloud
 from recon.core.text import counted
-from recon.core.values import PointCloud, Trajectory
+from recon.core.values import (
+    MapMetrics,
+    OccupancyGrid,
+    OccupancyMetrics,
+    PointCloud,
+    SequenceTruth,
+    Trajectory,
+    TrajectoryMetrics,
+)
 from recon.core.values.arrays import Float64
 from recon.evaluation.map import evaluate_map, register_cloud, within_reach
-from recon.evaluation.map_of_run import map_of_run
-from recon.evaluation.segments import TOLERANCE_S, associate
+from recon.evaluation.occupancy import evaluate_occupancy
+from recon.evaluation.trajectory import TOLERANCE_S, associate, evaluate_trajectory
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory
+from recon.map.drive.sequence import MappedSequence
+from recon.map.ground.grid import drop_undecided
+from recon.map.settings import DriveSettings
+from recon.map.store.map_file import MAP_FILE, MapFile
 from recon.places.places import drift_at_end, fit_to_path
 from recon.run.directory import RECORD
-from recon.run.finished import CLOUD
+from recon.run.finished import CLOUD, made_from
+from recon.sources.source import StereoSource
 
 ReferenceFrame = Literal["camera", "map"]
 # From half of either cloud near the other it is a fit; below a tenth of both it is none.
@@ -34,59 +48,74 @@ class MapComparison:
     """The result of a comparison, from which its clouds are coloured."""
 
     cloud: PointCloud  # the estimate, in the axes of the reference, aligned
-    reference: PointCloud  # the reference
+    reference: PointCloud
     thresholds_m: tuple[float, ...]  # distances below which a point counts as correct
     summary: dict[str, Any]  # the figures of ``summary.json``
 
 
+class MapOfRun(NamedTuple):
+    """The map of a finished run, as far as comparisons need it."""
+
+    path: Trajectory | None  # of the cameras of its first drive, world axes; None = unknown
+    T_map_world: Float64  # (4, 4), from world to map axes
+    doubts: Sequence[str]  # what is not to be trusted in the map
+
+
+def map_of_run(folder: Path) -> MapOfRun:
+    """Read what is needed from the map of a run; without one, from its record and path file."""
+    if (folder / MAP_FILE).is_file():
+        with closing(MapFile.open(folder)) as map_:
+            return MapOfRun(map_.first.trajectory, map_.first.T_map_world, map_.doubts)
+    T_map_world, doubts = made_from(folder)
+    file = folder / "trajectory_tum.txt"
+    return MapOfRun(read_trajectory(file) if file.is_file() else None, T_map_world, doubts)
+
+
+def doubts_of_file(file: Path) -> list[str]:
+    """Return lines of what is not to be trusted in the map of the run that a file belongs to."""
+    folder = next((one for one in file.absolute().parents[:3] if (one / MAP_FILE).is_file()), None)
+    return [] if folder is None else list(map_of_run(folder).doubts)
+
+
 @dataclass(frozen=True, eq=False)
 class MappedCloud:
-    """A cloud, and the run that it belongs to."""
+    """A cloud, and as in `MapOfRun` what is known of the run that it belongs to."""
 
     cloud: PointCloud  # as read, in map axes if it is of a run
-    path: Trajectory | None = None  # of the cameras; as read, in world axes; None = unknown
-    T_map_world: Float64 | None = None  # (4, 4), from world to map axes; None = no run
-    doubts: Sequence[str] = ()  # what is not to be trusted in the map of the run
+    path: Trajectory | None = None
+    T_map_world: Float64 | None = None  # None = no run
+    doubts: Sequence[str] = ()
 
 
 def read_mapped_cloud(run: Path) -> MappedCloud:
-    """Read the map of a run, by its folder, or a PLY file.
-
-    A PLY inside a run's folder is in that run's map axes.
-    """
+    """Read the map of a run, by its folder, or a PLY file: map axes if it is inside a run's."""
     folder = run if run.is_dir() else run.parent.parent
     if not run.is_dir() and (run.parent.name != "map" or not (folder / RECORD).is_file()):
         return MappedCloud(read_ply(run))
-    map_, cloud = map_of_run(folder), read_ply(run / CLOUD if run.is_dir() else run)
-    return MappedCloud(cloud, map_.path, map_.T_map_world, map_.doubts)
+    map_ = map_of_run(folder)
+    return MappedCloud(read_ply(run / CLOUD if run.is_dir() else run), *map_)
 
 
 def place_cloud(
     mapped: MappedCloud, frame: ReferenceFrame, align_to: Path | None
 ) -> tuple[MappedCloud, dict[str, Any]]:
-    """Bring a map into the axes of its reference: those of the first left camera, or the map's.
+    """Bring a map into the axes of its reference; also return how it was aligned.
 
-    A cloud of no run is taken to be in them already. ``align_to`` are true poses of the run's
-    cameras in these axes, to which its path is aligned rigidly. Also returns how it was aligned.
+    ``align_to`` are true poses of the run's cameras in these axes, to which its path is aligned
+    rigidly.
     """
     if frame == "map" and align_to is not None:
-        raise SettingsError(
-            "--align-to needs a reference in the axes of the poses",
-            where="--reference-frame",
-            got="map",
-            expected="camera",
-        )
-    T_map_world = mapped.T_map_world
-    if T_map_world is None and align_to is not None:
-        raise EvaluationError(
-            "a cloud without a run has no path to align", hint="give the folder of a run"
-        )
-    if T_map_world is None:
-        return mapped, {"alignment": "none"}
-    if frame == "map":
-        return replace(mapped, path=_moved(mapped.path, T_map_world)), {"alignment": "none"}
-    T = np.eye(4)
+        what = "--align-to needs a reference in the axes of the poses"
+        raise SettingsError(what, where="--reference-frame", got="map", expected="camera")
+    T_map_world, T = mapped.T_map_world, np.eye(4)
     how: dict[str, Any] = {"alignment": "none"}
+    if T_map_world is None:
+        if align_to is not None:
+            what = "a cloud without a run has no path to align"
+            raise EvaluationError(what, hint="give the folder of a run")
+        return mapped, how
+    if frame == "map":
+        return replace(mapped, path=_moved(mapped.path, T_map_world)), how
     if align_to is not None:
         T = _path_motion(mapped, align_to)
         how = {"alignment": "poses", **_size("path", T)}
@@ -109,13 +138,13 @@ def place_by_icp(
     frames: Sequence[ReferenceFrame],
     align_to: Path | None,
     reach_m: float,
-) -> tuple[MappedCloud, dict[str, Any], ReferenceFrame]:
+) -> tuple[MappedCloud, dict[str, Any]]:
     """Bring a map into the axes of its reference (`place_cloud`), and align it there by ICP.
 
     Of several ``frames``, the cloud is placed where most of its points have a partner within
-    ``reach_m``. Returns the map, how it was aligned, and the axes.
+    ``reach_m``: ``reference_frame`` of how it was aligned.
     """
-    found: list[tuple[MappedCloud, dict[str, Any], ReferenceFrame]] = []
+    found: list[tuple[MappedCloud, dict[str, Any]]] = []
     for frame in frames:
         placed, how = place_cloud(mapped, frame, align_to)
         try:
@@ -123,8 +152,8 @@ def place_by_icp(
         except RegistrationError:
             if frame == frames[-1] and not found:
                 raise
-            continue
-        found.append((fitted, {**how, "reference_frame": frame, **moved}, frame))
+        else:
+            found.append((fitted, {**how, "reference_frame": frame, **moved}))
     return max(found, key=lambda each: each[1]["icp_share"])
 
 
@@ -144,10 +173,7 @@ def _fit_cloud(
 def add_within_reach(
     mapped: MappedCloud, reference: PointCloud, by_threshold: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Add the figures of the points within reach of the reference; return the share beyond.
-
-    Nothing is added where the path of the cameras is unknown.
-    """
+    """Add the figures within reach of the reference, if the path is known; return the rest."""
     if mapped.path is None:
         return {}
     judged = within_reach(mapped.cloud, reference, mapped.path)
@@ -194,12 +220,9 @@ def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
     if holds_times(poses):
         path, truth = associate(path, truth, TOLERANCE_S)
     if len(path) != len(truth):
-        raise EvaluationError(
-            "run and true poses differ in length",
-            where=poses,
-            got=counted(len(truth), "pose"),
-            expected=f"{len(path)}",
-        )
+        got = counted(len(truth), "pose")
+        what = "run and true poses differ in length"
+        raise EvaluationError(what, where=poses, got=got, expected=f"{len(path)}")
     fit = fit_to_path(path.positions_m, truth.positions_m, drift_at_end(path))
     fit.check(poses, "are these the poses of its cameras, in metres?")
     return fit_paths(path, truth).T_to_from
@@ -212,3 +235,63 @@ def _moved(path: Trajectory | None, T: Float64) -> Trajectory | None:
 def _size(name: str, T: Float64) -> dict[str, Any]:
     moved_m, turned_deg = np.linalg.norm(T[:3, 3]), np.degrees(angle_rad(T))
     return {f"{name}_moved_m": float(moved_m), f"{name}_turned_deg": float(turned_deg)}
+
+
+_NEAR_M: Final = 0.2  # a map point this near the true surface is correct
+LEAST_FRAMES: Final = 3  # number of frames that must have seen a cell for it to be compared
+
+
+@dataclass(frozen=True)
+class DriveErrors:
+    """Errors of a drive; None = the truth is not known, or cannot be compared with."""
+
+    path: TrajectoryMetrics | None
+    surface: MapMetrics | None
+    occupancy: OccupancyMetrics | None
+    warnings: tuple[str, ...] = ()  # what could not be compared
+    true_path: Trajectory | None = None  # to be drawn
+
+
+def compare_with_truth(
+    source: StereoSource, mapped: MappedSequence, grid: OccupancyGrid, *, poses_given: bool
+) -> DriveErrors:
+    """Compare a mapped drive and its grid with the truth that its source knows.
+
+    Poses that were given are no estimate, and 0 % drift would mislead: the paths are not compared.
+    """
+    warnings: list[str] = []
+
+    def attempt(what: str, true: Any, compare: Callable[[Any], Any]) -> Any:
+        try:
+            return None if true is None else compare(true)
+        except EvaluationError as error:
+            warnings.append(f"not compared with the true {what}: {error}")
+
+    truth = source.truth or SequenceTruth()
+    path = None if poses_given else truth.trajectory
+    cells = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
+    return DriveErrors(
+        attempt("path", path, lambda true: evaluate_trajectory(mapped.trajectory, true)),
+        # Loads the whole cloud, but only where the whole true surface is in memory as well.
+        attempt("surface", truth.surface, lambda true: evaluate_map(mapped.cloud, true, _NEAR_M)),
+        attempt(
+            "occupancy",
+            cells,
+            lambda true: evaluate_occupancy(drop_undecided(mapped.voxels), grid, true),
+        ),
+        tuple(warnings),
+        truth.trajectory,
+    )
+
+
+def occupancy_view(
+    config: DriveSettings, T_map_world: Float64, least_frames: int = LEAST_FRAMES
+) -> dict[str, Any]:
+    """Return the cells, axes and height band of a map, for `StereoSource.occupancy_truth`."""
+    return {
+        "resolution_m": config.occupancy.resolution_m,
+        "band_m": (config.grid.min_height_m, config.grid.max_height_m),
+        "range_m": config.occupancy.max_range_m,
+        "least_frames": least_frames,
+        "T_map_world": T_map_world,
+    }

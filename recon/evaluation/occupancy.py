@@ -1,9 +1,7 @@
 """Accuracy and completeness of an occupancy map with respect to exact ground truth.
 
-Only what the drive could observe counts. A true voxel counts if enough frames saw its surface
-within the map's range. An occupied voxel counts if it was in the field of view and in range in
-enough frames, occluded or not: a voxel invented inside a wall is wrong too. A cell of the grid
-counts if enough frames saw a surface in it, not above the height band.
+Only what enough frames could observe counts: true voxels whose surface they saw, occupied voxels
+that they had in view and in range, occluded or not, and cells in which they saw a surface.
 """
 
 from __future__ import annotations
@@ -46,25 +44,22 @@ def evaluate_occupancy(
     """
     _check(voxels, grid, truth)
     occupied = voxels.keys[voxels.log_odds > 0]
-    counted = occupied[_looked_at(occupied, truth)]
-    grids = grid_on_truth(grid, truth), truth.grid.cells
+    counted, cells = occupied[_looked_at(occupied, truth)], grid_on_truth(grid, truth)
     return OccupancyMetrics(
         resolution_m=voxels.resolution_m,
         least_frames=truth.least_frames,
         voxels=_compare_voxels(occupied, counted, truth, _TOLERANCE),
         voxels_exact=_compare_voxels(occupied, counted, truth, 0),
-        grid=_compare_grids(*grids, truth.seen, _TOLERANCE),
-        grid_exact=_compare_grids(*grids, truth.seen, 0),
+        grid=_compare_grids(cells, truth, _TOLERANCE),
+        grid_exact=_compare_grids(cells, truth, 0),
     )
 
 
 def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) -> None:
     sizes = {voxels.resolution_m, grid.resolution_m, truth.grid.resolution_m}
     if max(sizes) - min(sizes) > 1e-9:
-        raise EvaluationError(
-            "map and truth have different resolutions",
-            got=", ".join(f"{size:g} m" for size in sorted(sizes)),
-        )
+        got = ", ".join(f"{size:g} m" for size in sorted(sizes))
+        raise EvaluationError("map and truth have different resolutions", got=got)
     if not (truth.frames >= truth.least_frames).any() or not truth.seen.any():
         raise EvaluationError(
             "no surface was seen in enough frames to compare",
@@ -74,7 +69,6 @@ def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) 
 
 
 def _looked_at(keys: Int32, truth: OccupancyTruth) -> Bool:
-    """Return which voxels were in view and in range in enough frames, occluded or not."""
     centres = (keys.astype(np.float64) + 0.5) * truth.grid.resolution_m
     frames = np.zeros(len(keys), np.int64)
     width, height = truth.camera.width_px, truth.camera.height_px
@@ -121,9 +115,8 @@ def grid_on_truth(grid: OccupancyGrid, truth: OccupancyTruth) -> NDArray[np.int8
     return cells
 
 
-def _compare_grids(
-    cells: NDArray[np.int8], true: NDArray[np.int8], seen: Bool, tolerance: int
-) -> GridMetrics:
+def _compare_grids(cells: NDArray[np.int8], truth: OccupancyTruth, tolerance: int) -> GridMetrics:
+    true, seen = truth.grid.cells, truth.seen
     occupied = seen & (true == OCCUPIED)
     return GridMetrics(
         iou_occupied=_iou(cells == OCCUPIED, true == OCCUPIED, seen, tolerance),

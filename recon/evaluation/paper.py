@@ -7,7 +7,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
@@ -38,17 +37,15 @@ from recon.stereo.match.search import usual_ndisp
 from recon.stereo.rectify.rectifier import Rectifier, to_grey
 
 # Scene of each experiment, identified by Table 1: docs/paper.md.
-EXPERIMENTS: Final[Mapping[int, str]] = MappingProxyType({2: "ArtL", 3: "Jadeplant", 4: "Pipes"})
+EXPERIMENTS: Final[Mapping[int, str]] = {2: "ArtL", 3: "Jadeplant", 4: "Pipes"}
 CORRECTED: Final = "corrected"
 ABSOLUTE: Final = "absolute"
 AS_PRINTED: Final = "as_printed"
-TITLES: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        CORRECTED: "corrected",
-        ABSOLUTE: "as printed, but absolute differences",
-        AS_PRINTED: "as printed",
-    }
-)
+TITLES: Final[Mapping[str, str]] = {
+    CORRECTED: "corrected",
+    ABSOLUTE: "as printed, but absolute differences",
+    AS_PRINTED: "as printed",
+}
 BAD_PX: Final = 1.0  # disparity error above which a pixel counts as wrong
 _SCENES: Final = Path("middlebury", "MiddEval3", "trainingQ")
 _WHERE: Final = "name the folder MiddEval3/trainingQ of the Middlebury benchmark"
@@ -56,16 +53,13 @@ _WHERE: Final = "name the folder MiddEval3/trainingQ of the Middlebury benchmark
 _SIGMA_PX: Final = 1 / math.sqrt(12)
 # Keeps every point of the printed method, regardless of range and uncertainty.
 _EVERY_POINT: Final = CloudSettings(min_range_m=0.0, max_range_m=None, max_relative_sigma=None)
-
-
-_PATCH_PX: Final = 11
-"""Patch size of the printed method, which the paper does not give."""
+_PATCH_PX: Final = 11  # of the printed method; the paper does not give it
 
 
 class PaperSettings(Settings):
     """How the seed paper's experiments are repeated."""
 
-    fixed: ClassVar = {"patch_px": 11}
+    fixed: ClassVar = {"patch_px": _PATCH_PX}
 
     as_printed: bool = False
     """Run the method as printed as well as the corrected one."""
@@ -106,9 +100,9 @@ class MethodResult:
 
     method: str  # a key of `TITLES`
     pair: RectifiedPair  # the grey images, with the camera that the method assumes
-    disparity: Disparity  # the disparity map
+    disparity: Disparity
     depth_m: Float32  # (H, W), metres; NaN = unknown
-    cloud: PointCloud  # the points in camera axes
+    cloud: PointCloud  # in camera axes
     figures: dict[str, Any]  # shares, and errors of disparity and depth; None without ground truth
 
 
@@ -118,16 +112,12 @@ class PrintedMatcher:
 
     A pixel has no value only where no patch lies within both images. Every other pixel keeps
     its minimum, however doubtful: confidence 1 says that nothing was asked, not that it is right.
-    ``signed`` sums the differences with their signs, as Eq. 9-10 are printed; else their absolute
-    values, which is what SAD means.
 
     Ref: Eq. 9-10 of the seed paper, see docs/paper.md.
     """
 
     patch_px: int  # edge of the patch; odd
-    # whether to sum the differences with their signs, as Eq. 9-10 are printed; else their absolute
-    # values, which is what SAD means. Ref: Eq. 9-10 of the seed paper, see docs/paper.md
-    signed: bool
+    signed: bool  # sum differences with their signs, as printed; else absolute ones, as SAD means
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Return the disparities with the smallest sum, as far as the camera says or a tenth."""
@@ -221,9 +211,8 @@ def apply_method(
 ) -> MethodResult:
     """Reconstruct one experiment by one method.
 
-    ``corrected`` is our matcher with the scene's calibration. ``absolute`` and ``as_printed`` find
-    integer disparities in Eq. 6 grey images, without and with the misprint of Eq. 9-10, and both
-    use Table 1's focal length as printed.
+    ``corrected`` is our matcher with the scene's calibration; ``absolute`` and ``as_printed`` find
+    integer disparities in Eq. 6 grey images, and use Table 1's focal length as printed.
     """
     if method == CORRECTED:
         rebuilt = FrameReconstructor(experiment.camera, config, threads=threads)
@@ -268,11 +257,7 @@ def try_patches(
 def compare_depth(
     depth_m: Float32, truth: DisparityTruth, camera: RectifiedCamera
 ) -> dict[str, float] | None:
-    """Compare depths (H, W) with the truth at pixels seen by both cameras; None = none has both.
-
-    Returns medians of the depth, of the true depth of these pixels, of the absolute error in per
-    cent of it, and of estimated ÷ true depth; and the number of pixels.
-    """
+    """Compare depths (H, W) with the truth at pixels seen by both cameras; None = none has both."""
     true_m = depth_from_disparity(truth.values, camera)
     both = np.isfinite(depth_m) & np.isfinite(true_m) & truth.nonocc
     if not both.any():
@@ -301,6 +286,5 @@ def _patch_figures(patch_px: int, found: Disparity, truth: DisparityTruth | None
         metrics = evaluate_disparity(found, truth, (BAD_PX,))
         bad, error = metrics.bad[BAD_PX], metrics.avgerr_px
         right = 100 - bad - metrics.invalid
-    figures = {"patch_px": patch_px, "valid_percent": 100 * float(found.valid.mean())}
-    errors = {"bad_percent": bad, "right_percent": right, "avgerr_px": error}
-    return dict(plain({**figures, **errors}))
+    valid = {"patch_px": patch_px, "valid_percent": 100 * float(found.valid.mean())}
+    return dict(plain({**valid, "bad_percent": bad, "right_percent": right, "avgerr_px": error}))

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import Field
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.alignment import Similarity, fit_points, fit_upright
+from recon.core.geometry.alignment import Similarity, fit_points, fit_upright, nearest_sorted
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, quaternion_from_rotation
 from recon.core.settings import Settings
 from recon.core.text import counted
 from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
-from recon.core.values.arrays import Float64, Int32
-from recon.evaluation.segments import Segments, choose_segments
+from recon.core.values.arrays import Bool, Float64, Int32
 from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
 from recon.places.places import drift_at_end, fit_to_path
@@ -46,12 +44,12 @@ class TrajectoryRules(Settings):
 class TrajectoryComparison:
     """Two trajectories and their differences, as needed for plots."""
 
-    estimate: Trajectory  # the aligned estimate
-    truth: Trajectory  # the true trajectory, pose by pose
-    segments: Segments  # the segments of the relative errors
+    estimate: Trajectory  # aligned
+    truth: Trajectory
+    segments: Segments  # of the relative errors
     segment_percent: Float64  # (N,), translation error of each segment, per cent of its length
     segment_deg_per_100m: Float64  # (N,), rotation error of each segment
-    metrics: TrajectoryMetrics  # the summary
+    metrics: TrajectoryMetrics
     motion: Similarity  # what aligned the estimate
 
     @property
@@ -62,35 +60,20 @@ class TrajectoryComparison:
 
     @property
     def roll_axis(self) -> Float64 | None:
-        """float64 (3,): direction of a straight path whose alignment leaves the roll about it open.
-
-        None if the positions fix every rotation, or if they are not what was aligned.
-        """
-        if self.metrics.alignment not in ("se3", "sim3"):
-            return None
-        return open_roll_axis(self.estimate, self.truth)
+        """`open_roll_axis`; None if the positions are not what was aligned, too."""
+        by_positions = self.metrics.alignment in ("se3", "sim3")
+        return open_roll_axis(self.estimate, self.truth) if by_positions else None
 
     @property
     def rotation_errors_rad(self) -> Float64:
         """float64 (N,): angle between each orientation and the true one.
 
-        Where the alignment leaves the roll open (`roll_axis`), the estimate is rolled to fit best:
-        the common roll would be an error of the alignment, not of the estimate.
+        Where the alignment leaves the roll open (`roll_axis`), the estimate is rolled to fit best.
         """
-        axis, estimate = self.roll_axis, self.estimate
-        if axis is not None:
+        estimate = self.estimate
+        if (axis := self.roll_axis) is not None:
             estimate = without_roll(estimate, self.truth, axis)
         return angle_rad(invert(self.truth.T_world_camera) @ estimate.T_world_camera)
-
-
-@dataclass(frozen=True, eq=False)
-class TrajectoryRun:
-    """The result of a comparison."""
-
-    estimate: Path  # file of the estimate
-    truth: Path  # file of the ground truth
-    comparison: TrajectoryComparison  # the two paths, aligned, and their differences
-    summary: dict[str, Any]  # the figures of ``summary.json``
 
 
 def evaluate_trajectory(
@@ -113,7 +96,6 @@ def evaluate_trajectory(
 
 
 def _path(name: str, given: object) -> Trajectory:
-    """Return a trajectory, that of a file, or that of the truth of a source."""
     found = given.trajectory if isinstance(given, SequenceTruth) else given
     if isinstance(found, str | PathLike):
         return read_trajectory(found)
@@ -131,12 +113,10 @@ def compare_paths(
 ) -> TrajectoryComparison:
     """Compare an estimated trajectory with the true one, pose by pose.
 
-    Relative errors follow the KITTI development kit: segments of 100 to 800 m, as far as the true
-    path has room for them, starting at every tenth frame; the error of a segment is the error of
-    the motion over it, divided by its length; the mean is over all segments. A drive with room for
-    fewer than two of these lengths uses segments of 50 and 100 m instead, starting at every frame,
-    and a drive of 50 m or less uses segments of half its length. The scale of the alignment affects
-    all errors, its rigid part only the ATE.
+    Relative errors follow the KITTI development kit: means over `choose_segments` of the error of
+    the motion, divided by the length. A drive too short for two of KITTI's lengths uses 50 and
+    100 m, one of 50 m or less half its length. The scale of the alignment affects all errors, its
+    rigid part only the ATE.
 
     Ref: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012; Sturm et al., "A
     benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
@@ -148,28 +128,31 @@ def compare_paths(
     segments = choose_segments(truth.distances_m, rules.lengths_m, rules.step_frames)
     translation_m, rotation_rad = motion_errors(estimate, truth, segments.first, segments.last)
     percent = 100.0 * translation_m / segments.length_m
-    deg_per_100m = 100.0 * np.rad2deg(rotation_rad) / segments.length_m
-    frames = np.arange(len(truth), dtype=np.int32)
-    apart = rules.rpe_frames
+    degrees = 100.0 * np.rad2deg(rotation_rad) / segments.length_m
+    lengths_m = np.unique(segments.length_m).tolist()
+    frames, apart = np.arange(len(truth), dtype=np.int32), rules.rpe_frames
     step_m, step_rad = motion_errors(estimate, truth, frames[:-apart], frames[apart:])
     away_m = np.linalg.norm(estimate.positions_m - truth.positions_m, axis=1)
     metrics = TrajectoryMetrics(
         t_rel_percent=float(np.mean(percent)),
-        r_rel_deg_per_100m=float(np.mean(deg_per_100m)),
+        r_rel_deg_per_100m=float(np.mean(degrees)),
         ate_m=_rms(away_m),
         rpe_m=_rms(step_m),
         rpe_deg=float(np.rad2deg(_rms(step_rad))),
         path_length_m=truth.path_length_m,
         frames=len(truth),
-        segment_lengths_m=tuple(float(length) for length in np.unique(segments.length_m)),
+        segment_lengths_m=tuple(lengths_m),
         segments=len(segments.first),
         alignment=rules.alignment,
         scale=motion.scale,
         ate_median_m=float(np.median(away_m)),
         ate_max_m=float(np.max(away_m)),
-        by_length=_by_length(segments, percent, deg_per_100m),
+        by_length=tuple(
+            LengthErrors(m, float(percent[of].mean()), float(degrees[of].mean()), int(of.sum()))
+            for m, of in ((m, segments.length_m == m) for m in lengths_m)
+        ),
     )
-    return TrajectoryComparison(estimate, truth, segments, percent, deg_per_100m, metrics, motion)
+    return TrajectoryComparison(estimate, truth, segments, percent, degrees, metrics, motion)
 
 
 def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity:
@@ -180,8 +163,7 @@ def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity
         return Similarity(truth.T_world_camera[0] @ invert(estimate.T_world_camera[0]))
     if alignment == "upright":
         return fit_upright(estimate.positions_m, truth.positions_m)
-    scaled = alignment == "sim3"
-    return fit_points(estimate.positions_m, truth.positions_m, scaled=scaled)
+    return fit_points(estimate.positions_m, truth.positions_m, scaled=alignment == "sim3")
 
 
 def motion_errors(
@@ -192,20 +174,6 @@ def motion_errors(
     motion: Float64 = invert(poses[first]) @ poses[last]
     wrong = invert(motion) @ (invert(true[first]) @ true[last])
     return np.linalg.norm(wrong[:, :3, 3], axis=1), angle_rad(wrong)
-
-
-def _by_length(
-    segments: Segments, percent: Float64, deg_per_100m: Float64
-) -> tuple[LengthErrors, ...]:
-    return tuple(
-        LengthErrors(
-            length_m=float(length_m),
-            t_rel_percent=float(np.mean(percent[segments.length_m == length_m])),
-            r_rel_deg_per_100m=float(np.mean(deg_per_100m[segments.length_m == length_m])),
-            segments=int((segments.length_m == length_m).sum()),
-        )
-        for length_m in np.unique(segments.length_m)
-    )
 
 
 def _rms(values: Float64) -> float:
@@ -222,9 +190,8 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
         )
     least = rules.rpe_frames + 1
     if len(truth) < least:
-        raise EvaluationError(
-            "too few poses to compare", got=counted(len(truth), "pose"), expected=f"{least} or more"
-        )
+        got, expected = counted(len(truth), "pose"), f"{least} or more"
+        raise EvaluationError("too few poses to compare", got=got, expected=expected)
     if truth.path_length_m < MIN_PATH_M:
         raise EvaluationError(
             "true path is too short for errors relative to its length",
@@ -241,17 +208,15 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
         )
 
 
-# A path is straight if its width (rms) is at most this share of its length (rms).
-_STRAIGHT: Final = 0.05
+_STRAIGHT: Final = 0.05  # largest width of a straight path, as share of its length (both rms)
 # The positions fix the roll to about their error over the width of the path, in radians.
 _FIXED_RAD: Final = float(np.radians(0.5))
 
 
 def open_roll_axis(estimate: Trajectory, truth: Trajectory) -> Float64 | None:
-    """Return the direction of a straight path about which aligned positions do not fix the roll.
+    """Return the direction of a straight path, about which aligned positions leave the roll open.
 
-    float64 (3,), world axes of ``truth``; None if the positions fix every rotation. The estimate is
-    aligned to the true path by positions.
+    float64 (3,), world axes of ``truth``; None if the positions fix every rotation.
     """
     centred = truth.positions_m - truth.positions_m.mean(axis=0)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
@@ -263,10 +228,7 @@ def open_roll_axis(estimate: Trajectory, truth: Trajectory) -> Float64 | None:
 
 
 def without_roll(estimate: Trajectory, truth: Trajectory, axis: Float64) -> Trajectory:
-    """Return the estimate with its poses rolled alike about an axis until their rotations fit best.
-
-    Positions stay as they are: across the axis they are too close to it to be moved.
-    """
+    """Roll all poses alike about an axis until their rotations fit best; positions stay."""
     wrong = truth.T_world_camera[:, :3, :3] @ np.swapaxes(estimate.T_world_camera[:, :3, :3], 1, 2)
     xyzw = np.array([quaternion_from_rotation(each) for each in wrong])
     rolls = 2 * np.arctan2(xyzw[:, :3] @ axis, xyzw[:, 3])
@@ -282,3 +244,112 @@ def _across(vectors: Float64, axis: Float64) -> Float64:
 
 def _extent(values: Float64) -> float:
     return float(np.sqrt((values**2).sum() / len(values)))
+
+
+KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+SHORT_LENGTHS_M: Final = (50.0, 100.0)  # for a drive with no room for two of KITTI's
+KITTI_STEP_FRAMES: Final = 10  # the benchmark starts a segment at every tenth frame (one second)
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Segments of the true path."""
+
+    first: Int32  # (N,), frames
+    last: Int32  # (N,), frames
+    length_m: Float64  # (N,), nominal
+
+
+def choose_segments(
+    distances_m: Float64, lengths_m: tuple[float, ...] | None = None, step_frames: int | None = None
+) -> Segments:
+    """Choose segments by the true path length (N,) from the first pose to each.
+
+    Without lengths: those of the benchmark that fit, or shorter ones; without a step between
+    starts: 10 frames, or 1 for the shorter lengths.
+    """
+    lengths = lengths_m or KITTI_LENGTHS_M
+    segments = segments_of(distances_m, lengths, step_frames or KITTI_STEP_FRAMES)
+    if lengths_m is not None and not len(segments.first):
+        raise EvaluationError(
+            "true path has no room for a segment of the requested lengths",
+            got=f"a path of {distances_m[-1]:.1f} m",
+            expected=f"more than {min(lengths_m):g} m",
+        )
+    if lengths_m is not None or len(np.unique(segments.length_m)) >= 2:
+        return segments
+    segments = segments_of(distances_m, SHORT_LENGTHS_M, step_frames or 1)
+    if len(segments.first):
+        return segments
+    return segments_of(distances_m, (0.5 * float(distances_m[-1]),), 1)
+
+
+def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -> Segments:
+    """Return segments from every ``step``-th frame to the first that is farther along the path."""
+    starts = np.arange(0, len(distances_m), step)
+    first = np.repeat(starts, len(lengths_m))
+    length_m = np.tile(np.asarray(lengths_m, dtype=np.float64), len(starts))
+    last = np.searchsorted(distances_m, distances_m[first] + length_m, side="right")
+    fits = last < len(distances_m)
+    return Segments(first[fits].astype(np.int32), last[fits].astype(np.int32), length_m[fits])
+
+
+TOLERANCE_S: Final = 0.01  # largest time difference of two associated poses
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float
+) -> tuple[Trajectory, Trajectory]:
+    """Match poses that are mutually nearest in time, on one clock; others are left out."""
+    there = nearest_sorted(estimate.timestamps_s, truth.timestamps_s)
+    back = nearest_sorted(truth.timestamps_s, estimate.timestamps_s)
+    apart_s = np.abs(truth.timestamps_s[there] - estimate.timestamps_s)
+    mutual = (back[there] == np.arange(len(estimate))) & (apart_s <= tolerance_s)
+    if not mutual.any():
+        times = (estimate.timestamps_s, truth.timestamps_s)
+        spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in times]
+        raise EvaluationError(
+            "no poses of the two trajectories match in time",
+            got=f"times {' and '.join(spans)}",
+            expected=f"times within {tolerance_s:g} s of each other",
+            hint="raise --tolerance, or make sure that both use the same clock",
+        )
+    return estimate.select(mutual), truth.select(there[mutual])
+
+
+# A turn changes evenly from frame to frame if it does so less than this share of the median.
+_EVEN: Final = 0.02
+_LEAST_CHANGES: Final = 5  # fewer even changes in a row may be chance
+# Where turns change less than this everywhere, the digits of the file decide: KITTI has six.
+_LEAST_MEDIAN_RAD: Final = 5e-5
+
+
+def interpolated_poses(path: Trajectory) -> Bool:
+    """Return bool (N,): poses along which the path turns at one rate, as it does nowhere else.
+
+    A vehicle's rates of turn change from frame to frame. A path that turns evenly for the most
+    part has none, as rendered ones do.
+    """
+    found = np.zeros(len(path), np.bool_)
+    if len(path) < _LEAST_CHANGES + 2:
+        return found
+    step = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
+    change = angle_rad(invert(step[:-1]) @ step[1:])
+    typical = float(np.median(change))
+    even = (change < _EVEN * typical) & (typical > _LEAST_MEDIAN_RAD)
+    runs = np.lib.stride_tricks.sliding_window_view(even, _LEAST_CHANGES).all(axis=1)
+    for first in np.flatnonzero(runs):
+        found[first : first + _LEAST_CHANGES + 2] = True
+    return found
+
+
+def interpolation_warnings(truth: Trajectory, segments: Segments) -> list[str]:
+    """Return what to know of relative errors: how many rest on poses that nobody measured."""
+    found = interpolated_poses(truth)
+    if not found.any():
+        return []
+    resting = int((found[segments.first] | found[segments.last]).sum())
+    first, last = np.flatnonzero(found)[[0, -1]]
+    which = f"{counted(int(found.sum()), 'true pose')} (between {first} and {last})"
+    where = f"{resting} of {counted(len(segments.first), 'segment')} begin or end there"
+    return [f"{which} turn evenly, as interpolated ones do: {where}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from string import Formatter
 from typing import Any, Final
@@ -19,9 +20,7 @@ from recon.run.directory import RunDirectory
 from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
 
-# Row errors are drawn this much longer than they are, since a pixel is invisible in a page. The
-# caption says so.
-_LONGER: Final = 20.0
+_LONGER: Final = 20.0  # row errors are drawn longer than they are, as the caption says
 _SHOWN_ROWS_PX: Final = 5.0  # farther apart are wrong matches
 
 
@@ -42,7 +41,6 @@ def write_audit_page(
 
 
 def _pair(look: Look, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
-    """Return what the page shows of one pair."""
     disparity = matcher.match(pair)
     return {
         "index": look.index,
@@ -79,14 +77,14 @@ def frames_figure(looks: Sequence[Look]) -> bytes:
     labels = ("mean grey level", "sharpness (0 to 1)", "row error (px)\nmedian, middle half")
     figure, (brightness, sharpness, rows) = style.stacked(6.4, "frame", labels)
     frames = [look.index for look in looks]
-    for side, name in enumerate(("left", "right")):
-        look_of: dict[str, Any] = {"label": name, "linewidth": 1.3}
-        brightness.plot(frames, [look.brightness_dn[side] for look in looks], "o-", **look_of)
-        sharpness.plot(frames, [look.sharpness[side] for look in looks], "o-", **look_of)
+    for axes, measured in (
+        (brightness, [look.brightness_dn for look in looks]),
+        (sharpness, [look.sharpness for look in looks]),
+    ):
+        axes.plot(frames, measured, "o-", linewidth=1.3, label=("left", "right"))
+        axes.legend(ncols=2)
     brightness.set_ylim(0, 255)
     sharpness.set_ylim(bottom=0)
-    for axes in (brightness, sharpness):
-        axes.legend(ncols=2)
     known = [look for look in looks if len(look.features)]
     if known:
         spread = np.array([np.quantile(look.rows_px, (0.25, 0.5, 0.75)) for look in known])
@@ -99,31 +97,27 @@ def frames_figure(looks: Sequence[Look]) -> bytes:
 
 def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     """Return the measurements of an audit as subject and text of lines, in display order."""
+    known, swapped = functools.partial(_known, summary), summary["swapped_share"]
+    depths_m = summary.get("depth_error_m", {})
     lines = {
         "frames": _frames(summary),
-        "rows": _known(
+        "rows": known(
             "{row_error_rms_px:.2f} px rms (mean {row_error_mean_px:+.2f}, "
             "spread {row_error_spread_px:.2f}, feature noise {row_noise_px:.2f}); "
-            "corrected by pitch {mend_pitch_deg:+.3f}, roll {mend_roll_deg:+.3f} deg",
-            summary,
+            "corrected by pitch {mend_pitch_deg:+.3f}, roll {mend_roll_deg:+.3f} deg"
         ),
         "left, right": "not known"
-        if summary["swapped_share"] is None
-        else f"{100 * summary['swapped_share']:.0f} % of near features suggest swapped cameras",
+        if swapped is None
+        else f"{100 * swapped:.0f} % of near features suggest swapped cameras",
         "time": _time(summary),
-        "brightness": _known("right / left {gain:.2f}", summary),
-        "sharpness": _known(
-            "left {sharpness_left:.2f}, right {sharpness_right:.2f} (0 to 1)", summary
-        ),
-        "disparities": _known(
+        "brightness": known("right / left {gain:.2f}"),
+        "sharpness": known("left {sharpness_left:.2f}, right {sharpness_right:.2f} (0 to 1)"),
+        "disparities": known(
             "{disparity_5_50_95_px[0]:.1f} to {disparity_5_50_95_px[2]:.1f} px (5 to 95 %), "
-            "median {disparity_5_50_95_px[1]:.1f} px",
-            summary,
+            "median {disparity_5_50_95_px[1]:.1f} px"
         ),
         "rig": _rig(summary),
-        "depth error": ", ".join(
-            f"{_length(error)} at {at} m" for at, error in summary.get("depth_error_m", {}).items()
-        )
+        "depth error": ", ".join(f"{_length(off)} at {at} m" for at, off in depths_m.items())
         or "not known",
     }
     if (by_motion := summary.get("rig_by_motion")) is not None:
@@ -133,7 +127,7 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     return lines
 
 
-def _known(text: str, figures: Mapping[str, Any]) -> str:
+def _known(figures: Mapping[str, Any], text: str) -> str:
     """Put figures into a text that names them; "not known" if one is not."""
     named = {name.partition("[")[0] for _, name, _, _ in Formatter().parse(text) if name}
     known = all(figures.get(name) is not None for name in named)
@@ -141,17 +135,14 @@ def _known(text: str, figures: Mapping[str, Any]) -> str:
 
 
 def _by_motion(found: Mapping[str, Any]) -> str:
-    off = {
-        name: f"{found[name]['value']:+.2f} ± {1.96 * found[name]['sigma']:.2f}"
+    disparity, focal, lens = (
+        f"{found[name]['value']:+.2f} ± {1.96 * found[name]['sigma']:.2f}"
         for name in ("disparity_px", "focal_percent", "lens_px")
-    }
-    depths = ", ".join(
-        f"{percent:+.1f} % at {z} m" for z, percent in found["depth_percent"].items()
     )
+    depths = ", ".join(f"{off:+.1f} % at {z} m" for z, off in found["depth_percent"].items())
     return (
-        f"disparities lack {off['disparity_px']} px (depth {depths}), at the sides another "
-        f"{off['lens_px']} px by the lenses; right focal length {off['focal_percent']} %; the "
-        "baseline cannot be seen"
+        f"disparities lack {disparity} px (depth {depths}), at the sides another {lens} px by the "
+        f"lenses; right focal length {focal} %; the baseline cannot be seen"
     )
 
 

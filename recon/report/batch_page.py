@@ -80,10 +80,7 @@ def batch_csv(results: Sequence[JobResult]) -> str:
 
 @style.styled
 def sweep_figure(results: Sequence[JobResult]) -> bytes:
-    """Draw accuracy and time over each swept setting: a point per job, a line through the medians.
-
-    Jobs of each command have panels of their own. Empty if no job of a sweep succeeded.
-    """
+    """Draw accuracy and time over each swept setting; empty if no job of a sweep succeeded."""
     done = [one for one in results if one.figures and one.job.swept]
     rows = list(dict.fromkeys((one.job.command, key) for one in done for key in one.job.swept))
     if not rows:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -21,8 +21,7 @@ from recon.run.directory import RunDirectory
 from recon.stereo.rectify.lens import epipolar_curves
 from recon.stereo.rectify.rectifier import Rectifier
 
-Sides = Sequence[Any]
-"""One value for the left image, one for the right."""
+Sides = Sequence[Any]  # one value for the left image, one for the right
 _CELLS: Final = (8, 6)
 
 
@@ -35,8 +34,7 @@ def write_calibration_page(result: CalibrationRun, run: RunDirectory) -> None:
         "row_errors": rows_figure(result),
         "depth_error": depth_error_figure(result),
     }
-    for name, png in figures.items():
-        write_bytes(run.path(f"pictures/{name}.png"), png)
+    _write_pictures(figures, run)
     write_page("calibration", run, result.summary, figures=figures)
 
 
@@ -51,22 +49,17 @@ def _epipolar_pictures(result: CalibrationRun) -> dict[str, bytes]:
     rectifier = Rectifier(fit.calibration, result.config.rectification)
     level = rectifier.rectify(StereoPair(left, right, name=view.name))
     level_px = [turns.place(fit.calibration, pixels[n], right=n == 1) for n in (0, 1)]
-    return epipolar_pictures(
-        ((left, right), pixels, epipolar_curves(fit.calibration, *pixels)),
-        ((level.left, level.right), level_px),
-        f": {view.name}",
-    )
+    raw = ((left, right), pixels, epipolar_curves(fit.calibration, *pixels))
+    return epipolar_pictures(raw, ((level.left, level.right), level_px), f": {view.name}")
 
 
 @style.styled
 def coverage_figure(result: CalibrationRun) -> bytes:
     """Draw all corners found in both images, over the cells of the coverage measure."""
     width, height = result.seen.size_px
-    figure, both = style.subplots(
-        style.WIDE_IN, style.WIDE_IN / 2 * height / width + 0.5, columns=2
-    )
-    for side, axes in enumerate(both):
-        name = ("left", "right")[side]
+    height_in = style.WIDE_IN / 2 * height / width + 0.5
+    figure, both = style.subplots(style.WIDE_IN, height_in, columns=2)
+    for side, (name, axes) in enumerate(zip(("left", "right"), both, strict=True)):
         colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(result.fit.views)))
         for view, colour in zip(result.fit.views, colours, strict=True):
             axes.plot(*view.seen[side].pixels.T, ".", color=colour, markersize=3.5, alpha=0.8)
@@ -124,9 +117,8 @@ def depth_error_figure(result: CalibrationRun) -> bytes:
     axes.plot([each.depth_m for each in errors], matching, "o-", color=style.FAINT, label=label)
     axes.plot(known_m, calibration, "o-", color=style.ESTIMATE, label="calibration, over the image")
     label = f"{100 * CONFIDENCE:.0f} % interval, middle of the image"
-    axes.fill_between(
-        known_m, 1e-3, reach, color=style.ESTIMATE, alpha=0.15, linewidth=0, label=label
-    )
+    look = {"color": style.ESTIMATE, "alpha": 0.15, "linewidth": 0}
+    axes.fill_between(known_m, 1e-3, reach, label=label, **look)
     axes.set(xscale="log", yscale="log", xlabel="depth, m", ylabel="depth error, cm")
     axes.set_ylim(bottom=max(min([*matching, *calibration]) / 3, 1e-3))
     axes.set_xticks([each.depth_m for each in errors], [f"{each.depth_m:g}" for each in errors])
@@ -139,10 +131,12 @@ def write_epipolar_images(result: RectifyRun, run: RunDirectory) -> None:
     """Write ``pictures/epipolar_raw.png`` and ``pictures/epipolar_rectified.png``."""
     chosen = spread_points(result.raw_px[0], 12)
     lines = [[lines[n] for n in chosen] for lines in result.raw_lines]
-    pictures = epipolar_pictures(
-        ((result.pair.left, result.pair.right), [px[chosen] for px in result.raw_px], lines),
-        (result.rectified, [px[chosen] for px in result.rectified_px]),
-    )
+    raw = ((result.pair.left, result.pair.right), [px[chosen] for px in result.raw_px], lines)
+    rectified = (result.rectified, [px[chosen] for px in result.rectified_px])
+    _write_pictures(epipolar_pictures(raw, rectified), run)
+
+
+def _write_pictures(pictures: Mapping[str, bytes], run: RunDirectory) -> None:
     for name, png in pictures.items():
         write_bytes(run.path(f"pictures/{name}.png"), png)
 
@@ -159,7 +153,7 @@ def epipolar_pictures(
 ) -> dict[str, bytes]:
     """Draw a pair with epipolar lines as recorded, and rectified with rows of the left image.
 
-    ``raw`` has images, points (N, 2) and a line (M, 2) for each; ``rectified`` images and points.
+    ``raw``: images, points (N, 2) and a line (M, 2) for each; ``rectified``: images and points.
     """
     images, pixels = rectified
     right = images[0].shape[1] - 1.0
@@ -176,9 +170,8 @@ def epipolar_pictures(
 def _side_by_side(images: Sides, pixels: Sides, lines: Sides, titles: Sides) -> bytes:
     """Draw both images; a point and its line have the same colour in both."""
     height, width = images[0].shape[:2]
-    figure, both = style.subplots(
-        style.WIDE_IN, style.WIDE_IN / 2 * height / width + 0.4, columns=2
-    )
+    height_in = style.WIDE_IN / 2 * height / width + 0.4
+    figure, both = style.subplots(style.WIDE_IN, height_in, columns=2)
     for n, axes in enumerate(both):
         style.show_image(axes, images[n], titles[n])
         colours = colormaps["turbo"](np.linspace(0.08, 0.92, max(len(pixels[n]), 1)))

@@ -19,9 +19,7 @@ from recon.core.values.arrays import Float64
 from recon.odometry.protocol import OdometryHealth
 from recon.report import style
 
-Line = tuple[Float64, Mapping[str, Any]]
-"""Points (N, 2) and how matplotlib draws them."""
-
+Line = tuple[Float64, Mapping[str, Any]]  # points (N, 2) and how matplotlib draws them
 _MAP_LABELS: Final = ("x, forward at the start (m)", "y, left at the start (m)")
 _MOST_CELLS: Final = 2400  # of a grid's figure, a side: some for each of its pixels
 _MARGIN_CELLS: Final = 10
@@ -38,10 +36,7 @@ def path_figure(
     health: Sequence[OdometryHealth] = (),
     radius_share: float = 0.0,
 ) -> bytes:
-    """Draw the path in map axes from above; poses that are not trusted are marked.
-
-    Circles of ``radius_share`` of the path up to there say where the camera was with 95 %.
-    """
+    """Draw the path in map axes from above, untrusted poses marked, circles of 95 % certainty."""
     path = seen_from_above(estimate, T_map_world)
     lines: list[Line] = [(path, ESTIMATE_LINE)]
     if radius_share > 0.0:
@@ -52,9 +47,8 @@ def path_figure(
     bad = _bad_frames(health, len(estimate))
     if len(bad):
         look = {"marker": "x", "linestyle": "", "markersize": 8, "markeredgewidth": 2}
-        lines.append(
-            (path[bad], {**look, "color": style.BAD, "label": f"not trusted ({len(bad)})"})
-        )
+        look |= {"color": style.BAD, "label": f"not trusted ({len(bad)})"}
+        lines.append((path[bad], look))
     return top_view(lines, path, _MAP_LABELS)
 
 
@@ -76,14 +70,12 @@ def loops_figure(
     odometry, closed = (seen_from_above(path, T_map_world) for path in (before, after))
     gaps = [np.concatenate([odometry[list(pair)], [[np.nan, np.nan]]]) for pair in loops]
     joined = np.concatenate([np.zeros((0, 2)), *gaps])
-    look = {"marker": "o", "linewidth": 0.8, "markersize": 2.5}
+    faint = {"color": style.FAINT, "linewidth": 1.4, "linestyle": "--", "label": "odometry"}
+    look = {"marker": "o", "linewidth": 0.8, "markersize": 2.5, "color": style.BAD}
     lines: list[Line] = [
-        (
-            odometry,
-            {"color": style.FAINT, "linewidth": 1.4, "linestyle": "--", "label": "odometry"},
-        ),
+        (odometry, faint),
         (closed, {**ESTIMATE_LINE, "label": "loops closed"}),
-        (joined, {**look, "color": style.BAD, "label": f"loops ({len(loops)})"}),
+        (joined, {**look, "label": f"loops ({len(loops)})"}),
     ]
     return top_view(lines, closed, _MAP_LABELS)
 
@@ -151,8 +143,8 @@ def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
     for way in paths.values():
         _mark_ends(axes, way)
     axes.grid(visible=False)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1])
+    limits = {"xlim": (low[0], high[0]), "ylim": (low[1], high[1])}
+    axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1], **limits)
     _draw_scale_bar(axes, low, high - low)
     colours = (style.GRID_FREE, style.GRID_OCCUPIED, style.GRID_UNKNOWN)
     keys = [*map(style.colour_key, ("free", "occupied", "unknown"), colours)]
@@ -196,7 +188,6 @@ def _height_in(points: NDArray[Any]) -> float:
 
 
 def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
-    """Mark where a path (N, 2) starts and ends."""
     # One label above and one below, as a drive may end where it started.
     ends = ((0, "start", 9, "o", 9), (-1, "end", -18, "s", 7))
     for number, text, up, marker, size in ends if len(path) else ():
@@ -208,12 +199,10 @@ def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
 
 
 def _bad_frames(health: Sequence[OdometryHealth], poses: int) -> NDArray[np.intp]:
-    """Return indices of the poses that are not trusted."""
     return np.flatnonzero([not record.ok for record in health[:poses]])
 
 
 def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
-    """Return the part of a grid with all known cells, and a margin."""
     known = np.argwhere(grid.cells != UNKNOWN)
     if not len(known):
         return grid

@@ -1,4 +1,4 @@
-"""The reports of maps: of one drive, of several; and clouds coloured by their errors."""
+"""The reports of maps and of paths, and clouds coloured by their errors."""
 
 from __future__ import annotations
 
@@ -10,22 +10,29 @@ import numpy as np
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
-from recon.evaluation.drive_errors import DriveErrors
 from recon.evaluation.map import nearest_distances
-from recon.evaluation.map_comparison import MapComparison
+from recon.evaluation.map_comparison import DriveErrors, MapComparison
+from recon.evaluation.trajectory import TrajectoryComparison
 from recon.export.make import Products
+from recon.io.atomic import write_bytes
 from recon.io.models.ply import write_ply
+from recon.map.localize.localizer import State
+from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
 from recon.report import style
 from recon.report.drive_figures import (
+    ESTIMATE_LINE,
+    TRUTH_LINE,
     drift_figure,
+    errors_along,
     grid_figure,
     health_figure,
     loops_figure,
     path_figure,
     seen_from_above,
+    top_view,
 )
 from recon.report.page import write_page
 from recon.report.pair_page import stereo_figures
@@ -84,14 +91,11 @@ def _map_content(
     T_map_world: Float64,
 ) -> Json:
     """Return what the pages of all maps show: paths on the grid, and with others in 3-D."""
-    from_above = {name: seen_from_above(path, T_map_world) for name, path in paths.items()}
-    ways = [
-        (name, apply(T_map_world, path.positions_m)) for name, path in (paths | only_in_3d).items()
-    ]
+    ways = {n: apply(T_map_world, one.positions_m) for n, one in (paths | only_in_3d).items()}
     return {
-        "grid": grid_figure(made.grid, from_above),
+        "grid": grid_figure(made.grid, {name: ways[name][:, :2] for name in paths}),
         "resolution_m": made.grid.resolution_m,
-        "view": plot_scene(Scene(np.eye(4), made.cloud, made.mesh, ways)),
+        "view": plot_scene(Scene(np.eye(4), made.cloud, made.mesh, [*ways.items()])),
     }
 
 
@@ -102,19 +106,105 @@ def _loops(session: Session) -> bytes | None:
     return loops_figure(session.odometry, session.trajectory, pairs, session.T_map_world)
 
 
-_SCALE_THRESHOLDS: Final = 2.0
-"""The last colour of the scale corresponds to this multiple of the largest threshold."""
-
-
 def write_map_errors(comparison: MapComparison, run: RunDirectory) -> None:
-    """Write ``error.ply`` and ``missed.ply``, both in the axes of the reference.
-
-    Map and reference are coloured by their distance to each other; ``quality`` is it in metres.
-    """
-    limit_m = _SCALE_THRESHOLDS * max(comparison.thresholds_m)
+    """Write ``error.ply`` and ``missed.ply``, coloured by distance, in axes of the reference."""
+    limit_m = 2.0 * max(comparison.thresholds_m)
     cloud, reference = comparison.cloud, comparison.reference
     for name, points, others in (("error", cloud, reference), ("missed", reference, cloud)):
         distance_m = nearest_distances(points.xyz, others.xyz)
         rgb = style.colour_values(distance_m, style.ERROR_SCALE, (0.0, limit_m))
         coloured = replace(PointCloud(points.xyz, frame=points.frame), rgb=rgb)
         write_ply(run.path(f"{name}.ply"), coloured, quality=distance_m)
+
+
+def write_trajectory_page(
+    comparison: TrajectoryComparison, names: tuple[str, str], summary: Json, run: RunDirectory
+) -> None:
+    """Write ``report.html`` of a path compared with its truth, and its figures as PNG files."""
+    figures = {
+        "path": compared_paths_figure(comparison),
+        "error_along_path": pose_errors_figure(comparison),
+        "translation_by_length": errors_by_length_figure(comparison, rotation=False),
+        "rotation_by_length": errors_by_length_figure(comparison, rotation=True),
+    }
+    for name, png in figures.items():
+        write_bytes(run.path(f"{name}.png"), png)
+    content = {"comparison": comparison, "names": names, "figures": figures}
+    write_page("trajectory", run, summary, **content)
+
+
+def compared_paths_figure(comparison: TrajectoryComparison) -> bytes:
+    """Draw both paths on the two world axes along which the true one extends farthest."""
+    axes = widest_axes(comparison.truth.positions_m)
+    truth = comparison.truth.positions_m[:, axes]
+    estimate = comparison.estimate.positions_m[:, axes]
+    first, second = (f"{'xyz'[axis]} (m)" for axis in axes)
+    return top_view([(truth, TRUTH_LINE), (estimate, ESTIMATE_LINE)], truth, (first, second))
+
+
+@style.styled
+def pose_errors_figure(comparison: TrajectoryComparison) -> bytes:
+    """Draw position and rotation error of each aligned pose, along the true path."""
+    degrees = np.degrees(comparison.rotation_errors_rad)
+    figure, (upper, _) = errors_along(comparison.truth, comparison.position_errors_m, degrees)
+    upper.axhline(
+        comparison.metrics.ate_m, color=style.FAINT, linestyle="--", label="root mean square"
+    )
+    upper.legend(loc="best")
+    return style.to_png(figure)
+
+
+@style.styled
+def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool) -> bytes:
+    """Draw the relative error of the segments by length: mean and interquartile range."""
+    values = comparison.segment_deg_per_100m if rotation else comparison.segment_percent
+    lengths = np.unique(comparison.segments.length_m)
+    groups = [values[comparison.segments.length_m == length] for length in lengths]
+    quarters = np.array([np.percentile(group, (25, 75)) for group in groups])
+    figure, axes = style.subplots(style.HALF_IN, 3.4)
+    # One bar per length, as a line shows nothing for one or two lengths.
+    axes.vlines(lengths, *quarters.T, color=style.ESTIMATE, alpha=0.35, linewidth=8)
+    axes.plot(lengths, [float(np.mean(group)) for group in groups], "o-")
+    margin = max(10.0, 0.05 * float(np.ptp(lengths)))
+    axes.set_xlim(max(0.0, lengths[0] - margin), lengths[-1] + margin)
+    label = "rotation error (°/100 m)" if rotation else "translation error (%)"
+    axes.set(xlabel="length of the segments (m)", ylabel=label, ylim=(0, None))
+    return style.to_png(figure)
+
+
+def widest_axes(positions_m: Float64) -> list[int]:
+    """Return the two axes along which a path extends farthest, in order of the axes."""
+    return sorted(np.argsort(-np.ptp(positions_m, axis=0), kind="stable")[:2].tolist())
+
+
+_SHADES: Final = {State.SEARCHING: style.FAINT, State.COASTING: style.TRUTH, State.LOST: style.BAD}
+
+
+def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
+    """Write ``report.html`` of a drive in a map."""
+    figures = {"path": _path(result), "certainty": certainty_figure(result.drive)}
+    write_page("localize", run, result.summary, result=result, figures=figures)
+
+
+def _path(result: LocalizeRun) -> bytes | None:
+    path, T_map_world = result.drive.trajectory, result.drive.T_map_world
+    if result.grid is not None:
+        return grid_figure(result.grid, {"path": seen_from_above(path, T_map_world)})
+    return path_figure(path, None, T_map_world) if len(path) else None
+
+
+@style.styled
+def certainty_figure(drive: LocalizedDrive) -> bytes:
+    """Draw standard deviations of each pose, and what confirms it; the others are shaded."""
+    known = [frame.located for frame in drive.frames]
+    inliers = [float(x.inliers) if x.covariance is not None else np.nan for x in known]
+    labels = ("standard deviation\nof the position (m)", "features that\nagree")
+    figure, rows = style.stacked(4.4, "frame", labels)
+    for axes, values in zip(rows, ([x.sigma_m for x in known], inliers), strict=True):
+        axes.plot(values, marker=".")
+        axes.set_ylim(bottom=0)
+        axes.set_xlim(-0.5, len(known) - 0.5)
+        for state, colour in _SHADES.items():
+            style.shade(axes, [n for n, x in enumerate(known) if x.state == state], 1.0, colour)
+    figure.align_ylabels()
+    return style.to_png(figure)

@@ -12,7 +12,7 @@ from PIL import Image
 from recon.core.text import counted
 from recon.core.values.arrays import UInt8
 from recon.evaluation.middlebury.bench import SceneResult
-from recon.evaluation.middlebury.score import error_map
+from recon.evaluation.middlebury.score import MASKS, error_map
 from recon.io.atomic import write_text
 from recon.io.images.image import write_image
 from recon.report import style
@@ -21,19 +21,15 @@ from recon.report.pair_page import ERROR_LIMIT_PX
 from recon.report.table import NOT_KNOWN, Row, Table, csv_text, join, number
 from recon.run.directory import RunDirectory
 
-Curves = Mapping[str, Any]
-"""Curves of one matcher, as in ``summary.json``: ``reliability`` and ``sparsification``."""
-
+Figures = Mapping[str, Any]  # as in ``summary.json``
+Path = tuple[str, ...]  # keys of a figure in them
 _WIDTH_PX: Final = 300  # largest width of an image in the report
 _GAP_PX: Final = 6
 _LEAST_SHARE: Final = 0.001
 
 
 def draw_result(result: SceneResult, run: RunDirectory) -> None:
-    """Write disparity, in colours of the range of the truth, and error of a result as images.
-
-    Blue is correct, red is wrong by `ERROR_LIMIT_PX` full-size pixels or more; holes are filled.
-    """
+    """Write disparity, in colours of the range of the truth, and error of a result as images."""
     scene, values = result.scene, result.values
     scale = round(4 * values.shape[1] / scene.truth.values.shape[1]) / 4
     low, high = style.value_range(scene.truth.values)
@@ -64,7 +60,7 @@ def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None
 
 
 @style.styled
-def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
+def reliability_figure(matchers: Mapping[str, Figures]) -> bytes:
     """Draw the share of correct pixels by confidence; below, the share of pixels in each bin."""
     ratios: dict[str, Any] = {"sharex": True, "height_ratios": (4, 1)}
     figure, (upper, lower) = style.subplots(style.HALF_IN, 5.0, 2, **ratios)
@@ -85,7 +81,7 @@ def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
 
 
 @style.styled
-def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
+def sparsification_figure(matchers: Mapping[str, Figures]) -> bytes:
     """Draw the fraction of wrong pixels left as the least confident ones are removed."""
     figure, axes = style.subplots(style.HALF_IN, 5.0)
     for n, (name, curves) in enumerate(matchers.items()):
@@ -100,13 +96,13 @@ def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
     return style.to_png(figure)
 
 
-def _floats(curves: Curves, *names: str) -> Any:
-    """Return float64 (names, N), with NaN for None."""
+def _floats(curves: Figures, *names: str) -> Any:
+    # None becomes NaN.
     return np.array([curves[name] for name in names], dtype=np.float64)
 
 
 def _scene(scene: str, summary: Mapping[str, Any], run: RunDirectory) -> dict[str, Any]:
-    """Return what the page shows of a scene: disparity and error of each matcher, row by row."""
+    """Return disparity and error of each matcher, row by row."""
     names = [name for name, found in summary["matchers"].items() if scene in found["scenes"]]
     rows = [np.hstack(_small_images(run, f"pictures/{name}/{scene}")) for name in names]
     buffer = io.BytesIO()
@@ -126,20 +122,13 @@ def _small_images(run: RunDirectory, stem: str) -> list[UInt8]:
     return [np.pad(image, strips, constant_values=255) for image in small]
 
 
-Figures = Mapping[str, Any]
-Path = tuple[str, ...]
-
 _LIMITS: Final = ("0.5", "1", "2", "4")
 _LENGTHS: Final = ("avgerr", "rms", "a50", "a90", "a95", "a99")
 _DEPTHS: Final = ("mean_m", "median_m", "rms_m", "median_percent", "over_5_percent", "infinite")
 _CONFIDENCE: Final = ("ece", "ause", "within_1_sigma", "within_2_sigma")
-_KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("all", "sparse"))
+_KINDS: Final = tuple((mask, holes) for mask in MASKS for holes in ("dense", "sparse"))
 _UNITS: Final = "bad and invalid in %, avgerr to a99 in px"
-_OF_EACH_SCENE: Final = {
-    "bad 1 (%) of each scene, nonocc, dense": ("nonocc", "dense", "bad", "1"),
-    "bad 2 (%) of each scene, nonocc, dense": ("nonocc", "dense", "bad", "2"),
-    "avgerr (px) of each scene, nonocc, dense": ("nonocc", "dense", "avgerr"),
-}
+_ERRORS: Final = {"bad 1 (%)": ("bad", "1"), "bad 2 (%)": ("bad", "2"), "avgerr (px)": ("avgerr",)}
 
 
 def middlebury_tables(summary: Figures) -> list[Table]:
@@ -151,13 +140,14 @@ def middlebury_tables(summary: Figures) -> list[Table]:
     tables = [
         _weighted_table(f"{mean}, {', '.join(kind)} ({_UNITS})", matchers, kind) for kind in _KINDS
     ]
-    tables += [_scene_table(title, matchers, path) for title, path in _OF_EACH_SCENE.items()]
+    for name, path in _ERRORS.items():
+        title = f"{name} of each scene, nonocc, dense"
+        tables.append(_scene_table(title, matchers, ("nonocc", "dense", *path)))
     if any(_at(found, ("weighted", "confidence")) for found in matchers.values()):
         tables.append(_confidence_table(f"Confidence, {mean.lower()}, all, sparse", matchers))
-        tables += [
-            _scene_table(f"{name} of each scene", matchers, ("confidence", name), digits=3)
-            for name in ("ece", "ause")
-        ]
+        for name in ("ece", "ause"):
+            path = ("confidence", name)
+            tables.append(_scene_table(f"{name} of each scene", matchers, path, digits=3))
     title = "seconds of each scene, matching alone"
     return [*tables, _scene_table(title, matchers, ("seconds",), digits=3)]
 
@@ -168,10 +158,7 @@ def scene_names(matchers: Figures) -> list[str]:
 
 
 def csv_table(summary: Figures) -> str:
-    """Return all figures of all matchers: one row per scene, mask and filling.
-
-    Figures of the confidence are in the rows they refer to: all pixels that have a value.
-    """
+    """Return all figures: one row per scene, mask and filling."""
     named = [*_columns("", ""), *(f"depth_{name}" for name in _DEPTHS), *_CONFIDENCE]
     rows = [["matcher", "scene", "mask", "holes", *named, "seconds"]]
     for matcher, found in summary["matchers"].items():

@@ -31,10 +31,7 @@ _NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
 
 
 def write_page(name: str, run: RunDirectory, found: Mapping[str, Any], /, **content: Any) -> None:
-    """Write ``report.html`` of a run, with its command, ``config.yaml`` and versions.
-
-    Warnings and verdict are those of the summary, ``found``, unless ``content`` has others.
-    """
+    """Write ``report.html`` of a run; ``content`` overrides warnings and verdict of its summary."""
     path, verdict = run.path("config.yaml"), found.get("verdict", "")
     page = {
         "found": found,
@@ -120,13 +117,12 @@ def _text(value: Any) -> str:
 
 
 def _timing(summary: Mapping[str, Any]) -> bytes:
-    """Draw the time by stage; empty if no stage was measured."""
+    # Empty if no stage was measured.
     stages = {name: s for name, s in (summary.get("stages") or {}).items() if _is_number(s)}
     return timing_figure(stages) if stages else b""
 
 
 def _is_number(value: Any) -> bool:
-    """Return whether a value of a summary is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -137,7 +133,7 @@ def _packed_plotly() -> str:
 
 
 def _embedded(png: bytes) -> str:
-    """Return the URL of an image, as WebP if that is smaller (a quarter if noisy), else as PNG."""
+    """Return the URL of an image, as WebP if that is smaller, else as PNG."""
     buffer = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
         image.convert("RGB").save(buffer, "WEBP", quality=_WEBP_QUALITY)
@@ -146,7 +142,7 @@ def _embedded(png: bytes) -> str:
 
 
 def _words(name: str) -> list[str]:
-    """Return the words of the name of a figure, between which a line may break."""
+    """Return the parts of the name of a figure, between which a line may break."""
     return re.split(r"(?<=[._])(?=[a-z])", name)
 
 

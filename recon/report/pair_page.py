@@ -32,41 +32,36 @@ def write_pair_page(result: PairRun, run: RunDirectory) -> None:
 
 def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
     """Write disparity, confidence and reasons of a pair as colour images."""
+    disparity = result.disparity
     images = {
-        "disparity_colour.png": style.colour_disparity(result.disparity.values),
-        "confidence_colour.png": style.colour_confidence(result.disparity.confidence),
-        "reason_colour.png": style.colour_reasons(result.disparity.reason),
+        "disparity": style.colour_disparity(disparity.values),
+        "confidence": style.colour_confidence(disparity.confidence),
+        "reason": style.colour_reasons(disparity.reason),
     }
     for name, image in images.items():
-        write_image(run.path(f"disparity/{name}"), image)
+        write_image(run.path(f"disparity/{name}_colour.png"), image)
 
 
 def pair_content(result: PairRun) -> Json:
     """Return what the page of a pair shows: disparity, accuracy and 3-D view."""
-    scene = Scene(T_UPRIGHT_CAMERA, result.cloud, result.mesh, eye_m=_beside_camera(result))
-    error: bytes | None = None
-    if result.truth is not None and result.truth.values.shape == result.disparity.values.shape:
-        error = error_figure(np.abs(result.disparity.values - result.truth.values))
+    values, truth, error = result.disparity.values, result.truth, None
+    if truth is not None and truth.values.shape == values.shape:
+        error = error_figure(np.abs(values - truth.values))
+    depth_m = depth_from_disparity(values, result.pair.camera)
+    known = depth_m[np.isfinite(depth_m)]
+    far = float(np.median(known)) if known.size else 1.0
+    # From behind, left of and above the camera, depth is visible.
+    eye_m = (-0.1 * far, 0.25 * far, 0.25 * far)
     return {
         "run": result,
         "result": stereo_figures(result.pair, result.disparity),
         "error": error,
         "limit_px": ERROR_LIMIT_PX,
-        "view": plot_scene(scene),
+        "view": plot_scene(Scene(T_UPRIGHT_CAMERA, result.cloud, result.mesh, eye_m=eye_m)),
     }
 
 
-def _beside_camera(result: PairRun) -> tuple[float, float, float]:
-    """Return a viewpoint behind, left of and above the camera, from which depth is visible."""
-    depth_m = depth_from_disparity(result.disparity.values, result.pair.camera)
-    known = depth_m[np.isfinite(depth_m)]
-    far = float(np.median(known)) if known.size else 1.0
-    return (-0.1 * far, 0.25 * far, 0.25 * far)
-
-
-ERROR_LIMIT_PX = 4.0
-"""Error of the last colour: the largest threshold of Middlebury's table."""
-
+ERROR_LIMIT_PX = 4.0  # error of the last colour: the largest threshold of Middlebury's table
 # Height of the strip below an image: axis label and ticks, colour bar, and depths above it.
 _BELOW_IN = 1.0
 _BAR_BOTTOM_IN = 0.5
@@ -145,7 +140,7 @@ def confidence_figure(disparity: Disparity) -> bytes:
 
 @style.styled
 def error_figure(error_px: NDArray[Any]) -> bytes:
-    """Draw the absolute disparity error of each pixel, up to the limit; NaN = not compared."""
+    """Draw the absolute disparity error of each pixel; NaN = not compared."""
     figure = _image(style.colour_error(error_px, ERROR_LIMIT_PX))
     label = "absolute disparity error in pixels (dark: not compared)"
     _colour_bar(figure, style.ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
@@ -168,10 +163,7 @@ def reasons_figure(disparity: Disparity) -> bytes:
 def depth_marks(
     low_m: float, high_m: float, place: Callable[[float], float], limits: tuple[float, float]
 ) -> list[float]:
-    """Return depths > 0 to mark on a scale, as many as there is room for labels, round ones first.
-
-    ``place`` maps a depth to its position on the scale, whose ends are ``limits``.
-    """
+    """Return depths > 0 to mark on a scale with these ends, as many as its labels have room for."""
     powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
     choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
     room = _LABEL_ROOM * (limits[1] - limits[0])
@@ -185,11 +177,11 @@ def depth_marks(
 
 
 def _image(image: UInt8) -> Figure:
-    """Return an image that fills the width of its figure, with room for a scale or legend below."""
+    """Return an image over the width of its figure, with room for a scale or legend below."""
     height, width = image.shape[:2]
     width_in = style.WIDE_IN if is_wide(image.shape) else style.HALF_IN
     height_in = width_in * height / width + _BELOW_IN
-    # Placed by hand, as layout engines ignore the ticks on the upper side of a scale.
+    # Layout engines ignore the ticks on the upper side of a scale.
     figure = style.bare_figure(width_in, height_in)
     axes = figure.add_axes((0.0, _BELOW_IN / height_in, 1.0, 1.0 - _BELOW_IN / height_in))
     axes.imshow(image, aspect="auto")
@@ -219,8 +211,7 @@ def _mark_depths(bar: Axes, limits: tuple[float, float], camera: RectifiedCamera
     def place(depth_m: float) -> float:
         return float(disparity_from_depth(np.asarray(depth_m), camera))
 
-    depths = depth_marks(near, far, place, limits)
-    upper = bar.twiny()
+    depths, upper = depth_marks(near, far, place, limits), bar.twiny()
     upper.set_xlim(*limits)
     upper.spines[:].set_visible(False)
     upper.set_xticks([place(depth) for depth in depths], [f"{depth:g} m" for depth in depths])

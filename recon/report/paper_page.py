@@ -36,7 +36,7 @@ from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 
 _MAX_POINTS: Final = 20_000
-_NEAR_SHARE: Final = 0.9  # the caption of the clouds says so
+_NEAR_SHARE: Final = 0.9  # as the caption says
 # Dashed, as both printed methods give a value to the same pixels.
 _LINES: Final = {
     CORRECTED: (style.ESTIMATE, "-"),
@@ -45,8 +45,6 @@ _LINES: Final = {
 }
 _SURFACE_COLUMNS: Final = 220
 _CURVE_SAMPLES: Final = 400
-_ELEVATION_DEG: Final = 55.0
-_AZIMUTH_DEG: Final = -72.0
 
 
 def write_paper_page(
@@ -121,7 +119,7 @@ def surface_figure(disparity: Disparity) -> bytes:
     # Seen like the image: row 0 is far and on top.
     axes.set(xlabel="column (px)", ylabel="row (px)", zlabel="disparity (px)", ylim=(height, 0))
     axes.set_box_aspect((1.0, height / width, 0.45), zoom=1.0)
-    axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)
+    axes.view_init(elev=55.0, azim=-72.0)
     return style.to_png(figure)
 
 
@@ -134,13 +132,12 @@ def depth_curve_figure(camera: RectifiedCamera, disparities_px: Float32) -> byte
     last = float(camera.ndisp or np.nanmax(disparities_px, initial=1.0))
     d = np.linspace(last / _CURVE_SAMPLES, last, _CURVE_SAMPLES)
     figure, axes = style.subplots(style.HALF_IN, 4.2)
-    doffs = f"doffs = {camera.doffs_px:.7g} px"
-    label = f"Z = f·b / (d + doffs), f = {camera.focal_px:.7g} px, {doffs}"
-    lines = [(camera, style.ESTIMATE, label)]
+    f, doffs = f"f = {camera.focal_px:.7g} px", f"doffs = {camera.doffs_px:.7g} px"
+    lines = [(camera, style.ESTIMATE, f"Z = f·b / (d + doffs), {f}, {doffs}")]
     if camera.doffs_px > 0:
         believed = camera_of_table_1(camera)
-        label = f"as printed: Z = f·b / d, f = {believed.focal_px:.7g} px"
-        lines.append((believed, style.BAD, label))
+        f = f"f = {believed.focal_px:.7g} px"
+        lines.append((believed, style.BAD, f"as printed: Z = f·b / d, {f}"))
     for each, colour, label in lines:
         axes.plot(d, depth_from_disparity(d, each), color=colour, linewidth=2.2, label=label)
     known = disparities_px[np.isfinite(disparities_px)]

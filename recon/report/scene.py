@@ -5,9 +5,10 @@ The colour of a point is its index in a palette: ``rgb()`` strings would be ten 
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -65,25 +66,20 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The content of a 3-D view, all in one frame, which ``T_view_frame`` turns to x forward, z up.
+    """The content of a 3-D view, all in one frame."""
 
-    Paths of cameras, float64 (N, 3), have names. ``eye_m`` is the first viewpoint in view axes;
-    None = above, from where the content fills the view.
-    """
-
-    T_view_frame: Float64
+    T_view_frame: Float64  # turns it to x forward, z up
     cloud: PointCloud | None = None
     mesh: TriangleMesh | None = None
-    paths: Sequence[tuple[str, Float64]] = ()
-    eye_m: tuple[float, float, float] | None = None
+    paths: Sequence[tuple[str, Float64]] = ()  # names and positions (N, 3) of cameras
+    eye_m: tuple[float, float, float] | None = None  # in view axes; None = where all is in view
 
 
 def plot_scene(scene: Scene, max_points: int = MAX_POINTS) -> Json | None:
     """Return the ``data`` and ``layout`` that plotly.js draws; None without point and triangle.
 
-    The cloud is thinned evenly; the mesh is simplified, and hidden at first if there is a cloud.
-    ``layout.meta`` lists the colourings of the cloud, the first trace: a ``label``, and the
-    ``marker`` that it gets when that one is chosen.
+    ``layout.meta`` lists the colourings of the cloud, the first trace: ``label``, and its
+    ``marker``.
     """
     T = scene.T_view_frame
     cloud = None if scene.cloud is None else _without_outliers(scene.cloud)
@@ -94,15 +90,16 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS) -> Json | None:
         figure.add_trace(_cloud_trace(thinned, len(cloud), T, colourings[0]["marker"]))
         figure.layout.meta = colourings
     if scene.mesh is not None and len(scene.mesh.faces):
-        hidden = bool(figure.data)
-        figure.add_trace(_mesh_trace(thin_mesh(scene.mesh, MAX_FACES), T, hidden=hidden))
+        thin, hidden = thin_mesh(scene.mesh, MAX_FACES), bool(figure.data)
+        figure.add_trace(_mesh_trace(thin, T, hidden=hidden))
     if not figure.data:
         return None
-    for number, (name, path) in enumerate(scene.paths):
-        figure.add_trace(_path_trace(name, path, T, _PATH_COLOURS[number % len(_PATH_COLOURS)]))
+    for (name, path), colour in zip(scene.paths, itertools.cycle(_PATH_COLOURS), strict=False):
+        look: Json = {"mode": "lines", "line": {"color": colour, "width": 6}}
+        look["hovertemplate"] = "frame %{pointNumber}<br>x %{x:.2f} y %{y:.2f} z %{z:.2f} m"
+        figure.add_trace(go.Scatter3d(name=name, **look, **_xyz(apply(T, path))))
     _set_view(figure, scene, _visible_points(cloud, scene))
-    plot: Json = json.loads(figure.to_json())
-    return plot
+    return dict(json.loads(figure.to_json()))
 
 
 def quantise_colours(rgb: UInt8) -> tuple[UInt8, UInt8]:
@@ -144,29 +141,20 @@ def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> go.Mesh3d:
     )
 
 
-def _path_trace(name: str, path: Float64, T: Float64, colour: str) -> go.Scatter3d:
-    return go.Scatter3d(
-        mode="lines",
-        name=name,
-        line={"color": colour, "width": 6},
-        hovertemplate="frame %{pointNumber}<br>x %{x:.2f} y %{y:.2f} z %{z:.2f} m",
-        **_xyz(apply(T, path)),
-    )
-
-
 def _xyz(points: NDArray[Any]) -> Json:
-    return dict(zip("xyz", points.astype(np.float32).T, strict=True))
+    return _named(points.astype(np.float32).T)
+
+
+def _named(values: Iterable[Any]) -> Json:
+    return dict(zip("xyz", values, strict=True))
 
 
 def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
-    """Return colourings of a cloud: by the image if it has colours, and by height."""
     low, high = style.value_range(xyz[:, 2])
     height = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
     scale = {"color": height, "colorscale": _TURBO, "cmin": 0, "cmax": 255}
-    by_height = [{"label": "height", "marker": scale}]
-    if cloud.rgb is None:
-        return by_height
-    return [{"label": "image", "marker": _palette_scale(cloud.rgb)}, *by_height]
+    by_image = [] if cloud.rgb is None else [("image", _palette_scale(cloud.rgb))]
+    return [{"label": by, "marker": marker} for by, marker in (*by_image, ("height", scale))]
 
 
 def _palette_scale(rgb: UInt8) -> Json:
@@ -190,16 +178,16 @@ def _without_outliers(cloud: PointCloud) -> PointCloud:
 
 def _visible_points(cloud: PointCloud | None, scene: Scene) -> Float64:
     """Return float64 (N, 3): the initially visible points, view axes."""
-    parts: list[NDArray[Any]] = [np.zeros((0, 3)), *(path for _, path in scene.paths)]
+    shown: NDArray[Any] = np.zeros((0, 3))
     if cloud is not None and len(cloud):
-        parts.append(cloud.xyz)
+        shown = cloud.xyz
     elif scene.mesh is not None:
-        parts.append(scene.mesh.vertices)
-    return np.asarray(apply(scene.T_view_frame, np.concatenate(parts)))
+        shown = scene.mesh.vertices
+    points = np.concatenate([np.zeros((0, 3)), *(path for _, path in scene.paths), shown])
+    return np.asarray(apply(scene.T_view_frame, points))
 
 
 def _set_view(figure: go.Figure, scene: Scene, seen: Float64) -> None:
-    """Set axes in true proportion, and the camera."""
     box = _bounding_box(seen)
     # Units of plotly.js: the longest side of the box gets 2 of them.
     unit = 2.0 / float(np.ptp(box, axis=0).max())
@@ -210,16 +198,12 @@ def _set_view(figure: go.Figure, scene: Scene, seen: Float64) -> None:
         # Seen from the position of a long lens, everything would be small in this wider view.
         eye *= min(1.0, _FARTHEST_EYE / max(float(np.linalg.norm(eye)), 1e-9))
     figure.update_layout(
-        scene_aspectratio=_named(unit * np.ptp(box, axis=0)),
-        scene_camera={"eye": _named(eye), "center": _named(look_at)},
+        scene_aspectratio=_named((unit * np.ptp(box, axis=0)).tolist()),
+        scene_camera={"eye": _named(eye.tolist()), "center": _named(look_at.tolist())},
     )
     for n, (axis, title) in enumerate(_TITLES.items()):
         axes = {"title_text": title, "range": box[:, n].tolist(), **_AXIS}
         figure.layout.scene[f"{axis}axis"].update(axes)
-
-
-def _named(values: Float64) -> dict[str, float]:
-    return dict(zip("xyz", values.tolist(), strict=True))
 
 
 def _bounding_box(seen: Float64) -> Float64:
@@ -232,7 +216,7 @@ def _bounding_box(seen: Float64) -> Float64:
 
 
 def _whole_view(seen: Float64) -> tuple[Float64, Float64]:
-    """Return viewpoint and look-at point, (3,) each, so that all points (N, 3) fill the view."""
+    """Return viewpoint and look-at point from which all points (N, 3) fill the view."""
     points = seen[:: max(1, len(seen) // _TRIED_POINTS)] if len(seen) else np.zeros((1, 3))
     tried = [_view_from(points, turn, above) for turn in _TURNS_RAD for above in _ABOVE_RAD]
     _, eye, look_at = max(tried, key=lambda view: view[0])
@@ -273,8 +257,7 @@ def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:
 
 def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
     """Return at most about ``limit`` triangles for display, by merging vertices in cells."""
-    # Open3D's quadric decimation takes nine times as long (1.6 s instead of 0.18 s of processor
-    # time, 168,579 to 80,000 triangles), and drops the colours.
+    # Open3D's quadric decimation takes nine times as long, and drops the colours.
     cell_m, thinned = 0.0, mesh
     while len(thinned.faces) > limit:
         # The number of triangles falls with the square of the cell size.
@@ -285,7 +268,6 @@ def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
 
 
 def _cell_numbers(xyz: NDArray[Any], cell_m: float) -> NDArray[np.int64]:
-    """Return int64 (N,): the number of the cell of each point."""
     cells = np.floor((xyz - xyz.min(axis=0)) / cell_m).astype(np.int64)
     return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 
@@ -301,6 +283,6 @@ def _merge_vertices(mesh: TriangleMesh, cell_m: float) -> TriangleMesh:
 
 def _typical_edge_m(mesh: TriangleMesh) -> float:
     first, second = mesh.vertices[mesh.faces[:, :2]].swapaxes(0, 1)
-    lengths_m = np.linalg.norm(first - second, axis=1)
+    edge_m = float(np.median(np.linalg.norm(first - second, axis=1)))
     # At most 1e5 cells per side, so that cell numbers fit in an int64.
-    return max(float(np.median(lengths_m)), float(np.ptp(mesh.vertices, axis=0).max()) * 1e-5, 1e-6)
+    return max(edge_m, float(np.ptp(mesh.vertices, axis=0).max()) * 1e-5, 1e-6)

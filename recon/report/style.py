@@ -17,41 +17,31 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from recon.core.errors import ShapeError
-from recon.core.values import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    OccupancyGrid,
-    OccupancyTruth,
-    Reason,
-)
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyTruth, Reason
 from recon.core.values.arrays import UInt8
 from recon.evaluation.occupancy import grid_on_truth
 
-WIDE_IN: Final = 11.0
-"""Width of a figure that fills the page."""
-HALF_IN: Final = 6.2
-"""Width of a figure with another one beside it."""
-
+WIDE_IN: Final = 11.0  # width of a figure that fills the page
+HALF_IN: Final = 6.2  # width of a figure with another one beside it
 ESTIMATE: Final = "#0b6bcb"
 TRUTH: Final = "#e07a1f"
 BAD: Final = "#cf222e"
 INK: Final = "#24292f"
 FAINT: Final = "#6e7781"
 
+# Decorator of a function that draws: the style sheet holds while it runs.
 styled = matplotlib.style.context(Path(__file__).with_name("figures.mplstyle"))
-"""Decorator of a function that draws: the style sheet holds while it runs."""
 
 
 def bare_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure whose axes are placed by hand."""
+    """Return an empty figure, whose axes are placed by hand."""
     figure = Figure((width_in, height_in))
     figure.set_layout_engine("none")
     return figure
 
 
 def to_png(figure: Figure) -> bytes:
-    """Render a figure to the bytes of a PNG file."""
+    """Render a figure as a PNG file."""
     buffer = io.BytesIO()
     # Pages embed WebP; to pack these bytes well would take longer than to draw the figure.
     figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 1})
@@ -134,10 +124,7 @@ GRID_NOT_COUNTED: Final[Rgb] = (120, 128, 136)
 
 
 def colour_disparity(values: NDArray[Any], limits: tuple[float, float] | None = None) -> UInt8:
-    """Colour a disparity map (H, W): far is blue, near is red, NaN is almost black.
-
-    ``limits`` are the values of the first and the last colour; None = `value_range`.
-    """
+    """Colour a disparity map (H, W): far is blue, near is red; None = limits of `value_range`."""
     return colour_values(values, DISPARITY_SCALE, limits or value_range(values))
 
 
@@ -148,15 +135,13 @@ def colour_confidence(confidence: NDArray[Any]) -> UInt8:
 
 
 def colour_error(error: NDArray[Any], limit: float) -> UInt8:
-    """Colour absolute errors: 0 is blue, ``limit`` and above is red, NaN is almost black."""
+    """Colour absolute errors: 0 is blue, ``limit`` and above is red."""
     return colour_values(np.abs(error), ERROR_SCALE, (0.0, limit))
 
 
 def colour_reasons(reason: UInt8) -> UInt8:
     """Colour a map of `Reason` codes (H, W) by `REASON_COLOURS`."""
-    table = np.zeros((len(Reason), 3), dtype=np.uint8)
-    for code, colour in REASON_COLOURS.items():
-        table[code] = colour
+    table = np.array([REASON_COLOURS[code] for code in sorted(Reason)], dtype=np.uint8)
     highest = int(reason.max(initial=0))
     if highest >= len(table):
         raise ShapeError("reason code is unknown", got=highest, expected=f"0 to {len(table) - 1}")
@@ -172,10 +157,7 @@ def colour_grid(grid: OccupancyGrid) -> UInt8:
 
 
 def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
-    """Colour a grid by comparison with ground truth (`GRID_ERRORS`); row 0 is the largest y.
-
-    Unseen cells are grey. Each cell is a square of whole pixels.
-    """
+    """Colour a grid by `GRID_ERRORS`, unseen cells grey; each cell is a square of pixels."""
     cells = grid_on_truth(grid, truth)
     image = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)
     for (true, found), colour in GRID_ERRORS.items():
@@ -204,6 +186,6 @@ def unit_colour(colour: Rgb) -> tuple[float, float, float]:
     return red / 255, green / 255, blue / 255
 
 
-def colour_key(label: str, colour: tuple[int, int, int]) -> Patch:
+def colour_key(label: str, colour: Rgb) -> Patch:
     """Return an entry of a legend: what a colour stands for."""
     return Patch(facecolor=unit_colour(colour), edgecolor=FAINT, linewidth=0.5, label=label)

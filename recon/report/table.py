@@ -9,10 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 Row = Sequence[str]
-
 NOT_KNOWN: Final = "–"
-"""The text of a figure that is not known."""
-
 _LATEX: Final = str.maketrans({
     **{sign: f"\\{sign}" for sign in "&%$#_{}"},
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--",
@@ -21,18 +18,15 @@ _LATEX: Final = str.maketrans({
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a head; the first cell of a row names it.
-
-    ``best`` says where the best, that is the smallest, number is looked for.
-    """
+    """A table with a head; the first cell of a row names it."""
 
     title: str
     head: Row
     rows: Sequence[Row]
-    best: Literal["columns", "rows", "nowhere"] = "nowhere"
+    best: Literal["columns", "rows", "nowhere"] = "nowhere"  # where to look for smallest numbers
 
     def text(self) -> str:
-        """Lay the table out in columns, for a terminal."""
+        """Return the table in columns, for a terminal."""
         lines = [self.head, *self.rows]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         padded = (
@@ -42,7 +36,6 @@ class Table:
         return "\n".join([self.title, *(line.rstrip() for line in padded)])
 
     def markdown(self) -> str:
-        """Write the table in Markdown."""
         rule = ["---", *["---:"] * (len(self.head) - 1)]
         rows = ([cell.replace("|", r"\|") for cell in row] for row in (self.head, rule, *self.rows))
         lines = [f"| {' | '.join(row)} |" for row in rows]

@@ -22,7 +22,7 @@ from recon.core.values import PointCloud, Trajectory
 from recon.evaluation.trajectory import TrajectoryRules
 from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import read_trajectory, write_kitti_poses, write_tum
-from recon.report.trajectory_page import widest_axes
+from recon.report.map_page import widest_axes
 
 T_MAP_WORLD = make_transform(exp_so3(np.array([0.3, -1.2, 0.8])), np.zeros(3))
 

@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.errors import EvaluationError
 from recon.core.values import Disparity, DisparityTruth, Reason
-from recon.evaluation.confidence import measure_reliability, measure_sparsification
+from recon.evaluation.disparity import measure_reliability, measure_sparsification
 
 SHAPE = (200, 500)
 

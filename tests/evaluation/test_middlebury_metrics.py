@@ -12,16 +12,15 @@ from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError, SettingsError, ShapeError, SourceError
 from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedCamera, RectifiedPair
-from recon.evaluation.confidence import share_within_sigma
-from recon.evaluation.disparity import evaluate_depth
+from recon.evaluation.disparity import evaluate_depth, share_within_sigma
 from recon.evaluation.middlebury.bench import (
     Bench,
+    find_results,
+    find_scenes,
     read_result,
+    read_scored_scene,
     summarise_scenes,
-    weighted_confidence,
-    weighted_figures,
 )
-from recon.evaluation.middlebury.scenes import find_results, find_scenes, read_scored_scene
 from recon.evaluation.middlebury.score import (
     MiddleburyRules,
     at_truth_size,
@@ -30,6 +29,8 @@ from recon.evaluation.middlebury.score import (
     evaluate_middlebury,
     fill_holes,
     scene_weight,
+    weighted_confidence,
+    weighted_figures,
 )
 from recon.io.images.disparity import write_pfm
 from recon.stereo.frame import StereoSettings

@@ -11,7 +11,7 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import nearest_sorted
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
-from recon.evaluation.segments import (
+from recon.evaluation.trajectory import (
     associate,
     choose_segments,
     interpolated_poses,

@@ -9,8 +9,13 @@ import pytest
 
 from recon.core.geometry.se3 import exp_so3, make_transform, quaternion_from_rotation
 from recon.core.values import Trajectory
-from recon.evaluation.segments import associate
-from recon.evaluation.trajectory import TrajectoryRules, align, compare_paths, evaluate_trajectory
+from recon.evaluation.trajectory import (
+    TrajectoryRules,
+    align,
+    associate,
+    compare_paths,
+    evaluate_trajectory,
+)
 
 pytest.importorskip("evo", reason="evo needs Python 3.11")
 

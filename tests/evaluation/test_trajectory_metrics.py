@@ -12,8 +12,13 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import fit_points, fit_upright
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import SequenceTruth, Trajectory
-from recon.evaluation.segments import KITTI_LENGTHS_M, segments_of
-from recon.evaluation.trajectory import TrajectoryRules, compare_paths, evaluate_trajectory
+from recon.evaluation.trajectory import (
+    KITTI_LENGTHS_M,
+    TrajectoryRules,
+    compare_paths,
+    evaluate_trajectory,
+    segments_of,
+)
 from recon.io.trajectory import write_tum
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.errors import FormatError
 from recon.core.geometry.projection import depth_from_disparity
-from recon.evaluation.middlebury.scenes import find_scenes, read_scored_scene
+from recon.evaluation.middlebury.bench import find_scenes, read_scored_scene
 from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
 from recon.io.middlebury import (

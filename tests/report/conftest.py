@@ -21,7 +21,7 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.core.values.arrays import Float64
-from recon.evaluation.drive_errors import DriveErrors
+from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 
 HEIGHT_PX, WIDTH_PX = 24, 60

@@ -18,7 +18,7 @@ from recon.core.values import (
     Reason,
     Trajectory,
 )
-from recon.evaluation.drive_errors import DriveErrors
+from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 from recon.report.map_page import map_content, write_joined_page, write_map_page
 from recon.report.pair_page import write_pair_page

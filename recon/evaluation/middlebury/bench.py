@@ -1,33 +1,42 @@
-"""Scenes matched by several matchers, or by other programs, scored, and the figures of all."""
+"""Scenes of a folder, matched by matchers or by other programs, and scored."""
 
 from __future__ import annotations
 
 import re
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import SettingsError, SourceError
+from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.text import counted
-from recon.core.values import RectifiedPair
-from recon.core.values.arrays import Float32, Float64
-from recon.evaluation.middlebury.scenes import ResultFolder, read_seconds
+from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair
+from recon.core.values.arrays import Float32
 from recon.evaluation.middlebury.score import (
     MASKS,
     Figures,
+    MiddleburyRules,
     ScoredScene,
     confidence_figures,
-    rounded,
     scene_weight,
     score_result,
+    weighted_confidence,
+    weighted_figures,
 )
-from recon.io.files import naming
+from recon.io.files import naming, read_table, resolved
 from recon.io.images.disparity import read_pfm
+from recon.io.middlebury import (
+    MiddleburyScene,
+    find_image,
+    find_layout,
+    read_middlebury_scene,
+    scene_root,
+    stand_in_camera,
+)
 from recon.run.run import plain
 from recon.stereo.frame import StereoSettings
 from recon.stereo.match.protocol import Matcher, name_of
@@ -42,54 +51,48 @@ _FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")
 class SceneResult:
     """Result of one matcher, or of another program, on one scene."""
 
-    scene: ScoredScene  # the scene
+    scene: ScoredScene
     matcher: str  # name of the matcher or of the folder of results
     values: Float32  # (h, w), its disparity in pixels of its own size; NaN = none
     figures: Figures  # an entry of ``scenes`` in ``summary.json``
 
 
+@dataclass(frozen=True, eq=False)
 class Bench:
-    """Matches and scores scenes; each thread has its own matchers, warmed up once.
+    """Matches and scores scenes; each thread has its own matchers, except given objects."""
 
-    The warm-up keeps kernel compilation and network loading out of the timings. A matcher given as
-    an object is shared by the threads. ``auto_range``: estimate the disparity range from each pair.
-    """
-
-    def __init__(
-        self,
-        matchers: Sequence[str | Matcher],
-        config: StereoSettings,
-        threads: int,
-        *,
-        auto_range: bool = False,
-    ) -> None:
-        self._given = matchers
-        self._config = config
-        self._threads = threads
-        self._auto_range = auto_range
-        self._own = threading.local()
+    given: Sequence[str | Matcher]
+    config: StereoSettings
+    threads: int
+    auto_range: bool = False  # whether to estimate the disparity range from each pair
+    _own: threading.local = field(default_factory=threading.local, init=False)
 
     def results(self, scene: ScoredScene) -> Iterator[SceneResult]:
         """Yield one result for each matcher, in the order given."""
-        camera = replace(scene.camera, ndisp=None) if self._auto_range else scene.camera
-        pair = Rectifier(camera, self._config.rectification).rectify(scene.pair)
+        camera = replace(scene.camera, ndisp=None) if self.auto_range else scene.camera
+        pair = Rectifier(camera, self.config.rectification).rectify(scene.pair)
         with naming(scene.name):
-            for given, matcher in zip(self._given, self._matchers(pair), strict=True):
+            for given, matcher in zip(self.given, self._matchers(pair), strict=True):
                 start = time.perf_counter()
                 disparity = matcher.match(pair)
                 seconds = time.perf_counter() - start
                 sure = disparity.confidence[disparity.valid]
                 # Not where the matcher gives all matches the same confidence.
                 rates = sure.size and sure.min() < sure.max()
-                rated = confidence_figures(disparity, scene.truth) if rates else None
-                ndisp = searched_ndisp(given, self._config.matching, pair)
-                figures = _figures(scene, disparity.values, ndisp, rated, round(seconds, 4))
+                figures = _figures(
+                    scene,
+                    disparity.values,
+                    ndisp=searched_ndisp(given, self.config.matching, pair),
+                    confidence=confidence_figures(disparity, scene.truth) if rates else None,
+                    seconds=round(seconds, 4),
+                )
                 yield SceneResult(scene, name_of(given), disparity.values, figures)
 
     def _matchers(self, pair: RectifiedPair) -> list[Matcher]:
+        # Kernels are compiled and networks loaded before anything is timed.
         made: list[Matcher] | None = getattr(self._own, "matchers", None)
         if made is None:
-            made = [make_matcher(n, self._config.matching, self._threads) for n in self._given]
+            made = [make_matcher(n, self.config.matching, self.threads) for n in self.given]
             rows = min(_WARM_UP_ROWS, pair.camera.height_px)
             camera = replace(pair.camera, height_px=rows)
             for matcher in made:
@@ -105,8 +108,8 @@ def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
         return None
     values = read_pfm(file)
     with naming(file):
-        figures = _figures(scene, values, None, None, read_seconds(file))
-    return SceneResult(scene, given.name, values, figures)
+        measured = {"ndisp": None, "confidence": None, "seconds": read_seconds(file)}
+        return SceneResult(scene, given.name, values, _figures(scene, values, **measured))
 
 
 def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
@@ -115,8 +118,8 @@ def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
         check_matcher(matcher)
     names = [name_of(matcher) for matcher in matchers]
     if len(set(names)) < len(names):
-        objects = any(not isinstance(one, str) for one in matchers)
-        hint = "give each object an attribute `name`" if objects else None
+        named = all(isinstance(one, str) for one in matchers)
+        hint = None if named else "give each object an attribute `name`"
         raise SettingsError("a matcher is named twice", got=", ".join(names), hint=hint)
     for name in names:
         if not _FOLDER_NAME.fullmatch(name):
@@ -124,18 +127,10 @@ def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
     return names
 
 
-def _figures(
-    scene: ScoredScene,
-    values: Float32,
-    ndisp: int | None,
-    confidence: Figures | None,
-    seconds: float | None,
-) -> Figures:
+def _figures(scene: ScoredScene, values: Float32, **measured: Any) -> Figures:
     return {
         **score_result(scene, values),
-        "ndisp": ndisp,
-        "confidence": confidence,
-        "seconds": seconds,
+        **measured,
         "width_px": scene.camera.width_px,
         "height_px": scene.camera.height_px,
         "full_size_factor": scene.rules.full_size_factor,
@@ -148,10 +143,7 @@ SceneFigures = dict[str, Figures]  # Figures of one scene, by matcher
 
 @dataclass(frozen=True)
 class SceneDone:
-    """A scene that is matched and scored: a `Step` of the progress of a run.
-
-    Without ground truth it has no figures; ``seconds`` are since the scene before.
-    """
+    """A scene that is scored, a `Step` of progress; without ground truth it has no figures."""
 
     name: str
     figures: SceneFigures | None
@@ -176,11 +168,7 @@ def summarise_scenes(
     results: Sequence[ResultFolder],
     folder: Path,
 ) -> Figures:
-    """Return the content of ``summary.json``: the figures of each matcher, and its means.
-
-    Means are over the scenes for which all ``names`` (matchers and folders of results) have a
-    result, so that they can be compared. A scene without ground truth has no figures.
-    """
+    """Return the content of ``summary.json``; means are over the scenes that all have."""
     skipped = [name for name, figures in found.items() if figures is None]
     scenes = {name: figures for name, figures in found.items() if figures is not None}
     if not scenes:
@@ -192,9 +180,8 @@ def summarise_scenes(
         )
     common = [name for name, figures in scenes.items() if all(one in figures for one in names)]
     if not common:
-        raise SourceError(
-            "there is no scene that all have a result for", where=folder, got=", ".join(names)
-        )
+        what = "there is no scene that all have a result for"
+        raise SourceError(what, where=folder, got=", ".join(names))
     warnings = [f"{name}: no truth, skipped" for name in skipped]
     for result in results:
         lacking = [name for name in scenes if name not in result.files]
@@ -216,56 +203,159 @@ def summarise_scenes(
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:
     """Return the entry of one matcher in ``summary.json``."""
     own = {name: figures[matcher] for name, figures in scenes.items() if matcher in figures}
-    counted = {name: own[name] for name in common}
-    masks = {name: {mask: one[mask] for mask in MASKS} for name, one in counted.items()}
-    seconds = {name: one["seconds"] for name, one in counted.items()}
-    confidence = {name: one["confidence"] for name, one in counted.items()}
     weighted = {
-        **weighted_figures(masks),
-        "confidence": weighted_confidence(confidence),
-        "seconds": None if None in seconds.values() else weighted_figures(seconds),
+        **weighted_figures({name: {mask: own[name][mask] for mask in MASKS} for name in common}),
+        "confidence": weighted_confidence({name: own[name]["confidence"] for name in common}),
+        # Not a number, so null, where one is not known.
+        "seconds": weighted_figures({name: own[name]["seconds"] for name in common}),
     }
     return {"scenes": own, "weighted": weighted}
 
 
-def weighted_figures(scenes: Mapping[str, Any]) -> Any:
-    """Return the mean of nested figures and curves over scenes, with the benchmark's weights.
+_STEP: Final = 16
+_DISPARITY: Final = "disp0"
+_SPARSE: Final = "_s"
 
-    A figure that any scene lacks is left out; one that is NaN in any is NaN.
+
+@dataclass(frozen=True)
+class ResultFolder:
+    """The results of one program."""
+
+    name: str  # the last part of the folder's path, with parents if several share it
+    folder: Path
+    files: Mapping[str, Path]  # the disparity map of each scene that has one
+
+
+def check_folder(folder: Path) -> None:
+    """Check that a path is an existing folder."""
+    if not folder.is_dir():
+        what = "not a folder" if folder.exists() else "folder does not exist"
+        raise SourceError(what, where=folder)
+
+
+def find_scenes(folder: Path) -> dict[str, Path]:
+    """Return folders of all scenes at or below a folder, by scene name."""
+    check_folder(folder)
+    paths = sorted(_scenes_below(folder))
+    if not paths:
+        expected = "folders with im0 and im1 and calib.txt, view1 and view5, or im2 and im6"
+        raise SourceError("folder contains no Middlebury scene", where=folder, expected=expected)
+    roots = [resolved(path) for path in paths]
+    short = [path.relative_to(scene_root(path).parent).as_posix() for path in roots]
+    if len(set(short)) < len(short):
+        short = [path.relative_to(folder).as_posix() for path in paths]
+    return dict(zip(short, paths, strict=True))
+
+
+def _scenes_below(folder: Path) -> Iterator[Path]:
+    # Scenes do not nest, so the search stops at each.
+    if find_layout(folder) is not None:
+        yield folder
+        return
+    for path in folder.iterdir():
+        if path.is_dir() and not path.name.startswith("."):
+            yield from _scenes_below(path)
+
+
+def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene | None:
+    """Read a scene with its ground truth; None if there is none for it.
+
+    A scene without its own gets that of the same name in the folder ``truth``, or of that folder.
     """
-    first = next(iter(scenes.values()))
-    if isinstance(first, Mapping):
-        shared = (key for key in first if all(key in one for one in scenes.values()))
-        by_key = {key: {name: one[key] for name, one in scenes.items()} for key in shared}
-        return {key: weighted_figures(each) for key, each in by_key.items()}
-    if isinstance(first, list):
-        return rounded(np.average(list(scenes.values()), axis=0, weights=_weights(scenes)))
-    values = np.array(list(scenes.values()), dtype=np.float64)
-    return float(np.average(values, weights=_weights(scenes)))
-
-
-def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
-    """Return the mean over the scenes that have figures, with the benchmark's weights."""
-    found = {name: one for name, one in scenes.items() if one is not None}
-    if not found:
+    scene = read_middlebury_scene(path)
+    judge = scene if scene.truth is not None else _judge(name, truth)
+    if judge is None or judge.truth is None:
         return None
-    bins = {name: one["reliability"] for name, one in found.items()}
-    rest = {name: {**one, "reliability": {}} for name, one in found.items()}
-    return {**weighted_figures(rest), "reliability": _pooled(bins)}
+    width_px, truth_width_px = scene.pair.left.shape[1], judge.truth.values.shape[1]
+    # Sizes may be off by a row or column; real mismatches are rejected by the comparison.
+    factor = max(round(4 * truth_width_px / width_px), 1) / 4
+    largest_px = None if scene.ndisp is None else scene.ndisp * factor
+    rules = MiddleburyRules(judge.full_size_factor, largest_px, judge.isint)
+    camera = _matching_camera(scene, judge.truth, factor)
+    return ScoredScene(name, scene.pair, camera, judge.truth, judge.camera, rules)
 
 
-def _pooled(scenes: Mapping[str, Figures]) -> Figures:
-    """Pool the bins of confidence with the share of each scene scaled to its weight."""
-    weights, bins = _weights(scenes), scenes.values()
-    share = np.array([one["share"] for one in bins]) * (weights / weights.sum())[:, None]
-    total = share.sum(axis=0)
-    pooled: Figures = {}
-    for name in ("confidence", "right"):
-        values = np.array([one[name] for one in bins], dtype=np.float64)
-        with np.errstate(invalid="ignore"):
-            pooled[name] = rounded(np.sum(share * np.nan_to_num(values), axis=0) / total)
-    return {**pooled, "share": rounded(total)}
+def _judge(name: str, folder: Path | None) -> MiddleburyScene | None:
+    last = name.rpartition("/")[2]
+    for path in (folder / name, folder / last, folder) if folder else ():
+        if path.name == last and path.is_dir() and find_layout(path) is not None:
+            return read_middlebury_scene(path)
+    return None
 
 
-def _weights(scenes: Iterable[str]) -> Float64:
-    return np.array([scene_weight(name) for name in scenes])
+def _matching_camera(
+    scene: MiddleburyScene, truth: DisparityTruth, factor: float
+) -> RectifiedCamera:
+    """Return the camera with the published disparity range, else that of the ground truth."""
+    height_px, width_px = scene.pair.left.shape[:2]
+    camera = scene.camera or stand_in_camera(width_px, height_px)
+    largest_px = float(np.nanmax(truth.values, initial=0.0)) / factor
+    of_truth = _STEP * int(largest_px // _STEP + 1)
+    return replace(camera, ndisp=scene.ndisp or camera.ndisp or of_truth)
+
+
+def find_results(
+    folders: Sequence[Path], scenes: Mapping[str, Path], taken: Sequence[str]
+) -> list[ResultFolder]:
+    """Find the results of other programs for scenes, one folder for each program.
+
+    A scene's result is ``Teddy.pfm``, or the only ``disp0*.pfm`` in a folder ``Teddy``, as the
+    benchmark's kit names them; the scene's name may be preceded by that of its folder
+    (``trainingQ/Teddy``). No program gets a name that is ``taken``.
+    """
+    found = []
+    for name, folder in zip(_names(folders, taken), folders, strict=True):
+        check_folder(folder)
+        files = ((scene, _file_of(folder, scene, path)) for scene, path in scenes.items())
+        present = {scene: file for scene, file in files if file is not None}
+        if not present:
+            first = next(iter(scenes))
+            expected = f"{first}.pfm, or {first}/{_DISPARITY}*.pfm, and so on"
+            raise SourceError("folder has no result for any scene", where=folder, expected=expected)
+        found.append(ResultFolder(name, folder, present))
+    return found
+
+
+def _names(folders: Sequence[Path], taken: Sequence[str]) -> list[str]:
+    """Return the shortest ends of the paths that distinguish them."""
+    paths = [resolved(folder) for folder in folders]
+    if len(set(paths)) < len(paths):
+        raise SettingsError("a folder of results is given twice", got=", ".join(map(str, folders)))
+    for depth in range(1, max((len(path.parts) for path in paths), default=0)):
+        names = ["/".join(path.parts[-depth:]) for path in paths]
+        if len({*names, *taken}) == len(names) + len(taken):
+            return names
+    return [str(path) for path in paths]
+
+
+def _file_of(folder: Path, scene: str, path: Path) -> Path | None:
+    root = scene_root(path)
+    for name in (scene, f"{root.parent.name}/{root.name}", root.name):
+        file = folder / f"{name}.pfm"
+        found = file if file.is_file() else _submitted(folder / name)
+        if found is not None:
+            return found
+    return None
+
+
+def _submitted(folder: Path) -> Path | None:
+    """Return the dense result in the folder of one scene; not its ground truth."""
+    truth = {"disp0GT", "disp0"} if find_image(folder, "im0") else {"disp0GT"}
+    stems = {file.stem for file in folder.glob(f"{_DISPARITY}*.pfm")}
+    sparse = {f"{stem}{_SPARSE}" for stem in stems}
+    found = [f"{stem}.pfm" for stem in sorted(stems - truth - sparse)]
+    if len(found) > 1:
+        what, hint = "folder has several results", "keep each method in a folder of its own"
+        raise SourceError(f"{what} for one scene", where=folder, got=", ".join(found), hint=hint)
+    return folder / found[0] if found else None
+
+
+def read_seconds(file: Path) -> float | None:
+    """Return what ``timeX.txt`` beside a result ``disp0X.pfm`` says; None if there is none."""
+    beside = file.with_name(f"time{file.stem.removeprefix(_DISPARITY)}.txt")
+    if not file.stem.startswith(_DISPARITY) or not beside.is_file():
+        return None
+    seconds = float(read_table(beside, (1,))[0][0, 0])
+    if not 0 <= seconds < float("inf"):
+        raise FormatError("not a time in seconds", where=beside, got=f"{seconds:g}")
+    return seconds

@@ -1,6 +1,4 @@
-"""The rules of the Middlebury stereo benchmark, version 3, and the figures of one result.
-
-Errors are in full-size pixels.
+"""The rules of the Middlebury stereo benchmark, version 3; errors are in full-size pixels.
 
 Ref: D. Scharstein, H. Hirschmüller et al., Middlebury Stereo Evaluation SDK 1.6, and the table of
 https://vision.middlebury.edu/stereo/eval3/.
@@ -8,7 +6,7 @@ https://vision.middlebury.edu/stereo/eval3/.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -24,35 +22,32 @@ from recon.core.values import (
     RectifiedCamera,
     StereoPair,
 )
-from recon.core.values.arrays import Bool, Float32, Int32, frozen_array
-from recon.evaluation.confidence import (
+from recon.core.values.arrays import Float32, Float64, frozen_array
+from recon.evaluation.disparity import (
+    evaluate_depth,
+    evaluate_disparity,
     measure_reliability,
     measure_sparsification,
     share_within_sigma,
+    truth_of,
+    values_of,
 )
-from recon.evaluation.disparity import evaluate_depth, evaluate_disparity, truth_of, values_of
 
 # Pixels that are scored: those seen by both cameras, or occluded ones as well.
 MASKS: Final = {"nonocc": False, "all": True}
 _HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
-Figures = dict[str, Any]
 _RIGHT_PX: Final = 1.0  # largest error of a correct pixel, in pixels of the result
 _KEPT: Final = 5  # every fifth point of a sparsification curve: 20 of 100
+Figures = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class MiddleburyRules:
-    """Rules of a scene for the evaluation of results.
+    """Rules of a scene for the evaluation of results."""
 
-    Attributes:
-        full_size_factor: Full-size pixels per pixel of the truth.
-        largest_px: Results are clipped to [0, this], pixels of the truth; None = unknown.
-        isint: Whether results are rounded to whole pixels of the truth.
-    """
-
-    full_size_factor: float = 1.0
-    largest_px: float | None = None
-    isint: bool = False
+    full_size_factor: float = 1.0  # full-size pixels per pixel of the truth
+    largest_px: float | None = None  # clips results to [0, this], px of the truth; None = unknown
+    isint: bool = False  # whether results are rounded to whole pixels of the truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +64,18 @@ class ScoredScene:
 
 def score_result(scene: ScoredScene, values: Float32) -> Figures:
     """Return the figures of a result, float32 (h, w) in pixels, by mask."""
-    maps = {"dense": dense_map(values), "sparse": values}
-    return {mask: _of_mask(scene, maps, occluded=occluded) for mask, occluded in MASKS.items()}
-
-
-def _of_mask(scene: ScoredScene, maps: Mapping[str, Float32], *, occluded: bool) -> Figures:
-    figures: Figures = {}
-    for name, values in maps.items():
-        metrics = evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded)
-        figures[name] = named_figures(metrics)
-        if scene.truth_camera is not None:
-            compared = values_compared(values, scene.truth.values.shape, scene.rules)
-            depth = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
-            figures[name]["depth"] = asdict(depth)
-        # The sparse map comes last: its holes are what the matcher did not find.
-        figures["invalid"] = metrics.invalid
+    truth, camera, factor = scene.truth, scene.truth_camera, scene.rules.full_size_factor
+    figures: Figures = {mask: {} for mask in MASKS}
+    # The sparse map comes last: its holes are what the matcher did not find.
+    for name, holed in {"dense": dense_map(values), "sparse": values}.items():
+        compared = values_compared(holed, truth.values.shape, scene.rules)
+        for mask, occluded in MASKS.items():
+            metrics = evaluate_disparity(compared, truth, occluded=occluded, scale=factor)
+            figures[mask][name] = named_figures(metrics)
+            if camera is not None:
+                depth = evaluate_depth(compared, truth, camera, occluded=occluded)
+                figures[mask][name]["depth"] = asdict(depth)
+            figures[mask]["invalid"] = metrics.invalid
     return figures
 
 
@@ -98,10 +90,9 @@ def named_figures(metrics: DisparityMetrics) -> Figures:
 
 
 def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | None:
-    """Return how well the confidence and the standard deviation of a result predict its errors.
+    """Return how well a result predicts its errors; None if no pixel can be compared.
 
-    Counts all pixels with a value and known ground truth, occluded ones included; None if there are
-    none. The truth may be 2 or 4 times larger or smaller.
+    All pixels with a value and known truth count. The truth may be 2 or 4 times larger or smaller.
     """
     shape = truth.values.shape
     step = _step(estimate.values.shape, shape)  # pixels of the result per pixel of the truth
@@ -121,17 +112,13 @@ def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -
     """Return the same for the confidence alone, of maps of equal size."""
     bins = measure_reliability(estimate, truth, limit_px)
     steps = measure_sparsification(estimate, truth, limit_px)
+    share = bins.pixels / bins.pixels.sum()
+    reliability = {"confidence": bins.confidence, "right": bins.right, "share": share}
     return {
         "ece": bins.calibration_error,
         "ause": steps.ause,
-        "reliability": {
-            "confidence": rounded(bins.confidence),
-            "right": rounded(bins.right),
-            "share": rounded(bins.pixels / bins.pixels.sum()),
-        },
-        "sparsification": {
-            name: rounded(getattr(steps, name)[::_KEPT]) for name in ("removed", "wrong", "best")
-        },
+        "reliability": {name: rounded(each) for name, each in reliability.items()},
+        "sparsification": {n: rounded(each[::_KEPT]) for n, each in steps._asdict().items()},
     }
 
 
@@ -148,10 +135,9 @@ def error_map(scene: ScoredScene, values: Float32) -> Float32:
 
 
 def dense_map(values: Float32) -> Float32:
-    """Return a map without holes: float32 (H, W).
+    """Return a map without holes, float32 (H, W): those that cannot be filled get disparity 0.
 
-    Holes that cannot be filled get disparity 0, which is wrong nearly everywhere, so that no
-    matcher gains by leaving pixels out.
+    That is wrong nearly everywhere, so that no matcher gains by leaving pixels out.
     """
     filled = fill_holes(values)
     return np.where(np.isfinite(filled), filled, np.float32(0))
@@ -160,30 +146,25 @@ def dense_map(values: Float32) -> Float32:
 def fill_holes(values: Float32) -> Float32:
     """Give each pixel without a disparity that of the background beside it: float32 (H, W).
 
-    What only one camera sees is hidden behind something nearer, so a hole gets the smaller one of
-    the nearest values to the left and to the right on its row, or the only one. A row without any
-    value is copied from the nearest row with some, the upper one of two. Known values stay.
+    That is the smaller of the nearest values to the left and to the right, or the only one. A row
+    without any is copied from the nearest row with some, the upper one of two.
 
     Ref: the background interpolation of A. Geiger et al., KITTI stereo development kit.
     """
     values = frozen_array("values", values, np.float32, (None, None))
     known = np.isfinite(values)
-    from_left = _gather(values, _last_known(known))
-    from_right = _gather(values[:, ::-1], _last_known(known[:, ::-1]))[:, ::-1]
-    filled = np.where(known, values, np.fmin(from_left, from_right))
+    background = np.fmin(_from_left(values), _from_left(values[:, ::-1])[:, ::-1])
+    filled = np.where(known, values, background)
     rows = np.flatnonzero(known.any(axis=1))
     return filled[rows[nearest_sorted(np.arange(len(filled)), rows)]] if rows.size else filled
 
 
-def _last_known(known: Bool) -> Int32:
-    """Return int32 (H, W): column of the nearest known pixel at or left of each; -1 = none."""
-    columns = np.arange(known.shape[1], dtype=np.int32)
-    return np.asarray(np.maximum.accumulate(np.where(known, columns, np.int32(-1)), axis=1))
-
-
-def _gather(values: Float32, columns: Int32) -> Float32:
-    there = np.take_along_axis(values, np.maximum(columns, 0).astype(np.intp), axis=1)
-    return np.where(columns >= 0, there, np.float32(np.nan))
+def _from_left(values: Float32) -> Float32:
+    """Return float32 (H, W): the nearest known value at or left of each; NaN = none."""
+    columns = np.where(np.isfinite(values), np.arange(values.shape[1], dtype=np.int32), -1)
+    last = np.maximum.accumulate(columns, axis=1)
+    there = np.take_along_axis(values, np.maximum(last, 0).astype(np.intp), axis=1)
+    return np.where(last >= 0, there, np.float32(np.nan))
 
 
 def evaluate_middlebury(
@@ -219,21 +200,56 @@ def values_compared(values: Float32, shape: tuple[int, ...], rules: MiddleburyRu
 
 
 def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
-    """Return float32 (H, W), a result at the size of the truth, in pixels of that size.
-
-    Pixels are repeated or skipped, never interpolated.
-    """
+    """Return a result at the size of the truth, in its pixels, which are repeated or skipped."""
     step = _step(values.shape, shape)
     return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)
 
 
 def scene_weight(name: str) -> float:
-    """Return what a scene counts for in the table's mean: 4 if it is a variant or hard, else 8.
-
-    ``name`` is that of its folder, or a path that ends in it.
-    """
+    """Return what a scene, by its name or path, counts for in the mean: 4 if it is hard, else 8."""
     scene = name.rpartition("/")[2].removesuffix("-perfect").removesuffix("-imperfect")
     return 4.0 if scene in _HALF_WEIGHT else 8.0
+
+
+def weighted_figures(scenes: Mapping[str, Any]) -> Any:
+    """Return the mean of nested figures over scenes, without those that any lacks."""
+    first = next(iter(scenes.values()))
+    if isinstance(first, Mapping):
+        return {
+            key: weighted_figures({name: one[key] for name, one in scenes.items()})
+            for key in first
+            if all(key in one for one in scenes.values())
+        }
+    values = np.array(list(scenes.values()), dtype=np.float64)
+    mean = np.average(values, axis=0, weights=_weights(scenes))
+    return rounded(mean) if isinstance(first, list) else float(mean)
+
+
+def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
+    """Return the mean over the scenes that have figures, with the benchmark's weights."""
+    found = {name: one for name, one in scenes.items() if one is not None}
+    if not found:
+        return None
+    bins = {name: one["reliability"] for name, one in found.items()}
+    rest = {name: {**one, "reliability": {}} for name, one in found.items()}
+    return {**weighted_figures(rest), "reliability": _pooled(bins)}
+
+
+def _pooled(scenes: Mapping[str, Figures]) -> Figures:
+    """Pool the bins of confidence with the share of each scene scaled to its weight."""
+    weights, bins = _weights(scenes), scenes.values()
+    share = np.array([one["share"] for one in bins]) * (weights / weights.sum())[:, None]
+    total = share.sum(axis=0)
+    pooled = {}
+    for name in ("confidence", "right"):
+        values = np.nan_to_num(np.array([one[name] for one in bins], dtype=np.float64))
+        with np.errstate(invalid="ignore"):
+            pooled[name] = rounded(np.sum(share * values, axis=0) / total)
+    return {**pooled, "share": rounded(total)}
+
+
+def _weights(scenes: Iterable[str]) -> Float64:
+    return np.array([scene_weight(name) for name in scenes])
 
 
 def _step(shape: tuple[int, ...], truth_shape: tuple[int, ...]) -> float:
