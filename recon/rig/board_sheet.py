@@ -54,13 +54,8 @@ def write_board(
 ) -> dict[str, Any]:
     """Draw a board to scale in the centre of a sheet, with a ruler to check the print.
 
-    Args:
-        path: ``.pdf`` or ``.png``.
-        board: The board, with a square size.
-        paper: Name of a paper size, or ``600x400mm``; None = the smallest A size that fits.
-        dpi: Approximate resolution of a PNG; a square has a whole number of pixels.
-
-    Returns a description of the sheet as plain values.
+    ``paper`` is the name of a size, or ``600x400mm``; None = the smallest A size that fits. ``dpi``
+    is approximate, as squares of a PNG have whole pixels. Returns a description of the sheet.
     """
     kind = path.suffix.lower()
     if kind not in _KINDS:
@@ -77,7 +72,8 @@ def write_board(
             hint="name it, as in chess:9x6:25mm",
         )
     sheet = choose_sheet(board, paper)
-    exact_dpi = _whole_pixels(board, dpi)
+    square_in = 1e3 * board.square_m / _MM_PER_IN
+    exact_dpi = max(round(square_in * dpi), 1) / square_in
     longest = round(max(sheet.width_mm, sheet.height_mm) / _MM_PER_IN * exact_dpi)
     if kind == ".png" and longest > _LARGEST_PNG_PX:
         raise SettingsError(
@@ -139,12 +135,6 @@ def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
         largest_mm.append(paper_mm / (squares + 2 * _MARGIN_SQUARES))
         largest_mm.append((paper_mm - 2 * _SMALLEST_MARGIN_MM) / squares)
     return min(largest_mm) / (1e3 * board.square_m)
-
-
-def _whole_pixels(board: CalibrationBoard, dpi: float) -> float:
-    """Return the resolution nearest to ``dpi`` at which a square has a whole number of pixels."""
-    square_in = 1e3 * board.square_m / _MM_PER_IN
-    return max(round(square_in * dpi), 1) / square_in
 
 
 def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes:

@@ -24,12 +24,9 @@ from recon.sources.source import StereoSource
 
 
 class CameraSource(StereoSource):
-    """The pairs that cameras take from now on; their number need not be known.
+    """The pairs that cameras take from now on; live if none of them is a video file.
 
-    It is live if all are cameras; video files take as long as one likes.
-
-    ``files`` are what the calibration was read from; ``stopped`` is called before each pair, and
-    True ends the drive.
+    ``files`` are what the calibration was read from; ``stopped`` is asked before each pair.
     """
 
     name: str

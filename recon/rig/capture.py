@@ -144,9 +144,8 @@ def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:
         stamps[earlier] = cameras[earlier].grab()
     silent = cameras[stamps.index(None)]
     if silent.live:
-        raise SourceError(
-            "camera gives no more frames", where=silent.name, hint="check its cable and power"
-        )
+        hint = "check its cable and power"
+        raise SourceError("camera gives no more frames", where=silent.name, hint=hint)
     return None
 
 
@@ -181,15 +180,13 @@ class CaptureFolder:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
-                raise OutputError(
-                    "folder is not empty", where=folder, hint="give a new one with --out"
-                )
+                hint = "give a new one with --out"
+                raise OutputError("folder is not empty", where=folder, hint=hint)
             self._list = os.open(folder / FRAMES, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
             self._length = os.write(self._list, HEADER.encode())
         except OSError as error:
-            raise OutputError(
-                "folder cannot be written", where=folder, got=error.strerror
-            ) from error
+            what = "folder cannot be written"
+            raise OutputError(what, where=folder, got=error.strerror) from error
 
     def __enter__(self) -> Self:
         return self

@@ -78,8 +78,7 @@ def rectify_images(
 ) -> UncalibratedRectification:
     """Find the simplest change that aligns the rows of grey pairs of one uncalibrated rig.
 
-    If homographies are needed, features are matched again in the images that these align. ``count``
-    limits the features of an image.
+    ``count`` limits the features of an image; homographies are refined by a second matching.
     """
     height, width = pairs[0][0].shape
     matched = [match_exactly(left, right, count) for left, right in pairs]
@@ -245,8 +244,8 @@ def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> H
 def _levelled(views: list[Float64], border: Float64) -> list[Float64]:
     """Tilt both images together about a horizontal axis, until top and bottom have equal scale.
 
-    Rows stay aligned under (x, y) -> (x, y) / (1 + g·(y - y0)). The scale at a pixel depends on its
-    third coordinate: g makes this as even as possible along the borders of both images.
+    Rows stay aligned under (x, y) -> (x, y) / (1 + g·(y - y0)); g makes the third coordinates as
+    even as possible along the borders of both images.
     """
     points = np.hstack([border, np.ones((len(border), 1))])
     views = [H / (points @ H[2]).mean() for H in views]

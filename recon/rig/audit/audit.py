@@ -28,16 +28,14 @@ from recon.stereo.rectify.rectifier import Rectifier, plan_turns
 
 _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
 # Findings of a pair that images alone support, and those that need a calibration. The inspection of
-# the frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
-# is dense.
+# the frame reports others, except few features, which do not matter if the disparity is dense.
 _BY_IMAGES: Final = frozenset({"black", "gain", "blur"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 # Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs, even
 # of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %.
 _FEW_VALID_SHARE: Final = 0.25
 _MATCHED_ROWS_PX: Final = 0.3  # rms row error that does not spoil matching
-# No matcher is more accurate than a twentieth of a pixel on real images.
-_LEAST_SIGMA_PX: Final = 0.05
+_LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +76,7 @@ class Audit:
 
 
 def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool = False) -> Audit:
-    """Check a drive before a long run; ``quick``: in a second or two, as `recon map` does.
-
-    Of the configuration, ``audit``, ``rectification`` and ``matching`` are used.
-    """
+    """Check a drive before a long run; ``quick``: in a second or two, as `recon map` does."""
     check_source(source)
     rectifier = Rectifier(source.calibration, config.rectification)
     camera = rectifier.camera
@@ -100,9 +95,8 @@ def correct_calibration(
 ) -> dict[str, Any]:
     """Write the calibration with which rows and motion agree, and return how it differs.
 
-    The lenses of rectified images are straightened, if they bend; and the right camera is turned.
-    What the drive does not show beyond two standard deviations stays as it is; the baseline always
-    does.
+    Lenses of rectified images that bend are straightened, and the right camera is turned, by what
+    the drive shows beyond two standard deviations; the baseline stays.
     """
     if audit.alignment is None:
         raise CalibrationError(
@@ -134,8 +128,7 @@ def _corrected_turn(
     """Return a calibration with the right camera turned as rows and motion show, and the turn."""
     turn = None if audit.motion is None else audit.motion.turn
     turns = [alignment.turn] if turn is None or _rows_off(alignment) else []
-    if turn is not None:
-        turns.append(turn.telling)
+    turns += [] if turn is None else [turn.telling]
     for each in turns:
         rig = _turned(rig, each, config)
     return rig, np.asarray(np.sum(turns, axis=0))
@@ -167,9 +160,7 @@ def _turned(rig: Rig, turn: Float64, config: AuditedSettings) -> StereoCalibrati
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
     """Return the largest disparity that is searched; None if the range adapts to each pair."""
     own = settings_of(matching.matcher, matching)
-    if not isinstance(own, SearchSettings):
-        return None
-    if own.ndisp is None and camera.ndisp is None:
+    if not isinstance(own, SearchSettings) or (own.ndisp is None and camera.ndisp is None):
         return None
     return own.min_disparity_px + own.ndisp_for(camera)
 
@@ -281,11 +272,8 @@ def _reasons(disparity: Disparity) -> str:
 
 
 def _quick_findings(source: StereoSource, config: AuditedSettings) -> tuple[Finding, ...]:
-    """Return findings of a quick audit; none if it is switched off.
-
-    A calibration that cannot rectify is reported by the run itself, not here.
-    """
+    """Return findings of a quick audit; none if it is switched off."""
     try:
         return audit_source(source, config, quick=True).findings if config.audit.quick else ()
-    except CalibrationError:
+    except CalibrationError:  # it cannot rectify, which the run itself reports
         return ()

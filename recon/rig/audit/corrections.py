@@ -1,9 +1,8 @@
 """Corrections of a rig from the motion of a drive: the right camera turned, both lenses bent.
 
-Where a lens bends otherwise than calibrated, a feature does not move as its depth and the motion of
-the camera say, and its row differs between the images by how far apart it is seen in them. Both
-show in any drive; on kitti_raw_0013 and sequence 06 of KITTI, calibrated on different days, they
-show the same lenses.
+Where a lens bends otherwise than calibrated, features do not move as their depth and the motion of
+the camera say, and their rows differ. On kitti_raw_0013 and sequence 06 of KITTI, calibrated on
+different days, that shows the same lenses.
 """
 
 from __future__ import annotations
@@ -29,12 +28,9 @@ MIN_WINDOWS: Final = 6  # fewer windows do not show how much their answers scatt
 _PARAMETERS: Final = 5  # pitch, yaw, roll, focal length, lenses
 _TERMS: Final = 6  # of each lens: k1 k2 p1 p2 s1 s3 of OpenCV
 _TURN: Final = 4  # of the right camera: pitch, yaw, roll, enlargement
-# Standard deviation of what each term moves at the corners, before anything is seen.
-_PRIOR_PX: Final = 2.0
-# Times that bent places are straightened; each adds at least a digit where lenses are usable.
-_ROUNDS: Final = 10
-# Share of the cost of other windows that lenses must take away, or they are not believed.
-_LEAST_GAIN: Final = 0.1
+_PRIOR_PX: Final = 2.0  # standard deviation of what each term moves at the corners, beforehand
+_ROUNDS: Final = 10  # of straightening; each adds at least a digit where lenses are usable
+_LEAST_GAIN: Final = 0.1  # share of the cost of other windows that believable lenses take away
 _TELLING_SIGMAS: Final = 2.0  # what is nearer to zero than this is left as it is calibrated
 
 
@@ -70,8 +66,8 @@ class RightTurn:
 def estimate_turn(tracks: Sequence[StereoTracks], camera: RectifiedCamera) -> RightTurn | None:
     """Estimate the turn of the right camera that makes disparities fit the motion, and rows meet.
 
-    The covariance is that of the windows' answers: what one window gets wrong as a whole, such as
-    what drives beside it, counts once and not once a feature. None if there are too few windows.
+    The covariance is that of the windows' answers, whose features err together. None if there are
+    too few windows.
 
     Ref: Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986 (the
     covariance of clustered data).
@@ -102,10 +98,7 @@ def turned_places(right_uv: Float64, turn: Float64, camera: RectifiedCamera) -> 
 
 
 def _basis(uv: Float64, camera: RectifiedCamera) -> Float64:
-    """Return what a turn does to places (…, 2) in the right image: float64 (…, 2, 5).
-
-    A small rotation w moves a ray p by w × p.
-    """
+    """Return what a turn does to places (…, 2) in the right image: float64 (…, 2, 5)."""
     x, y = np.moveaxis((uv - [camera.cx_right_px, camera.cy_px]) / camera.focal_px, -1, 0)
     columns = np.stack([-x * y, 1 + x * x, -y, x, x * x], axis=-1)
     rows = np.stack([-(1 + y * y), x * y, x, y, np.zeros_like(x)], axis=-1)
@@ -145,8 +138,8 @@ class BentLenses:
 def estimate_lenses(tracks: Sequence[StereoTracks], camera: RectifiedCamera) -> BentLenses | None:
     """Estimate what both lenses bend, with the turn of the right camera.
 
-    They are believed if, fitted to every second window, they explain the others better than a turn
-    alone does. None if not, or if there are too few windows.
+    None if, fitted to every second window, they explain the others no better than a turn alone, or
+    if there are too few windows.
     """
     if len(tracks) < MIN_WINDOWS:
         return None
@@ -185,27 +178,23 @@ def bending(camera: RectifiedCamera) -> RigCorrection:
     """Return lenses, and the turn of the right camera, as a correction of a rig."""
     f = camera.focal_px
 
-    def straight(
-        uv: Float64, cx_px: float, enlarged: float, terms: Float64
-    ) -> tuple[Float64, Float64]:
+    def straight(uv: Float64, cx_px: float, zoom: float, terms: Float64) -> tuple[Float64, Float64]:
         """Return places (…, 2) after a lens, and how they follow its terms (…, 2, 6)."""
         centre = np.array([cx_px, camera.cy_px])
-        xy = straightened(enlarged * (uv - centre) / f, terms)
+        xy = straightened(zoom * (uv - centre) / f, terms)
         return f * xy + centre, -f * _bent_by(xy)
 
     def place(tracks: StereoTracks, values: Float64) -> CorrectedPlaces:
         turn, left, right = _split(values)
         left_uv, by_left = straight(tracks.window.uvd[..., :2], camera.cx_px, 1.0, left)
-        enlarged = float(1.0 + turn[3])
-        right_uv, by_right = straight(tracks.right_uv, camera.cx_right_px, enlarged, right)
+        zoom = float(1.0 + turn[3])
+        right_uv, by_right = straight(tracks.right_uv, camera.cx_right_px, zoom, right)
         by_turn = (f * _basis(right_uv, camera))[..., :_TURN]
         none = np.zeros_like(by_left)
-        return CorrectedPlaces(
-            left_uv,
-            turned_places(right_uv, np.array([*turn[:3], 0.0, 0.0]), camera),
-            np.concatenate([np.zeros_like(by_turn), by_left, none], axis=-1),
-            np.concatenate([by_turn, none, by_right], axis=-1),
-        )
+        by_left = np.concatenate([np.zeros_like(by_turn), by_left, none], axis=-1)
+        by_right = np.concatenate([by_turn, none, by_right], axis=-1)
+        turned_uv = turned_places(right_uv, np.array([*turn[:3], 0.0, 0.0]), camera)
+        return CorrectedPlaces(left_uv, turned_uv, by_left, by_right)
 
     # Lenses are calibrated to a few pixels.
     corner = np.array([camera.width_px, camera.height_px]) / (2.0 * f)

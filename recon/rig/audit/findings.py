@@ -28,14 +28,12 @@ _ROW_PX: Final = 0.75  # rms row error above which it is reported
 _BAD_ROW_PX: Final = 1.5  # rms row error above which that finding is fatal
 _DISPARITY_PX: Final = 0.75  # error common to all disparities above which it is reported
 _GAIN: Final = 1.2  # brightness ratio above which a finding is reported
-# One camera counts as blurred below this sharpness relative to the other.
-_SHARPNESS_RATIO: Final = 0.65
+_SHARPNESS_RATIO: Final = 0.65  # one camera counts as blurred below, relative to the other
 _SHARPNESS: Final = 0.14  # both cameras count as blurred below this sharpness
 _REPEATED_SHARE: Final = 0.02  # share of repeated frames that is still accepted
 _FROZEN_FRAMES: Final = 3  # repeats in a row from which one camera counts as frozen
 _SKEW_FRAMES: Final = 0.1  # time skew between the cameras above which it is reported, in frames
-# Share of features beyond the disparity range above which they are reported.
-_NEAR_SHARE: Final = 0.02
+_NEAR_SHARE: Final = 0.02  # share of features beyond the disparity range that is accepted
 _FAR_PX: Final = 1.5  # a scene with a smaller median disparity is too far for the baseline
 _MAX_SPEED_M_PER_S: Final = 70.0  # a higher apparent speed means that the baseline is wrong
 _TEXTS: Final = {
@@ -219,14 +217,13 @@ def _of_range(disparity_px: Float64, reach_px: int | None, camera: RectifiedCame
     columns_px = disparity_px - camera.doffs_px
     near = float(np.mean(columns_px > reach_px)) if reach_px else 0.0
     if reach_px and near > _NEAR_SHARE:
-        reach_m = scale / (reach_px + camera.doffs_px)
+        reach = {"reach_px": reach_px, "reach_m": scale / (reach_px + camera.doffs_px)}
         most = int(np.ceil(np.quantile(columns_px, 0.98) / 16) * 16)
-        reach = {"reach_px": reach_px, "reach_m": reach_m, "most": most}
-        yield "near", {"percent": 100 * near, **reach}
+        yield "near", {"percent": 100 * near, **reach, "most": most}
     middle = float(np.median(disparity_px))
     if 0 < middle < _FAR_PX:
-        own = {"depth_m": scale / middle, "middle": middle}
-        yield "far", {**own, "baseline_m": camera.baseline_m}
+        baseline = {"baseline_m": camera.baseline_m}
+        yield "far", {"depth_m": scale / middle, "middle": middle, **baseline}
 
 
 def _of_calibration(

@@ -14,26 +14,23 @@ from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.odometry.locate_camera import find_consensus, fit_pose
 from recon.sources.source import StereoSource
 
-# Half of the pixels around a corner may be saturated before their median is.
-_AROUND_PX: Final = 9
+_AROUND_PX: Final = 9  # half of these may be saturated before their median is
 _DARK: Final = 12.0
 _BRIGHT: Final = 243.0
-# Mean difference in grey levels; two exposures of a static scene differ more, by sensor noise.
-_SAME_DN: Final = 0.05
+_SAME_DN: Final = 0.05  # two exposures of a static scene differ more, by sensor noise
 _GAP_PERIODS: Final = 1.7  # time step, in frame periods, above which frames count as missing
 _MIN_POINTS: Final = 20
 _MIN_DISPARITY_PX: Final = 2.0
 _AGREE_PX: Final = 2.0
-# Features must move at least this many rows per frame to reveal a time skew.
-_MIN_FLOW_PX: Final = 1.0
+_MIN_FLOW_PX: Final = 1.0  # rows per frame by which features must move to reveal a time skew
 
 
 def measure_gain(left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32) -> Float64:
-    """Return the brightness of the right image relative to the left, around matched features.
+    """Return float64 (M,), brightness of the right image relative to the left, around features.
 
-    float64 (M,), for each feature whose surroundings are mostly neither black nor saturated.
+    Features whose surroundings are mostly black or saturated are left out.
     """
-    first, second = (_medians(image, uv) for image, uv in ((left, left_uv), (right, right_uv)))
+    first, second = _medians(left, left_uv), _medians(right, right_uv)
     fair = (np.minimum(first, second) > _DARK) & (np.maximum(first, second) < _BRIGHT)
     return np.asarray(second[fair] / first[fair], dtype=np.float64)
 
@@ -49,8 +46,7 @@ def _medians(image: UInt8, uv: Float32) -> Float64:
 def measure_sharpness(image: UInt8) -> float:
     """Return the share of the finest detail in all detail of a grey image, in [0, 1].
 
-    Compares Laplacians at full and at quarter size: blur reduces the first, but not the second.
-    Sensor noise is subtracted from both.
+    Blur reduces the Laplacian at full size, but not at a quarter of it.
     """
     fine = image.astype(np.float32)
     coarse = cv2.resize(fine, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
@@ -90,7 +86,8 @@ class RepeatCounter:
                 for now, last in zip((left, right), self._last, strict=True)
             ]
             self.both += all(same)
-            for side, alone in enumerate((same[0] and not same[1], same[1] and not same[0])):
+            for side in range(2):
+                alone = same[side] and not same[1 - side]
                 self._run[side] = self._run[side] + 1 if alone else 0
                 self.frozen[side] = max(self.frozen[side], self._run[side])
         self._last = (left, right)
@@ -112,10 +109,9 @@ def track(now: UInt8, then: UInt8, uv: Float32) -> tuple[Float32, Bool]:
 def measure_speed(
     left_uv: Float32, right_uv: Float32, later_uv: Float32, camera: RectifiedCamera
 ) -> float | None:
-    """Return how far the rig moves between two frames, metres, if the calibration is correct.
+    """Return how far the rig moves between two frames, metres; None if too few features agree.
 
-    The features (N, 2) are those of the left and of the right image, and of the left image of the
-    next frame. None if too few agree on one motion.
+    ``later_uv`` is where the features (N, 2) are in the left image of the next frame.
     """
     disparity = left_uv[:, 0] - right_uv[:, 0] + camera.doffs_px
     near = disparity > _MIN_DISPARITY_PX
@@ -124,26 +120,19 @@ def measure_speed(
     depth_m = camera.focal_px * camera.baseline_m / disparity[near].astype(np.float64)
     rays = np.linalg.inv(camera.matrix) @ np.vstack([left_uv[near].T, np.ones(near.sum())])
     xyz = (rays * depth_m).T
-    found = find_consensus(
-        xyz,
-        later_uv[near].astype(np.float64),
-        camera,
-        limit_px=_AGREE_PX,
-        iterations=100,
-        min_inliers=max(_MIN_POINTS, math.ceil(0.4 * near.sum())),
-    )
+    uv, enough = later_uv[near].astype(np.float64), max(_MIN_POINTS, math.ceil(0.4 * near.sum()))
+    found = find_consensus(xyz, uv, camera, limit_px=_AGREE_PX, iterations=100, min_inliers=enough)
     if found is None:
         return None
-    T = fit_pose(xyz[found.agree], later_uv[near][found.agree].astype(np.float64), camera)
+    T = fit_pose(xyz[found.agree], uv[found.agree], camera)
     return float(np.linalg.norm(T[:3, 3]))
 
 
 def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[float, float] | None:
-    """Return the delay of the right camera in frames, and its standard error.
+    """Return the delay of the right camera in frames, and its standard error; None if unknown.
 
-    A camera that is s frames late sees a feature whose row moves by v per frame v·s rows lower:
-    the slope of the row error (right minus left, (N,)) over the row flow is the skew. None if too
-    few features move enough.
+    It is the slope of the row error (right minus left, (N,)) over the rows that features move by in
+    a frame, as a late camera sees them moved on.
     """
     moving = np.abs(row_flow_px) > _MIN_FLOW_PX
     if moving.sum() < _MIN_POINTS:

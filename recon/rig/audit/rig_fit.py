@@ -192,9 +192,5 @@ def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
     f, fb = camera.focal_px, camera.focal_px * camera.baseline_m
     z = np.maximum(xyz[..., 2], bundle.MIN_DEPTH_M)
     x, y, zero = xyz[..., 0] / z, xyz[..., 1] / z, np.zeros_like(z)
-    rows = [
-        np.stack([f / z, zero, -f * x / z], -1),
-        np.stack([zero, f / z, -f * y / z], -1),
-        np.stack([zero, zero, -fb / z**2], -1),
-    ]
-    return np.stack(rows, axis=-2)
+    rows = [f / z, zero, -f * x / z], [zero, f / z, -f * y / z], [zero, zero, -fb / z**2]
+    return np.stack([np.stack(row, -1) for row in rows], axis=-2)

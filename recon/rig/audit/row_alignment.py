@@ -41,8 +41,7 @@ class RowAlignment:
 
     def turned_rows(self, right_uv: Float32, camera: RectifiedCamera) -> Float64:
         """Return float64 (N,): rows of features of the right image after correction."""
-        turn = np.array([self.pitch_rad, self.roll_rad])
-        return np.asarray(turn_features(right_uv, camera, turn)[:, 1])
+        return np.asarray(turn_features(right_uv, camera, self.turn[[0, 2]])[:, 1])
 
 
 def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> RowAlignment | None:
@@ -80,10 +79,7 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
 
 
 def turn_features(right_uv: Float32, camera: RectifiedCamera, turn: Float64) -> Float64:
-    """Return where features (N, 2) of the right image are after a rotation of its camera.
-
-    ``turn`` is pitch and roll, radians.
-    """
+    """Return where features (N, 2) of the right image are after a pitch and roll, radians."""
     centre = np.array([camera.cx_right_px, camera.cy_px])
     rays = np.column_stack([(right_uv - centre) / camera.focal_px, np.ones(len(right_uv))])
     turned = rays @ exp_so3(np.array([turn[0], 0.0, turn[1]])).T
@@ -100,12 +96,9 @@ def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) 
 def correct_rig(rig: Rig, turn: Float64, R_rect_left: Float64) -> StereoCalibration:
     """Return the calibration with the right camera turned in place, and its focal length changed.
 
-    Args:
-        rig: The calibration that the images were rectified with.
-        turn: float64 (4,): pitch, yaw and roll, radians, by which rays of the rectified right
-            camera are turned, and the share by which its image is enlarged.
-        R_rect_left: float64 (3, 3), rotation from the left camera to the rectified camera; the
-            identity for a rectified rig.
+    ``turn`` (4,) is pitch, yaw and roll, radians, of rays of the rectified right camera, and the
+    share by which its image is enlarged; ``R_rect_left`` the rotation from the left camera to the
+    rectified one, the identity for a rectified rig.
     """
     raw = rig
     if isinstance(raw, RectifiedCamera):

@@ -34,14 +34,11 @@ from recon.stereo.rectify.features import (
 )
 from recon.stereo.rectify.rectifier import Rectifier
 
-# Stretches of a quick audit; each is just long enough to detect a delayed camera.
-_QUICK_RUNS = 2
-# Pairs that are also compared at other lags.
-_LAG_PAIRS = 4
-# A quick audit stays near the start, since a video is decoded up to each frame.
-_QUICK_REACH = 300
-# Smaller images have no features, and are too small to measure their sharpness.
-_LEAST_SIDE_PX = 16
+Sides = tuple[float, float]  # of the left and of the right image
+_QUICK_RUNS = 2  # stretches of a quick audit, just long enough to detect a delayed camera
+_LAG_PAIRS = 4  # pairs that are also compared at other lags
+_QUICK_REACH = 300  # a quick audit stays near the start: a video is decoded up to each frame
+_LEAST_SIDE_PX = 16  # smaller images have no features, and no sharpness
 FRAMES: Final = 300  # frames that are read in all
 _RUNS: Final = 6  # number of runs of consecutive frames on longer drives
 _PAIRS: Final = 12  # pairs in which features are matched
@@ -50,20 +47,18 @@ _QUICK_FEATURES: Final = 800  # the same in a quick audit
 _MAX_LAG: Final = 4  # largest delay of one camera to look for, in frames
 _QUICK_LAG: Final = 3  # the same in a quick audit
 BLANK_DN: Final = 4.0  # an image counts as blank below this standard deviation, in grey levels
-# Agreement at a lag, relative to that at lag 0, from which a delay is reported.
-_LAG_FACTOR: Final = 1.25
-# A larger skew, in frames, is closer to a lag of one frame.
-_LARGEST_SKEW: Final = 0.75
+_LAG_FACTOR: Final = 1.25  # agreement relative to lag 0 from which a delay is reported
+_LARGEST_SKEW: Final = 0.75  # a larger skew, in frames, is closer to a lag of one frame
 MIN_FEATURES: Final = 60  # minimum number of features, in all, to judge geometry
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What was measured in one pair, (left, right)."""
+    """What was measured in one pair."""
 
     index: int  # number of the pair
-    brightness_dn: tuple[float, float]  # mean grey levels
-    sharpness: tuple[float, float]  # shares of the finest detail; NaN if unknown
+    brightness_dn: Sides  # mean grey levels
+    sharpness: Sides  # shares of the finest detail; NaN if unknown
     features: PairFeatures  # matched features
     pair: RectifiedPair | None  # the images; None where they are not kept
 
@@ -88,15 +83,12 @@ class Sample:
 
     frames: int = 0  # number of pairs that were read
     repeats: RepeatCounter = field(default_factory=RepeatCounter)
-    # (left, right) standard deviation of the grey levels
-    contrast_dn: list[tuple[float, float]] = field(default_factory=list)
-    # (left, right) mean grey level
-    brightness_dn: list[tuple[float, float]] = field(default_factory=list)
-    # (left, right) share of the finest detail
-    sharpness: list[tuple[float, float]] = field(default_factory=list)
+    contrast_dn: list[Sides] = field(default_factory=list)  # standard deviations of grey levels
+    brightness_dn: list[Sides] = field(default_factory=list)  # mean grey levels
+    sharpness: list[Sides] = field(default_factory=list)  # shares of the finest detail
     gains: list[Float64] = field(default_factory=list)  # brightness ratios around features
     features: list[PairFeatures] = field(default_factory=list)  # matched features
-    # pairs by how many frames after the left image the right image is taken from
+    # by how many frames after the left image the right image is taken from
     lagged: dict[int, list[_Lagged]] = field(default_factory=dict)
     speeds_m_per_s: list[float] = field(default_factory=list)  # of the rig, where measured
     # (N,), rows by which each feature moves to the next frame; NaN if unknown
@@ -119,10 +111,7 @@ def take_sample(source: StereoSource, rectifier: Rectifier, *, quick: bool) -> S
 
 
 def plan_stretches(frames: int, read: int, *, quick: bool) -> list[tuple[int, int]]:
-    """Return first frame and end of each stretch of a drive; ``read`` frames are read in all.
-
-    A short drive is read whole. A quick audit stays near the start.
-    """
+    """Return first frame and end of each stretch of a drive; ``read`` frames are read in all."""
     frames = min(frames, _QUICK_REACH) if quick else frames
     runs = _QUICK_RUNS if quick else _RUNS
     length = 2 * _QUICK_LAG + 1 if quick else max(2, read // runs)
@@ -166,15 +155,14 @@ class _Sampler:
         """Read one stretch; a pair is measured once its neighbours have been read."""
         self.sample.repeats.restart()
         self._recent.clear()
-        reach = self._lag
         waiting = [centre for centre in self._centres if start <= centre < stop]
         for recorded in islice(self._source.frames(start), stop - start):
             self.sample.frames += 1
             self.sample.repeats.add(recorded.left, recorded.right)
             pair = self._rectifier.rectify(recorded)
             self._recent[pair.index] = pair
-            self._recent.pop(pair.index - 2 * reach - 1, None)
-            while waiting and pair.index >= min(waiting[0] + reach, stop - 1):
+            self._recent.pop(pair.index - 2 * self._lag - 1, None)
+            while waiting and pair.index >= min(waiting[0] + self._lag, stop - 1):
                 self._measure(waiting.pop(0))
 
     def _measure(self, centre: int) -> None:
@@ -194,15 +182,14 @@ class _Sampler:
         features = match_features(pair.left, pair.right, self._features)
         sample.features.append(features)
         sample.looks.append(replace(look, sharpness=sample.sharpness[-1], features=features))
-        gains = measure_gain(pair.left, pair.right, features.left_uv, features.right_uv)
-        sample.gains.append(gains)
+        seen = (features.left_uv, features.right_uv)
+        sample.gains.append(measure_gain(pair.left, pair.right, *seen))
         if centre in self._with_lag:
             self._compare_lags(centre, features)
         self._measure_motion(centre, features)
 
     def _compare_lags(self, centre: int, features: PairFeatures) -> None:
-        ends = (min(self._recent), max(self._recent))
-        span = min(self._lag, *(abs(end - centre) for end in ends))
+        span = min(self._lag, centre - min(self._recent), max(self._recent) - centre)
         pair, sample = self._recent[centre], self.sample
         for lag in range(-span, span + 1):
             found = features
@@ -284,7 +271,6 @@ def _align(features: PairFeatures, camera: RectifiedCamera) -> RowAlignment | No
 def _disparities(
     features: PairFeatures, alignment: RowAlignment | None, camera: RectifiedCamera
 ) -> Float64:
-    """Return float64 (M,), pixels; matches with a large row error are left out."""
     if alignment is None:
         return np.zeros(0)
     rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
@@ -295,8 +281,7 @@ def _disparities(
 def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: RectifiedCamera) -> int:
     """Return the lag that fits best, if it fits clearly better than none.
 
-    A delay of half a frame fits both neighbours badly and is reported as skew, not as lag: what
-    moves tells the two apart, where it is seen at that lag.
+    A delay of half a frame fits both neighbours badly; it is a skew, which moving features show.
     """
     if not sample.lagged:
         return 0

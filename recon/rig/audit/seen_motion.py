@@ -1,13 +1,11 @@
 """How the right camera is turned against its calibration, as the motion of a drive shows it.
 
-Pitch and roll move rows, which correspond in each pair. Yaw and another focal length move columns,
-and in one pair nothing distinguishes that from depth. Over a motion something does: a tracked point
-has a depth by the motion alone, and the disparities of all points must fit these depths by one
-factor. The factor itself, the length of the baseline, is what no motion shows.
+Pitch and roll move rows. Yaw and another focal length move columns, which one pair cannot tell from
+depth; but a tracked point has a depth by the motion alone, up to the length of the baseline.
 
-Lenses that are calibrated badly bend both: disparities then misfit by the square of the distance
-from the middle of the image (kitti_raw_0013: 1.3 px at its sides). That is estimated with the turn,
-which would take it for yaw otherwise, but no turn can correct it.
+Lenses that are calibrated badly bend disparities by the square of the distance from the middle of
+the image (kitti_raw_0013: 1.3 px at its sides). That is estimated with the turn, which would take
+it for yaw otherwise, but no turn can correct it.
 """
 
 from __future__ import annotations
@@ -68,13 +66,9 @@ class SeenMotion:
         return tuple(_mapped(part, left, right) for part in self.tracks)
 
     def bent_lenses(self, rig: Rig) -> BentLenses | None:
-        """Return what the lenses bend; None if they do not.
-
-        Lenses of images that are rectified here are for a board to calibrate: None too.
-        """
-        if not isinstance(rig, RectifiedCamera):
-            return None
-        return estimate_lenses(self.tracks_as_recorded(rig), rig)
+        """Return what the lenses bend; None if they do not, or if images are rectified here."""
+        rectified = isinstance(rig, RectifiedCamera)
+        return estimate_lenses(self.tracks_as_recorded(rig), rig) if rectified else None
 
 
 def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> SeenMotion | None:

@@ -22,11 +22,9 @@ from recon.rig.calibrate.stereo import StereoFit, stereo_of
 from recon.rig.settings import CalibrationSettings
 from recon.stereo.rectify.lens import project_into_image, rays_of
 
-# The depth error is evaluated on a 3 by 3 grid in the left image, in fractions of its size.
-_PLACES: Final = (0.2, 0.5, 0.8)
+_PLACES: Final = (0.2, 0.5, 0.8)  # depth errors are those of a 3 by 3 grid in the left image
 _MIDDLE: Final = 4
-# Depth error due to matching at the default working distance, relative to it.
-_MATCHED: Final = 0.02
+_MATCHED: Final = 0.02  # relative error of matching at the default working distance
 MATCH_SIGMA_PX: Final = 0.25  # assumed matching error, by which depth errors are predicted
 DEPTHS_M: Final = (2.0, 5.0, 10.0, 20.0)  # depths at which the error is predicted
 _RESAMPLES: Final = 500
@@ -38,12 +36,9 @@ class DepthError:
     """Predicted depth error at one distance along the optical axis of the left camera."""
 
     depth_m: float  # the distance
-    # root mean square error due to calibration, over the resamples and over the image; NaN if the
-    # two views do not overlap at that depth
-    calibration_m: float
-    # lower end of the interval of the error at the image centre; negative = measured too near
-    low_m: float
-    high_m: float  # upper end of that interval
+    calibration_m: float  # rms error over resamples and image; NaN = the views do not overlap
+    low_m: float  # interval of the error at the image centre; negative = measured too near
+    high_m: float
     matching_m: float  # error due to matching, with `MATCH_SIGMA_PX`
 
 
@@ -58,7 +53,7 @@ class Spread:
     working: DepthError  # the same at the working distance, see `_working_distance`
 
 
-def _resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibration]:
+def _resample(fit: StereoFit) -> list[StereoCalibration]:
     """Return rigs calibrated from bootstrap resamples of the views; failed ones are left out."""
     rng = np.random.default_rng(0)
     count, info = len(fit.views), fit.information
@@ -82,7 +77,7 @@ def _resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalib
 
 def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
     """Return bootstrap intervals of focal length, baseline, rotation and depth."""
-    rigs = _resample(fit, settings)
+    rigs = _resample(fit)
     turns = [rig.T_right_left[:3, :3] @ fit.calibration.T_right_left[:3, :3].T for rig in rigs]
     cosines = np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)
     return Spread(
@@ -95,16 +90,13 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
 
 
 def _working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
-    """Return the distance at which depth matters, in metres.
+    """Return the distance at which depth matters: by default, where matching errs by 2 %.
 
-    By default it is as far as the rig itself allows 2 % of error: errors of calibration and of
-    matching both grow with its square, so it is the same to ask there whether the calibration is as
-    good as the matching.
+    Errors of calibration grow with its square as well: it is the same to ask there whether the
+    calibration is as good as the matching.
     """
-    if settings.working_m is not None:
-        return settings.working_m
-    focal_px = float(rig.left.matrix[0, 0])
-    return _MATCHED * focal_px * rig.baseline_m / MATCH_SIGMA_PX
+    usual_m = _MATCHED * float(rig.left.matrix[0, 0]) * rig.baseline_m / MATCH_SIGMA_PX
+    return usual_m if settings.working_m is None else settings.working_m
 
 
 def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:
@@ -127,12 +119,8 @@ def _jackknife_vectors(fit: StereoFit) -> Float64:
     info = fit.information
     whole = info.prior + info.matrices.sum(axis=0)
     # (1 - M / W)^-1 v = W (W - M)^-1 v: well conditioned although the parameters differ in size.
-    return np.array(
-        [
-            whole @ solve_scaled(whole - matrix, vector)
-            for matrix, vector in zip(info.matrices, info.vectors, strict=True)
-        ]
-    )
+    each = zip(info.matrices, info.vectors, strict=True)
+    return np.array([whole @ solve_scaled(whole - matrix, vector) for matrix, vector in each])
 
 
 def _interval(values: list[float]) -> tuple[float, float]:
@@ -152,9 +140,8 @@ def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) 
     matching_m = depth_m**2 * MATCH_SIGMA_PX / (focal_px * rig.baseline_m)
     if not shared[_MIDDLE]:
         return DepthError(depth_m, np.nan, np.nan, np.nan, matching_m)
-    errors = np.array(
-        [measure_depth(other, places[shared], right_px[shared]) - depth_m for other in rigs]
-    )
+    seen = places[shared], right_px[shared]
+    errors = np.array([measure_depth(other, *seen) - depth_m for other in rigs])
     middle = errors[:, int(shared[:_MIDDLE].sum())]
     low_m, high_m = _interval(list(middle))
     # NaN: the lens of a resample may not be invertible at the image border.

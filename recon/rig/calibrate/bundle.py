@@ -100,16 +100,12 @@ def solve(
     corners = _gather(views)
     if not np.isfinite(_cost(corners, start, w)):
         raise CalibrationError("no initial guess puts the board in front of the cameras")
-    state = minimise(
-        Problem(
-            cost=lambda state: _cost(corners, state, w),
-            linearise=lambda state: _linearise(corners, state),
-            step=lambda state, normals, damping: _step(normals, state, w, damping),
-        ),
-        start,
-        rounds=_ROUNDS,
-        min_gain=_STILL,
+    problem = Problem(
+        cost=lambda state: _cost(corners, state, w),
+        linearise=lambda state: _linearise(corners, state),
+        step=lambda state, normals, damping: _step(normals, state, w, damping),
     )
+    state = minimise(problem, start, rounds=_ROUNDS, min_gain=_STILL)
     matrices, vectors, _ = _without_poses(_linearise(corners, state))
     return state, Information(matrices, vectors, _prior(state)[1])
 
@@ -156,10 +152,9 @@ def _gather(views: Sequence[View]) -> list[_Corners]:
 
 
 def _linearise(corners: Sequence[_Corners], state: RigState) -> Float64:
-    """Return float64 (V, P + 7, P + 7), the normal equations of each view.
+    """Return the normal equations JᵀJ of each view, float64 (V, P + 7, P + 7).
 
-    They are JᵀJ with the columns of J by the shared parameters, the pose of the board, and the
-    error itself.
+    Columns of J: the shared parameters, the pose of the board, and the error itself.
     """
     size, at = len(_prior(state)[0]), 0
     normals = np.zeros((len(state.T_rig_board), size + _POSE + 1, size + _POSE + 1))
@@ -187,10 +182,7 @@ def _by_motion(xyz: Float64) -> Float64:
 
 
 def _prior(state: RigState) -> tuple[Float64, Float64]:
-    """Return what a prior keeps near zero, coefficients of rational lenses: numbers, information.
-
-    float64 (P,) and (P, P); 0 for all other shared parameters.
-    """
+    """Return what a prior keeps near zero, lenses of rational models: (P,), information (P, P)."""
     numbers, information = [], []
     for camera in state.cameras:
         kept = (_PRIOR_PX / _PRIOR_SPREAD) ** 2 if camera.distortion.size >= 8 else 0.0
@@ -246,10 +238,7 @@ def _step(normals: Float64, state: RigState, weights: Float64, damping: float) -
 
 
 def solve_scaled(A: Float64, a: Float64) -> Float64:
-    """Solve symmetric equations whose unknowns differ by orders of magnitude.
-
-    Directions that are not determined stay at 0.
-    """
+    """Solve symmetric equations of unknowns of any size; undetermined directions stay at 0."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
     solution, *_ = np.linalg.lstsq(A * np.outer(scale, scale), a * scale, rcond=1e-14)
     return np.asarray(solution * scale)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -18,8 +19,7 @@ from recon.core.values.board import CalibrationBoard
 from recon.rig.calibrate.bundle import Sighting
 
 Inner = tuple[int, int]
-# Corners are detected at this width at most, and refined at full resolution.
-_SEARCH_WIDTH_PX: Final = 1280
+_SEARCH_WIDTH_PX: Final = 1280  # corners are refined at full resolution
 # Half the window of the subpixel search, relative to the corner spacing: as wide as possible
 # without another corner in it.
 _WINDOW: Final = 0.33
@@ -34,12 +34,9 @@ _LOST: Final = 0.5
 # Least contrast of dark and light quadrants at an inner corner, relative to the median corner.
 _CORNER_CONTRAST: Final = 0.5
 _LARGEST: Final = 60
-# Images that must agree on a size, or markers per image, to rule out chance.
-_SURE: Final = 3
-# Images in which any board is searched if few show the given one.
-_PROBED: Final = 8
-# Fewer for markers, because all of OpenCV's twenty dictionaries are tried.
-_PROBED_MARKERS: Final = 2
+_SURE: Final = 3  # images that must agree on a size, or markers per image, to rule out chance
+_PROBED: Final = 8  # images in which any board is searched if few show the given one
+_PROBED_MARKERS: Final = 2  # fewer for markers: all of OpenCV's twenty dictionaries are tried
 _PREFIX: Final = "DICT_"
 
 
@@ -66,15 +63,13 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 def orient_like(reference: Float64, pixels: Float64, inner: Inner) -> Float64:
     """Reorder the corners (N, 2) of a whole chessboard as in another view of it.
 
-    A chessboard looks the same when rotated by 180 degrees, and OpenCV may start at either end. Of
-    all orders that preserve neighbours, this takes the one that resembles the reference most, up
-    to translation and scale.
+    OpenCV may start at any corner of the board. Of all orders that preserve neighbours, this takes
+    the one that resembles the reference most, up to translation and scale.
     """
     columns, rows = inner
     grid = np.arange(columns * rows).reshape(rows, columns)
-    orders = [grid[::a, ::b].ravel() for a, b in product((1, -1), repeat=2)]
-    if columns == rows:
-        orders += [grid.T[::a, ::b].ravel() for a, b in product((1, -1), repeat=2)]
+    grids = (grid, grid.T) if columns == rows else (grid,)
+    orders = [g[::a, ::b].ravel() for g in grids for a, b in product((1, -1), repeat=2)]
     likeness = [float((_shape(reference) * _shape(pixels[order])).sum()) for order in orders]
     return pixels[orders[int(np.argmax(likeness))]]
 
@@ -136,12 +131,8 @@ def check_chessboard(
 ) -> None:
     """Check that the chessboard in the images has as many corners as the user gave.
 
-    OpenCV also detects part of a larger board, but not the same part in both cameras.
-
-    Args:
-        sizes: `grown_size` of the board found in each image, None if none was found.
-        read: Returns the grey image of a given number.
-        board: The board that the user gave.
+    OpenCV also detects part of a larger board, but not the same part in both cameras. ``sizes`` are
+    the `grown_size` of the board in each image, None if none was found; ``read`` gives the images.
     """
     claimed = _sorted(board.inner)
     seen = Counter(_sorted(size) for size in sizes if size is not None)
@@ -215,9 +206,8 @@ def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
 
 
 def _probe_size(grey: UInt8) -> Inner | None:
-    found, corners, meta = cv2.findChessboardCornersSBWithMeta(
-        grey, (3, 3), cv2.CALIB_CB_LARGER | _SLOW_FLAGS
-    )
+    flags = cv2.CALIB_CB_LARGER | _SLOW_FLAGS
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
     if not found or meta is None:
         return None
     rows, columns = meta.shape[:2]
@@ -265,11 +255,8 @@ def _contrast(grey: UInt8, grid: Float64) -> Float64:
     Differences within a pair count against it. NaN where a quadrant is outside the image.
     """
     down, across = np.gradient(grid, axis=(0, 1))
-    quarters = [
-        grid + 0.4 * (a * across + b * down) for a, b in ((1, 1), (-1, -1), (1, -1), (-1, 1))
-    ]
-    smooth = cv2.blur(grey, (3, 3))
-    a, b, c, d = (_sample(smooth, places) for places in quarters)
+    smooth, signs = cv2.blur(grey, (3, 3)), ((1, 1), (-1, -1), (1, -1), (-1, 1))
+    a, b, c, d = (_sample(smooth, grid + 0.4 * (p * across + q * down)) for p, q in signs)
     return np.asarray(np.abs(a + b - c - d) - np.abs(a - b) - np.abs(c - d)) / 2
 
 
@@ -353,10 +340,8 @@ def _find_markers(grey: UInt8, dictionary: str) -> Int32:
 
 def _marker_votes(images: Sequence[UInt8]) -> tuple[str, Counter[str]]:
     """Return the dictionary with the most markers found, and the number found of each."""
-    votes = Counter(
-        {name: sum(len(_find_markers(image, name)) for image in images) for name in _dictionaries()}
-    )
-    return votes.most_common(1)[0][0], votes
+    counts = {n: sum(len(_find_markers(image, n)) for image in images) for n in _dictionaries()}
+    return max(counts, key=counts.__getitem__), Counter(counts)
 
 
 def _dictionaries() -> list[str]:
@@ -364,16 +349,14 @@ def _dictionaries() -> list[str]:
 
 
 def _marker_count(board: CalibrationBoard) -> int:
-    columns, rows = board.squares
-    return columns * rows // 2
+    return math.prod(board.squares) // 2
 
 
 def _dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, f"{_PREFIX}{name}", None)
     if number is None:
-        raise SettingsError(
-            "unknown marker dictionary", got=name, expected=", ".join(_dictionaries())
-        )
+        known = ", ".join(_dictionaries())
+        raise SettingsError("unknown marker dictionary", got=name, expected=known)
     return cv2.aruco.getPredefinedDictionary(number)
 
 

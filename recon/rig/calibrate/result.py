@@ -51,7 +51,11 @@ def describe_calibration(
 ) -> CalibrationRun:
     """Rectify the views with the calibrated rig, and measure how well it describes them."""
     turns = plan_turns(fit.calibration, config.rectification)
-    rows_px = np.concatenate([_rows_apart(turns, fit, view) for view in fit.views])
+    rows = []
+    for left_px, right_px in map(shared_pixels, fit.views):
+        left = turns.place(fit.calibration, left_px)
+        rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
+    rows_px = np.concatenate(rows)
     summary = _summarise(seen, fit, spread, rows_px)
     summary["rectified_focal_px"] = turns.camera.focal_px
     return CalibrationRun(config, seen, fit, spread, turns, rows_px, summary)
@@ -72,17 +76,12 @@ def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) ->
     return (path,)
 
 
-def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
-    left_px, right_px = shared_pixels(view)
-    left = turns.place(fit.calibration, left_px)
-    right = turns.place(fit.calibration, right_px, right=True)
-    return np.asarray(left[:, 1] - right[:, 1])
-
-
 def _summarise(
     seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
 ) -> dict[str, Any]:
-    rig, tilts_deg, away_m = fit.calibration, _tilt_deg(fit), _distances_m(fit)
+    rig, away_m = fit.calibration, _distances_m(fit)
+    # Angles between the board's normal and the optical axis of the left camera.
+    tilts_deg = np.degrees(np.arccos(np.clip(np.abs(fit.state.T_rig_board[:, 2, 2]), 0.0, 1.0)))
     return {
         "board": str(seen.board),
         "model": rig.left.model,
@@ -142,12 +141,6 @@ def _coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
     cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
     inside = np.clip(cells, 0, np.array(_CELLS) - 1)
     return len(np.unique(inside, axis=0)) / (_CELLS[0] * _CELLS[1])
-
-
-def _tilt_deg(fit: StereoFit) -> Float64:
-    """Return float64 (V,), angle between the board's normal and the left camera's optical axis."""
-    normals = np.array([T[2, 2] for T in fit.state.T_rig_board])
-    return np.asarray(np.degrees(np.arccos(np.clip(np.abs(normals), 0.0, 1.0))))
 
 
 def _distances_m(fit: StereoFit) -> Float64:

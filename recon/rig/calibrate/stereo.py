@@ -89,8 +89,9 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
         if good.all():
             break
     sums, counts = squared_errors(kept, state)
-    rms_px, alone_px = math.sqrt(float(sums.sum() / counts.sum())), (_rms(alone[0]), _rms(alone[1]))
-    _check_fit(rms_px, alone_px)
+    rms_px = math.sqrt(float(sums.sum() / counts.sum()))
+    left_px, right_px = (math.sqrt(float((errors**2).mean())) for errors in alone)
+    _check_fit(rms_px, (left_px, right_px))
     return StereoFit(
         calibration=stereo_of(state),
         state=state,
@@ -99,13 +100,13 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
         repeated=repeated,
         dropped=dropped,
         errors_px=np.sqrt(sums / counts),
-        alone_px=alone_px,
+        alone_px=(left_px, right_px),
         rms_px=rms_px,
     )
 
 
 def stereo_of(state: RigState) -> StereoCalibration:
-    """The rig of a state."""
+    """Return the rig of a state."""
     left, right = state.cameras
     return StereoCalibration(left, right, state.T_camera_rig[1])
 
@@ -120,14 +121,13 @@ def _group_views(views: Sequence[View]) -> list[list[View]]:
     for view in views:
         same = next((group for group in groups if _moved(group[0], view) < _STILL), None)
         if same is None:
-            groups.append([view])
-        else:
-            same.append(view)
+            groups.append(same := [])
+        same.append(view)
     return [_middle_first(group) for group in groups]
 
 
 def _moved(first: View, second: View) -> float:
-    return max(_shift(*both) for both in zip(first.seen, second.seen, strict=True))
+    return max(map(_shift, first.seen, second.seen))
 
 
 def _shift(first: Sighting, second: Sighting) -> float:
@@ -185,10 +185,6 @@ def _length_rms(apart: Float64) -> float:
     return math.sqrt(float((apart**2).sum(axis=1).mean()))
 
 
-def _rms(errors: Float64) -> float:
-    return math.sqrt(float((errors**2).mean()))
-
-
 def _calibrate_one(
     sightings: Sequence[Sighting], size: Size, settings: CalibrationSettings
 ) -> RigState:
@@ -210,20 +206,17 @@ def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsic
     pixels = [seen.pixels.astype(np.float32) for seen in sightings]
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     try:
-        _, matrix, distortion, *_ = cv2.calibrateCamera(
-            boards, pixels, size, None, None, flags=flags
-        )
+        found = cv2.calibrateCamera(boards, pixels, size, None, None, flags=flags)
     except cv2.error as error:
         raise CalibrationError("views do not determine a camera", got=error.err) from error
-    return CameraIntrinsics(matrix, np.array(distortion, dtype=np.float64).ravel(), *size)
+    return CameraIntrinsics(found[1], np.array(found[2], dtype=np.float64).ravel(), *size)
 
 
 def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
     """Return the undistorted fisheye lens, of several fields of view, that fits the board best."""
     radius, (cx, cy) = math.hypot(*size) / 2, ((n - 1) / 2 for n in size)
     views = [View("", (seen,)) for seen in sightings]
-    best: RigState | None = None
-    least = math.inf
+    best, least = None, math.inf
     for angle in _HALF_ANGLES:
         matrix = np.array([[radius / angle, 0, cx], [0, radius / angle, cy], [0, 0, 1]])
         camera = CameraIntrinsics(matrix, np.zeros(4), *size, "fisheye")

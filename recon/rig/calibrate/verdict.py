@@ -88,33 +88,34 @@ def judge_calibration(
     board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]
 ) -> list[CalibrationFinding]:
     """Return all findings of a calibration, the gravest first."""
-    found = [*_find_depth_faults(board, summary)]
-    found += [_finding("warning", code, summary, own) for code, own in _doubts(board, summary)]
+
+    def described(severity: Severity, found: Found) -> list[CalibrationFinding]:
+        return [
+            CalibrationFinding(code, severity, _TEXTS[code].format_map(summary | own))
+            for code, own in found
+        ]
+
+    share = summary["working_error"]["calibration_share"]
+    found = described(
+        "fatal" if share is None or share > _USABLE else "warning", _depth_faults(board, summary)
+    )
+    found += described("warning", _doubts(board, summary))
     lacking: list[CalibrationFinding] = []
     if verdict_of_calibration(found) != "good":
-        lacking = [_finding("note", code, summary, own) for code, own in _lacks(summary)]
-        lacking = lacking or [CalibrationFinding("more", "note", _NOTHING_LACKS)]
-    left_out = _left_out(board, images, summary)
-    return [*found, *(_finding("note", code, summary, own) for code, own in left_out), *lacking]
+        nothing = CalibrationFinding("more", "note", _NOTHING_LACKS)
+        lacking = described("note", _lacks(summary)) or [nothing]
+    return [*found, *described("note", _left_out(board, images, summary)), *lacking]
 
 
-def _finding(
-    severity: Severity, code: str, summary: dict[str, Any], own: dict[str, Any]
-) -> CalibrationFinding:
-    return CalibrationFinding(code, severity, _TEXTS[code].format_map(summary | own))
-
-
-def _find_depth_faults(
-    board: CalibrationBoard, summary: dict[str, Any]
-) -> Iterator[CalibrationFinding]:
+def _depth_faults(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
     expected = summary["working_error"]
     distance_m, share = expected["distance_m"], expected["calibration_share"]
-    own = {"at": _length(distance_m, board)}
+    at = _length(distance_m, board)
     if share is None:
-        yield _finding("fatal", "overlap", summary, own)
+        yield "overlap", {"at": at}
     elif share > _GOOD:
-        own |= {"wrong": _length(share * distance_m, board), "percent": 100 * share}
-        yield _finding("fatal" if share > _USABLE else "warning", "depth", summary, own)
+        wrong = _length(share * distance_m, board)
+        yield "depth", {"at": at, "wrong": wrong, "percent": 100 * share}
 
 
 def _doubts(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
