@@ -29,13 +29,10 @@ from recon.sources.opencv_camera import Camera
 from recon.sources.settings import SourceSettings
 from recon.sources.video import split_views
 
-# Assumed if a driver does not report its rate; the most common one.
-_USUAL_RATE_HZ: Final = 30.0
+_USUAL_RATE_HZ: Final = 30.0  # assumed if a driver does not report its rate
 _WARM_UP_FRAMES: Final = 15  # frames dropped at the start, while the exposure adapts
-# Length of the write queue: a longer one would only hide that the disk is too slow.
-_WAITING: Final = 32
-# A time step longer than this many periods means that a frame was lost.
-_GAP_PERIODS: Final = 1.5
+_WAITING: Final = 32  # pairs to be written; more would only hide that the disk is too slow
+_GAP_PERIODS: Final = 1.5  # a longer time step means that a frame was lost
 
 
 class CaptureSettings(Settings):
@@ -118,9 +115,9 @@ def capture_pairs(
 
 
 def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
-    """Drop the first frames, then lock the exposure of the left camera on both.
+    """Drop the first frames, lock the exposure of the left camera on both, return whether it is.
 
-    Returns whether it is locked on every camera. Video files need no warm-up and keep all frames.
+    Video files keep all frames.
     """
     if not all(camera.live for camera in cameras):
         return False
@@ -168,10 +165,7 @@ def _retrieve(cameras: tuple[Camera, ...], settings: CaptureSettings) -> tuple[U
 
 
 class CaptureFolder:
-    """The folder a capture is written to, pair by pair; valid at any moment.
-
-    A pair that cannot be written completely is removed again.
-    """
+    """The folder a capture is written to, pair by pair, each wholly or not at all."""
 
     def __init__(self, folder: Path, suffix: str) -> None:
         self.folder, self._suffix = folder, suffix

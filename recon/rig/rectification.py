@@ -41,12 +41,10 @@ class RectifyPlan:
     """One way to rectify."""
 
     warp: Callable[[StereoPair], tuple[UInt8, UInt8]]  # rectifies the images of a pair
-    # maps float64 (N, 2) pixels of the left and right image to the rectified ones
+    # maps (N, 2) pixels of the left and right image to the rectified ones
     place: Callable[[Float64, Float64], tuple[Float64, Float64]]
-    # epipolar lines of such pixels in the left and right image as recorded
-    lines: Callable[[Float64, Float64], Lines]
-    # writes the calibration of the rectified images, or the homographies
-    write: Callable[[RunDirectory], None]
+    lines: Callable[[Float64, Float64], Lines]  # their epipolar lines in the images as recorded
+    write: Callable[[RunDirectory], None]  # writes the calibration, or the homographies
     figures: dict[str, Any]  # figures of the plan for ``summary.json``
 
 

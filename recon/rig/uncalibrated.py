@@ -48,9 +48,7 @@ _MIN_FEATURES: Final = 40  # matches that must agree on one geometry
 _HELD_OUT: Final = 4  # every fourth feature of a single pair is held out of the fit
 _FLAT_SHARE: Final = 0.9  # share of matches on one plane from which the scene counts as flat
 _FOCAL_WIDTHS: Final = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0)  # tried: they decide how pitch bends rows
-# Row error that a simpler model may have more: matching compares whole rows, and half of one is
-# less than a warped image costs.
-_RESOLVED_PX: Final = 0.5
+_RESOLVED_PX: Final = 0.5  # row error that a simpler model may have more: warped images cost more
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +94,8 @@ def rectify_features(
 ) -> UncalibratedRectification:
     """Find the simplest change whose held-out row errors are not clearly above the smallest.
 
-    Held out are every second pair or, of fewer than four pairs, every fourth feature. So many as
-    ``min_features`` must agree on homographies.
+    Held out are every second pair or, of fewer than four, every fourth feature. ``min_features``
+    must agree on homographies.
     """
     features = pool_features(matched)
     several = sum(len(each) > 0 for each in matched) >= _HELD_OUT
@@ -218,9 +216,8 @@ def _result(
 def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> Homographies:
     """Return float64 (3, 3) for the left and for the right image, which align matching rows.
 
-    The borders of both images stay as near to their places as aligned rows allow, and then the
-    right image is shifted so that disparities are positive. The matches are correct ones, raw
-    pixels, for which ``right.T @ F @ left = 0``.
+    Borders stay as near to their places as aligned rows allow, then the right image is shifted so
+    that disparities are positive. The matches are correct ones, ``right.T @ F @ left = 0``.
 
     Ref: Hartley 1999, "Theory and practice of projective rectification", as OpenCV has it.
     """
@@ -276,8 +273,7 @@ def _affine(places: Float64, wanted: Float64) -> Float64:
 def find_fundamental(features: PairFeatures, inlier_px: float) -> tuple[Float64 | None, Bool]:
     """Estimate the fundamental matrix robustly (RANSAC, MAGSAC++) and refine it on its inliers.
 
-    Returns float64 (3, 3) with ``right.T @ F @ left = 0``, or None; and bool (N,), the matches that
-    are at most ``inlier_px`` away from their epipolar lines.
+    Returns float64 (3, 3), or None; and bool (N,), matches at most ``inlier_px`` off their lines.
     """
     left, right = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)
     best, distances = None, np.full(len(left), np.inf)

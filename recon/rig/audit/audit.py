@@ -127,7 +127,7 @@ def _corrected_turn(
 ) -> tuple[Rig, Float64]:
     """Return a calibration with the right camera turned as rows and motion show, and the turn."""
     turn = None if audit.motion is None else audit.motion.turn
-    turns = [alignment.turn] if turn is None or _rows_off(alignment) else []
+    turns = [alignment.turn] if turn is None or alignment.rms_px > _MATCHED_ROWS_PX else []
     turns += [] if turn is None else [turn.telling]
     for each in turns:
         rig = _turned(rig, each, config)
@@ -141,13 +141,9 @@ def _measure_motion(
     if alignment is None:
         return None
     rig = source.calibration
-    if _rows_off(alignment):
+    if alignment.rms_px > _MATCHED_ROWS_PX:
         rig = _turned(rig, alignment.turn, config)
     return measure_turn(source, rig, config)
-
-
-def _rows_off(alignment: RowAlignment) -> bool:
-    return alignment.rms_px > _MATCHED_ROWS_PX
 
 
 def _turned(rig: Rig, turn: Float64, config: AuditedSettings) -> StereoCalibration:

@@ -67,8 +67,9 @@ class SeenMotion:
 
     def bent_lenses(self, rig: Rig) -> BentLenses | None:
         """Return what the lenses bend; None if they do not, or if images are rectified here."""
-        rectified = isinstance(rig, RectifiedCamera)
-        return estimate_lenses(self.tracks_as_recorded(rig), rig) if rectified else None
+        if not isinstance(rig, RectifiedCamera):
+            return None
+        return estimate_lenses(self.tracks_as_recorded(rig), rig)
 
 
 def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> SeenMotion | None:

@@ -30,17 +30,14 @@ from recon.sources.settings import SourceSettings
 from recon.sources.video import open_videos, split_views, view_size
 from recon.stereo.rectify.rectifier import to_grey
 
-# Looks at a video per second: a hand holds a board still for longer than that.
-_LOOKS_HZ: Final = 10.0
-# Frames are compared at this width, at which noise of the sensor averages out.
-_SMALL_PX: Final = 80
+_LOOKS_HZ: Final = 10.0  # looks at a video per second: a hand holds a board still for longer
+_SMALL_PX: Final = 80  # frames are compared at this width, at which sensor noise averages out
 # A frame is still if it changes no more than this multiple of the stillest tenth of all frames, or
 # than this many grey levels, which is what remains of noise at that size.
 _STILL: Final = 2.0
 _STILL_SHARE: Final = 0.1
 _NOISE_DN: Final = 0.5
-# The most different frames are taken, up to this number; some of them will not show the board.
-_MOST: Final = 120
+_MOST: Final = 120  # frames that are taken at most; some of them will not show the board
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +81,11 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
     empty = tuple(path for path, look in zip(files, looks, strict=True) if look.seen is None)
     views, pairs = {}, {}
     for pair, first, second in zip(images.pairs, looks[::2], looks[1::2], strict=True):
-        if first.seen is not None and second.seen is not None:
-            name, right = pair[0].name, _same_order(first.seen, second.seen, board)
-            views[name], pairs[name] = View(name, (first.seen, right)), pair
+        if (left := first.seen) is not None and (right := second.seen) is not None:
+            if board.kind == "chess":  # its corners have no ids
+                pixels = orient_like(left.pixels, right.pixels, board.inner)
+                right = replace(right, pixels=pixels)
+            views[pair[0].name], pairs[pair[0].name] = View(pair[0].name, (left, right)), pair
     return BoardViews(tuple(views.values()), pairs, empty, size, len(images.pairs), board)
 
 
@@ -112,12 +111,6 @@ def _look(path: Path, board: CalibrationBoard) -> _Look:
     return _Look((grey.shape[1], grey.shape[0]), seen, grown)
 
 
-def _same_order(left: Sighting, right: Sighting, board: CalibrationBoard) -> Sighting:
-    if board.kind == "charuco":  # its corners have ids
-        return right
-    return replace(right, pixels=orient_like(left.pixels, right.pixels, board.inner))
-
-
 def _read_grey(path: Path) -> UInt8:
     return to_grey(read_image(path))
 
@@ -126,14 +119,11 @@ def _one_size(files: Sequence[Path], looks: Sequence[_Look]) -> tuple[int, int]:
     first = looks[0].size_px
     for path, look in zip(files, looks, strict=True):
         if look.size_px != first:
-            got, expected = (f"{size[0]}x{size[1]}" for size in (look.size_px, first))
-            raise SourceError(
-                "images differ in size",
-                where=path,
-                got=got,
-                expected=f"{expected} as {files[0].name}",
-                hint="both cameras must record the same size",
-            )
+            got, other = ("x".join(map(str, size)) for size in (look.size_px, first))
+            expected = f"{other} as {files[0].name}"
+            hint = "both cameras must record the same size"
+            what = "images differ in size"
+            raise SourceError(what, where=path, got=got, expected=expected, hint=hint)
     return first
 
 

@@ -1,8 +1,8 @@
 """Bundle adjustment of the lenses, the pose of the right camera and every pose of the board.
 
-One solver handles one or two cameras, pinhole and fisheye lenses, and partly visible boards. The
-board poses are eliminated view by view (Schur complement), which leaves the few parameters shared
-by all views and each view's information about them, which the bootstrap reweights.
+One solver handles one or two cameras, any lens, and partly visible boards. Board poses are
+eliminated view by view (Schur complement), which leaves each view's information about the shared
+parameters, which the bootstrap reweights.
 
 Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6; Zhang 2000.
 """
@@ -24,8 +24,7 @@ from recon.core.values.arrays import Float64, Int32
 from recon.stereo.rectify.lens import project_raw, project_with_jacobian
 
 _ROUNDS: Final = 100
-# Relative decrease of the cost at which the solver has converged.
-_STILL: Final = 1e-12
+_STILL: Final = 1e-12  # relative decrease of the cost at which the solver has converged
 # The eight coefficients of a rational lens are not all observable: each has a zero-mean prior of
 # this standard deviation, against corners measured to 0.1 px.
 _PRIOR_SPREAD: Final = 2.0

@@ -23,20 +23,16 @@ Size = tuple[int, int]
 # Half fields of view that are tried for a fisheye lens.
 _HALF_ANGLES: Final = tuple(math.radians(angle) for angle in (35, 45, 55, 65, 75, 85, 95, 110))
 _COEFFICIENTS: Final = {"rational": 8}
-# Rounds of reweighting; outlying views stand out after two.
-_REWEIGHTED: Final = 4
+_REWEIGHTED: Final = 4  # rounds of reweighting; outlying views stand out after two
 _DROPPING_ROUNDS: Final = 4
-# An rms error this many times that of each camera alone: the images were not taken together.
-_MISMATCH: Final = 3.0
+_MISMATCH: Final = 3.0  # rms error relative to each camera alone if images do not belong together
 # Views whose error exceeds this multiple of the median of all views are dropped …
 _OUTLIER_RATIO: Final = 3.0
 _OUTLIER_PX: Final = 0.3  # … but never those with an rms error below this
 _MAX_RMS_PX: Final = 2.0  # largest rms error of an accepted calibration
 _MIN_VIEWS: Final = 5  # minimum number of views with the board
-# A view repeats another if the corners moved by less than this share of the board's own size (rms
-# distance of its corners from their mean, in the image). A hand that holds a board still moves it
-# by that much (8 mm on a board of 9 by 6 squares of 25 mm); it is a roll of 6 degrees, or a tenth
-# of the distance.
+# A view repeats another if the corners moved by less than this share of the board's size (rms, in
+# the image): by what a hand moves that holds it still, 8 mm on 9 by 6 squares of 25 mm.
 _STILL: Final = 0.1
 
 
@@ -58,8 +54,7 @@ class StereoFit:
 def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
     """Calibrate two cameras: each alone, then all parameters of both together.
 
-    Of views that repeat each other, one is used. Views whose error exceeds three times the median
-    are dropped.
+    Of views that repeat each other one is used; views that do not fit are dropped.
 
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
@@ -114,8 +109,7 @@ def stereo_of(state: RigState) -> StereoCalibration:
 def _group_views(views: Sequence[View]) -> list[list[View]]:
     """Group the views by pose of the board, the view that represents a group first.
 
-    Errors of corners on a still board are mostly the same in every image (flatness, lens, blur), so
-    a repeated view is hardly a new measurement, and it never adds a pose.
+    Errors on a still board are mostly the same in every image: repeated views measure nothing new.
     """
     groups: list[list[View]] = []
     for view in views:

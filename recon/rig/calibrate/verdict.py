@@ -28,8 +28,7 @@ _ENOUGH_VIEWS: Final = 20
 _COVERED: Final = 0.8
 _TILTED: Final = 0.5
 _FAR_TO_NEAR: Final = 2.0
-# A board turned away from the camera by this much determines the focal length.
-TILT_DEG: Final = 20.0
+TILT_DEG: Final = 20.0  # a board turned away by this much determines the focal length
 _SHARP_PX: Final = 0.5
 _UNSURE_FOCAL: Final = 0.01  # half of the interval, relative to the focal length
 # Texts of findings; {name} is a figure of the summary, or one that is given with the code.
@@ -70,9 +69,7 @@ class CalibrationFinding:
     """One fact about a calibration that its user should know."""
 
     code: str  # its kind, one word, for programs
-    # ``fatal`` makes the verdict "repeat", ``warning`` makes it "usable" at best, and a ``note``
-    # does not change it
-    severity: Severity
+    severity: Severity  # see `verdict_of_calibration`; a note does not change the verdict
     text: str  # description and advice, for people
 
 
