@@ -204,10 +204,7 @@ RECIPES: Final[dict[Material, Recipe]] = {
 
 
 def sky_colour(directions: Float64, pixel: float, seed: int) -> Float64:
-    """Return linear light (N, 3) of the sky, z up: blue above, haze below, clouds.
-
-    ``pixel`` is the width of a pixel in radians.
-    """
+    """Return linear light (N, 3) of the sky, z up; ``pixel`` is the width of a pixel, radians."""
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     climb = np.clip(unit[:, 2:], 0.0, 1.0)
     haze = np.exp(-climb / 0.22)
@@ -252,16 +249,14 @@ def tile_tone(
 ) -> Float64:
     """Return a random tone in [-1, 1) per tile, averaged if a pixel covers several.
 
-    ``seed`` is the number of the object; ``bond`` the offset of each row from the one below, as a
-    fraction of the tile (bricks: 0.5).
+    ``seed`` is the number of the object; ``bond`` the offset of rows in tiles (bricks: 0.5).
     """
     total = np.zeros(len(uv))
     for su, sv in ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)):
         row = np.floor((uv[:, 1] + sv * spread[:, 1]) / tile[1])
         column = np.floor((uv[:, 0] + su * spread[:, 0]) / tile[0] + bond * (row % 2))
         total += lattice_values(column, row, seed, 7)
-    # A pixel that covers n tiles shows their mean, whose deviation is 1/sqrt(n) times that of one
-    # tile; four are sampled.
+    # The mean of n tiles deviates by 1/sqrt(n) of what one tile does; four are sampled.
     several = np.maximum(spread[:, 0] / tile[0], 1.0) * np.maximum(spread[:, 1] / tile[1], 1.0)
     return np.asarray(0.25 * total / several)
 

@@ -45,9 +45,8 @@ class CentreLine:
     def points(self, along_m: NDArray[np.float64], lateral_m: NDArray[np.float64]) -> Float64:
         """Return points (N, 2) at distances along the centre line and offsets to its left."""
         s = self._in_lap(along_m)
-        x = np.interp(s, self.along_m, self.xy_m[:, 0])
-        y = np.interp(s, self.along_m, self.xy_m[:, 1])
-        heading = np.interp(s, self.along_m, self.heading_rad)
+        curves = (*self.xy_m.T, self.heading_rad)
+        x, y, heading = (np.interp(s, self.along_m, values) for values in curves)
         return np.stack([x - lateral_m * np.sin(heading), y + lateral_m * np.cos(heading)], axis=-1)
 
     def place(self, along_m: float, lateral_m: float, height_m: float = 0.0) -> Float64:

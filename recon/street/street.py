@@ -136,10 +136,9 @@ def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Pain
     along = _stations(road)
     rims, uvs = [], []
     for lateral, height in edges:
-        xy = road.points(along, np.full(len(along), lateral))
-        rims.append(np.column_stack([xy, np.full(len(along), height)]))
-        across = lateral if edges[0][1] == edges[1][1] else height
-        uvs.append(np.column_stack([along, np.full(len(along), across)]))
+        y, z = np.full(len(along), lateral), np.full(len(along), height)
+        rims.append(np.column_stack([road.points(along, y), z]))
+        uvs.append(np.column_stack([along, y if edges[0][1] == edges[1][1] else z]))
     return painted(band(*rims), band(*uvs), paint)
 
 

@@ -26,10 +26,7 @@ _QUARTERS: Final = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.
 def true_surface(
     camera: StreetCamera, *, range_m: float = 30.0, voxel_m: float = 0.05
 ) -> PointCloud:
-    """Return points on the surfaces that the left camera saw within a range, in frame ``world``.
-
-    Of the pixels in a voxel one is kept, unmoved, so that every point lies exactly on a surface.
-    """
+    """Return exact points, one a voxel, on the surfaces that the left camera saw within a range."""
     T_street_camera = camera.world.T_street_camera
     kept = np.empty((0, 3), dtype=np.float32)
     pending: list[Float32] = []
@@ -53,10 +50,9 @@ def true_occupancy(
 ) -> OccupancyTruth:
     """Return the true surfaces and obstacles on the part of the street that was seen.
 
-    A surface is an obstacle between the heights of the band above the road; the pavement is 0.12 m
-    high. A frame sees as far as ``range_m``; cells of the grid, with borders at multiples of the
-    resolution, are known where ``least_frames`` have seen them. Axes are those of the street world,
-    or ``T_map_world``.
+    Obstacles are between the heights of the band above the road; the pavement is 0.12 m high. Cells
+    are known where ``least_frames`` have seen them from at most ``range_m``. Axes are those of the
+    street world, or ``T_map_world``.
     """
     world = camera.world
     T = world.T_map_world if T_map_world is None else T_map_world
@@ -153,10 +149,15 @@ def _footprint(
     inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
     occupied = np.zeros((rows, columns), dtype=np.bool_)
     occupied[cells[inside, 1], cells[inside, 0]] = True
-    row, column = np.indices((rows, columns))
-    corners = np.stack([column, row], axis=-1).reshape(-1, 1, 2)
+    corners = np.indices((rows, columns))[::-1].transpose(1, 2, 0).reshape(-1, 1, 2)
     centres = ((corners + _QUARTERS) * resolution_m + origin).reshape(-1, 2)
-    occupied |= _covered(world, T_map_street, centres, band_m).reshape(rows, columns, 4).any(axis=2)
+    # Also where a vertical line between the two heights hits a surface.
+    level = np.column_stack([centres, np.full(len(centres), T_map_street[2, 3])])
+    feet = se3.apply(se3.invert(T_map_street), level)
+    feet[:, 2] = band_m[1]
+    down = np.broadcast_to([0.0, 0.0, band_m[0] - band_m[1]], feet.shape)
+    hit = RayScene(world.soup.vertices, world.settings.threads).blocked(feet, down)
+    occupied |= hit.reshape(rows, columns, 4).any(axis=2)
     values = np.where(occupied, OCCUPIED, FREE).astype(np.int8)
     return OccupancyGrid(values, resolution_m, origin)
 
@@ -190,14 +191,3 @@ def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
     first = np.cumsum(pieces + 1) - (pieces + 1)
     share = (np.arange(len(segment)) - first[segment]) / pieces[segment]
     return np.asarray(start[segment] + share[:, None] * (end - start)[segment])
-
-
-def _covered(
-    world: StreetWorld, T_map_street: Float64, xy_map: Float64, band_m: tuple[float, float]
-) -> Bool:
-    """Return whether a vertical line between the two heights hits a surface, for points (N, 2)."""
-    level = np.column_stack([xy_map, np.full(len(xy_map), T_map_street[2, 3])])
-    feet = se3.apply(se3.invert(T_map_street), level)
-    feet[:, 2] = band_m[1]
-    down = np.broadcast_to([0.0, 0.0, band_m[0] - band_m[1]], feet.shape)
-    return RayScene(world.soup.vertices, world.settings.threads).blocked(feet, down)
