@@ -117,9 +117,8 @@ def choose_sheet(board: CalibrationBoard, paper: str | None = None) -> Sheet:
 def _turned(name: str, board: CalibrationBoard) -> Sheet:
     custom = _CUSTOM.fullmatch(name)
     if custom is None and name not in _PAPERS_MM:
-        raise SettingsError(
-            "unknown paper", got=name, expected=", ".join(_PAPERS_MM) + " or 600x400mm"
-        )
+        known = ", ".join(_PAPERS_MM) + " or 600x400mm"
+        raise SettingsError("unknown paper", got=name, expected=known)
     sides = (float(custom[1]), float(custom[2])) if custom else _PAPERS_MM[name]
     if min(sides) <= 2 * _SMALLEST_MARGIN_MM:
         raise SettingsError("paper is too small for any board", got=name)
@@ -130,11 +129,9 @@ def _turned(name: str, board: CalibrationBoard) -> Sheet:
 
 def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
     """Return the factor by which the squares could grow (above 1) or must shrink on a sheet."""
-    largest_mm = []
-    for paper_mm, squares in zip((sheet.width_mm, sheet.height_mm), board.squares, strict=True):
-        largest_mm.append(paper_mm / (squares + 2 * _MARGIN_SQUARES))
-        largest_mm.append((paper_mm - 2 * _SMALLEST_MARGIN_MM) / squares)
-    return min(largest_mm) / (1e3 * board.square_m)
+    paper_mm, squares = np.array([sheet.width_mm, sheet.height_mm]), np.array(board.squares)
+    narrow, wide = paper_mm / (squares + 2 * _MARGIN_SQUARES), paper_mm - 2 * _SMALLEST_MARGIN_MM
+    return float(min(*narrow, *(wide / squares)) / (1e3 * board.square_m))
 
 
 def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes:

@@ -38,9 +38,8 @@ _TELLING_SIGMAS: Final = 2.0  # what is nearer to zero than this is left as it i
 class RightTurn:
     """What corrects the right camera: it is turned in place, and its image is enlarged."""
 
-    # (5,): pitch, yaw and roll, radians, by which rays are turned about x, y and z; the share by
-    # which the image is enlarged about the principal point; and what lenses bend: the shift of
-    # columns at 45° from the axis, in focal lengths
+    # (5,): pitch, yaw and roll of rays, radians; the share by which the image is enlarged; and what
+    # lenses bend: the shift of columns at 45° from the axis, in focal lengths
     values: Float64
     covariance: Float64  # (5, 5), of the values
     windows: int  # number of windows they are from

@@ -1,7 +1,6 @@
 """A correction of the rig that makes disparities fit the motion, and rows meet.
 
-Bundle adjustment of a few windows, with the correction as one more unknown that all windows share.
-Poses and points are eliminated, so that each window says something of the correction alone.
+Bundle adjustment of a few windows that share the correction; poses and points are eliminated.
 """
 
 from __future__ import annotations
@@ -33,13 +32,10 @@ _ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the 
 
 @dataclass(frozen=True, eq=False)
 class StereoTracks:
-    """Tracks in the left images of a window, and the same features in the right ones.
-
-    ``right_uv``: float64 (W, N, 2), columns and rows; NaN = not found.
-    """
+    """Tracks in the left images of a window, and the same features in the right ones."""
 
     window: TrackWindow
-    right_uv: Float64
+    right_uv: Float64  # (W, N, 2), columns and rows; NaN = not found
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +65,7 @@ class CorrectedPlaces:
 class RigCorrection:
     """What may be wrong with a rig, as parameters (P) that are 0 where nothing is."""
 
-    # returns where the features of a window are after a correction
-    place: Callable[[StereoTracks, Float64], CorrectedPlaces]
+    place: Callable[[StereoTracks, Float64], CorrectedPlaces]  # of a window, by the parameters
     prior: Float64  # (P,), what is known beforehand: information that a parameter is 0
 
 

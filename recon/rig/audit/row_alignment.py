@@ -24,12 +24,10 @@ _REFITS: Final = 8
 class RowAlignment:
     """Row errors (right minus left), and the rotation of the right camera that minimises them."""
 
-    features: int  # number of matched features
     agreeing: int  # number of features that agree with the rotation
     mean_px: float  # mean row error of the agreeing features
     spread_px: float  # standard deviation of their row error
-    # root mean square row error with the feature noise removed; 0 if rows are aligned
-    rms_px: float
+    rms_px: float  # root mean square row error without the feature noise; 0 if rows are aligned
     residual_px: float  # robust standard deviation after the rotation: the feature noise
     pitch_rad: float  # correcting rotation about x
     roll_rad: float  # correcting rotation about z
@@ -67,7 +65,6 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
     error = (right_uv[:, 1] - left_uv[:, 1])[agree].astype(np.float64)
     noise = float(np.mean(left_over**2))
     return RowAlignment(
-        features=len(rows),
         agreeing=int(agree.sum()),
         mean_px=float(error.mean()),
         spread_px=float(error.std()),

@@ -231,11 +231,9 @@ class Geometry:
     matched: int  # number of features matched in pairs as recorded
     alignment: RowAlignment | None  # row errors; None if there are too few features
     disparity_px: Float64  # (M,), of the features whose rows agree; 0 is at infinity
-    # share of near features that lie farther right in the right image; NaN if there are too few
-    swapped_share: float
+    swapped_share: float  # of near features, farther right in the right image; NaN = too few
     lag: int  # delay of the right camera in whole frames
-    # its delay as a fraction of a frame, and the standard error; None if there is too little
-    # motion, or if the delay is whole frames
+    # its delay in parts of a frame, and the standard error; None if unknown, or whole frames
     skew: tuple[float, float] | None
 
 

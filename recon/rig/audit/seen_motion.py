@@ -50,8 +50,7 @@ class SeenMotion:
 
     turn: RightTurn | None  # how the right camera is turned; None if there are too few windows
     tracks: tuple[StereoTracks, ...]  # the windows of tracks
-    # how their images were rectified; None if they were rectified before
-    views: RectifyingTurns | None
+    views: RectifyingTurns | None  # of their images; None if they were rectified before
 
     def tracks_as_recorded(self, camera: RectifiedCamera) -> tuple[StereoTracks, ...]:
         """Return the windows as they are in the images of a camera that were rectified before."""

@@ -29,10 +29,8 @@ _SUB_PIXEL: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-5)
 _CHESS_FLAGS: Final = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SLOW_FLAGS: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _FEWEST_CORNERS: Final = 8
-# A corner that refinement moves farther than this, relative to the spacing, keeps its old position.
-_LOST: Final = 0.5
-# Least contrast of dark and light quadrants at an inner corner, relative to the median corner.
-_CORNER_CONTRAST: Final = 0.5
+_LOST: Final = 0.5  # corners that refinement moves farther, relative to the spacing, stay
+_CORNER_CONTRAST: Final = 0.5  # least contrast of quadrants at a corner, relative to the median
 _LARGEST: Final = 60
 _SURE: Final = 3  # images that must agree on a size, or markers per image, to rule out chance
 _PROBED: Final = 8  # images in which any board is searched if few show the given one

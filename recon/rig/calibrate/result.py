@@ -15,7 +15,7 @@ from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import write_camera_info, write_kalibr
 from recon.rig.calibrate.board_views import BoardViews
-from recon.rig.calibrate.bootstrap import DepthError, Spread
+from recon.rig.calibrate.bootstrap import Spread
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.stereo import StereoFit
 from recon.rig.calibrate.verdict import TILT_DEG
@@ -24,8 +24,8 @@ from recon.run.run import plain
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
-# Image cells: in a cell without corners, the lens model is extrapolated.
-_CELLS: Final = (8, 6)
+_CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there
+_DEPTH_CM: Final = ("calibration", "low", "high", "matching")  # of each `DepthError`
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
     "verdict", "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
@@ -114,18 +114,16 @@ def _summarise(
         "tilt_max_deg": float(tilts_deg.max()),
         "tilted_share": float((tilts_deg >= TILT_DEG).mean()),
         "far_to_near": float(away_m.max() / away_m.min()),
-        "depth_error_cm": {f"{each.depth_m:g}": _depth_cm(each) for each in spread.depths},
+        "depth_error_cm": {
+            f"{each.depth_m:g}": {k: plain(100.0 * getattr(each, f"{k}_m")) for k in _DEPTH_CM}
+            for each in spread.depths
+        },
         "working_error": {
             "distance_m": spread.working.depth_m,
             "calibration_share": plain(spread.working.calibration_m / spread.working.depth_m),
             "matching_share": spread.working.matching_m / spread.working.depth_m,
         },
     }
-
-
-def _depth_cm(each: DepthError) -> dict[str, float | None]:
-    names = ("calibration", "low", "high", "matching")
-    return {name: plain(100.0 * getattr(each, f"{name}_m")) for name in names}
 
 
 def shared_pixels(view: View) -> tuple[Float64, Float64]:
@@ -136,7 +134,7 @@ def shared_pixels(view: View) -> tuple[Float64, Float64]:
 
 
 def _coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
-    """Return the share of the 8 by 6 image cells in which a corner was seen, in [0, 1]."""
+    """Return the share of image cells in which a corner was seen, in [0, 1]."""
     size = np.array([camera.width_px, camera.height_px])
     cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
     inside = np.clip(cells, 0, np.array(_CELLS) - 1)
