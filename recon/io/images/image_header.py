@@ -11,8 +11,10 @@ from __future__ import annotations
 import math
 import re
 import struct
+import warnings
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from typing import Any, Final
@@ -130,16 +132,25 @@ def _check_bmp(content: bytes) -> None:
         raise _truncated("BMP", f"{len(content)} of {counted(needed, 'byte')}")
 
 
+@contextmanager
+def _silent_pillow() -> Iterator[None]:
+    """Leave unsaid what Pillow warns of in damaged headers: their check says it in a line."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def stated_size(content: bytes) -> tuple[int, int] | None:
     """Return the width and height that a header states; None = a damaged or unknown one."""
     reader = next((kind for start, kind in _READERS.items() if content.startswith(start)), None)
     try:
-        if is_tiff(content):
-            width, height = _tiff_size(content)
-        elif reader is not None:  # `PIL.Image.open` has a limit of its own
-            width, height = reader(BytesIO(content)).size
-        else:
-            return None
+        with _silent_pillow():
+            if is_tiff(content):
+                width, height = _tiff_size(content)
+            elif reader is not None:  # `PIL.Image.open` has a limit of its own
+                width, height = reader(BytesIO(content)).size
+            else:
+                return None
     except Exception:  # noqa: BLE001 - a damaged header, which the check of the content reports
         return None
     return int(width), int(height)
@@ -164,7 +175,7 @@ class ExifFocal:
 def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal | None:
     """Read the focal length of a photograph by its sensor or 35 mm equivalent; None = unknown."""
     try:
-        with reading(path), Image.open(path) as image:
+        with _silent_pillow(), reading(path), Image.open(path) as image:
             tags: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_IFD)
             return _by_sensor(tags, width_px) or _by_35mm(tags, width_px, height_px)
     except FormatError:
