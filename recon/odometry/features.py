@@ -249,8 +249,7 @@ def _peaks(score: Float32) -> Bool:
     peak = score >= cv2.dilate(score, np.ones((size, size), np.uint8))
     peak &= score > _MIN_SCORE
     inside = np.zeros_like(peak)
-    border = _BORDER_PX
-    inside[border : -border or None, border : -border or None] = True
+    inside[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = True
     return np.asarray(peak & inside)
 
 

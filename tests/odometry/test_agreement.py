@@ -59,12 +59,25 @@ def test_an_image_that_is_dark_now_give_no_answer(see: See, blind: See) -> None:
     assert ask(see(np.eye(4)), blind(2), STEP).informative == 0
 
 
-def test_edges_of_one_direction_give_no_answer(see: See) -> None:
+@pytest.mark.parametrize("direction", [(0, 1), (1, 0), (1, 1), (1, -1)])
+def test_edges_of_one_direction_give_no_answer(direction: tuple[int, int], see: See) -> None:
     """Stripes look alike however far the camera went along them."""
     frame = see(np.eye(4))
-    stripes = np.tile(np.where(np.arange(160) % 20 < 10, 60, 180)[:, None], (1, 400))
-    striped = replace(frame, pair=replace(frame.pair, left=stripes.astype(np.uint8)))
+    rows, columns = np.mgrid[0:160, 0:400]
+    across = direction[0] * rows + direction[1] * columns
+    stripes = np.rint(120 + 60 * np.sin(across / 4)).astype(np.uint8)
+    striped = replace(frame, pair=replace(frame.pair, left=stripes))
     assert ask(striped, striped, np.eye(4)).informative == 0
+
+
+def test_patches_are_counted_one_by_one(see: See) -> None:
+    """Where half of the image is another one, half of the patches disagree."""
+    before, now = see(np.eye(4)), see(STEP)
+    mixed = now.pair.left.copy()
+    mixed[:, 200:] = mixed[:, :199:-1]
+    found = ask(before, replace(now, pair=replace(now.pair, left=mixed)), STEP)
+    assert found.informative > 20
+    assert 0.35 < found.share < 0.65
 
 
 @pytest.mark.parametrize("sigma", [1.0, 3.0, 8.0])
