@@ -121,7 +121,7 @@ def test_runs_killed_at_a_write_give_the_same_files(runs: Runs, tmp_path: Path, 
 def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
     runs: Runs, tmp_path: Path, what: str
 ) -> None:
-    at = {"beginning": 2, "mapping": runs.writes // 3, "exporting": runs.before_moving - 4}[what]
+    at = {"beginning": 8, "mapping": runs.writes // 3, "exporting": runs.before_moving - 4}[what]
     done = runs.broken(tmp_path / "run", "full", at)
     assert done.returncode == 1
     [line] = done.stderr.splitlines()
@@ -130,6 +130,16 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
     assert f"recon map --resume {tmp_path / 'run'} goes on from there" in line
     assert [path.name for path in (tmp_path / "run").iterdir()] == [".partial"]
     runs.finish(tmp_path / "run")
+
+
+def test_a_disk_that_is_full_at_once_is_one_line_and_leaves_nothing(
+    runs: Runs, tmp_path: Path
+) -> None:
+    done = runs.broken(tmp_path / "run", "full", 2)
+    assert done.returncode == 1
+    [line] = done.stderr.splitlines()
+    assert "No space left on device" in line
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("command", ["mesh", "occupancy"])

@@ -122,7 +122,7 @@ def test_loops_stand_in_summary_report_and_file(closed: tuple[Path, MapRun, int]
 
     assert figures["closed"] == len(edges["closed"]) >= 5
     assert figures["refused_by_graph"] == len(edges["refused"]) == 0
-    assert 0.3 < figures["largest_correction_m"] < 5.0
+    assert 0.1 < figures["largest_correction_m"] < 5.0
     for edge in edges["closed"]:
         way_m = STEP_M * (edge["last"] - edge["first"])
         assert way_m == pytest.approx(LAP_M, abs=8.0)  # places that far apart may still be matched
