@@ -13,13 +13,12 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedCamera
-from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.arrays import Bool, Float64, Int64, UInt8
 from recon.odometry.protocol import (
     Odometry,
     OdometryFrame,
@@ -116,11 +115,7 @@ def _contradiction(share: float, informative: int) -> list[str]:
     return [f"only {100 * share:.0f} % of {patches} of the image moved like that"]
 
 
-Int64 = NDArray[np.int64]
-
-_LEAST_NOISE = 0.5  # grey values: rounding alone leaves 0.3
-
-
+_LEAST_NOISE: Final = 0.5  # grey values: rounding alone leaves 0.3
 _STRIDE_PX: Final = 5  # every n-th row and column is sampled
 _PATCH_PX: Final = 48  # edge of a patch
 _MIN_PIXELS: Final = 24  # least number of samples with a disparity in a patch
@@ -243,7 +238,7 @@ def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
     return grey.reshape(-1)[: len(u)]
 
 
-def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_]:
+def _textured(samples: _Samples, count: Int64, sigma: float) -> Bool:
     """Patches (P,) with gradients in every direction that exceed the noise."""
     x, y = samples.slope.T
     xx, yy, xy = (_mean(samples, values, count) for values in (x * x, y * y, x * y))

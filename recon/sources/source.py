@@ -52,7 +52,6 @@ class StereoSource(ABC):
     @abstractmethod
     def calibration(self) -> Rig:
         """A `RectifiedCamera` if the images are already rectified."""
-        raise NotImplementedError
 
     @cached_property
     def files(self) -> Sequence[Path]:
