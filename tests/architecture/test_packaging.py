@@ -1,9 +1,11 @@
-"""The package declares exactly the dependencies it uses."""
+"""The package declares, installs, loads and exports exactly what it should."""
 
 from __future__ import annotations
 
 import ast
+import inspect
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import packages_distributions
@@ -13,6 +15,8 @@ from typing import Any
 import pytest
 
 import recon
+from recon.commands.doctor import PACKAGES, SYSTEM_LIBRARIES
+from recon.commands.kernel_samples import SAMPLES
 
 # What numba takes from scipy: it is compiled without, and fails when it is called.
 FROM_SCIPY = {"linalg", "dot", "vdot", "matmul", "tensordot", "roots", "cov", "corrcoef"}
@@ -43,27 +47,27 @@ def _declared(pyproject: dict[str, Any]) -> set[str]:
     return {_normal(entry) for entry in pyproject["project"]["dependencies"]}
 
 
-def test_every_imported_library_is_declared(
-    imported: dict[str, set[str]], pyproject: dict[str, Any]
+def _extras(pyproject: dict[str, Any]) -> dict[str, list[str]]:
+    return pyproject["project"]["optional-dependencies"]
+
+
+def test_what_is_imported_is_declared_and_pinned_and_nothing_else(
+    imported: dict[str, set[str]], pyproject: dict[str, Any], root: Path
 ) -> None:
     declared = _declared(pyproject)
-
     assert {name for name, providers in imported.items() if not declared & providers} == set()
-
-
-def test_every_declared_library_is_imported(
-    imported: dict[str, set[str]], pyproject: dict[str, Any]
-) -> None:
-    assert _declared(pyproject) - set().union(*imported.values()) == set()
+    assert declared - set().union(*imported.values()) == set()
+    lines = (root / "constraints.txt").read_text().splitlines()
+    pinned = {_normal(line) for line in lines if "==" in line and not line.startswith("#")}
+    assert declared | set(map(_normal, _extras(pyproject)["dev"])) <= pinned
 
 
 def test_every_optional_library_is_declared_by_the_extra_that_its_error_names(
     trees: dict[Path, ast.Module], pyproject: dict[str, Any]
 ) -> None:
-    extras = pyproject["project"]["optional-dependencies"]
+    extras = _extras(pyproject)
     asked = {pair for tree in trees.values() for pair in _required(tree)}
     providers = packages_distributions()
-
     assert {extra for _, extra in asked} == set(extras) - {"dev"}
     for library, extra in asked:
         # "dask[distributed]" brings dask and distributed.
@@ -96,7 +100,6 @@ def test_kernels_need_no_linear_algebra_of_scipy(trees: dict[Path, ast.Module]) 
         if (isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult))
         or (isinstance(node, ast.Attribute) and node.attr in FROM_SCIPY)
     ]
-
     assert found == []
 
 
@@ -106,18 +109,63 @@ def _is_compiled(function: ast.FunctionDef) -> bool:
     return "kernel" in names
 
 
-def test_constraints_pin_every_declared_library(root: Path, pyproject: dict[str, Any]) -> None:
-    lines = (root / "constraints.txt").read_text().splitlines()
-    pinned = {_normal(line) for line in lines if "==" in line and not line.startswith("#")}
-    wanted = _declared(pyproject) | {
-        _normal(entry) for entry in pyproject["project"]["optional-dependencies"]["dev"]
-    }
-
-    assert wanted - pinned == set()
-
-
 def test_version_is_the_same_everywhere(root: Path, pyproject: dict[str, Any]) -> None:
     version = pyproject["project"]["version"]
-
     assert recon.__version__ == version
     assert f"## [{version}]" in (root / "CHANGELOG.md").read_text()
+
+
+def test_doctor_looks_for_what_is_installed_and_runs_kernels_of_each_room_that_has_some(
+    root: Path, pyproject: dict[str, Any]
+) -> None:
+    entry = re.compile(r"^ +(lib\S+\.so\S*?):(\S+)", re.MULTILINE)
+    installed = dict(entry.findall((root / "scripts" / "setup.sh").read_text()))
+    assert dict(SYSTEM_LIBRARIES) == installed
+    declared = {re.split("[>= ]", entry)[0] for entry in pyproject["project"]["dependencies"]}
+    unneeded = {"tomli"} if sys.version_info >= (3, 11) else set()
+    assert set(PACKAGES) == declared - unneeded
+    assert set(SAMPLES) == {folder.parent.name for folder in (root / "recon").glob("*/kernels")}
+
+
+def test_public_names_are_exactly_the_documented_ones_and_explain_themselves(root: Path) -> None:
+    lines = (root / "docs" / "api.md").read_text().splitlines()
+    documented = {line.split("`")[1].split("(")[0] for line in lines if line.startswith("- `")}
+    assert set(recon.__all__) == documented
+    values = [getattr(recon, name) for name in documented]
+    named = [each for each in values if inspect.isfunction(each) or inspect.isclass(each)]
+    assert [each for each in named if not inspect.getdoc(each)] == []
+
+
+HEAVY = {
+    "cv2", "kiss_icp", "matplotlib", "numba", "open3d", "plotly", "pymeshlab", "pyoctomap",
+}  # fmt: skip
+
+
+def loaded(probe: str) -> set[str]:
+    """The modules that a process has loaded at its end."""
+    command = [sys.executable, "-c", f"{probe}\nimport sys; print('LOADED', *sys.modules)"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(done.stdout.rpartition("LOADED")[2].split())
+
+
+def test_help_loads_the_shells_and_neither_libraries_nor_numbers_nor_settings() -> None:
+    """What it takes is measured by `benchmarks/two_checkouts.py`; this is what makes it little."""
+    found = loaded(
+        "import contextlib, sys; sys.argv = ['recon', '--help']; from recon.cli import main\n"
+        "with contextlib.suppress(SystemExit): main()"
+    )
+    assert found.isdisjoint(HEAVY | {"numpy", "pydantic", "scipy", "dask"})
+    rooms = {name.split(".")[1] for name in found if name.startswith("recon.")}
+    assert rooms == {"cli", "core"}
+
+
+# The second meshes, in a process for each tile of a surface.
+@pytest.mark.parametrize("module", ["recon", "recon.export.pymeshlab"])
+def test_imports_load_no_heavy_library(module: str) -> None:
+    assert loaded(f"import {module}").isdisjoint(HEAVY)
+
+
+def test_doctor_loads_nothing_whose_lack_it_reports() -> None:
+    shell = {"typer", "rich", "typing_extensions"}  # without these there is no command line
+    found = loaded("import recon.cli.getting_started, recon.commands.doctor")
+    assert found & set(PACKAGES.values()) <= shell
