@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,86 +20,49 @@ from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import build_street
 
-RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
 BLOCK_M = (80.0, 60.0)
 LAP_M = 2 * sum(BLOCK_M) - 8 * CORNER_M + 2 * math.pi * CORNER_M
-LAP = 168
-"""Frames of a lap: frame 168 stands where frame 0 stood."""
-PERIOD = 40
-"""Frames after which the repeated street looks the same."""
+LAP = 168  # frames: frame 168 stands where frame 0 stood
+PERIOD = 40  # frames after which the repeated street looks the same
 
 
-class KeyframeMemory:
+class KeyframeMemory(dict[int, StoredKeyframe]):
     """Keeps keyframes in memory, for short drives."""
 
-    def __init__(self) -> None:
-        self._kept: dict[int, StoredKeyframe] = {}
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
     def __iter__(self) -> Iterator[StoredKeyframe]:
-        return iter(self._kept.values())
+        return iter(self.values())
 
     def put(self, stored: StoredKeyframe) -> None:
-        """Keep a keyframe."""
-        self._kept[stored.keyframe.frame] = stored
+        self[stored.keyframe.frame] = stored
 
-    def get(self, frame: int) -> StoredKeyframe:
-        """Return the keyframe of a frame."""
-        return self._kept[frame]
+    get = dict.__getitem__
 
 
-@dataclass(frozen=True)
-class Drive:
-    """Frames of a drive, with its true path."""
+class Filmed:
+    """A drive whose frames are rendered once, when they are first asked for, and its true path."""
 
-    camera: StreetCamera
+    def __init__(self, **street: Any) -> None:
+        size = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
+        self.camera = StreetCamera(build_street(StreetScene(**street, **size)))
+        self.truth = self.camera.world.trajectory
+        self.frame = cache(self._frame)
 
-    @property
-    def truth(self) -> Trajectory:
-        return self.camera.world.trajectory
-
-    def pair(self, frame: int) -> RectifiedPair:
-        left, right = (
-            np.rint(side @ [0.299, 0.587, 0.114]).astype(np.uint8)
-            for side in (self.camera.pair(frame).left, self.camera.pair(frame).right)
-        )
-        return RectifiedPair(left, right, self.camera.world.camera, index=frame)
-
-    def disparity(self, frame: int) -> Disparity:
-        """The truth where both cameras see, with an error of a quarter of a pixel."""
-        truth = self.camera.disparity_truth(frame)
-        noise = np.random.default_rng(frame).normal(0.0, 0.25, truth.values.shape)
+    def _frame(self, index: int) -> tuple[RectifiedPair, Disparity]:
+        """A pair and the truth where both cameras see, with an error of a quarter of a pixel."""
+        seen, weights = self.camera.pair(index), [0.299, 0.587, 0.114]
+        both = (np.rint(side @ weights).astype(np.uint8) for side in (seen.left, seen.right))
+        truth = self.camera.disparity_truth(index)
+        noise = np.random.default_rng(index).normal(0.0, 0.25, truth.values.shape)
         values = np.where(truth.nonocc, truth.values + noise, np.nan).astype(np.float32)
         valid = np.isfinite(values)
-        return Disparity(
-            values,
-            valid.astype(np.float32),
-            np.where(valid, 0.25, np.nan).astype(np.float32),
-            np.where(valid, Reason.VALID, Reason.OCCLUDED).astype(np.uint8),
-        )
+        sigma_px = np.where(valid, 0.25, np.nan).astype(np.float32)
+        reason = np.where(valid, Reason.VALID, Reason.OCCLUDED).astype(np.uint8)
+        disparity = Disparity(values, valid.astype(np.float32), sigma_px, reason)
+        return RectifiedPair(*both, self.camera.world.camera, index=index), disparity
 
     def motion(self, first: int, last: int) -> np.ndarray:
         poses = self.truth.T_world_camera
         return se3.invert(poses[first]) @ poses[last]
-
-
-class Filmed:
-    """A drive whose frames are rendered once, when they are first asked for."""
-
-    def __init__(self, settings: StreetScene) -> None:
-        self.drive = Drive(StreetCamera(build_street(settings)))
-        self._frames: dict[int, tuple[RectifiedPair, Disparity]] = {}
-
-    @property
-    def truth(self) -> Trajectory:
-        return self.drive.truth
-
-    def frame(self, index: int) -> tuple[RectifiedPair, Disparity]:
-        if index not in self._frames:
-            self._frames[index] = (self.drive.pair(index), self.drive.disparity(index))
-        return self._frames[index]
 
     def keyframe(self, index: int) -> Keyframe:
         return make_keyframe(index, *self.frame(index))
@@ -109,38 +73,21 @@ class Filmed:
         path_m = path_lengths(path.T_world_camera, trusted)
         detector = LoopDetector(KeyframeMemory())
         for k in frames:
-            pair, disparity = self.frame(k)
             pose = path.T_world_camera[k]
-            detector.add(k, pair, disparity, pose, path_m=path_m[k], trusted=bool(trusted[k]))
+            detector.add(k, *self.frame(k), pose, path_m=path_m[k], trusted=bool(trusted[k]))
         return detector, path_m
 
 
 @pytest.fixture(scope="session")
 def block() -> Filmed:
-    return Filmed(
-        StreetScene(
-            path="block",
-            block_m=BLOCK_M,
-            frames=LAP + 20,
-            speed_m_per_frame=LAP_M / LAP,
-            seed=1,
-            **RIG,
-        )
-    )
+    speed = LAP_M / LAP
+    return Filmed(path="block", block_m=BLOCK_M, frames=LAP + 20, speed_m_per_frame=speed, seed=1)
 
 
 @pytest.fixture(scope="session")
 def alike() -> Filmed:
-    return Filmed(
-        StreetScene(
-            path="straight",
-            repeat_m=60.0,
-            frames=60,
-            speed_m_per_frame=60.0 / PERIOD,
-            seed=2,
-            **RIG,
-        )
-    )
+    speed = 60.0 / PERIOD
+    return Filmed(path="straight", repeat_m=60.0, frames=60, speed_m_per_frame=speed, seed=2)
 
 
 def drifted(truth: Trajectory, *, share: float, turn_deg_per_m: float) -> Trajectory:
@@ -159,8 +106,8 @@ INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 
 def true_loop(truth: Trajectory, first: int, last: int) -> Loop:
     """The loop that two frames of a path give."""
-    poses = truth.T_world_camera
-    return Loop(first, last, se3.invert(poses[first]) @ poses[last], INFORMATION, 100, 1.0)
+    T_first_last = se3.invert(truth.T_world_camera[first]) @ truth.T_world_camera[last]
+    return Loop(first, last, T_first_last, INFORMATION, 100, 1.0)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,6 @@ def test_likeness_is_the_share_of_words_in_common(known, asked):
     index = WordIndex()
     for words in known:
         index.add(_sorted(words))
-
     expected = [
         len(words & asked) / np.sqrt(len(words) * len(asked)) if words and asked else 0.0
         for words in known
@@ -47,7 +46,6 @@ def test_likeness_is_that_of_the_right_image_among_many():
     index = WordIndex()
     for words in images:
         index.add(words)
-
     for number in (0, 255, 256, 511, 512, 700, 899):
         alike = index.likeness(images[number])
         assert alike[number] == 1.0
@@ -70,7 +68,6 @@ def test_a_place_is_near_if_odometry_could_be_so_wrong():
     for share in (0.99, 1.01):
         places.add(_place(len(places), 0.0, 0.0, share * turn_deg))
     places.add(_place(9, 0.0, 100.0 - 0.9 * places_file._MIN_PATH_M))
-
     near = places.near(_place(10, 0.0, 100.0))
     assert near.tolist() == [True, True, False, True, False, False]
 
@@ -79,7 +76,6 @@ def test_places_keep_what_they_are_given_beyond_their_first_size():
     places = Places()
     for k in range(200):
         places.add(_place(k, float(k), 2.0 * k))
-
     assert places.frames == list(range(200))
     assert np.array_equal(places.path_m, 2.0 * np.arange(200))
     assert np.array_equal(places.T_world_camera[:, 0, 3], np.arange(200.0))
@@ -93,7 +89,6 @@ def test_a_question_after_ten_kilometres_takes_milliseconds():
         words = np.unique(rng.integers(0, 1 << 22, 2000, np.uint32))
         places.add(Place(k, np.eye(4), 1.5 * k, words))
     asked = Place(6700, np.eye(4), 1.5 * 6700, words)
-
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
@@ -107,7 +102,6 @@ def test_a_question_after_ten_kilometres_takes_milliseconds():
 def test_the_most_alike_images_stand_apart():
     stands_m = np.array([[0.0], [1.0], [4.0], [9.0], [20.0], [30.0]])
     likeness = np.array([0.5, 0.9, 0.8, 0.7, 0.6, 1.0])
-
     assert most_alike(likeness, np.arange(5), stands_m) == [1, 3, 4]
     assert most_alike(likeness, np.arange(2), stands_m) == [1]
     assert most_alike(likeness, np.array([0, 2]), stands_m) == [2, 0]  # 4 m are enough
@@ -121,7 +115,6 @@ def test_a_fit_to_a_path_states_misfit_and_scale(scale, off_m):
     there = ours_m + np.outer(zigzag, [0.0, 0.0, 1.0])
     turned = se3.exp_so3(np.array([0.3, -0.2, 1.0]))
     found = fit_to_path(ours_m, scale * there @ turned.T + [500.0, 20.0, 3.0], 1.0, 0.1)
-
     assert found.scale == pytest.approx(scale, rel=1e-3)
     assert found.scaled_m == pytest.approx(off_m, rel=0.01, abs=1e-9)
     spread_m = np.sqrt(np.square(ours_m - ours_m.mean(axis=0)).sum(axis=1).mean())
