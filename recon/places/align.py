@@ -15,7 +15,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.odometry.locate_camera import find_consensus, fit_pose
 
 _ITERATIONS: Final = 500  # RANSAC's samples at most
-_REPROJECTION_PX: Final = 2.5  # RANSAC's inlier limit
+_LIMIT_PX: Final = 2.5  # RANSAC's inlier limit
 MIN_INLIERS: Final = 20  # least number of matches that agree in both directions
 _SIGMA_UV_PX: Final = 1.0  # standard deviation of a feature's column or row
 _SIGMA_D_PX: Final = 1.0  # standard deviation of its disparity
@@ -52,12 +52,7 @@ def locate(points: Float64, seen: Seen) -> Float64 | None:
     """Return the pose of a camera that sees known points, ``T_points_camera``; None = no pose."""
     uv, camera = seen.uvd[:, :2], seen.camera
     consensus = find_consensus(
-        points,
-        uv,
-        camera,
-        limit_px=_REPROJECTION_PX,
-        iterations=_ITERATIONS,
-        min_inliers=MIN_INLIERS,
+        points, uv, camera, limit_px=_LIMIT_PX, iterations=_ITERATIONS, min_inliers=MIN_INLIERS
     )
     if consensus is None:
         return None
@@ -81,13 +76,11 @@ def refine(first: Seen, last: Seen, T_first_last: Float64) -> Alignment:
 def agreement(first: Seen, last: Seen, T_first_last: Float64) -> Bool:
     """Return bool (N,), matches whose reprojection error is within the limit in both frames."""
     agree = np.ones(len(first.xyz), np.bool_)
-    for T, points, seen in (
-        (T_first_last, last.xyz, first),
-        (invert(T_first_last), first.xyz, last),
-    ):
+    both = (T_first_last, last.xyz, first), (invert(T_first_last), first.xyz, last)
+    for T, points, seen in both:
         u, v, _ = project(apply(T, points), seen.camera)
         # A point behind the camera has a NaN error, which compares as False.
-        agree &= np.hypot(u - seen.uvd[:, 0], v - seen.uvd[:, 1]) <= _REPROJECTION_PX
+        agree &= np.hypot(u - seen.uvd[:, 0], v - seen.uvd[:, 1]) <= _LIMIT_PX
     return agree
 
 
@@ -113,22 +106,11 @@ def _residuals(xyz: Float64, d_xyz: Float64, seen: Seen) -> tuple[Float64, Float
     front = xyz[:, 2] > 0.1
     z = np.where(front, xyz[:, 2], 1.0)
     f, b = camera.focal_px, camera.baseline_m
-    predicted = np.stack(
-        [
-            f * xyz[:, 0] / z + camera.cx_px,
-            f * xyz[:, 1] / z + camera.cy_px,
-            f * b / z - camera.doffs_px,
-        ],
-        axis=1,
-    )
+    u, v = f * xyz[:, 0] / z + camera.cx_px, f * xyz[:, 1] / z + camera.cy_px
+    predicted = np.stack([u, v, f * b / z - camera.doffs_px], axis=1)
     J = np.zeros((len(xyz), 3, 3))
     J[:, 0, 0] = J[:, 1, 1] = f / z
-    J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = (
-        -f * xyz[:, 0] / z**2,
-        -f * xyz[:, 1] / z**2,
-        -f * b / z**2,
-    )
-    J = J @ d_xyz / sigma[:, None]
-    return np.where(front[:, None], (predicted - seen.uvd) / sigma, 0.0), np.where(
-        front[:, None, None], J, 0.0
-    )
+    J[:, 0, 2], J[:, 1, 2] = -f * xyz[:, 0] / z**2, -f * xyz[:, 1] / z**2
+    J[:, 2, 2] = -f * b / z**2
+    J = np.where(front[:, None, None], J @ d_xyz / sigma[:, None], 0.0)
+    return np.where(front[:, None], (predicted - seen.uvd) / sigma, 0.0), J

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -22,8 +22,6 @@ from recon.places.places import Drift, drift_over
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
 _KEPT: Final = 0.25  # least weight of a loop that is believed
-
-
 _NODE_M: Final = 5.0  # path between two nodes of the graph
 _MAX_NODES: Final = 400  # longer drives get nodes farther apart: time is cubic
 _LOOP_SIGMA_M: Final = 0.05  # standard deviation of a loop that more matches do not improve
@@ -93,11 +91,11 @@ def close_loops(trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop]) 
     joined = join_drives([DrivePath(trajectory, path_m)], ties) if ties else None
     if joined is None:  # a map by odometry alone is better than none
         return Closure(trajectory, (), tuple(loops))
-    sides = [
-        [loop for loop, kept in zip(loops, joined.kept, strict=True) if kept == side]
+    closed, refused = (
+        tuple(loop for loop, kept in zip(loops, joined.kept, strict=True) if kept == side)
         for side in (True, False)
-    ]
-    return Closure(joined.trajectories[0], tuple(sides[0]), tuple(sides[1]))
+    )
+    return Closure(joined.trajectories[0], closed, refused)
 
 
 def join_drives(
@@ -136,15 +134,10 @@ def join_drives(
         return None
     parts = [poses[a:b] for a, b in pairwise(begins)]
     paths = [_bent(*each) for each in zip(drives, nodes, parts, strict=True)]
-    paths[0] = _begun_at(drives[0].trajectory.T_world_camera[0], paths[0])
+    begun = paths[0].T_world_camera.copy()
+    begun[0] = drives[0].trajectory.T_world_camera[0]  # which rounding has moved
+    paths[0] = replace(paths[0], T_world_camera=begun)
     return JoinedDrives(tuple(paths), kept)
-
-
-def _begun_at(T_world_camera: Float64, path: Trajectory) -> Trajectory:
-    """A path with its first pose put back, which rounding has moved."""
-    poses = path.T_world_camera.copy()
-    poses[0] = T_world_camera
-    return replace(path, T_world_camera=poses)
 
 
 def loop_bias(loop: Loop) -> Drift:
@@ -159,8 +152,7 @@ def loop_bias(loop: Loop) -> Drift:
 def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     """Return chi-square of an edge."""
     T = invert(T_world_node[edge.first]) @ T_world_node[edge.last]
-    off = invert(edge.T_first_last) @ T
-    step = as_step(off)
+    step = as_step(invert(edge.T_first_last) @ T)
     return float(step @ edge.information @ step)
 
 
@@ -171,7 +163,7 @@ def _spaced(drives: Sequence[DrivePath]) -> list[NDArray[np.intp]]:
     return [_nodes(drive.path_m, round(limit)) for drive, limit in zip(drives, most, strict=True)]
 
 
-def _nodes(path_m: Float64, most: int = _MAX_NODES) -> NDArray[np.intp]:
+def _nodes(path_m: Float64, most: int) -> NDArray[np.intp]:
     """Return frames at even distances along the path, including the first and the last."""
     length = float(path_m[-1])
     if length == 0.0:
@@ -183,8 +175,7 @@ def _nodes(path_m: Float64, most: int = _MAX_NODES) -> NDArray[np.intp]:
 
 def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple[Float64, Float64]:
     """Return poses of the nodes, and the weights of the loops."""
-    poses = start
-    worst = max((misfit(edge, poses) for edge in ties), default=0.0)
+    poses, worst = start, max((misfit(edge, start) for edge in ties), default=0.0)
     rounds = math.ceil(math.log(max(worst / _MAX_CHI2, 1.0), _EASING))
     for k in range(rounds, -1, -1):
         tolerance = _MAX_CHI2 * _EASING**k
@@ -211,10 +202,7 @@ def _solve_held(
 def _odometry_edges(
     drive: DrivePath, nodes: NDArray[np.intp], begin: int, share: float
 ) -> list[PoseEdge]:
-    """The edges along a drive, with a share of the drift that is possible.
-
-    Its nodes are numbered from ``begin``.
-    """
+    """The edges along a drive, with a share of its drift; nodes are numbered from ``begin``."""
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes), begin):
@@ -226,21 +214,16 @@ def _odometry_edges(
 
 
 def _tie_edge(
-    tie: Tie,
-    drives: Sequence[DrivePath],
-    nodes: Sequence[NDArray[np.intp]],
-    begins: Sequence[int],
+    tie: Tie, drives: Sequence[DrivePath], nodes: Sequence[NDArray[np.intp]], begins: Sequence[int]
 ) -> PoseEdge:
     """Return a tie as an edge between the nodes nearest to its frames."""
     loop, (one, other) = tie.loop, tie.drives
     first, to_first, before_m = _to_node(drives[one], nodes[one], loop.first)
     last, to_last, after_m = _to_node(drives[other], nodes[other], loop.last)
     drift, bias = drift_over(before_m + after_m), loop_bias(loop)
-    more = Drift(
-        math.hypot(drift.position_m, bias.position_m),
-        math.hypot(drift.angle_rad, bias.angle_rad),
-    )
-    covariance = np.linalg.inv(_turned(loop.information, invert(to_last))) + more.covariance
+    more = Drift(*map(math.hypot, astuple(drift), astuple(bias)))
+    turn = adjoint(invert(to_last))  # from the axes of the frame to those of its node
+    covariance = np.linalg.inv(turn.T @ loop.information @ turn) + more.covariance
     T = orthonormalise(to_first @ loop.T_first_last @ invert(to_last))
     ends = begins[one] + first, begins[other] + last
     return PoseEdge(*ends, T, _inverse(covariance), doubtful=True)
@@ -257,13 +240,6 @@ def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int
 def _inverse(covariance: Float64) -> Float64:
     """Return the information (6, 6) of a covariance (6, 6)."""
     return np.asarray(np.linalg.inv(covariance), np.float64)
-
-
-def _turned(information: Float64, T_frame_node: Float64) -> Float64:
-    """Return the information of a step in a node's axes, from that in a frame's axes near it."""
-    turn = adjoint(T_frame_node)
-    turned: Float64 = turn.T @ information @ turn
-    return turned
 
 
 def _bent(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:

@@ -28,8 +28,6 @@ from recon.places.verify import Verdict, verify
 
 CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""
-
-
 _DISTANCE_M: Final = 1.5  # distance from the last keyframe at which a new one is taken
 _ANGLE_DEG: Final = 10.0  # rotation since the last keyframe at which a new one is taken
 _MIN_LIKENESS: Final = 0.3

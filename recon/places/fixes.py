@@ -138,7 +138,10 @@ def optimise_poses(
             registration.GlobalOptimizationConvergenceCriteria(),
             option,
         )
-    return _poses(graph), np.array([edge.confidence for edge in graph.edges])
+    poses = np.array([node.pose for node in graph.nodes])
+    if not np.isfinite(poses).all():
+        raise RegistrationError("the pose graph has no solution")
+    return poses, np.array([edge.confidence for edge in graph.edges])
 
 
 def _edge(edge: PoseEdge) -> Any:
@@ -148,10 +151,3 @@ def _edge(edge: PoseEdge) -> Any:
     return o3d.pipelines.registration.PoseGraphEdge(
         edge.last, edge.first, np.array(edge.T_first_last), information, edge.doubtful
     )
-
-
-def _poses(graph: Any) -> Float64:
-    poses = np.array([node.pose for node in graph.nodes])
-    if not np.isfinite(poses).all():
-        raise RegistrationError("the pose graph has no solution")
-    return poses

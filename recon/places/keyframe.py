@@ -24,8 +24,6 @@ _SURPLUS: Final = 3  # corners to choose from, per feature
 # pairs of kitti_raw_0013's frames gave 111 loops instead of 110.
 _SCALE_STEP: Final = 1.3
 _SCALES: Final = 5
-
-
 FEATURES: Final = 500  # features of a keyframe
 _CELL_PX: Final = 48  # edge of the cells that features are spread over
 _FAST_THRESHOLD: Final = 10  # threshold of the FAST corner detector
@@ -79,13 +77,8 @@ def make_keyframe(
 
     Ref: Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
     """
-    orb = cv2.ORB.create(
-        nfeatures=_SURPLUS * FEATURES,
-        scaleFactor=_SCALE_STEP,
-        nlevels=_SCALES,
-        edgeThreshold=_EDGE_PX,
-        fastThreshold=_FAST_THRESHOLD,
-    )
+    most, fast = _SURPLUS * FEATURES, _FAST_THRESHOLD
+    orb = cv2.ORB.create(most, _SCALE_STEP, _SCALES, edgeThreshold=_EDGE_PX, fastThreshold=fast)
     image, zoom = _at_focal_length(pair, focal_px)
     corners = _spread(orb.detect(image), image.shape)
     described, descriptors = orb.compute(image, corners)
@@ -95,8 +88,8 @@ def make_keyframe(
     if descriptors is None:
         descriptors = np.zeros((0, _DESCRIPTOR_BYTES), np.uint8)
     uvd = np.column_stack([uv, _disparity(disparity, uv, pair.camera)])
-    half, step = _COARSE_PX // 2, _COARSE_PX
-    coarse = np.ascontiguousarray(disparity.values[half::step, half::step])
+    sampled = np.s_[_COARSE_PX // 2 :: _COARSE_PX]
+    coarse = np.ascontiguousarray(disparity.values[sampled, sampled])
     return Keyframe(frame, uvd.astype(np.float32), descriptors, coarse)
 
 

@@ -44,11 +44,7 @@ _MAJORITY: Final = 2  # loops that confirm one, for each that contradicts it
 
 
 def agreeing_loops(
-    loops: Sequence[Loop],
-    firsts: Poses,
-    lasts: Poses,
-    *,
-    keyframes: int = _MIN_AGREEING,
+    loops: Sequence[Loop], firsts: Poses, lasts: Poses, *, keyframes: int = _MIN_AGREEING
 ) -> list[Loop]:
     """The verified loops that enough others confirm, and few contradict.
 
@@ -81,8 +77,7 @@ def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses]) -> bool:
     T_lasts, lasts_m = _between(one.last, other.last, lasts)
     T_firsts, firsts_m = _between(one.first, other.first, firsts)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
-    drift = drift_over(lasts_m + firsts_m)
-    return is_possible(ring, drift, LOOP_SIGMAS)
+    return is_possible(ring, drift_over(lasts_m + firsts_m), LOOP_SIGMAS)
 
 
 def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:

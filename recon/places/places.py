@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from os import PathLike
 from typing import Final
 
@@ -17,8 +17,6 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
-
-
 _MIN_PATH_M: Final = 25.0  # least path between two places that are compared
 VIEW_M: Final = 8.0  # largest distance at which two places see enough in common
 VIEW_DEG: Final = 45.0  # largest such angle between their viewing directions
@@ -133,8 +131,7 @@ class WordIndex:
     Runs of sorted words are merged when they have the same size, as in a binary counter, up to a
     size that still merges in little time and memory.
 
-    Ref:
-        O'Neil et al., "The log-structured merge-tree", Acta Informatica 1996.
+    Ref: O'Neil et al., "The log-structured merge-tree", Acta Informatica 1996.
     """
 
     def __init__(self) -> None:
@@ -193,8 +190,7 @@ def drift_over(path_m: float) -> Drift:
     The scale error is constant and the heading a random walk. The position error of the latter is
     that of a straight drive, the worst case: ``turn·√(path³/3)``.
     """
-    position_m, turn_rad = spread_over(np.array(path_m))
-    return Drift(float(position_m), float(turn_rad))
+    return Drift(*map(float, spread_over(np.array(path_m))))
 
 
 def spread_over(path_m: Float64) -> tuple[Float64, Float64]:
@@ -209,11 +205,9 @@ def is_possible(T_difference: NDArray[np.float64], drift: Drift, other: Drift) -
 
     ``T_difference`` is the inverse of odometry's motion times the other one.
     """
-    off_m = float(np.linalg.norm(T_difference[:3, 3]))
-    off_rad = float(angle_rad(T_difference))
-    sigma_m = math.hypot(drift.position_m, other.position_m)
-    sigma_rad = math.hypot(drift.angle_rad, other.angle_rad)
-    return off_m <= SIGMAS * sigma_m and off_rad <= SIGMAS * sigma_rad
+    sigma_m, sigma_rad = map(math.hypot, astuple(drift), astuple(other))
+    near = float(np.linalg.norm(T_difference[:3, 3])) <= SIGMAS * sigma_m
+    return near and float(angle_rad(T_difference)) <= SIGMAS * sigma_rad
 
 
 RECEIVER_M: Final = 10.0

@@ -16,9 +16,7 @@ from recon.places.align import MIN_INLIERS, Alignment, Seen, agreement, locate, 
 from recon.places.keyframe import Keyframe, points_of
 from recon.places.loop import Loop
 
-_CELLS = 4
-
-
+_CELLS: Final = 4
 _MAX_HAMMING: Final = 64  # largest Hamming distance of a match
 _MIN_INLIER_SHARE: Final = 0.3  # least share of the matches that agree
 _SPREAD_CELLS: Final = 5  # of 4 by 4 cells of each image, how many must hold inliers
@@ -57,21 +55,17 @@ def verify(
     aligned = _aligned(*match_keyframes(first, last, *cameras))
     if isinstance(aligned, str):
         return Verdict(None, aligned)
-    dense = dense_agreement(first, last, aligned.T_first_last, *cameras)
+    T, inliers = aligned.T_first_last, int(aligned.agree.sum())
+    dense = dense_agreement(first, last, T, *cameras)
     if dense < _MIN_DENSE_SHARE:
         return Verdict(None, "surfaces differ")
-    inliers = int(aligned.agree.sum())
-    T = aligned.T_first_last
     return Verdict(Loop(first.frame, last.frame, T, aligned.information, inliers, dense))
 
 
 def _aligned(first: Seen, last: Seen) -> Alignment | str:
     """The motion between the frames, or why it is not verified."""
     T_there = locate(first.xyz, last)
-    if T_there is None:
-        return "no common motion"
-    T_back = locate(last.xyz, first)
-    if T_back is None:
+    if T_there is None or (T_back := locate(last.xyz, first)) is None:
         return "no common motion"
     if not _inverse(T_there, T_back):
         return "there and back differ"
@@ -89,14 +83,12 @@ def match_keyframes(
     """Return features that are each other's best match and have a depth in both frames."""
     ours, theirs = (np.isfinite(k.uvd[:, 2]) for k in (first, last))
     pairs = _mutual(first.descriptors[ours], last.descriptors[theirs])
-    return (
-        _seen(first.uvd[ours][pairs[:, 0]], first_camera),
-        _seen(last.uvd[theirs][pairs[:, 1]], last_camera),
+    both = (
+        (first.uvd[ours][pairs[:, 0]], first_camera),
+        (last.uvd[theirs][pairs[:, 1]], last_camera),
     )
-
-
-def _seen(uvd: Float32, camera: RectifiedCamera) -> Seen:
-    return Seen(uvd.astype(np.float64), points_of(uvd, camera), camera)
+    seen = [Seen(uvd.astype(np.float64), points_of(uvd, camera), camera) for uvd, camera in both]
+    return seen[0], seen[1]
 
 
 def dense_agreement(
@@ -112,18 +104,14 @@ def dense_agreement(
     larger one means that something is in front of it, which does not count. 0 where the two frames
     hardly overlap.
     """
-    shares = (
+    return min(
         _confirmed(_coarse_points(last, last_camera), first, T_first_last, first_camera),
         _confirmed(_coarse_points(first, first_camera), last, invert(T_first_last), last_camera),
     )
-    return min(shares)
 
 
 def _confirmed(
-    xyz: Float64,
-    target: Keyframe,
-    T_target_source: Float64,
-    camera: RectifiedCamera,
+    xyz: Float64, target: Keyframe, T_target_source: Float64, camera: RectifiedCamera
 ) -> float:
     """The share of points of another frame that the target sees where they should be."""
     u, v, d = project(apply(T_target_source, xyz), camera)
@@ -179,20 +167,13 @@ def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
 def _inverse(T_there: Float64, T_back: Float64) -> bool:
     """Whether the two poses are inverse to each other."""
     around = T_there @ T_back
-    off_deg = float(np.rad2deg(angle_rad(around)))
-    off_m = float(np.linalg.norm(around[:3, 3]))
-    return off_m <= _BOTH_WAYS_M and off_deg <= _BOTH_WAYS_DEG
+    near = float(np.linalg.norm(around[:3, 3])) <= _BOTH_WAYS_M
+    return near and float(np.rad2deg(angle_rad(around))) <= _BOTH_WAYS_DEG
 
 
-def _weakness(
-    first: Seen,
-    last: Seen,
-    aligned: Alignment,
-    matches: int,
-) -> str:
+def _weakness(first: Seen, last: Seen, aligned: Alignment, matches: int) -> str:
     """Why the inliers are not enough; "" where they are."""
-    inliers = int(aligned.agree.sum())
-    if inliers < max(MIN_INLIERS, _MIN_INLIER_SHARE * matches):
+    if int(aligned.agree.sum()) < max(MIN_INLIERS, _MIN_INLIER_SHARE * matches):
         return "few inliers"
     if min(_spread(seen.select(aligned.agree)) for seen in (first, last)) < _SPREAD_CELLS:
         return "inliers in one corner"
@@ -214,5 +195,4 @@ def _sigma_m(information: Float64) -> float:
     values = np.linalg.eigvalsh(information)
     if values[0] <= 1e-9 * values[-1]:
         return float("inf")
-    covariance = np.linalg.inv(information)[:3, :3]
-    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]))
