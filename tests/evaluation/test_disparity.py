@@ -1,24 +1,29 @@
-"""Disparity metrics, checked by hand and against their definitions."""
+"""Errors of disparities, depths and confidences, counted by hand and against definitions."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError
-from recon.core.values import Disparity, DisparityTruth
-from recon.evaluation.disparity import evaluate_disparity
+from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedCamera
+from recon.evaluation.disparity import (
+    evaluate_depth,
+    evaluate_disparity,
+    measure_reliability,
+    measure_sparsification,
+    share_within_sigma,
+)
 from recon.evaluation.middlebury.score import evaluate_middlebury
 
-NAN = float("nan")
+N = float("nan")
 
 
 def truth(values: list[float], nonocc: list[bool] | None = None) -> DisparityTruth:
-    array = np.array([values], dtype=np.float32)
-    seen = np.ones(array.shape, dtype=bool) if nonocc is None else np.array([nonocc])
-    return DisparityTruth(array, seen)
+    seen = np.array([nonocc or [True] * len(values)])
+    return DisparityTruth(np.array([values], dtype=np.float32), seen)
 
 
 def estimate(values: list[float]) -> np.ndarray:
@@ -28,8 +33,8 @@ def estimate(values: list[float]) -> np.ndarray:
 def test_a_case_counted_by_hand() -> None:
     # Errors 0, 0.5, 1, 3, none; the sixth truth is unknown, the seventh occluded.
     given = (
-        estimate([10, 10.5, 9, 13, NAN, 4, 90]),
-        truth([10, 10, 10, 10, 10, NAN, 10], [True] * 6 + [False]),
+        estimate([10, 10.5, 9, 13, N, 4, 90]),
+        truth([10, 10, 10, 10, 10, N, 10], [True] * 6 + [False]),
     )
     result = evaluate_disparity(*given)
     assert result.pixels == 5
@@ -41,56 +46,101 @@ def test_a_case_counted_by_hand() -> None:
     assert evaluate_disparity(*given, occluded=True).bad[4.0] == pytest.approx(100 / 6)
     assert evaluate_disparity(*given, (3.0,)).bad == {3.0: 0.0}
     # KITTI's outliers are off by three pixels, and by a twentieth.
-    found, true = estimate([13.5, 13, 103.5, 106, NAN]), truth([10, 10, 100, 100, 9])
+    found, true = estimate([13.5, 13, 103.5, 106, N]), truth([10, 10, 100, 100, 9])
     assert evaluate_disparity(found, true).d1 == pytest.approx(40.0)
 
 
 def test_maps_without_values_or_truth_or_of_another_size_have_no_errors() -> None:
-    result = evaluate_disparity(estimate([NAN, NAN]), truth([1, 2]))
+    result = evaluate_disparity(estimate([N, N]), truth([1, 2]))
     assert (result.invalid, set(result.bad.values())) == (100, {0.0})
-    assert np.isnan([result.avgerr_px, result.rms_px]).all()
+    assert np.isnan([result.avgerr_px, result.rms_px, *result.quantiles_px.values()]).all()
     with pytest.raises(EvaluationError, match="differ in size"):
         evaluate_disparity(estimate([1, 2]), truth([1]))
-    with pytest.raises(EvaluationError, match="no pixel has a known truth"):
-        evaluate_disparity(estimate([1]), truth([NAN]))
-
-
-@given(st.integers(0, 2**16))
-def test_bad_falls_with_the_threshold_and_shares_stay_shares(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    values = rng.normal(20, 3, (6, 9)).astype(np.float32)
-    values[rng.random(values.shape) < 0.3] = np.nan
-    known = DisparityTruth(np.full((6, 9), 20, np.float32), rng.random((6, 9)) < 0.9)
-    result = evaluate_disparity(values, known)
-    bad = [result.bad[t] for t in sorted(result.bad)]
-    assert bad == sorted(bad, reverse=True)
-    assert 0 <= bad[0] + result.invalid <= 100 + 1e-9
-    if np.isfinite(result.rms_px):
-        assert result.avgerr_px <= result.rms_px + 1e-9
-
-
-def test_quantiles_are_errors_that_occur() -> None:
-    errors = np.arange(100, 0, -1, dtype=np.float32)[None]
-    known = DisparityTruth(np.zeros_like(errors), np.ones(errors.shape, dtype=bool))
-    assert evaluate_disparity(errors, known).quantiles_px == {50: 50, 90: 90, 95: 95, 99: 99}
-
-
-def test_figures_of_the_full_size_are_those_of_maps_enlarged() -> None:
-    small = evaluate_disparity(estimate([10.25, 12, 9]), truth([10, 10, 10]), scale=4)
-    large = evaluate_disparity(estimate([41, 48, 36]), truth([40, 40, 40]))
-    assert small == large
+    for measure in (evaluate_disparity, measure_reliability, measure_sparsification):
+        with pytest.raises(EvaluationError, match="no pixel has a known truth"):
+            measure(Disparity.from_values(estimate([1])), truth([N]))
+    with pytest.raises(EvaluationError, match="both a disparity and a known truth"):
+        share_within_sigma(Disparity.from_values(estimate([N, 1])), truth([1, N]))
 
 
 def test_plain_arrays_are_evaluated_like_values() -> None:
     true = np.array([[8.0, np.inf, 0.0, 6.0], [4.0, 5.0, np.nan, 7.0]])
     found = np.array([[8.5, 3.0, 3.0, np.inf], [9.0, 5.0, 1.0, np.nan]])
-    expected = evaluate_disparity(
-        found.astype(np.float32), DisparityTruth.from_values(true.astype(np.float32))
-    )
-    for estimate in (found, found.tolist(), Disparity.from_values(found)):
-        got = evaluate_disparity(estimate, true)
-        assert got == expected
+    known = DisparityTruth.from_values(true.astype(np.float32))
+    expected = evaluate_disparity(found.astype(np.float32), known)
     # Of five known pixels two have no value, and one is off by 5.
-    assert (got.pixels, got.invalid, got.bad[2.0]) == (5, 40, 20)
-    assert evaluate_middlebury(found, true) == expected
-    assert evaluate_middlebury(Disparity.from_values(found), true.tolist()) == expected
+    assert (expected.pixels, expected.invalid, expected.bad[2.0]) == (5, 40, 20)
+    for one in (found, found.tolist(), Disparity.from_values(found)):
+        assert evaluate_disparity(one, true) == expected
+        assert evaluate_middlebury(one, true.tolist()) == expected
+
+
+def test_depth_errors_of_a_case_counted_by_hand() -> None:
+    # f·b = 10, doffs 1: disparities 1, 4, 9 are 5 m, 2 m, 1 m.
+    camera = RectifiedCamera(100.0, 1.0, 0.0, 2.0, 0.1, 4, 1)
+    found = evaluate_depth(estimate([4, 4, -1, N]), truth([1, 4, 9, 9]), camera)
+    assert (found.mean_m, found.median_m) == pytest.approx((1.5, 3.0))
+    assert found.rms_m == pytest.approx(math.sqrt(4.5))
+    assert found.median_percent == pytest.approx(60.0)
+    assert (found.over_5_percent, found.infinite) == pytest.approx((200 / 3, 100 / 3))
+
+
+def made(
+    error_px: np.ndarray, confidence: np.ndarray | float = 0.8
+) -> tuple[Disparity, DisparityTruth]:
+    """A map off by ``error_px`` from a truth of 20 px."""
+    values = np.full(error_px.shape, 20, np.float32)
+    estimate = Disparity(
+        values=(values + error_px).astype(np.float32),
+        confidence=np.broadcast_to(confidence, values.shape).astype(np.float32),
+        sigma_px=np.full(values.shape, 0.5, np.float32),
+        reason=np.full(values.shape, Reason.VALID, np.uint8),
+    )
+    return estimate, DisparityTruth(values, np.ones(values.shape, bool))
+
+
+def test_share_within_sigma_counts_what_is_less_than_it() -> None:
+    pair = made(np.array([[0.2, 0.7, 1.2, 5.0]]))
+    assert [share_within_sigma(*pair, n) for n in (1, 2, 3)] == [0.25, 0.5, 0.75]
+
+
+def test_honest_confidence_has_no_calibration_error() -> None:
+    """Pixels are right just as often as their confidence says."""
+    rng, shape = np.random.default_rng(0), (200, 500)
+    confidence = rng.uniform(0, 1, shape)
+    error_px = np.where(rng.uniform(0, 1, shape) < confidence, 0.5, 5.0)
+    reliability = measure_reliability(*made(error_px, confidence))
+    # 10 000 pixels in a bin: a standard deviation of 0.005 or less.
+    assert 0 < reliability.calibration_error < 0.01
+    np.testing.assert_allclose(reliability.right, reliability.confidence, atol=0.02)
+    assert reliability.pixels.sum() == confidence.size
+
+
+@pytest.mark.parametrize(
+    ("claimed", "error_px", "gap", "place"),
+    [(0.9, 5.0, 0.9, 8), (0.25, 0.0, 0.75, 2), (1.0, 1.0, 0.0, 9)],
+)
+def test_calibration_error_is_the_gap(
+    claimed: float, error_px: float, gap: float, place: int
+) -> None:
+    """A pixel off by the limit is right; what is certain falls into the last bin."""
+    reliability = measure_reliability(*made(np.full((4, 5), error_px), claimed))
+    # 1e-6: confidence is float32, in which 0.9 is a little less.
+    assert reliability.calibration_error == pytest.approx(gap, abs=1e-6)
+    assert np.flatnonzero(reliability.pixels).tolist() == [place]
+    assert np.flatnonzero(~np.isnan(reliability.right)).tolist() == [place]
+
+
+def test_confidence_that_sorts_better_leaves_less_area() -> None:
+    error_px = np.where(np.arange(1000).reshape(10, 100) < 300, 5.0, 0.0)
+    best, flat, worst = (
+        measure_sparsification(*made(error_px, np.where(error_px > 1, wrong, right)))
+        for wrong, right in ((0.2, 0.8), (0.5, 0.5), (0.8, 0.2))
+    )
+    assert best.ause == pytest.approx(0, abs=1e-12)
+    assert best.wrong[0] == pytest.approx(0.3)
+    # 0.7 of the pixels are right: nothing wrong is left once the 0.3 are gone.
+    assert not best.wrong[31:].any()
+    assert best.wrong[:30].all()
+    np.testing.assert_allclose(flat.wrong, 0.3, atol=1e-12)
+    assert 0 < flat.ause < worst.ause < 1

@@ -1,20 +1,31 @@
-"""Map metrics on clouds with known distances."""
+"""Metrics of clouds and of occupancy maps, on truth that can be counted by hand, and ICP."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from recon.core.errors import EvaluationError
-from recon.core.values import PointCloud
-from recon.evaluation.map import evaluate_map, nearest_distances
-from recon.io.models.ply import read_ply
+from recon.core.errors import EvaluationError, RegistrationError
+from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
+from recon.core.values import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    OccupancyTruth,
+    OccupancyVoxels,
+    PointCloud,
+    RectifiedCamera,
+)
+from recon.evaluation.map import evaluate_map, icp, nearest_distances
+from recon.evaluation.occupancy import evaluate_occupancy
+from recon.map.ground.axes import AXES_MAP_WORLD
 
 
-def grid(offset_m: float = 0.0, step_m: float = 0.5, n: int = 20) -> np.ndarray:
-    x, y = np.meshgrid(np.arange(n) * step_m, np.arange(n) * step_m)
+def grid(offset_m: float = 0.0) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(20) * 0.5, np.arange(20) * 0.5)
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, offset_m)], axis=1).astype(np.float32)
 
 
@@ -29,16 +40,14 @@ def test_an_offset_is_the_median_and_decides_at_the_threshold() -> None:
     assert 0 <= same.median_m <= same.p95_m < 1e-3
     assert (same.points, same.reference_points) == (400, 400)
     near = evaluate_map(cloud(grid(0.15)), cloud(grid()), 0.2)
-    assert near.median_m == pytest.approx(0.15, abs=1e-4)
-    assert near.p95_m == pytest.approx(0.15, abs=1e-4)
+    assert (near.median_m, near.p95_m) == pytest.approx((0.15, 0.15), abs=1e-4)
     assert near.f_score == 1
     far = evaluate_map(cloud(grid(0.25)), cloud(grid()), 0.2)
     assert (far.precision, far.recall, far.f_score) == (0, 0, 0)
 
 
 def test_precision_counts_wrong_points_and_recall_missing_ones() -> None:
-    right, wrong = grid()[:320], grid(5.0)[:80]
-    clouds = cloud(np.concatenate([right[:240], wrong])), cloud(grid())
+    clouds = cloud(np.concatenate([grid()[:240], grid(5.0)[:80]])), cloud(grid())
     there, back = evaluate_map(*clouds, 0.2), evaluate_map(*clouds[::-1], 0.2)
     assert (there.precision, there.recall) == pytest.approx((0.75, 0.6))
     assert (back.precision, back.recall) == pytest.approx((0.6, 0.75))
@@ -54,11 +63,9 @@ def test_density_does_not_weigh() -> None:
 
 def test_distances_hold_far_from_the_origin() -> None:
     far = np.array([4000.0, 0, 9000.0])
-    distances = nearest_distances(
-        (grid(0.125) + far).astype(np.float32), (grid() + far).astype(np.float32)
-    )
+    here, there = ((grid(z) + far).astype(np.float32) for z in (0.125, 0.0))
     # float32 places points at 9 km to half a millimetre.
-    np.testing.assert_allclose(distances, 0.125, atol=2e-3)
+    np.testing.assert_allclose(nearest_distances(here, there), 0.125, atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -67,21 +74,143 @@ def test_distances_hold_far_from_the_origin() -> None:
         (cloud(np.zeros((0, 3))), cloud(grid()), 0.2, "estimated cloud is empty"),
         (cloud(grid()), cloud(np.zeros((0, 3))), 0.2, "reference cloud is empty"),
         (cloud(grid()), PointCloud(grid(), frame="map"), 0.2, "different frames"),
+        (cloud(grid()), grid(), 0.2, "PointCloud and ndarray"),
         (cloud(grid()), cloud(grid()), 0.0, "threshold is not positive"),
         (cloud(grid()), cloud(grid()), float("nan"), "threshold is not positive"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(
+def test_clouds_that_cannot_be_compared_are_refused(
     estimate: PointCloud, reference: PointCloud, threshold_m: float, complaint: str
 ) -> None:
     with pytest.raises(EvaluationError, match=complaint):
         evaluate_map(estimate, reference, threshold_m)
 
 
-@pytest.mark.real
-def test_the_lidar_map_agrees_with_half_of_itself(recon_data: Path) -> None:
-    reference = read_ply(recon_data / "driven" / "kitti_raw_0013" / "lidar_map.ply")
-    half = reference.select(np.arange(0, len(reference), 2))
-    result = evaluate_map(half, reference, 0.2)
-    assert result.precision == 1
-    assert 0.9 < result.recall <= 1
+def corner(seed: int) -> np.ndarray:
+    """Points on three planes that meet at right angles."""
+    sides = np.random.default_rng(seed).uniform(0, 10, (3, 3000, 3))
+    for axis in range(3):
+        sides[axis, :, axis] = 0
+    return sides.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("away_m", [0.0, 5000.0])
+def test_icp_finds_the_motion_between_two_samples_of_a_corner(away_m: float) -> None:
+    here = np.eye(4)
+    here[:3, 3] = away_m
+    small = make_transform(exp_so3(np.array([0.01, -0.02, 0.015])), np.array([0.3, -0.2, 0.1]))
+    T = here @ small @ invert(here)
+    found, share = icp(apply(here, corner(0)), apply(T @ here, corner(1)), (2.0, 0.5, 0.2))
+    wrong = invert(here) @ invert(T) @ found @ here
+    # Random samples of planes: exact up to the normals at the edges of the corner.
+    assert np.linalg.norm(wrong[:3, 3]) < 0.01
+    assert angle_rad(wrong) < 1e-3
+    assert share > 0.9
+
+
+def test_clouds_that_are_too_far_apart_for_icp_are_reported() -> None:
+    with pytest.raises(RegistrationError, match="no corresponding points"):
+        icp(corner(0), corner(1) + 100, (2.0, 0.5))
+    xyz = corner(2)
+    xyz.flags.writeable = False
+    assert icp(xyz, xyz, (1.0,))[1] == 1.0
+
+
+EDGE_M = 0.2
+WALL = np.array([(50, j, k) for j in range(-6, 6) for k in range(-3, 3)], np.int32)
+CELLS = np.full((20, 60), FREE, np.int8)
+CELLS[4:16, 50] = OCCUPIED
+
+
+def seen(frames: int = 3) -> OccupancyTruth:
+    """A wall 10 m ahead, in view of a camera that stands still; a grid with its footprint."""
+    pose = np.eye(4)
+    pose[:3, :3] = AXES_MAP_WORLD
+    return OccupancyTruth(
+        grid=OccupancyGrid(CELLS, EDGE_M, (0.0, -2.0)),
+        seen=np.ones(CELLS.shape, dtype=np.bool_),
+        keys=WALL,
+        frames=np.full(len(WALL), frames, np.int32),
+        # Half as wide as far: sees 10 m to each side at 20 m.
+        camera=RectifiedCamera(100.0, 49.5, 49.5, 49.5, 0.5, 100, 100),
+        T_map_camera=np.tile(pose, (frames, 1, 1)),
+        range_m=20.0,
+        least_frames=3,
+    )
+
+
+TRUTH = seen()
+
+
+def voxels(*occupied: np.ndarray, free: np.ndarray = WALL[:0]) -> OccupancyVoxels:
+    keys = np.concatenate([*occupied, free]).astype(np.int32)
+    log_odds = np.full(len(keys), 2.0, np.float32)
+    log_odds[len(keys) - len(free) :] = -2.0
+    return OccupancyVoxels(keys, log_odds, EDGE_M)
+
+
+def test_the_true_occupancy_itself_is_perfect() -> None:
+    found = evaluate_occupancy(voxels(WALL, free=WALL - np.array([5, 0, 0])), TRUTH.grid, TRUTH)
+    for one in (found.voxels, found.voxels_exact):
+        assert (one.precision, one.recall, one.voxels, one.true_voxels) == (1.0, 1.0, 72, 72)
+    for each in (found.grid, found.grid_exact):
+        assert (each.iou_occupied, each.iou_free, each.unknown) == (1.0, 1.0, 0.0)
+        assert (each.cells, each.true_occupied) == (1200, 12)
+
+
+@pytest.mark.parametrize(("shift", "exact", "tolerant"), [(1, 0.0, 1.0), (2, 0.0, 0.0)])
+def test_the_tolerance_is_one_cell(shift: int, exact: float, tolerant: float) -> None:
+    moved = OccupancyGrid(np.roll(CELLS, shift, axis=1), EDGE_M, (0.0, -2.0))
+    found = evaluate_occupancy(voxels(WALL + np.array([shift, 0, 0])), moved, TRUTH)
+    assert (found.voxels_exact.precision, found.voxels_exact.recall) == (exact, exact)
+    assert (found.voxels.precision, found.voxels.recall) == (tolerant, tolerant)
+    assert (found.grid_exact.iou_occupied, found.grid.iou_occupied) == (exact, tolerant)
+
+
+def test_voxels_that_no_image_held_do_not_count() -> None:
+    beside, behind, far = (WALL + np.array(by) for by in ([0, 80, 0], [-100, 0, 0], [60, 0, 0]))
+    found = evaluate_occupancy(voxels(WALL, beside, behind, far), TRUTH.grid, TRUTH)
+    assert (found.voxels.precision, found.voxels.voxels) == (1.0, 72)
+    # What is invented behind a wall is wrong.
+    found = evaluate_occupancy(voxels(WALL, WALL + np.array([6, 0, 0])), TRUTH.grid, TRUTH)
+    assert (found.voxels.precision, found.voxels.recall) == (0.5, 1.0)
+
+
+def test_true_voxels_must_have_been_seen_often_enough() -> None:
+    frames = np.where(WALL[:, 1] < 0, 3, 2).astype(np.int32)
+    seldom = replace(TRUTH, frames=frames)
+    half = evaluate_occupancy(voxels(WALL[WALL[:, 1] < 0]), TRUTH.grid, seldom)
+    assert (half.voxels.true_voxels, half.voxels.recall) == (len(WALL) / 2, 1.0)
+    # A surface that was seen once is a surface nevertheless.
+    assert evaluate_occupancy(voxels(WALL), TRUTH.grid, seldom).voxels.precision == 1.0
+
+
+def test_intersection_over_union_on_paper() -> None:
+    cells = np.full((20, 60), FREE, np.int8)
+    cells[4:10, 50] = OCCUPIED  # 6 of 12 found
+    cells[10:12, 50] = UNKNOWN  # 2 not known, so 4 are called free
+    cells[4:10, 20] = OCCUPIED  # 6 invented
+    found = evaluate_occupancy(voxels(WALL), OccupancyGrid(cells, EDGE_M, (0.0, -2.0)), TRUTH)
+    assert found.grid_exact.iou_occupied == pytest.approx(6 / 18)
+    # Free in both: all but 12 true, 6 invented. In either: all but 12 true, and 4 called free.
+    assert found.grid_exact.iou_free == pytest.approx((1200 - 18) / (1200 - 12 + 4))
+    assert found.grid_exact.occupied_called_free == pytest.approx(4 / 12)
+    assert found.grid_exact.unknown == pytest.approx(2 / 1200)
+    # Within one cell, a seventh true cell is found.
+    assert found.grid.iou_occupied == pytest.approx(7 / 18)
+
+
+def test_only_seen_cells_of_the_grid_count_wherever_it_lies() -> None:
+    ahead = np.zeros_like(TRUTH.seen)
+    ahead[:, 40:60] = True
+    part = OccupancyGrid(CELLS[:, 45:], EDGE_M, (9.0, -2.0))
+    found = evaluate_occupancy(voxels(WALL), part, replace(TRUTH, seen=ahead)).grid_exact
+    assert (found.iou_occupied, found.unknown, found.cells) == pytest.approx((1.0, 5 / 20, 400))
+
+
+def test_occupancies_that_cannot_be_compared_are_refused() -> None:
+    coarse = OccupancyGrid(np.zeros((2, 2), np.int8), 0.4, (0.0, 0.0))
+    with pytest.raises(EvaluationError, match="different resolutions"):
+        evaluate_occupancy(voxels(WALL), coarse, TRUTH)
+    with pytest.raises(EvaluationError, match="no surface was seen in enough frames"):
+        evaluate_occupancy(voxels(WALL), TRUTH.grid, seen(frames=2))

@@ -104,39 +104,28 @@ def mesh() -> TriangleMesh:
 
 
 @pytest.fixture
-def drive(
-    pair: RectifiedPair,
-    disparity: Disparity,
-    trajectory: Trajectory,
-    T_map_world: Float64,
-    health: list[OdometryHealth],
-    grid: OccupancyGrid,
-    cloud: PointCloud,
-    mesh: TriangleMesh,
-) -> SimpleNamespace:
+def drive(request: pytest.FixtureRequest) -> SimpleNamespace:
     """What the page of a drive is made from, with everything but loops."""
+    names = ("pair", "disparity", "trajectory", "T_map_world", "health", "grid", "cloud", "mesh")
+    given = SimpleNamespace(**{name: request.getfixturevalue(name) for name in names})
     session = SimpleNamespace(
-        trajectory=trajectory,
-        odometry=trajectory,
-        T_map_world=T_map_world,
-        health=health,
-        camera=pair.camera,
+        trajectory=given.trajectory,
+        odometry=given.trajectory,
+        T_map_world=given.T_map_world,
+        health=given.health,
+        camera=given.pair.camera,
         loops={},
     )
     return SimpleNamespace(
         map_=SimpleNamespace(first=session),
-        made=SimpleNamespace(cloud=cloud, grid=grid, mesh=mesh),
-        errors=DriveErrors(METRICS, None, None, true_path=trajectory),
-        sample=SimpleNamespace(pair=pair, disparity=disparity),
+        made=given,
+        errors=DriveErrors(METRICS, None, None, true_path=given.trajectory),
+        sample=given,
         summary={
-            "source": "drives/drive <1>",
-            "fps": 4.25,
-            "points": 2000,
-            "stages": {"match": 1.0},
-            "nested": {"a": [1, None]},
-            "warnings": ["frame 5: lost"],
+            "source": "drives/drive <1>", "fps": 4.25, "points": 2000, "stages": {"match": 1.0},
+            "nested": {"a": [1, None]}, "warnings": ["frame 5: lost"],
         },
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture

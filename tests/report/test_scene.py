@@ -1,3 +1,5 @@
+"""The 3-D view: what is drawn, from where, and how it is thinned and packed."""
+
 from __future__ import annotations
 
 import base64
@@ -25,9 +27,9 @@ def unpack(packed: dict[str, str]) -> np.ndarray[Any, Any]:
     return np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
 
 
-def plot(scene: Scene, **limits: int) -> Json:
+def plot(scene: Scene) -> Json:
     """The plot of a scene that is not empty."""
-    found = plot_scene(scene, **limits)
+    found = plot_scene(scene)
     assert found is not None
     return found
 
@@ -80,11 +82,9 @@ def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(
     both = plot(Scene(np.eye(4), cloud, mesh))["data"]
     grey = TriangleMesh(mesh.vertices, mesh.faces)
     (alone,) = plot(Scene(np.eye(4), None, grey))["data"]
-    assert [(trace["type"], trace["visible"]) for trace in (both[1], alone)] == [
-        ("mesh3d", "legendonly"),
-        ("mesh3d", True),
-    ]
-    assert (both[0]["type"], alone["color"]) == ("scatter3d", "#b8c4ce")
+    assert [trace["type"] for trace in (*both, alone)] == ["scatter3d", "mesh3d", "mesh3d"]
+    assert [both[1]["visible"], alone["visible"]] == ["legendonly", True]
+    assert alone["color"] == "#b8c4ce"
 
 
 def test_axes_have_true_proportion_and_the_longest_is_two(cloud: PointCloud) -> None:
@@ -120,25 +120,10 @@ def test_a_point_far_from_all_others_does_not_make_the_rest_small(cloud: PointCl
 
 
 @pytest.mark.parametrize("paths", [(), (("path", np.zeros((3, 3))),), (("p", np.zeros((0, 3))),)])
-def test_scene_of_one_place_is_valid_json(paths: Any) -> None:
-    one = PointCloud(np.zeros((1, 3), dtype=np.float32))
+def test_scene_of_one_place_is_valid_json_and_of_none_is_not_drawn(paths: Any) -> None:
+    one, empty = (PointCloud(np.zeros((n, 3), dtype=np.float32)) for n in (1, 0))
     json.dumps(plot(Scene(np.eye(4), one, None, paths)), allow_nan=False)
-
-
-def test_scene_of_nothing_is_not_drawn() -> None:
-    empty = PointCloud(np.zeros((0, 3), dtype=np.float32))
-    assert plot_scene(Scene(np.eye(4), empty, None, (("path", np.zeros((3, 3))),))) is None
-
-
-def test_large_cloud_is_thinned_and_takes_few_bytes_per_point() -> None:
-    generator = np.random.default_rng(0)
-    rgb = generator.integers(0, 256, (50_000, 3), dtype=np.uint8)
-    cloud = PointCloud(generator.uniform(0, 50, (50_000, 3)).astype(np.float32), rgb=rgb)
-    scene = plot(Scene(np.eye(4), cloud), max_points=20_000)
-    points = len(unpack(scene["data"][0]["x"]))
-    assert 10_000 < points <= 20_000
-    # 12 bytes of position and three times 1 of colour, times 4/3 for base64; the scales are small.
-    assert len(json.dumps(scene)) < 20 * points + 50_000
+    assert plot_scene(Scene(np.eye(4), empty, None, paths)) is None
 
 
 def drive(angle_deg: float, length_m: float = 300.0) -> PointCloud:
@@ -187,6 +172,8 @@ def test_thinned_cloud_is_a_part_of_the_cloud_within_the_limit(
 
 def test_thinned_cloud_keeps_its_extent_and_most_of_what_it_may(cloud: PointCloud) -> None:
     thinned = thin_cloud(cloud, 500)
+    (trace,) = plot_scene(Scene(np.eye(4), cloud), 500)["data"]  # type: ignore[index]
+    assert len(unpack(trace["x"])) == len(thinned)
     # A cell may not be much larger than needed, or detail would be lost for nothing.
     assert 250 <= len(thinned) <= 500
     assert np.ptp(thinned.xyz, axis=0) == pytest.approx(np.ptp(cloud.xyz, axis=0), abs=1.0)

@@ -1,0 +1,294 @@
+"""Cut meshes meet without a gap, and the surface of a drive is built of such tiles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.commands.config import load_config
+from recon.core.errors import MeshingError, OutputError
+from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
+from recon.export.mesh.cut import (
+    Plane,
+    close_seam,
+    cut_mesh,
+    drop_small_components,
+    keep_vertices,
+    nearest_on_edges,
+    open_edges,
+    vertex_normals,
+)
+from recon.export.mesh.pieces import export_mesh
+from recon.export.mesh.poisson import MeshSettings
+from recon.io.models.mesh import read_mesh
+from recon.io.models.ply import write_ply
+from recon.map.tiles import Tiles
+from recon.run.directory import RunDirectory
+
+
+def sheet(seed: int, n: int = 24, shift_m: float = 0.0, noise_m: float = 0.0) -> TriangleMesh:
+    """A wavy sheet over [-1, 1]², triangles as its vertices were jittered; it faces up."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
+    x, y = (v + rng.uniform(-0.4 / n, 0.4 / n, v.shape) for v in (x, y))
+    z = 0.1 * np.sin(3 * x) * np.cos(4 * y) + shift_m + rng.normal(0, noise_m, x.shape)
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    around = (corner, corner + n, corner + n + 1), (corner, corner + n + 1, corner + 1)
+    faces = np.concatenate([np.stack(corners, axis=1) for corners in around])
+    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    rgb = np.repeat(np.uint8(127 + 120 * x.ravel()[:, None].clip(-1, 1)), 3, axis=1)
+    normals = np.tile(np.float32([0, 0, 1]), (n * n, 1))
+    return TriangleMesh(vertices, faces.astype(np.int32), normals, rgb)
+
+
+def ups(mesh: TriangleMesh) -> np.ndarray:
+    """The normals of the faces, twice as long as their areas."""
+    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
+
+
+def area_m2(mesh: TriangleMesh) -> float:
+    return float(np.linalg.norm(ups(mesh), axis=1).sum() / 2)
+
+
+@given(axis=st.integers(0, 1), at=st.floats(-0.9, 0.9), seed=st.integers(0, 5))
+def test_the_halves_are_the_whole(axis: int, at: float, seed: int) -> None:
+    mesh, plane = sheet(seed), Plane(axis, at)
+    halves = [cut_mesh(mesh, plane, keep_above=above) for above in (False, True)]
+    # float32 places new vertices to 1e-7 m.
+    assert sum(map(area_m2, halves)) == pytest.approx(area_m2(mesh), rel=1e-5)
+    assert halves[0].vertices[:, axis].max() == np.float32(at)
+    assert halves[1].vertices[:, axis].min() == np.float32(at)
+    for half in halves:
+        assert (ups(half)[:, 2] > -1e-9).all()
+        assert set(np.unique(half.faces)) == set(range(len(half.vertices)))
+    borders = [np.unique(open_edges(half, plane).reshape(-1, 3), axis=0) for half in halves]
+    np.testing.assert_array_equal(borders[0], borders[1])
+
+
+def test_new_vertices_have_normals_and_colours_between() -> None:
+    half = cut_mesh(sheet(0), Plane(0, 0.0), keep_above=True)
+    on_plane = half.vertices[:, 0] == 0
+    assert half.rgb is not None
+    assert half.normals is not None
+    assert np.abs(half.rgb[on_plane].astype(int) - 127).max() <= 12
+    np.testing.assert_allclose(np.linalg.norm(half.normals, axis=1), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_a_mesh_on_one_side_is_kept_or_dropped_whole(above: bool) -> None:
+    mesh = sheet(1)
+    kept = cut_mesh(mesh, Plane(0, -5.0 if above else 5.0), keep_above=above)
+    assert len(kept.faces) == len(mesh.faces)
+    assert len(cut_mesh(mesh, Plane(0, 5.0 if above else -5.0), keep_above=above).faces) == 0
+
+
+def gaps_m(one: TriangleMesh, other: TriangleMesh, plane: Plane) -> np.ndarray:
+    """How far points along each border are from the other border."""
+    borders, found = [open_edges(mesh, plane) for mesh in (one, other)], []
+    along = np.linspace(0, 1, 7, dtype=np.float32)[None, :, None]
+    for here, there in (borders, borders[::-1]):
+        points = here[:, :1] * (1 - along) + here[:, 1:] * along
+        found.append(nearest_on_edges(points.reshape(-1, 3), there).distance_m)
+    return np.concatenate(found)
+
+
+@pytest.mark.parametrize("n", [12, 24, 57])
+def test_a_seam_between_two_versions_of_a_surface_is_closed(n: int) -> None:
+    plane = Plane(0, 0.1)
+    left = cut_mesh(sheet(2), plane, keep_above=False)
+    right = cut_mesh(sheet(3, n, shift_m=0.02, noise_m=0.005), plane, keep_above=True)
+    assert gaps_m(left, right, plane).max() > 0.01
+    closed = close_seam(right, plane, open_edges(left, plane), 0.2)
+    # Both ends of the seam lie where the sheets end, up to 0.02 m apart.
+    assert gaps_m(_within(left, 0.9), _within(closed, 0.9), plane).max() < 1e-5
+    assert area_m2(closed) == pytest.approx(area_m2(right), rel=0.02)
+    assert (ups(closed)[:, 2] > -1e-9).all()
+
+
+def _within(mesh: TriangleMesh, y_m: float) -> TriangleMesh:
+    """The mesh between two planes across y."""
+    below = cut_mesh(mesh, Plane(1, y_m), keep_above=False)
+    return cut_mesh(below, Plane(1, -y_m), keep_above=True)
+
+
+def test_a_seam_whose_neighbour_is_far_stays_as_it_is() -> None:
+    plane = Plane(0, 0.0)
+    left = cut_mesh(sheet(2), plane, keep_above=False)
+    right = cut_mesh(sheet(3, shift_m=1.0), plane, keep_above=True)
+    closed = close_seam(right, plane, open_edges(left, plane), 0.2)
+    np.testing.assert_array_equal(closed.vertices, right.vertices)
+    np.testing.assert_array_equal(closed.faces, right.faces)
+
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32)
+HALVES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+
+
+def test_a_face_stays_only_with_all_its_vertices_and_in_a_large_component() -> None:
+    vertices, faces = keep_vertices(SQUARE, HALVES, np.array([True, False, True, True]))
+    np.testing.assert_array_equal(vertices, SQUARE[[0, 2, 3]])
+    np.testing.assert_array_equal(faces, [[0, 1, 2]])
+    both = np.concatenate([HALVES, [[4, 5, 6]]]).astype(np.int32)
+    kept, left = drop_small_components(np.concatenate([SQUARE, SQUARE[:3] + 10]), both, 2)
+    np.testing.assert_array_equal(kept, SQUARE)
+    np.testing.assert_array_equal(left, HALVES)
+    with pytest.raises(MeshingError, match="trimming left no face"):
+        drop_small_components(SQUARE, HALVES, 3)
+
+
+def test_normals_of_a_flat_square_are_its_normal_and_large_faces_weigh_more() -> None:
+    np.testing.assert_allclose(vertex_normals(SQUARE, HALVES), [[0, 0, 1]] * 4)
+    np.testing.assert_allclose(vertex_normals(SQUARE, HALVES[:, ::-1]), [[0, 0, -1]] * 4)
+    vertices = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, -1]], dtype=np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    # Areas 4.5 (normal z) and 1.5 (normal -x) at the shared vertices.
+    expected = np.array([-1.5, 0, 4.5]) / np.hypot(1.5, 4.5)
+    np.testing.assert_allclose(vertex_normals(vertices, faces)[0], expected, atol=1e-6)
+
+
+STEP_M = 0.1
+CONFIG = load_config(None, ["submaps.tile_m=6.4"])
+SETTINGS = MeshSettings(tile_m=8.0, trim_density_quantile=0.0)
+
+
+def street(seed: int = 0) -> PointCloud:
+    """A bumpy street from x = -2 to 11.5 m, 6 m wide, with a wall along it; 1 cm of noise."""
+    rng = np.random.default_rng(seed)
+    x, y = (axes.ravel() for axes in np.mgrid[-2:11.5:STEP_M, -3:3:STEP_M])
+    ground = np.stack([x, y, 0.1 * np.sin(x) + 0.05 * np.cos(2 * y)], axis=1)
+    along, up = (axes.ravel() for axes in np.mgrid[-2:11.5:STEP_M, 0.3:2.5:STEP_M])
+    wall = np.stack([along, np.full_like(along, 3.0), up], axis=1)
+    xyz = np.concatenate([ground, wall]) + rng.normal(0, 0.01, (len(ground) + len(wall), 3))
+    sizes = [len(ground), len(wall)]
+    normals = np.repeat([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], sizes, axis=0).astype(np.float32)
+    rgb = np.repeat([[90] * 3, [200] * 3], sizes, axis=0).astype(np.uint8)
+    return PointCloud(xyz.astype(np.float32), rgb, normals, frame="map")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, list[TriangleMesh]]:
+    """The mesh of the street, and its tiles."""
+    folder = tmp_path_factory.mktemp("street")
+    with pytest.MonkeyPatch.context() as patch:
+        overlap_less(patch)
+        whole, tiles, warnings = written(filled(), folder / "out", threads=1)
+    assert warnings == []
+    return whole, tiles
+
+
+def overlap_less(patch: pytest.MonkeyPatch) -> None:
+    """Let tiles overlap in the proportion of the pieces of 8 m, which are small."""
+    patch.setattr("recon.export.mesh.pieces.OVERLAP_M", 1.5)
+
+
+@pytest.fixture
+def store() -> Tiles:
+    return filled()
+
+
+def filled() -> Tiles:
+    store = Tiles(CONFIG, np.eye(4))
+    cloud = street()
+    # As from a drive: in pieces that do not know the tiles.
+    for part in np.array_split(np.arange(len(cloud)), 7):
+        store.put_cloud(cloud.select(part))
+    return store
+
+
+def written(
+    store: Tiles, folder: Path, settings: MeshSettings = SETTINGS, threads: int | None = None
+) -> tuple[TriangleMesh, list[TriangleMesh], list[str]]:
+    """The whole mesh, that of each tile, and the warnings."""
+    with RunDirectory(folder) as directory:
+        layer = directory.path("mesh/cloud.ply")
+        write_ply(layer, street())
+        found = export_mesh(store, settings, directory, layer, threads)
+        directory.write_json("run.json", {"files": directory.files()})
+    tiles = [read_mesh(path) for path in sorted((folder / "mesh" / "tiles").glob("*.ply"))]
+    return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)
+
+
+def test_tiles_lie_on_the_surface_and_are_the_whole(
+    made: tuple[TriangleMesh, list[TriangleMesh]],
+) -> None:
+    whole, tiles = made
+    assert len(tiles) == 2
+    assert sum(len(tile.faces) for tile in tiles) == len(whole.faces)
+    np.testing.assert_array_equal(whole.vertices, np.concatenate([t.vertices for t in tiles]))
+    # Within what was sampled; beyond it the surface goes on for two spacings, as it likes.
+    inside = (np.abs(whole.vertices[:, 1]) < 2.5) & (np.abs(whole.vertices[:, 0] - 5) < 6)
+    x, y, z = whole.vertices[inside].T
+    # Noise of 1 cm is smoothed; an octree cell of 0.1 m adds little on a bump of 1 m.
+    assert np.abs(z - 0.1 * np.sin(x) - 0.05 * np.cos(2 * y)).max() < 0.03
+    assert whole.rgb is not None
+    assert set(np.unique(whole.rgb)) >= {90, 200}
+
+
+def test_no_gap_is_left_where_tiles_meet(made: tuple[TriangleMesh, list[TriangleMesh]]) -> None:
+    distance_m = gaps_m(*made[1], Plane(0, 4.0))
+    assert len(distance_m) > 2 * 60 * 7
+    assert distance_m.max() < 0.1
+    assert np.percentile(distance_m, 95) < 1e-4
+
+
+def test_tiles_made_at_once_are_those_made_one_by_one(
+    made: tuple[TriangleMesh, list[TriangleMesh]],
+    store: Tiles,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    overlap_less(monkeypatch)
+    alone, together = made[0], written(store, tmp_path / "out", threads=3)[0]
+    np.testing.assert_array_equal(together.vertices, alone.vertices)
+    np.testing.assert_array_equal(together.faces, alone.faces)
+
+
+def test_a_target_is_that_of_all_tiles(store: Tiles, tmp_path: Path) -> None:
+    settings = SETTINGS.model_copy(update={"target_faces": 4000})
+    whole, _, _ = written(store, tmp_path / "out", settings)
+    assert 3000 < len(whole.faces) < 5000
+
+
+def test_what_hangs_where_cameras_looked_is_cut_off(store: Tiles, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    ball = rng.normal(0, 1, (3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    ghost = PointCloud(
+        (0.5 * ball + [1.0, 0.0, 1.6]).astype(np.float32),
+        rgb=np.full((3000, 3), 255, np.uint8),
+        normals=ball.astype(np.float32),
+        frame="map",
+    )
+    store.put_cloud(ghost)
+    cells = np.stack(np.meshgrid(*[np.arange(-8, 20)] * 2, np.arange(3, 13), indexing="ij"), -1)
+    free = cells.reshape(-1, 3).astype(np.int32)
+    store.put_voxels(OccupancyVoxels(free, np.full(len(free), -1, np.float32), 0.2))
+    kept = SETTINGS.model_copy(update={"free_space": False})
+    assert (written(store, tmp_path / "kept", kept)[0].vertices[:, 2] > 1.0).sum() > 500
+    whole = written(store, tmp_path / "cut")[0]
+    above = whole.vertices[(whole.vertices[:, 2] > 1.0) & (whole.vertices[:, 1] < 2.5)]
+    assert len(above) == 0
+
+
+def test_tiles_with_too_few_points_are_reported_in_one_line(store: Tiles, tmp_path: Path) -> None:
+    stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
+    cloud = street().select(np.arange(3))
+    store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
+    coarse = SETTINGS.model_copy(update={"max_depth": 5})
+    warnings = written(store, tmp_path / "out", coarse)[2]
+    assert len(warnings) == 1
+    assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")
+
+
+def test_a_store_without_a_surface_or_a_folder_is_an_error(store: Tiles, tmp_path: Path) -> None:
+    with pytest.raises(MeshingError, match="no part of the map gives a surface"):
+        written(Tiles(CONFIG, np.eye(4)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(OutputError):
+        written(store, tmp_path / "out")

@@ -1,0 +1,393 @@
+"""What figures show: their colours, lines, bars, limits and words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from recon.core.errors import ShapeError
+from recon.core.values import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    Disparity,
+    OccupancyGrid,
+    OccupancyTruth,
+    Reason,
+    RectifiedCamera,
+    RectifiedPair,
+    Trajectory,
+)
+from recon.core.values.arrays import Float64, UInt8
+from recon.evaluation.paper import ABSOLUTE, AS_PRINTED, CORRECTED, TITLES
+from recon.odometry.protocol import OdometryHealth
+from recon.report import (
+    audit_page,
+    calibration_page,
+    middlebury_page,
+    pair_page,
+    paper_page,
+    style,
+)
+from recon.report import drive_figures as figures
+from recon.report.page import timing_figure
+
+
+def picture(png: bytes) -> UInt8:
+    """The image in a PNG, at least 300 pixels wide to be readable, and not empty."""
+    assert png.startswith(b"\x89PNG")
+    found = cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_COLOR)
+    assert found.shape[1] > 300
+    assert found.std() > 1
+    return np.asarray(found, dtype=np.uint8)
+
+
+def colour(scale: str, place: int) -> np.ndarray:
+    """One of the 256 colours of a matplotlib colormap."""
+    return colormaps[scale](place, bytes=True)[:3]
+
+
+def test_colours_of_disparities_are_those_of_the_scale_and_near_is_red() -> None:
+    values = np.array([[0.0, 10.0, np.nan, -5.0, 99.0]], dtype=np.float32)
+    far, near, missing, below, above = style.colour_disparity(values, (0.0, 10.0))[0]
+    assert (far == below).all()
+    assert (near == above).all()
+    np.testing.assert_array_equal([far, near], [colour("turbo", 0), colour("turbo", 255)])
+    np.testing.assert_array_equal(missing, style.MISSING)
+    far, near = style.colour_disparity(np.array([[20.0, 85.0]]), (0.0, 100.0))[0].astype(int)
+    assert far[2] > far[0]
+    assert near[0] > near[2]
+
+
+def test_range_ignores_what_is_not_finite_and_is_never_empty() -> None:
+    assert style.value_range(np.array([np.nan, np.inf])) == (0.0, 1.0)
+    assert style.value_range(np.array([4.0, 4.0, np.nan])) == (4.0, 5.0)
+    assert style.value_range(np.arange(101.0)) == pytest.approx((1.0, 99.0))
+
+
+def test_errors_are_coloured_by_size_up_to_the_limit_and_no_confidence_as_missing() -> None:
+    wrong, other, missing, far = style.colour_error(np.array([[2.0, -2.0, np.nan, 9.0]]), 4.0)[0]
+    nothing, sure = style.colour_confidence(np.array([[0.0, 1.0]], dtype=np.float32))[0]
+    np.testing.assert_array_equal(wrong, other)
+    np.testing.assert_array_equal([missing, nothing], [style.MISSING] * 2)
+    np.testing.assert_array_equal([far, sure], [colour("RdYlBu_r", 255), colour("viridis", 255)])
+
+
+def test_each_reason_has_a_colour_and_a_label_of_its_own() -> None:
+    assert set(style.REASON_COLOURS) == set(style.REASON_LABELS) == set(Reason)
+    assert len(set(style.REASON_COLOURS.values())) == len(Reason)
+    assert len(set(style.REASON_LABELS.values())) == len(Reason)
+    colours = style.colour_reasons(np.array([list(Reason)], dtype=np.uint8))[0]
+    np.testing.assert_array_equal(colours, [style.REASON_COLOURS[reason] for reason in Reason])
+    with pytest.raises(ShapeError, match="reason code is unknown"):
+        style.colour_reasons(np.array([[len(Reason)]], dtype=np.uint8))
+
+
+def test_grid_is_drawn_with_its_largest_y_on_top() -> None:
+    grid = OccupancyGrid(np.array([[0, 100], [-1, -1]], dtype=np.int8), 1.0, (0.0, 0.0))
+    picture = style.colour_grid(grid)
+    np.testing.assert_array_equal(picture[0], [style.GRID_UNKNOWN] * 2)
+    np.testing.assert_array_equal(picture[1], [style.GRID_FREE, style.GRID_OCCUPIED])
+
+
+def test_each_cell_of_a_small_grid_is_large_enough_to_be_seen() -> None:
+    cells = np.array([[FREE, OCCUPIED], [OCCUPIED, FREE]], dtype=np.int8)
+    grid, seen = OccupancyGrid(cells, 0.2, (0.0, 0.0)), np.array([[True, True], [True, False]])
+    camera = RectifiedCamera(100.0, 49.5, 49.5, 49.5, 0.5, 100, 100)
+    nothing = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
+    truth = OccupancyTruth(grid, seen, *nothing, camera, np.eye(4)[None], 20.0, 3)
+    image = style.colour_grid_errors(grid, truth)
+    side = image.shape[0] // 2
+    assert side == 750
+    expected = style.colour_grid(grid)
+    expected[0, 1] = style.GRID_NOT_COUNTED
+    np.testing.assert_array_equal(image[::side, ::side], expected)
+
+
+@pytest.mark.parametrize("which", ["disparity", "nothing_found", "below zero"])
+def test_every_figure_of_a_pair_is_a_png(
+    which: str, pair: RectifiedPair, disparity: Disparity, nothing_found: Disparity
+) -> None:
+    """With doffs, disparities may be negative; they have no depth here, where doffs is 0."""
+    below = replace(disparity, values=disparity.values - 20)
+    shown = {"disparity": disparity, "nothing_found": nothing_found}.get(which, below)
+    found = pair_page.stereo_figures(pair, shown)
+    assert found.pop("wide")
+    assert found.pop("valid_percent") == 100 * shown.valid.mean()
+    for png in (*found.values(), pair_page.error_figure(shown.values)):
+        picture(png)
+
+
+def test_a_figure_shows_its_picture(pair: RectifiedPair, disparity: Disparity) -> None:
+    image = picture(pair_page.disparity_figure(disparity, pair.camera)).astype(int)
+    left, right = image[100, 20], image[100, -20]
+    assert left.max() < 40  # no match: almost black
+    assert right[2] > right[0] + 60  # near: red (OpenCV decodes to BGR)
+    assert [pair_page.is_wide((10, width, 3)) for width in (19, 20)] == [False, True]
+    assert [*disparity.reason_shares.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
+
+
+def test_depth_marks_are_round_inside_the_range_and_apart() -> None:
+    limits = (math.log(3.3), math.log(80.0))
+    marks = pair_page.depth_marks(3.3, 80.0, math.log, limits)
+    assert {5.0, 10.0, 20.0, 50.0} <= set(marks)
+    assert 3.3 <= min(marks) < max(marks) <= 80.0
+    # Room for a label.
+    assert (np.diff(np.log(marks)) / (limits[1] - limits[0])).min() >= 0.1
+    assert len(marks) >= 7
+
+
+def test_path_is_drawn_with_truth_drift_and_frames_that_are_not_trusted_or_without(
+    trajectory: Trajectory,
+    T_map_world: Float64,
+    health: list[OdometryHealth],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = figures.path_figure(trajectory, trajectory, T_map_world, health, 0.1)
+    picture(known)
+    assert known != figures.path_figure(trajectory, trajectory, T_map_world, health)
+    lines: list[list[str]] = []
+    keep = lambda drawn, *_: lines.append([look["label"] for _, look in drawn])  # noqa: E731
+    monkeypatch.setattr(figures, "top_view", keep)
+    figures.path_figure(trajectory, trajectory, T_map_world, health, 0.1)
+    figures.path_figure(trajectory, None, T_map_world)
+    given = ["truth", "estimate", "95 % (expected drift)", "not trusted (1)"]
+    assert lines == [given, ["estimate"]]
+
+
+@pytest.mark.parametrize("frames", [0, 1, 3])
+def test_path_of_any_length_is_drawn(frames: int, T_map_world: Float64) -> None:
+    path, longer = (
+        Trajectory(np.tile(np.eye(4), (n, 1, 1)), np.arange(float(n))) for n in (frames, frames + 1)
+    )
+    for png in (
+        figures.path_figure(path, path, T_map_world),
+        figures.drift_figure(path, path),
+        figures.drift_figure(longer, path),
+    ):
+        picture(png)
+
+
+def test_grid_is_drawn_with_and_without_path_and_without_any_known_cell(
+    grid: OccupancyGrid, trajectory: Trajectory, T_map_world: Float64
+) -> None:
+    path = figures.seen_from_above(trajectory, T_map_world)
+    np.testing.assert_array_equal(path, np.column_stack([np.arange(11), np.zeros(11)]))
+    unknown = OccupancyGrid(np.full((4, 5), -1, dtype=np.int8), 0.1, (0.0, 0.0))
+    for one, paths in ((grid, {"path": path}), (grid, {}), (unknown, {})):
+        picture(figures.grid_figure(one, paths))
+
+
+def test_health_and_times_are_drawn_whatever_was_measured() -> None:
+    measured = [OdometryHealth(9, 8, 0.2, 0.1)] * 5
+    for health in ([], [OdometryHealth()] * 3, [OdometryHealth(ok=False)], measured):
+        picture(figures.health_figure(health))
+    for stages in ({}, {"match": 0.0}, {"match": 3.2, "mesh": 1.1}):
+        picture(timing_figure(stages))
+
+
+@pytest.mark.parametrize(
+    ("target", "length"), [(34.0, 20.0), (0.7, 0.5), (1.0, 1.0), (99.9, 50.0), (5.0, 5.0)]
+)
+def test_scale_bar_has_a_round_length_that_fits(target: float, length: float) -> None:
+    assert figures.nice_length(target) == pytest.approx(length)
+
+
+def test_a_thinned_grid_keeps_its_obstacles_and_its_place() -> None:
+    cells = np.full((7, 10), UNKNOWN, np.int8)
+    cells[:3] = FREE
+    cells[1, 9] = cells[6, 0] = OCCUPIED
+    thinned = figures.thin_grid(OccupancyGrid(cells, 0.2, (-3.0, 4.0)), 4)
+    assert (thinned.resolution_m, thinned.origin_m) == (pytest.approx(0.6), (-3.0, 4.0))
+    expected = [[FREE, FREE, FREE, OCCUPIED], [UNKNOWN] * 4, [OCCUPIED, *[UNKNOWN] * 3]]
+    np.testing.assert_array_equal(thinned.cells, expected)
+    small = OccupancyGrid(np.zeros((3, 4), np.int8), 0.2, (0.0, 0.0))
+    assert figures.thin_grid(small, 4) is small
+
+
+def test_a_grid_is_cropped_to_its_known_cells_and_a_margin() -> None:
+    cells = np.full((60, 50), UNKNOWN, np.int8)
+    cells[20, 30] = cells[25, 33] = FREE
+    cropped = figures._crop_to_known(OccupancyGrid(cells, 0.5, (1.0, 2.0)))
+    assert cropped.cells.shape == (26, 24)
+    assert cropped.origin_m == (1.0 + 20 * 0.5, 2.0 + 10 * 0.5)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that are drawn; none becomes a PNG."""
+    found: list[Figure] = []
+    monkeypatch.setattr(style, "to_png", lambda figure: found.append(figure) or b"")
+    return found
+
+
+def legend(figure: Figure) -> list[str]:
+    (found,) = figure.legends
+    return [text.get_text() for text in found.get_texts()]
+
+
+def test_the_effect_of_the_patch_size_has_a_line_per_method(drawn: list[Figure]) -> None:
+    tried = [{"patch_px": px, "bad_percent": None, "valid_percent": 90.0} for px in (5, 9)]
+    tried = [{**one, "avgerr_px": one["patch_px"] / 10} for one in tried]
+    paper_page.patches_figure({CORRECTED: tried, AS_PRINTED: tried, ABSOLUTE: tried})
+    wrong, error, valid = drawn[0].axes
+    assert legend(drawn[0]) == [TITLES[name] for name in (CORRECTED, AS_PRINTED, ABSOLUTE)]
+    assert [len(line.get_xdata()) for line in wrong.lines] == [0, 0, 0]
+    assert wrong.texts[0].get_text() == "no truth to compare with"
+    np.testing.assert_array_equal(error.lines[1].get_xydata(), [[5, 0.5], [9, 0.9]])
+    assert not error.texts + valid.texts
+
+
+@pytest.mark.parametrize(("doffs_px", "curves"), [(0.0, 1), (20.0, 2)])
+def test_depth_falls_with_disparity_as_the_camera_says(
+    doffs_px: float, curves: int, drawn: list[Figure]
+) -> None:
+    camera = RectifiedCamera(500.0, 30.0, 20.0, 30.0 + doffs_px, 0.2, 60, 40, ndisp=80)
+    paper_page.depth_curve_figure(camera, np.linspace(10, 20, 101, dtype=np.float32))
+    (axes,) = drawn[0].axes
+    assert len(axes.lines) == curves
+    d, z = axes.lines[0].get_xydata().T
+    np.testing.assert_allclose(z, 100.0 / (d + doffs_px))
+    assert (d[0], d[-1], len(d)) == (0.2, 80.0, 400)
+    (span,) = axes.patches
+    assert (span.get_x(), span.get_width()) == pytest.approx((10.1, 9.8))
+
+
+def test_confidence_is_drawn_bin_by_bin_and_thin_bins_are_left_out(drawn: list[Figure]) -> None:
+    bins = {"confidence": [0.25, 0.75], "right": [None, 0.5], "share": [0.0005, 0.9995]}
+    steps = {"removed": [0, 0.5], "wrong": [0.2, 0.1], "best": [0.2, 0.0]}
+    curves = {"reliability": bins, "ece": 0.125, "sparsification": steps, "ause": 0.5}
+    middlebury_page.reliability_figure({"sad": curves, "sgm": curves})
+    middlebury_page.sparsification_figure({"sad": curves})
+    upper, lower = drawn[0].axes
+    np.testing.assert_array_equal(upper.lines[1].get_xydata(), [[0.75, 0.5]])
+    bars = [(bar.get_x(), bar.get_width()) for bar in lower.patches]
+    np.testing.assert_allclose(bars, [(x, 0.225) for x in (0.0125, 0.5125, 0.2625, 0.7625)])
+    left, best, _ = drawn[1].axes[0].lines
+    np.testing.assert_allclose(left.get_xydata(), [[0, 20], [50, 10]])
+    np.testing.assert_allclose(best.get_ydata(), [20, 0])
+    assert left.get_label() == "sad: AUSE 0.500"
+
+
+def test_points_lie_on_lines_of_their_colour_and_level_ones_are_rows_of_the_left(
+    drawn: list[Figure],
+) -> None:
+    images, pixels = [np.zeros((40, 60), np.uint8)] * 2, [np.array([[5.0, 7.0], [50.0, 30.0]])] * 2
+    lines = [[np.array([[0.0, 7.0], [59.0, 9.0]])] * 2] * 2
+    calibration_page.epipolar_pictures((images, pixels, lines), (images, pixels), ": view 3")
+    (raw, _), (_, level) = (figure.axes for figure in drawn)
+    assert raw.get_title(loc="left") == "Left, as recorded: view 3"
+    assert (raw.get_xlim(), raw.get_ylim()) == ((-0.5, 59.5), (39.5, -0.5))
+    np.testing.assert_array_equal(level.lines[2].get_xydata(), [[0, 30], [59, 30]])
+    for axes in (raw, level):
+        one, point, other, _ = axes.lines
+        np.testing.assert_array_equal(one.get_color(), point.get_color())
+        assert not np.array_equal(one.get_color(), other.get_color())
+    spread = calibration_page.spread_points(np.array([[0.0, y] for y in (9, 1, 5, 3, 7)]), 3)
+    assert spread.tolist() == [1, 2, 0]
+
+
+def test_each_view_of_a_calibration_has_its_error_and_corners(drawn: list[Figure]) -> None:
+    corners = SimpleNamespace(pixels=np.array([[1.0, 2.0], [3.0, 4.0]]))
+    views = [SimpleNamespace(name=name, seen=(corners, corners)) for name in ("a", "b")]
+    fit = SimpleNamespace(
+        views=views, dropped={"c": 9.0}, errors_px=np.array([[0.1, 0.2], [0.3, 0.4]]), rms_px=0.3
+    )
+    result: Any = SimpleNamespace(
+        fit=fit,
+        seen=SimpleNamespace(size_px=(80, 60)),
+        rows_px=np.linspace(-1, 1, 101),
+        summary={"coverage_left": 0.5, "coverage_right": 0.75},
+    )
+    calibration_page.errors_figure(result)
+    calibration_page.coverage_figure(result)
+    calibration_page.rows_figure(result)
+    errors, (_, right), rows = drawn[0].axes[0], drawn[1].axes, drawn[2].axes[0]
+    assert [bar.get_height() for bar in errors.patches] == [0.1, 0.3, 0.2, 0.4, 9.0]
+    middles = [bar.get_x() + bar.get_width() / 2 for bar in errors.patches]
+    np.testing.assert_allclose(middles, [-0.2, 0.8, 0.2, 1.2, 2.0])
+    assert right.get_title(loc="left") == "Right: 75 % of the cells"
+    assert (right.get_xlim(), right.get_ylim()) == ((-0.5, 79.5), (59.5, -0.5))
+    assert (right.get_xticks().tolist(), len(right.get_yticks())) == ([*range(10, 80, 10)], 5)
+    assert len(rows.patches) == 60
+    assert sum(bar.get_height() for bar in rows.patches) == pytest.approx(101, abs=2)
+
+
+class Points(SimpleNamespace):
+    def __len__(self) -> int:
+        return len(self.left_uv)
+
+
+def test_pairs_of_an_audit_are_drawn_by_frame(pair: RectifiedPair, drawn: list[Figure]) -> None:
+    def look(index: int, rows_px: list[float]) -> Any:
+        features = Points(left_uv=np.arange(2.0 * len(rows_px)).reshape(-1, 2))
+        return SimpleNamespace(
+            index=index, features=features, rows_px=np.array(rows_px),
+            brightness_dn=(90.0, 80.0 + index), sharpness=(0.5, 0.25),
+        )  # fmt: skip
+
+    looks = [look(0, [0.0, 1.0, 2.0]), look(4, [])]
+    audit_page.frames_figure(looks)
+    audit_page.rows_figure(look(2, [0.5, 9.0]), pair)
+    brightness, sharpness, rows = drawn[0].axes
+    np.testing.assert_array_equal(brightness.lines[1].get_xydata(), [[0, 80], [4, 84]])
+    assert (brightness.get_ylim(), sharpness.get_ylim()[0]) == ((0, 255), 0)
+    np.testing.assert_array_equal(rows.lines[0].get_xydata(), [[0, 1]])
+    arrows = drawn[1].axes[0].collections[0]
+    np.testing.assert_array_equal(arrows.V, [20 * 0.5])  # a wrong match is no arrow
+
+
+def test_frames_that_are_not_trusted_are_shaded(
+    trajectory: Trajectory, health: list[OdometryHealth], drawn: list[Figure]
+) -> None:
+    T = np.array(trajectory.T_world_camera)
+    T[:, 0, 3] = 0.1 * np.arange(11)
+    figures.health_figure(health)
+    figures.drift_figure(Trajectory(T, trajectory.timestamps_s), trajectory, health)
+    for axes in (*drawn[0].axes, *drawn[1].axes):
+        (span,) = axes.patches
+        assert (span.get_x(), span.get_width()) == (4.5, 1.0)
+    position, rotation = drawn[1].axes
+    np.testing.assert_allclose(position.lines[0].get_ydata(), 0.1 * np.arange(11))
+    assert rotation.lines[0].get_ydata().max() < 1e-6
+
+
+def test_lines_of_an_audit_say_what_is_not_known() -> None:
+    summary: dict[str, Any] = {
+        "frames": 40, "frames_read": 10, "repeated_frames": 2, "frozen_left_frames": 0,
+        "frozen_right_frames": 3, "usual_step_s": 0.1, "gaps": 1, "swapped_share": 0.25,
+        "lag_frames": 0, "time_skew_frames": -0.001, "gain": 1.5, "sharpness_left": 0.5,
+        "sharpness_right": None, "speed_m_per_s": 9.5, "focal_px": 700.0, "baseline_m": 0.5372,
+        "field_of_view_deg": 80.0, "depth_error_m": {"10": 0.0312, "30": 0.0042, "90": 3.0},
+        "disparity_5_50_95_px": [1.0, 5.0, 20.0],
+    }  # fmt: skip
+    lines = audit_page.audit_lines(summary)
+    assert lines == {
+        "frames": "40 at 10 Hz, 1 gap; 10 examined, 2 repeated, one camera frozen for 3",
+        "rows": "not known",
+        "left, right": "25 % of near features suggest swapped cameras",
+        "time": "right camera +0.00 frames late",
+        "brightness": "right / left 1.50",
+        "sharpness": "not known",
+        "disparities": "1.0 to 20.0 px (5 to 95 %), median 5.0 px",
+        "rig": "baseline 54 cm, f 700 px (80 deg wide), moving at 9.5 m/s",
+        "depth error": "3.1 cm at 10 m, 4.2 mm at 30 m, 3 m at 90 m",
+    }
+    off = {"value": -0.5, "sigma": 0.1}
+    motion = dict.fromkeys(("disparity_px", "focal_percent", "lens_px"), off)
+    summary |= {"rig_by_motion": {**motion, "depth_percent": {"10": 1.0}}, "lag_frames": 2}
+    mended = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
+    summary["mended"] = {**mended, "calibration": "new.yaml", "lenses_px": (0.5, 0.25)}
+    lines = audit_page.audit_lines(summary)
+    assert lines["time"] == "right camera +2 frames late"
+    assert "lack -0.50 ± 0.20 px (depth +1.0 % at 10 m)" in lines["by its motion"]
+    assert "by +0.100 deg pitch, -0.200 deg yaw, +0.000 deg roll" in lines["mended"]
+    assert lines["mended"].endswith("both lenses straightened, by 0.50 and 0.25 px (rms)")

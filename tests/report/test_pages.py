@@ -1,0 +1,426 @@
+"""A page is one file that loads nothing, shows text as text, and says all that a run has to say."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import json
+import re
+import sys
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import pytest
+from jinja2 import UndefinedError
+from PIL import Image
+from plotly.offline import get_plotlyjs
+
+from recon.core.values import Disparity, DisparityTruth, PointCloud, Reason, Trajectory
+from recon.evaluation.map_comparison import DriveErrors
+from recon.odometry.protocol import OdometryHealth
+from recon.report.map_page import map_content, write_joined_page, write_map_page
+from recon.report.page import (
+    command_line,
+    page_environment,
+    render_page,
+    summary_rows,
+)
+from recon.report.pair_page import pair_content, write_pair_page
+from recon.report.scene import Scene, plot_scene
+from recon.report.style import REASON_COLOURS
+from recon.run.directory import RunDirectory
+
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
+NASTY = "<script>alert('x')</script> & \"quoted\" {{ 1 + 1 }} {% raw %}"
+MAX_BYTES = 12e6
+LOADING = {"src", "href", "data", "action", "poster", "srcset", "xlink:href"}
+
+
+class Loads(HTMLParser):
+    """Collects what a page would load, its text, and the elements that stay open."""
+
+    VOID: ClassVar = frozenset({"meta", "img", "br", "wbr", "link", "input"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.tags: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.loads += [value or "" for name, value in attrs if name in LOADING]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def parse(page: str) -> Loads:
+    parser = Loads()
+    parser.feed(page)
+    parser.close()
+    return parser
+
+
+def blocks(page: str) -> dict[str, str]:
+    """The HTML of each block by its title."""
+    found = re.findall(
+        r"<figure class=\"block[^>]*>\s*<h3>(.*?)</h3>(.*?)</figure>", page, re.DOTALL
+    )
+    return {unescape(title): inside for title, inside in found}
+
+
+def images(page: str) -> set[str]:
+    """Titles of the blocks that are images."""
+    return {title for title, inside in blocks(page).items() if "<img" in inside}
+
+
+def key_figures(page: str) -> dict[str, str]:
+    """The key figures of a page."""
+    found = re.findall(r"<div><dt>(.*?)</dt><dd>(.*?)</dd></div>", page)
+    return {unescape(label): unescape(value) for label, value in found}
+
+
+def rows(block: str) -> list[tuple[str, ...]]:
+    """The cells of a table's body."""
+    body = re.findall(r"<tr>(.*?)</tr>", block.rpartition("<tbody>")[2], re.DOTALL)
+    cells = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL) for row in body]
+    return [tuple(unescape(cell.replace("<wbr>", "")) for cell in row) for row in cells]
+
+
+def map_html(run: SimpleNamespace) -> str:
+    content = map_content(run.map_, run.made, run.errors, run.sample)
+    return render_page("map", found=run.summary, warnings=run.summary["warnings"], **content)
+
+
+def pair_html(run: SimpleNamespace) -> str:
+    return render_page("pair", found=run.summary, warnings=run.warnings, **pair_content(run))  # type: ignore[arg-type]
+
+
+def png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+BLACK = png(np.zeros((2, 2, 3), np.uint8))
+
+
+def view(coloured: bool = False) -> dict[str, Any] | None:
+    rgb = np.eye(3, dtype=np.uint8) if coloured else None
+    return plot_scene(Scene(np.eye(4), PointCloud(np.eye(3, dtype=np.float32), rgb=rgb)))
+
+
+def audit_page(text: str = "plain", **changes: Any) -> str:
+    """A page with a text in every place that can be foreign."""
+    pair = {"index": 3, "images": BLACK, "rows": None, "disparity": BLACK, "wide": True}
+    content = {
+        "source": SimpleNamespace(name=f"Source {text}", description=f"Description {text}"),
+        "lines": {"frames": f"Frames {text}", f"Check {text}": f"Cell {text}"},
+        "found": {"baseline_m": 0.5, "row_error_rms_px": None, "depth_error_m": None},
+        "frames": None,
+        "pairs": [{**pair, "valid_percent": 75.0}],
+        "warnings": [f"Warning {text}"],
+        "verdict": f"Word {text}",
+        "command": f"recon {text}",
+        "config": f"key: {text}",
+        "versions": {f"Package {text}": f"Version {text}"},
+    }
+    return render_page("audit", **{**content, **changes})
+
+
+def scene_page(plot: dict[str, Any] | None, times: int = 1) -> str:
+    """A page with the same view several times."""
+    calls = "{{ scene('In 3-D', plot, 'caption') }}" * times
+    template = (
+        '{% extends "page.html.j2" %}{% from "parts.html.j2" import scene, section %}'
+        "{% block body %}{% call section('S') %}" + calls + "{% endcall %}{% endblock %}"
+    )
+    return page_environment().from_string(template).render(plot=plot)
+
+
+def embedded(image: np.ndarray) -> tuple[str, np.ndarray]:
+    """Kind and pixels of an image in a page."""
+    page = audit_page(frames=png(image))
+    (kind, data), *_ = re.findall(r'src="data:image/(\w+);base64,([^"]+)"', page)
+    with Image.open(io.BytesIO(base64.b64decode(data))) as found:
+        return kind, np.asarray(found.convert("RGB"))
+
+
+def test_an_image_is_packed_where_that_makes_it_smaller() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    kind, pixels = embedded(noise)
+    assert (kind, pixels.shape) == ("webp", noise.shape)
+    kind, pixels = embedded(np.zeros((1, 1, 3), np.uint8))
+    np.testing.assert_array_equal(pixels, 0)
+    assert kind in {"png", "webp"}
+
+
+def test_report_loads_nothing_from_outside_and_the_browser_would_refuse_it() -> None:
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', audit_page())
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    for page in (audit_page(), scene_page(view())):
+        assert all(target.startswith(("data:", "#")) for target in parse(page).loads)
+        assert "link" not in parse(page).tags
+        assert not re.search(r"@import|url\(", page)
+        assert not re.search(r"https?://", page)
+
+
+def test_all_text_is_escaped_and_every_element_closed() -> None:
+    page, plain = parse(audit_page(NASTY)), parse(audit_page())
+    assert page.open == []
+    assert page.tags == plain.tags
+    parts = ("Source", "Description", "Frames", "Check", "Cell", "Warning", "Word", "Package")
+    for part in (*parts, "Version", "recon", "key:"):
+        assert f"{part} {NASTY}" in page.text
+        assert f"{part} plain" in plain.text
+
+
+def test_warnings_come_before_all_figures() -> None:
+    page = audit_page()
+    assert 0 < page.index("Warning plain") < page.index("<dt>Baseline") < page.index("<img")
+    assert "No warnings" in audit_page(warnings=(), verdict="")
+    assert "2 warnings" in audit_page(warnings=("a", "b"), verdict="")
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        ({"warnings": (), "verdict": ""}, "good"),
+        ({"warnings": ("w",), "verdict": ""}, "warn"),
+        ({"warnings": ("w",), "verdict": "usable"}, "warn"),
+        ({"warnings": ("w",), "verdict": "good", "sound": True}, "good"),
+    ],
+)
+def test_only_what_is_wrong_is_alarming(content: dict[str, Any], kind: str) -> None:
+    page = audit_page(**content)
+    assert f'class="notice {kind}"' in page
+    assert ('role="alert"' in page) == (kind == "warn")
+
+
+def test_text_in_a_scene_cannot_end_its_script() -> None:
+    plot = {"data": [{"name": "</script><b>"}], "layout": {}}
+    page = scene_page(plot)
+    assert "</script><b>" not in page
+    assert parse(page).open == []
+    (packed,) = re.findall(r'<script type="application/json">(.*?)</script>', page)
+    assert json.loads(packed) == plot
+
+
+def test_plotly_travels_once_compressed_and_only_with_a_scene() -> None:
+    page = scene_page(view(), times=2)
+    assert page.count('<div class="scene">') == 2
+    packed = re.findall(r'<script type="text/plain" id="plotly">([^<]*)</script>', page)
+    assert len(packed) == 1
+    assert gzip.decompress(base64.b64decode(packed[0])).decode() == get_plotlyjs()
+    without = audit_page()
+    assert 'id="plotly"' not in without
+    assert len(without) < 20_000
+
+
+def test_colourings_of_a_scene_get_a_button_each_where_there_is_a_choice() -> None:
+    page = scene_page(view(coloured=True))
+    assert re.findall(r"<button[^>]*>(\w+)</button>", page) == ["image", "height"]
+    assert "</button>" not in scene_page(view())
+    # A scene of nothing is left out, and with it its section.
+    assert not re.search("In 3-D|#section-", scene_page(None))
+
+
+def test_contents_name_the_sections_and_long_names_are_broken_between_words() -> None:
+    page = audit_page(lines={"frames": "1", "trajectory.ate_max_m": "0.05"})
+    sections = [("1", "Measured"), ("2", "Pair 3")]
+    assert re.findall(r'<a href="#section-(\d)">([^<]+)</a>', page) == sections
+    assert re.findall(r'<section id="section-(\d)">\s*<h2>([^<]+)', page) == sections
+    assert "trajectory.<wbr>ate_<wbr>max_<wbr>m</th><td>0.05</td>" in page
+    with pytest.raises(UndefinedError):
+        render_page("audit")
+
+
+def test_figures_of_each_part_are_rows_of_their_own() -> None:
+    found: dict[str, Any] = {"by_length": [{"length_m": 50.0, "segments": 15}]}
+    found |= {"views_dropped": [], "stages": {"match": 1.0}, "nested": {"a": [1, None]}}
+    assert summary_rows(found) == [
+        ("by_length.0.length_m", "50 m"),
+        ("by_length.0.segments", "15"),
+        ("views_dropped", "none"),
+        ("nested.a", "1, –"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("program", "line"),
+    [
+        ("bin/recon", "recon map 'a b'"),
+        ("site-packages/recon/__main__.py", "recon map 'a b'"),
+        ("other.py", ""),
+    ],
+)
+def test_report_names_the_command_that_made_it_and_no_other_program(
+    program: str, line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", [program, "map", "a b"])
+    assert command_line() == line
+
+
+def test_page_of_a_drive_shows_all_that_the_run_has(drive: SimpleNamespace) -> None:
+    page = map_html(drive)
+    assert images(page) == {
+        "Occupancy grid", "Path from above", "Error along the path", "Health of the odometry",
+        "Input pair", "Disparity", "Depth", "Why pixels have no disparity", "Confidence",
+        "Time by stage",
+    }  # fmt: skip
+    assert key_figures(page) == {
+        "Path": "10.0 m", "Drift (t_rel)": "0.62 %", "Position error (ATE)": "0.41 m",
+        "Frames not trusted": "1 of 11", "Mapping rate": "4.2 fps", "Points in the map": "2,000",
+    }  # fmt: skip
+    shown = blocks(page)
+    assert '<div class="scene">' in shown["In 3-D"]
+    table = rows(shown["All figures"])
+    assert {("nested.a", "1, –"), ("fps", "4.25 frames/s")} <= set(table)
+    assert ("segments", "3 of 5 m") in rows(shown["Path against truth"])
+    assert "Stereo, frame 7" in page
+    assert 1e5 < len(page.encode()) < MAX_BYTES
+
+
+def test_page_of_a_pair_shows_all_that_the_run_has(view: SimpleNamespace) -> None:
+    page = pair_html(view)
+    shown = blocks(page)
+    assert {"Input pair", "Disparity", "Disparity error", "In 3-D"} <= shown.keys()
+    assert ("pixels compared", "1,440") in rows(shown["Disparity against truth"])
+    figures = key_figures(page)
+    assert figures["Pixels with a disparity"] == "75.0 %"
+    assert figures["Bad 2: off by more than 2 px"] == "10.0 %"
+    assert figures["Points"] == "2,000"
+    assert len(page.encode()) < MAX_BYTES
+    assert "baseline 0.5 m" in page
+    view.summary["up_to_scale"] = True
+    assert "every m in this report is one baseline" in pair_html(view)
+
+
+def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
+    drive: SimpleNamespace,
+) -> None:
+    session, figures = drive.map_.first, {"found": 3, "keyframes": 11, "largest_correction_m": 2.5}
+    session.loops = {"closed": [{"first": 0, "last": 9}]}
+    drive.summary["loops"] = {**figures, "closed": 1}
+    page = map_html(drive)
+    assert key_figures(page)["Loops closed, path moved by"] == "1 of 3, 2.50 m"
+    assert "1 loop closed, with 11 keyframes" in blocks(page)["Loops"]
+    session.loops = {"closed": []}
+    drive.summary["loops"] = {**figures, "closed": 0, "largest_correction_m": 0.0}
+    page = map_html(drive)
+    assert key_figures(page)["Loops closed, path moved by"] == "0 of 3, 0.00 m"
+    assert "Loops" not in blocks(page)
+
+
+def test_notes_of_the_odometry_are_listed_by_frame(drive: SimpleNamespace) -> None:
+    assert rows(blocks(map_html(drive))["Notes of the odometry"]) == [("5", "too few <tracks>")]
+    poses = np.tile(np.eye(4), (23, 1, 1))
+    drive.map_.first.trajectory = Trajectory(poses, np.arange(23.0))
+    drive.map_.first.health = [OdometryHealth(ok=False)] * 23
+    notes = blocks(map_html(drive))["Notes of the odometry"]
+    assert len(rows(notes)) == 20
+    assert "The first 20 of 23." in notes
+
+
+def test_a_map_compared_with_the_truth_is_tabulated(drive: SimpleNamespace) -> None:
+    cells = {"precision": 0.75, "recall": 0.5, "iou_occupied": None, "iou_free": 0.25}
+    part = cells | {"occupied_called_free": 0.125}
+    kinds = ("voxels", "grid", "voxels_exact", "grid_exact")
+    found = {**dict.fromkeys(kinds, part), "least_frames": 3, "resolution_m": 0.2}
+    drive.summary["occupancy"] = found
+    table = blocks(map_html(drive))["Occupancy against truth"]
+    assert "at least 3 frames saw, in cells of 0.2 m" in table
+    assert rows(table)[0] == ("occupied voxels, precision", "0.750", "0.750")
+    assert rows(table)[2][1:] == ("–", "–")
+
+
+def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> None:
+    plot: dict[str, Any] = map_content(drive.map_, drive.made, drive.errors, drive.sample)["view"]
+    assert [trace["name"] for trace in plot["data"]][-2:] == ["path", "true path"]
+    low, high = plot["layout"]["scene"]["xaxis"]["range"]
+    # Both run from 0 to 10 m forward in map axes.
+    assert low == pytest.approx(0.0, abs=0.3)
+    assert high == pytest.approx(10.0, abs=0.3)
+
+
+def test_page_of_a_drive_with_nothing_but_path_and_grid_is_made(drive: SimpleNamespace) -> None:
+    drive.errors, drive.made.cloud, drive.made.mesh = DriveErrors(None, None, None), None, None
+    drive.summary, drive.map_.first.health = {"source": "drive", "warnings": []}, ()
+    page = map_html(drive)
+    assert "Path from above" in blocks(page)
+    assert not {"In 3-D", "Notes of the odometry"} & blocks(page).keys()
+
+
+def test_page_of_a_pair_with_truth_of_another_size_or_without_any_disparity_is_made(
+    view: SimpleNamespace, nothing_found: Disparity
+) -> None:
+    half = view.disparity.values[::2, ::2].copy()
+    view.truth = DisparityTruth(half, np.isfinite(half))
+    assert "Disparity error" not in blocks(pair_html(view))
+    view.disparity, view.cloud = nothing_found, PointCloud(np.zeros((0, 3), dtype=np.float32))
+    view.truth = view.metrics = None
+    page = pair_html(view)
+    assert key_figures(page)["Pixels with a disparity"] == "0.0 %"
+    assert "Against the truth" not in page
+    assert "In 3-D" not in page
+
+
+def test_runs_leave_their_pages_and_images(
+    drive: SimpleNamespace, view: SimpleNamespace, tmp_path: Path
+) -> None:
+    for name, write in (
+        ("drive", lambda run: write_map_page(**vars(drive), run=run)),
+        ("pair", lambda run: write_pair_page(view, run)),
+    ):
+        with RunDirectory(tmp_path / name) as directory:
+            directory.path("config.yaml").write_text("rectification: <b>\n")
+            write(directory)
+            directory.write_json("run.json", {})
+    page = (tmp_path / "drive/report.html").read_text(encoding="utf-8")
+    assert re.search("Map of drive &lt;1&gt;(?s:.*)frame 5: lost(?s:.*)Versions", page)
+    assert "<pre>rectification: &lt;b&gt;\n</pre>" in page
+    page = (tmp_path / "pair/report.html").read_text(encoding="utf-8")
+    assert re.search("Stereo pair im0.png(?s:.*)a warning", page)
+    folder = tmp_path / "pair/disparity"
+    names = {"disparity_colour.png", "confidence_colour.png", "reason_colour.png"}
+    assert {path.name for path in folder.iterdir()} == names
+    reasons = cv2.imread(str(folder / "reason_colour.png"))[:, :, ::-1]
+    np.testing.assert_array_equal(reasons[0, 0], REASON_COLOURS[Reason.BORDER])
+
+
+def test_drives_of_a_merged_map_are_named_in_its_page(
+    drive: SimpleNamespace, trajectory: Trajectory, tmp_path: Path
+) -> None:
+    drive.map_.paths = {0: trajectory, 2: trajectory}
+    sessions = [
+        {"number": n, "name": f"drive {n}", "frames": 11, "frames_placed": 10, "length_m": 10.0,
+         "positions": 0, "linked": n != 1}
+        for n in range(3)
+    ]  # fmt: skip
+    summary = drive.summary | {"frames": 22, "path_length_m": 20.0, "sessions": sessions}
+    summary |= {"links": {"count": 4, "refused": 1, "pairs": {"0-2": 4}}, "points_removed": 3}
+    summary |= {"positions_misfit_rms_m": None, "seconds": 1.0, "peak_memory_mb": 9.0}
+    with RunDirectory(tmp_path / "run") as directory:
+        write_joined_page(drive.map_, drive.made, summary, directory)
+        directory.write_json("run.json", {})
+    page = (tmp_path / "run/report.html").read_text(encoding="utf-8")
+    assert "Map of 3 drives" in page
+    assert key_figures(page)["Drives in the map"] == "2 of 3"
+    assert rows(blocks(page)["Sessions"])[1] == ("1", "drive 1", "11", "10", "10.0", "0", "no")
+    assert "1 more contradict" in blocks(page)["Places that two drives saw"]
+    assert "session 2" in blocks(page)["In 3-D"]
