@@ -46,6 +46,7 @@ KINDS: Final = (
 )
 """The most distinctive first: what `recon capture` wrote is listed in a file, and may look like
 others."""
+_NAMELESS: Final = frozenset({"kitti", "kitti-raw", "middlebury"})  # their layouts name the cameras
 
 
 def open_source(
@@ -66,6 +67,9 @@ def open_source(
         opening = {row.name: row.open for row in KINDS}
         if kind not in opening:
             raise SourceError("unknown kind of source", got=kind, expected=", ".join(opening))
+        if kind in _NAMELESS:
+            hint = "leave it out; --source folders takes image folders of any name"
+            settings.refuse_names(("left", "right"), path, hint)
         return opening[kind](Path(path), settings)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -9,6 +10,7 @@ from pydantic import Field
 
 from recon.core.errors import SourceError
 from recon.core.settings import Settings
+from recon.io.files import StrPath
 from recon.io.images.image import MAX_MEGAPIXELS
 
 
@@ -69,6 +71,13 @@ class SourceSettings(Settings):
                 hint="name them with --left and --right, or neither",
             )
         return folder / self.left, folder / self.right
+
+    def refuse_names(self, sides: Sequence[str], where: StrPath, hint: str) -> None:
+        """Refuse names of cameras where the layout of the source leaves nothing to name."""
+        named = [f"--{side} {name}" for side in sides if (name := getattr(self, side)) is not None]
+        if named:
+            what = "camera of this source cannot be named"
+            raise SourceError(what, where=where, got=" ".join(named), hint=hint)
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -146,6 +146,7 @@ def split_views(image: UInt8, settings: SourceSettings) -> tuple[UInt8, UInt8]:
 
 def _find_videos(path: Path, settings: SourceSettings) -> list[Path]:
     if path.is_file():
+        settings.refuse_names(("left",), path, "leave it out; SOURCE is the left video")
         return [path] if settings.right is None else [path, Path(settings.right)]
     if not path.is_dir():
         raise SourceError("file does not exist", where=path)

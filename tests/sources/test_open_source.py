@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from recon.io.images.image import write_image
 from recon.sources.one_pair import read_pair, read_pair_input
 from recon.sources.registry import open_source, recognise_source
 from recon.sources.settings import SourceSettings
+from tests.hostile.refusals import assert_refused, run
+from tests.sources.drives import CAMERA, write_calib, write_video
 
 KITTI = "P0: 700 0 16 0 0 700 8 0 0 0 1 0\nP1: 700 0 16 -350 0 700 8 0 0 0 1 0\n"
 MIDDLEBURY = (
@@ -54,6 +57,22 @@ def test_a_kind_is_recognised_or_named(tmp_path: Path, kind: str, make: type) ->
         assert folder / "calib.txt" in source.files
         assert len(source) == len(list(source)) == 1
         assert repr(source) == f"{type(source).__name__}(folder, pairs: 1, {source.description})"
+
+
+def make_video(folder: Path) -> Path:
+    write_calib(folder, CAMERA)
+    return write_video(folder / "left.avi", [image(64)] * 3)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("make", [make_kitti, make_middlebury, make_video])
+def test_a_name_of_a_camera_where_nothing_is_named_is_refused(
+    tmp_path: Path, make: Callable[[Path], Path], side: str
+) -> None:
+    path = make(tmp_path / "in")
+    ended = run("map", path, f"--{side}", "X", "--out", tmp_path / "out")
+    found = "X: file does not exist" if make is make_video else f"got --{side} X); leave it out"
+    assert_refused(ended, found if side == "right" else f"got --{side} X); leave it out")
 
 
 def test_a_middlebury_scene_has_its_geometry_one_frame_and_no_path(tmp_path: Path) -> None:
