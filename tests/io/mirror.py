@@ -11,25 +11,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 @dataclass
 class Mirror:
-    """What is served, and how.
+    """What is served, and how."""
 
-    Attributes:
-        files: Content by path, such as ``/a.zip``.
-        break_after: Bytes after which each connection is closed; None = never.
-        ranges: Whether a part of a file can be asked for.
-        claimed: Size that is claimed instead of the real one; None = no size at all.
-        redirect: Where every path without it in front leads to; "" = nowhere.
-        busy: Answers with 503 before the first that is not.
-        asked: The Range of every request for a file, "" = none.
-    """
-
-    files: dict[str, bytes] = field(default_factory=dict)
-    break_after: int | None = None
-    ranges: bool = True
-    claimed: int | None = -1
-    redirect: str = ""
-    busy: int = 0
-    asked: list[str] = field(default_factory=list)
+    files: dict[str, bytes] = field(default_factory=dict)  # content by path, such as ``/a.zip``
+    break_after: int | None = None  # bytes after which each connection is closed
+    ranges: bool = True  # whether a part of a file can be asked for
+    claimed: int | None = -1  # the size that is claimed; -1 = the real one, None = none at all
+    redirect: str = ""  # where every path without it in front leads to
+    busy: int = 0  # answers with 503 before the first that is not
+    asked: list[str] = field(default_factory=list)  # the Range of every request, "" = none
     address: str = ""
 
 
@@ -81,9 +71,8 @@ def handler_of(mirror: Mirror) -> type[BaseHTTPRequestHandler]:
             if mirror.ranges and asked and self.headers.get("If-Range") == tag:
                 begin = int(asked.removeprefix("bytes=").removesuffix("-"))
                 self.send_response(206)
-                self.send_header(
-                    "Content-Range", f"bytes {begin}-{len(content) - 1}/{len(content)}"
-                )
+                parts = f"bytes {begin}-{len(content) - 1}/{len(content)}"
+                self.send_header("Content-Range", parts)
             else:
                 self.send_response(200)
             if mirror.claimed is not None:

@@ -6,7 +6,7 @@ import io
 import stat
 import tarfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,124 +22,103 @@ CONTENT = np.random.default_rng(0).bytes(3_500_000)
 SIZE = len(CONTENT)
 
 
-@pytest.fixture(autouse=True)
-def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PAUSE_S", 0.0)
+Fetch = Callable[..., Path]
 
 
 @pytest.fixture
-def mirror() -> Iterator[Mirror]:
+def mirror(monkeypatch: pytest.MonkeyPatch) -> Iterator[Mirror]:
+    monkeypatch.setattr(module, "_PAUSE_S", 0.0)
     with serving(Mirror({"/a.zip": CONTENT})) as served:
         yield served
+
+
+@pytest.fixture
+def fetch(mirror: Mirror, tmp_path: Path) -> Fetch:
+    """Download ``a.zip``, or what has that name, into a folder of its own."""
+
+    def fetch(
+        size: int | None = SIZE, on_bytes: OnBytes = lambda *_: None, name: str = "a.zip"
+    ) -> Path:
+        download(f"{mirror.address}/{name}", tmp_path / "a.zip", size, on_bytes)
+        return tmp_path / "a.zip"
+
+    return fetch
 
 
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_a_download_is_what_the_server_has(mirror: Mirror, tmp_path: Path) -> None:
+def test_a_download_is_what_the_server_has(mirror: Mirror, fetch: Fetch) -> None:
     told: list[tuple[int, int | None]] = []
     mirror.redirect, mirror.busy = f"{mirror.address}/moved", 3
-    download(f"{mirror.address}/a.zip", tmp_path / "a.zip", None, lambda *now: told.append(now))
-    assert (tmp_path / "a.zip").read_bytes() == CONTENT
-    assert names(tmp_path) == {"a.zip"}
+    path = fetch(None, lambda *now: told.append(now))
+    assert path.read_bytes() == CONTENT
+    assert names(path.parent) == {"a.zip"}
     assert told[-1] == (SIZE, SIZE)
 
 
-def test_a_connection_that_breaks_off_goes_on_where_it_was(mirror: Mirror, tmp_path: Path) -> None:
+def test_a_connection_that_breaks_off_goes_on_where_it_was(mirror: Mirror, fetch: Fetch) -> None:
     mirror.break_after = 1_200_000
-    download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-    assert (tmp_path / "a.zip").read_bytes() == CONTENT
+    assert fetch().read_bytes() == CONTENT
     assert mirror.asked == ["", "bytes=1199999-", "bytes=2399998-"]
 
 
-def interrupt_at(size: int) -> OnBytes:
-    def on_bytes(done: int, total: int | None) -> None:
+# A file that is complete is not received again.
+@pytest.mark.parametrize(("size", "asked"), [(1_500_000, 1_999_999), (SIZE, SIZE - 1)])
+def test_a_later_call_goes_on_where_an_earlier_one_broke_off(
+    mirror: Mirror, tmp_path: Path, fetch: Fetch, size: int, asked: int
+) -> None:
+    def interrupt(done: int, total: int | None) -> None:
         if done >= size:
             raise KeyboardInterrupt
 
-    return on_bytes
-
-
-def test_a_later_call_goes_on_where_an_earlier_one_broke_off(
-    mirror: Mirror, tmp_path: Path
-) -> None:
     with pytest.raises(KeyboardInterrupt):
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE, interrupt_at(1_500_000))
-    assert "a.zip" not in names(tmp_path)
-    download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-    assert (tmp_path / "a.zip").read_bytes() == CONTENT
-    assert mirror.asked == ["", "bytes=1999999-"]
+        fetch(on_bytes=interrupt)
+    assert names(tmp_path) == {"a.zip.part", "a.zip.part.version"}
+    assert fetch().read_bytes() == CONTENT
+    assert mirror.asked == ["", f"bytes={asked}-"]
 
 
 @pytest.mark.parametrize("change", ["no ranges", "another file"])
 def test_a_download_begins_anew_where_it_cannot_go_on(
-    mirror: Mirror, tmp_path: Path, change: str
+    mirror: Mirror, tmp_path: Path, fetch: Fetch, change: str
 ) -> None:
-    mirror.break_after = 1_000_000
-    with pytest.raises(DownloadError):
-        download(f"{mirror.address}/b.zip", tmp_path / "a.zip")
     (tmp_path / "a.zip.part").write_bytes(b"x" * 1000)
     (tmp_path / "a.zip.part.version").write_text('"old"')
-    mirror.break_after = None
     mirror.ranges = change == "another file"
-    download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-    assert (tmp_path / "a.zip").read_bytes() == CONTENT
-    assert mirror.asked[-1] == "bytes=999-"
+    assert fetch().read_bytes() == CONTENT
+    assert mirror.asked == ["bytes=999-"]
 
 
-def test_a_server_that_always_breaks_off_is_given_up(mirror: Mirror, tmp_path: Path) -> None:
-    mirror.break_after = 0
-    with pytest.raises(DownloadError, match=r"again and again .*0 of 3500000 bytes") as told:
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-    assert "goes on from there" in str(told.value)
-    assert len(mirror.asked) == 5
-
-
-@pytest.mark.parametrize("target", ["file:///etc/hostname?", "ftp://127.0.0.1", "gopher://x"])
-def test_a_redirection_to_anything_but_http_is_refused(
-    mirror: Mirror, tmp_path: Path, target: str
+@pytest.mark.parametrize(
+    ("how", "name", "message", "asked"),
+    [
+        ({"break_after": 0}, "a.zip", r"again and again .*0 of 3500000 bytes.*goes on from", 5),
+        ({"redirect": "file:///etc/hostname?"}, "a.zip", "is not allowed", 1),
+        ({"redirect": "ftp://127.0.0.1"}, "a.zip", "not encrypted", 1),
+        ({"claimed": 5_000_000}, "a.zip", r"another file than .*expected 3500000 bytes", 1),
+        ({"claimed": 1_000_000}, "a.zip", r"another file than .*expected 3500000 bytes", 1),
+        ({}, "b.zip", r"refuses the file .*404", 1),
+    ],
+)
+def test_a_server_that_does_not_give_the_file_is_one_line(
+    mirror: Mirror, fetch: Fetch, how: dict[str, object], name: str, message: str, asked: int
 ) -> None:
-    mirror.redirect = target
-    with pytest.raises(DownloadError):
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-    assert "a.zip" not in names(tmp_path)
+    vars(mirror).update(how)
+    with pytest.raises(DownloadError, match=message):
+        fetch(name=name)
+    assert len(mirror.asked) == asked
 
 
-def test_a_file_that_is_complete_is_not_received_again(mirror: Mirror, tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE, interrupt_at(SIZE))
-    assert names(tmp_path) == {"a.zip.part", "a.zip.part.version"}
-    download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-    assert (tmp_path / "a.zip").read_bytes() == CONTENT
-    assert mirror.asked[-1] == f"bytes={SIZE - 1}-"
-
-
-@pytest.mark.parametrize("claimed", [None, 5_000_000, 1_000_000])
-def test_lies_about_the_size_give_one_line(
-    mirror: Mirror, tmp_path: Path, claimed: int | None
+def test_a_size_that_is_not_said_is_no_lie_but_more_than_promised_is(
+    mirror: Mirror, tmp_path: Path, fetch: Fetch
 ) -> None:
-    mirror.claimed = claimed
-    if claimed is None:  # no size at all is no lie
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-        assert (tmp_path / "a.zip").read_bytes() == CONTENT
-        return
-    with pytest.raises(DownloadError, match=r"another file than .*expected 3500000 bytes"):
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
-    assert "a.zip" not in names(tmp_path)
-
-
-def test_more_than_was_promised_is_not_received(mirror: Mirror, tmp_path: Path) -> None:
     mirror.claimed = None
     with pytest.raises(DownloadError, match="sends more than it said"):
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", 1_000_000)
+        fetch(1_000_000)
     assert names(tmp_path) == set()
-
-
-def test_a_file_that_is_not_there_is_one_line(mirror: Mirror, tmp_path: Path) -> None:
-    with pytest.raises(DownloadError, match=r"refuses the file .*404"):
-        download(f"{mirror.address}/b.zip", tmp_path / "b.zip")
-    assert len(mirror.asked) == 1
+    assert fetch().read_bytes() == CONTENT
 
 
 @pytest.mark.parametrize("address", ["file:///etc/hostname", "a.zip", "ftp://127.0.0.1/a"])
@@ -148,12 +127,10 @@ def test_other_addresses_are_refused(tmp_path: Path, address: str) -> None:
         download(address, tmp_path / "a")
 
 
-def test_a_full_disk_is_one_line(
-    mirror: Mirror, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_one_line(fetch: Fetch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
     with pytest.raises(OutputError, match="no room for the download"):
-        download(f"{mirror.address}/a.zip", tmp_path / "a.zip", SIZE)
+        fetch()
 
 
 FILES = {"data/a.txt": b"one", "data/b/c.png": b"two", "README": b"three"}
@@ -173,6 +150,9 @@ def write_tar(path: Path, files: Mapping[str, bytes] = FILES, mode: str = "w") -
             info.size = len(content)
             file.addfile(info, io.BytesIO(content))
     return path
+
+
+WRITERS = [write_zip, write_tar]
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -208,28 +188,20 @@ def test_archives_in_an_archive_are_unpacked_beside_themselves(tmp_path: Path) -
     "name",
     ["../a", "/etc/a", "b/../../a", "b/../a", "..", "c:/a", "c:a", "b\\a", "\\\\host\\a", "a\x07b"],
 )
-@pytest.mark.parametrize("write", [write_zip, write_tar])
-def test_paths_outside_are_refused(tmp_path: Path, write: object, name: str) -> None:
-    path = write(tmp_path / "a", {"good": b"1", name: b"2"})  # type: ignore[operator]
+@pytest.mark.parametrize("write", WRITERS)
+def test_paths_outside_are_refused(tmp_path: Path, write: Fetch, name: str) -> None:
+    path = write(tmp_path / "a", {"good": b"1", name: b"2"})
     with pytest.raises(FormatError, match="path outside of itself"):
         unpack(path, tmp_path / "deep" / "out")
     assert set(content(tmp_path)) <= {"a", "deep/out/good"}
 
 
-def test_a_name_of_a_zip_that_hides_its_end_is_refused(tmp_path: Path) -> None:
-    path = write_zip(tmp_path / "a.zip", {"aXb": b"1"})
-    path.write_bytes(path.read_bytes().replace(b"aXb", b"a\0b"))
-    with pytest.raises(FormatError):
-        unpack(path, tmp_path / "out")
-
-
-def link_tar(path: Path, kind: bytes, name: str, target: str) -> Path:
+def special_tar(path: Path, kind: bytes, name: str, target: str = "") -> Path:
+    """Something that is no file, and a file below it."""
     with tarfile.open(path, "w") as file:
-        info = tarfile.TarInfo(name)
-        info.type, info.linkname = kind, target
+        info, after = tarfile.TarInfo(name), tarfile.TarInfo(f"{name}/x")
+        info.type, info.linkname, after.size = kind, target, 1
         file.addfile(info)
-        after = tarfile.TarInfo(f"{name}/x")
-        after.size = 1
         file.addfile(after, io.BytesIO(b"x"))
     return path
 
@@ -237,7 +209,7 @@ def link_tar(path: Path, kind: bytes, name: str, target: str) -> Path:
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE])
 @pytest.mark.parametrize("target", ["/etc", "../..", "../../../etc/passwd"])
 def test_links_that_lead_out_are_refused(tmp_path: Path, kind: bytes, target: str) -> None:
-    path = link_tar(tmp_path / "a.tar", kind, "dso/images", target)
+    path = special_tar(tmp_path / "a.tar", kind, "dso/images", target)
     with pytest.raises(FormatError, match="path outside of itself"):
         unpack(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -247,34 +219,38 @@ def test_links_that_lead_out_are_refused(tmp_path: Path, kind: bytes, target: st
     ("kind", "target"), [(tarfile.SYMTYPE, "../mav0"), (tarfile.LNKTYPE, "mav0/x")]
 )
 def test_links_that_stay_are_left_out(tmp_path: Path, kind: bytes, target: str) -> None:
-    path = link_tar(tmp_path / "a.tar", kind, "dso/images", target)
-    unpack(path, tmp_path / "out")
+    unpack(special_tar(tmp_path / "a.tar", kind, "dso/images", target), tmp_path / "out")
     assert content(tmp_path / "out") == {"dso/images/x": b"x"}
     assert not (tmp_path / "out" / "dso" / "images").is_symlink()
 
 
-def test_a_link_in_a_zip_that_leads_out_is_refused(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+def hidden_end(path: Path) -> Path:
+    write_zip(path, {"aXb": b"1"})
+    path.write_bytes(path.read_bytes().replace(b"aXb", b"a\0b"))
+    return path
+
+
+def link_zip(path: Path) -> Path:
+    with zipfile.ZipFile(path, "w") as file:
         info = zipfile.ZipInfo("link")
         info.external_attr = (stat.S_IFLNK | 0o777) << 16
         file.writestr(info, "/etc/passwd")
-    with pytest.raises(FormatError, match="path outside of itself"):
-        unpack(tmp_path / "a.zip", tmp_path / "out")
+    return path
 
 
-def test_devices_are_refused(tmp_path: Path) -> None:
-    with tarfile.open(tmp_path / "a.tar", "w") as file:
-        info = tarfile.TarInfo("pipe")
-        info.type = tarfile.FIFOTYPE
-        file.addfile(info)
-    with pytest.raises(FormatError, match="device"):
-        unpack(tmp_path / "a.tar", tmp_path / "out")
-
-
-def test_two_entries_of_one_name_are_refused(tmp_path: Path) -> None:
-    path = write_tar(tmp_path / "a.tar", {"a": b"1", "./a": b"2"})
-    with pytest.raises(FormatError, match="one name"):
-        unpack(path, tmp_path / "out")
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (hidden_end, "a: "),
+        (link_zip, "path outside of itself"),
+        (lambda path: special_tar(path, tarfile.FIFOTYPE, "pipe"), "device"),
+        (lambda path: write_tar(path, {"a": b"1", "./a": b"2"}), "one name"),
+    ],
+    ids=["hidden end", "link", "device", "twice"],
+)
+def test_other_hostile_entries_are_refused(tmp_path: Path, write: Fetch, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        unpack(write(tmp_path / "a"), tmp_path / "out")
 
 
 @pytest.mark.parametrize("kind", ["in one", "in another", "empty files"])
@@ -292,9 +268,9 @@ def test_a_bomb_is_refused_before_it_fills_the_disk(tmp_path: Path, kind: str) -
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty", "text"])
-@pytest.mark.parametrize("write", [write_zip, write_tar])
-def test_damaged_archives_are_one_line(tmp_path: Path, write: object, damage: str) -> None:
-    path = write(tmp_path / "a", {"a.bin": bytes(range(256)) * 40})  # type: ignore[operator]
+@pytest.mark.parametrize("write", WRITERS)
+def test_damaged_archives_are_one_line(tmp_path: Path, write: Fetch, damage: str) -> None:
+    path = write(tmp_path / "a", {"a.bin": bytes(range(256)) * 40})
     good = bytearray(path.read_bytes())
     good[50] ^= 0xFF
     path.write_bytes(

@@ -37,15 +37,10 @@ def image(height: int, width: int) -> np.ndarray:
     return np.random.default_rng(3).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-def make_2014(folder: Path, **change: str) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+def make_2014(folder: Path) -> Path:
     for name in ("im0.png", "im1.png"):
         write_image(folder / name, image(12, 24))
-    text = CALIB
-    for key, value in change.items():
-        kept = [line for line in text.splitlines() if not line.startswith(f"{key}=")]
-        text = "\n".join(kept + ([f"{key}={value}"] if value else [])) + "\n"
-    (folder / "calib.txt").write_text(text)
+    (folder / "calib.txt").write_text(CALIB)
     return folder
 
 
@@ -86,20 +81,23 @@ def test_truth_in_pfm_makes_a_scene_without_its_calibration(tmp_path: Path) -> N
     assert scene.truth is not None
 
 
-def test_truth_of_2006_may_lie_above_folders_of_light_and_exposure(tmp_path: Path) -> None:
-    inner = tmp_path / "Aloe" / "Illum1" / "Exp2"
-    inner.mkdir(parents=True)
+@pytest.mark.parametrize("inside", ["", "Illum1/Exp2"])
+def test_truth_and_dmin_of_2005_may_lie_above_folders_of_light_and_exposure(
+    tmp_path: Path, inside: str
+) -> None:
+    root, name = tmp_path / "Aloe", f"Aloe/{inside}".rstrip("/")
     for view in ("view1.png", "view5.png"):
-        write_image(inner / view, image(370, 30))
-    write_image(tmp_path / "Aloe" / "disp1.png", np.full((370, 30), 9, np.uint8))
-    (tmp_path / "Aloe" / "dmin.txt").write_text("150\n")
-    scene = read_middlebury_scene(inner)
+        write_image(root / inside / view, image(370, 463))
+    write_image(root / "disp1.png", np.full((370, 463), 9, np.uint8))
+    (root / "dmin.txt").write_text("150\n")
+    scene = read_middlebury_scene(root / inside)
     assert scene.truth is not None
     assert (scene.truth.values == 3).all()
-    assert scene.camera is not None
-    assert scene.camera.doffs_px == pytest.approx(50)
-    assert list(find_scenes(tmp_path)) == ["Aloe/Illum1/Exp2"]
-    assert read_scored_scene("Aloe/Illum1/Exp2", inner, None) is not None
+    assert scene.camera == nominal_camera_2005(463, 370, 150, 3)
+    assert scene.camera.focal_px == pytest.approx(3740 / 3)
+    assert (scene.camera.doffs_px, scene.camera.baseline_m) == (pytest.approx(50), 0.16)
+    assert list(find_scenes(tmp_path)) == [name]
+    assert read_scored_scene(name, root / inside, None) is not None
 
 
 def test_eval3_truth_has_nan_for_inf_and_the_mask_of_its_file(tmp_path: Path) -> None:
@@ -163,31 +161,16 @@ def test_older_scenes_are_distinguished_and_their_truth_scaled(
     np.testing.assert_allclose(scene.truth.values[0, :3], [NAN, 1 / scale, 2 / scale], rtol=1e-6)
 
 
-def test_a_scene_of_2005_gets_its_nominal_camera_from_dmin(tmp_path: Path) -> None:
-    for name in ("view1.png", "view5.png"):
-        write_image(tmp_path / name, image(370, 463))
-    (tmp_path / "dmin.txt").write_text("200")
-    scene = read_middlebury_scene(tmp_path)
-    assert scene.camera == nominal_camera_2005(463, 370, 200, 3)
-    assert scene.camera.focal_px == pytest.approx(3740 / 3)
-    assert scene.camera.doffs_px == pytest.approx(200 / 3)
-    assert scene.camera.baseline_m == 0.16
-
-
-def test_a_missing_image_is_named(tmp_path: Path) -> None:
-    folder = make_2014(tmp_path)
-    (folder / "im1.png").unlink()
-    with pytest.raises(FormatError, match=r"image is missing \(expected im1.png\)"):
-        read_middlebury_scene(folder)
-
-
-def test_images_and_truth_of_different_sizes_are_named(tmp_path: Path) -> None:
+def test_images_that_are_missing_or_of_another_size_are_named(tmp_path: Path) -> None:
     folder = make_2014(tmp_path)
     write_pfm(folder / "disp0.pfm", np.ones((12, 23), dtype=np.float32))
     with pytest.raises(FormatError, match=r"disp0\.pfm: size.*got 23x12, expected 24x12"):
         read_middlebury_scene(folder)
     write_image(folder / "im1.png", image(12, 23))
     with pytest.raises(FormatError, match=r"differ in size \(got im0 24x12, im1 23x12\)"):
+        read_middlebury_scene(folder)
+    (folder / "im1.png").unlink()
+    with pytest.raises(FormatError, match=r"image is missing \(expected im1.png\)"):
         read_middlebury_scene(folder)
 
 

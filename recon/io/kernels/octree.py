@@ -2,7 +2,7 @@
 
 Nodes come depth first, the children of a node in the order of their numbers (bit 0 is x, bit 1 y,
 bit 2 z). A walk can stop after any node and go on, so a tree of any size is read in pieces. The
-reference implementation is in `tests/io/kernels/octree_reference.py`.
+reference implementation is in `tests/io/kernels/test_octree.py`.
 """
 
 from __future__ import annotations

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.io.kernels.octree import Leaves, begin_walk, find_leaves
-from tests.io.kernels.octree_reference import Leaf, find_leaves_reference
 
 DEPTH = 4
+Place = tuple[int, int, int]
+Leaf = tuple[int, int, Place]  # its number, level and place
+
+
+def find_leaves_reference(
+    nodes: Iterator[tuple[int, int]], level: int = 0, place: Place = (0, 0, 0)
+) -> Iterator[Leaf]:
+    """The same walk by recursion, over numbered nodes with a bit for each of their children."""
+    node, children = next(nodes)
+    if not children:
+        yield node, level, place
+    x, y, z = (2 * coordinate for coordinate in place)
+    for child in range(8):
+        if children >> child & 1:
+            corner = (x + (child & 1), y + (child >> 1 & 1), z + (child >> 2))
+            yield from find_leaves_reference(nodes, level + 1, corner)
 
 
 @st.composite
@@ -24,13 +41,9 @@ def trees(draw: st.DrawFn) -> list[int]:
     return below(0)
 
 
-def _listed(leaves: Leaves, first: int = 0) -> list[Leaf]:
-    return [
-        (first + node, level, tuple(place))
-        for node, level, place in zip(
-            leaves.nodes.tolist(), leaves.levels.tolist(), leaves.places.tolist(), strict=True
-        )
-    ]
+def listed(leaves: Leaves, first: int = 0) -> list[Leaf]:
+    found = zip(*(part.tolist() for part in leaves), strict=True)
+    return [(first + node, level, tuple(place)) for node, level, place in found]
 
 
 @settings(max_examples=50)
@@ -43,8 +56,8 @@ def test_the_kernel_finds_what_the_reference_finds_in_pieces_of_any_size(
         piece = children[first : first + size]
         seen, leaves = find_leaves(piece, walk)
         assert seen == len(piece)
-        found += _listed(leaves, first)
-    assert found == find_leaves_reference(tree)
+        found += listed(leaves, first)
+    assert found == list(find_leaves_reference(enumerate(tree)))
     assert walk.level[0] == -1  # the tree is whole
 
 
@@ -52,8 +65,7 @@ def test_the_kernel_finds_what_the_reference_finds_in_pieces_of_any_size(
 @given(trees(), st.integers(0, 255))
 def test_nodes_behind_the_end_of_the_tree_are_not_walked_over(tree: list[int], more: int) -> None:
     seen, leaves = find_leaves(np.array([*tree, more], np.uint8), begin_walk(DEPTH))
-    assert seen == len(tree)
-    assert len(leaves.nodes) == len(find_leaves_reference(tree))
+    assert (seen, len(leaves.nodes)) == (len(tree), tree.count(0))
 
 
 def test_a_tree_that_is_cut_does_not_end() -> None:
@@ -67,8 +79,7 @@ def test_children_below_the_deepest_level_end_the_walk(depth: int) -> None:
     chain = np.full(depth + 1, 0b10000000, np.uint8)
     seen, leaves = find_leaves(chain, begin_walk(depth))
     assert (seen, len(leaves.nodes)) == (depth, 0)
-
-
-def test_a_chain_of_last_children_ends_in_the_last_cell() -> None:
-    _, leaves = find_leaves(np.array([128] * 16 + [0], np.uint8), begin_walk(16))
-    assert _listed(leaves) == [(16, 16, (65535, 65535, 65535))]
+    chain[-1] = 0  # a chain of last children ends in the last cell
+    last = 2**depth - 1
+    _, leaves = find_leaves(chain, begin_walk(depth))
+    assert listed(leaves) == [(depth, depth, (last, last, last))]

@@ -1,3 +1,5 @@
+"""Text, tables, YAML, trajectories: what is read is what was written, or meant."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -10,6 +12,8 @@ from hypothesis import strategies as st
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
+from recon.io.fields import read_yaml, write_yaml
+from recon.io.files import read_table, read_text
 from recon.io.trajectory import (
     holds_times,
     read_kitti_poses,
@@ -19,7 +23,21 @@ from recon.io.trajectory import (
     write_tum,
 )
 
-IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+
+def test_a_table_skips_comments_empty_lines_and_the_mark_of_byte_order(tmp_path: Path) -> None:
+    path = tmp_path / "t.txt"
+    path.write_bytes(b"\xef\xbb\xbf# t x\n1 2\n\n3, 4  # late\n")
+    assert read_text(path)[0] == "#"
+    table, lines = read_table(path, (2,))
+    np.testing.assert_array_equal(table, [[1, 2], [3, 4]])
+    assert lines == [2, 4]
+
+
+def test_yaml_comes_back_as_it_was_written_and_in_order(tmp_path: Path) -> None:
+    values = {"b": {"window_px": 9, "alpha": None}, "a": [1, 2.5, "größe"]}
+    write_yaml(tmp_path / "c.yaml", values)
+    assert read_yaml(tmp_path / "c.yaml") == values
+    assert list(read_yaml(tmp_path / "c.yaml")) == ["b", "a"]
 
 
 def random_trajectory(seed: int, length: int) -> Trajectory:
@@ -29,16 +47,12 @@ def random_trajectory(seed: int, length: int) -> Trajectory:
         make_transform(exp_so3(rng.uniform(-np.pi, np.pi, 3)), rng.uniform(-5e3, 5e3, 3))
         for _ in range(length)
     ]
-    times = np.cumsum(rng.uniform(0, 1, length)) + 1.3e9
-    return Trajectory(np.stack(poses), times)
-
-
-TRAJECTORIES = st.builds(random_trajectory, st.integers(0, 2**31), st.integers(1, 8))
+    return Trajectory(np.stack(poses), np.cumsum(rng.uniform(0, 1, length)) + 1.3e9)
 
 
 @pytest.mark.parametrize("form", ["kitti", "tum"])
 @settings(max_examples=30)
-@given(trajectory=TRAJECTORIES)
+@given(trajectory=st.builds(random_trajectory, st.integers(0, 2**31), st.integers(1, 8)))
 def test_poses_lose_nothing_that_matters(
     trajectory: Trajectory, form: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -54,40 +68,28 @@ def test_poses_lose_nothing_that_matters(
 
 def test_tum_line_is_time_position_and_quaternion_xyzw_with_positive_w(tmp_path: Path) -> None:
     quarter_turn = make_transform(exp_so3(np.array([0, np.pi / 2, 0])), np.array([1.0, 2.0, 3.0]))
-    write_tum(tmp_path / "t.txt", Trajectory(quarter_turn[None], np.array([0.5])))
-    numbers = [float(word) for word in (tmp_path / "t.txt").read_text().split()]
-    half = np.sqrt(0.5)
+    path, half = tmp_path / "t.txt", np.sqrt(0.5)
+    write_tum(path, Trajectory(quarter_turn[None], np.array([0.5])))
+    numbers = [float(word) for word in path.read_text().split()]
     np.testing.assert_allclose(numbers, [0.5, 1, 2, 3, 0, half, 0, half], atol=1e-12)
-
-
-def test_a_quaternion_and_its_negative_are_one_rotation(tmp_path: Path) -> None:
-    (tmp_path / "t.txt").write_text(
-        "0 0 0 0 0.1 0.2 0.3 0.9273618\n1 0 0 0 -0.1 -0.2 -0.3 -0.9273618\n"
-    )
-    first, second = read_tum(tmp_path / "t.txt").T_world_camera
+    path.write_text("0 0 0 0 0.1 0.2 0.3 0.9273618\n1 0 0 0 -0.1 -0.2 -0.3 -0.9273618\n")
+    first, second = read_tum(path).T_world_camera  # the negative is the same rotation
     np.testing.assert_allclose(first, second, rtol=0, atol=1e-12)
 
 
-def test_quaternions_of_few_digits_still_give_rotations(tmp_path: Path) -> None:
-    (tmp_path / "t.txt").write_text("# groundtruth\n0 0 0 0 0.57 0.57 0.57 0.16\n")
-    rotation = read_tum(tmp_path / "t.txt").T_world_camera[0, :3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-12)
+def test_rotations_of_few_digits_become_orthonormal(tmp_path: Path) -> None:
+    path = tmp_path / "p.txt"
+    path.write_text("0.9998 -0.02 0 1 0.02 0.9998 0 2 0 0 1 3\n")
+    kitti = read_kitti_poses(path).T_world_camera[0]
+    np.testing.assert_array_equal(kitti[:3, 3], [1, 2, 3])
+    path.write_text("# groundtruth\n0 0 0 0 0.57 0.57 0.57 0.16\n")
+    for pose in (kitti, read_tum(path).T_world_camera[0]):
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
 
 
-def test_kitti_rotations_of_few_digits_become_orthonormal(tmp_path: Path) -> None:
-    (tmp_path / "p.txt").write_text("0.9998 -0.02 0 1 0.02 0.9998 0 2 0 0 1 3\n")
-    pose = read_kitti_poses(tmp_path / "p.txt").T_world_camera[0]
-    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(pose[:3, 3], [1, 2, 3])
-
-
-def test_kitti_poses_without_times_are_one_second_apart(tmp_path: Path) -> None:
-    (tmp_path / "p.txt").write_text(IDENTITY * 3)
-    assert read_kitti_poses(tmp_path / "p.txt").timestamps_s.tolist() == [0, 1, 2]
-
-
-def test_a_number_of_poses_that_is_not_that_of_the_times_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "p.txt").write_text(IDENTITY * 2)
+def test_kitti_poses_get_a_second_each_or_as_many_times_as_they_are(tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    assert read_kitti_poses(tmp_path / "p.txt").timestamps_s.tolist() == [0, 1]
     with pytest.raises(FormatError, match=r"p\.txt: numbers of poses .*\(got 2 poses, expected 3"):
         read_trajectory(tmp_path / "p.txt", np.arange(3.0))
 

@@ -1,8 +1,10 @@
-"""Mesh files: each format keeps what was written, and other programs read it."""
+"""Mesh files and MeshLab projects: each keeps what was written, and other programs read it."""
 
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import struct
 from pathlib import Path
 
@@ -11,23 +13,22 @@ import pymeshlab
 import pytest
 
 from recon.core.errors import FormatError, OutputError
-from recon.core.values import TriangleMesh
+from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.cloud import Frame
+from recon.io.images.image import write_image
 from recon.io.models import open3d_meshes
 from recon.io.models.mesh import MESH_SUFFIXES, read_mesh, srgb_from_linear, write_glb, write_mesh
+from recon.io.models.mlp import Photo, write_mlp
+from recon.io.models.ply import write_ply
 
-
-def tetrahedron(*, coloured: bool = True) -> TriangleMesh:
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float32)
-    outwards = vertices - vertices.mean(axis=0)
-    return TriangleMesh(
-        vertices=vertices,
-        faces=np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32),
-        normals=outwards / np.linalg.norm(outwards, axis=1, keepdims=True),
-        rgb=np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [10, 20, 30]], dtype=np.uint8)
-        if coloured
-        else None,
-    )
+VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32)
+OUTWARDS = VERTICES - VERTICES.mean(axis=0)
+MESH = TriangleMesh(
+    vertices=VERTICES,
+    faces=np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32),
+    normals=OUTWARDS / np.linalg.norm(OUTWARDS, axis=1, keepdims=True),
+    rgb=np.array([[255, 0, 0], [0, 255, 0], [0, 127, 255], [10, 20, 30]], dtype=np.uint8),
+)
 
 
 def triangles(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[tuple[float, ...], ...]]:
@@ -37,48 +38,37 @@ def triangles(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[tuple[float,
     return {tuple(face) for face in turned}
 
 
-@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
-def test_every_format_gives_the_triangles_back(tmp_path: Path, suffix: str) -> None:
-    mesh = tetrahedron()
-    write_mesh(tmp_path / f"mesh{suffix}", mesh)
-    again = read_mesh(tmp_path / f"mesh{suffix}")
-    assert triangles(again.vertices, again.faces) == triangles(mesh.vertices, mesh.faces)
-
-
 # Text rounds; Open3D keeps a GLB's linear colours in bytes, which are coarse in the dark.
-@pytest.mark.parametrize(("suffix", "off"), [(".ply", 0), (".obj", 1), (".glb", 4)])
-def test_colours_survive(tmp_path: Path, suffix: str, off: int) -> None:
-    mesh = tetrahedron()
-    write_mesh(tmp_path / f"mesh{suffix}", mesh)
+@pytest.mark.parametrize(("suffix", "off"), [*zip(MESH_SUFFIXES, (0, 1, None, 4), strict=True)])
+def test_every_format_gives_triangles_and_colours_back(
+    tmp_path: Path, suffix: str, off: int | None
+) -> None:
+    write_mesh(tmp_path / f"mesh{suffix}", MESH)
     again = read_mesh(tmp_path / f"mesh{suffix}")
-    assert again.rgb is not None
-    order = [int(np.argmin(np.abs(again.vertices - v).sum(axis=1))) for v in mesh.vertices]
-    assert np.abs(again.rgb[order].astype(int) - mesh.rgb).max() <= off
+    assert triangles(again.vertices, again.faces) == triangles(MESH.vertices, MESH.faces)
+    if off is None:
+        assert again.rgb is None
+        return
+    order = [int(np.argmin(np.abs(again.vertices - v).sum(axis=1))) for v in MESH.vertices]
+    assert np.abs(again.rgb[order].astype(int) - MESH.rgb).max() <= off
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl"])
 def test_meshlab_opens_it(tmp_path: Path, suffix: str) -> None:
-    mesh = tetrahedron()
-    write_mesh(tmp_path / f"mesh{suffix}", mesh)
+    write_mesh(tmp_path / f"mesh{suffix}", MESH)
     meshes = pymeshlab.MeshSet()
     meshes.load_new_mesh(str(tmp_path / f"mesh{suffix}"))
-    seen = meshes.current_mesh()
-    assert triangles(seen.vertex_matrix(), seen.face_matrix()) == triangles(
-        mesh.vertices, mesh.faces
-    )
+    seen = triangles(meshes.current_mesh().vertex_matrix(), meshes.current_mesh().face_matrix())
+    assert seen == triangles(MESH.vertices, MESH.faces)
 
 
 def test_ply_keeps_floats_normals_and_colours_bit_by_bit(tmp_path: Path) -> None:
-    mesh = tetrahedron()
-    write_mesh(tmp_path / "mesh.ply", mesh)
+    write_mesh(tmp_path / "mesh.ply", MESH)
     again = read_mesh(tmp_path / "mesh.ply")
     for name in ("vertices", "faces", "normals", "rgb"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(mesh, name))
+        np.testing.assert_array_equal(getattr(again, name), getattr(MESH, name))
     assert b"property float x" in (tmp_path / "mesh.ply").read_bytes()
-
-
-def test_a_mesh_without_colours_has_none_when_read(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "mesh.ply", tetrahedron(coloured=False))
+    write_mesh(tmp_path / "mesh.ply", TriangleMesh(MESH.vertices, MESH.faces))
     assert read_mesh(tmp_path / "mesh.ply").rgb is None
 
 
@@ -100,45 +90,36 @@ def test_junk_and_missing_files_are_refused_quietly(
     (tmp_path / f"junk{suffix}").write_bytes(b"junk")
     with pytest.raises(FormatError):
         read_mesh(tmp_path / f"junk{suffix}")
+    with pytest.raises(OutputError):
+        open3d_meshes.write_mesh(tmp_path / "none" / "a.stl", MESH)
     assert capfd.readouterr().out == ""
 
 
-def test_an_unknown_suffix_and_an_empty_mesh_are_refused(tmp_path: Path) -> None:
+def test_an_unknown_suffix_and_an_empty_mesh_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"expected .ply .obj .stl .glb"):
-        write_mesh(tmp_path / "mesh.xyz", tetrahedron())
-    with pytest.raises(FormatError, match="unknown kind"):
-        read_mesh(tmp_path / "mesh.xyz")
+        write_mesh(tmp_path / "mesh.xyz", MESH)
     empty = TriangleMesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
     with pytest.raises(OutputError, match="no face"):
         write_mesh(tmp_path / "mesh.ply", empty)
     assert list(tmp_path.iterdir()) == []
 
 
-MESH = TriangleMesh(
-    vertices=np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32),
-    faces=np.array([[0, 2, 1], [0, 1, 3]], dtype=np.int32),
-    rgb=np.array([[0, 127, 255]] * 4, dtype=np.uint8),
-)
-
-
 def read_chunks(path: Path) -> tuple[dict, bytes]:
     data = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
     size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON"
-    assert size % 4 == 0
+    assert (kind, size % 4) == (b"JSON", 0)
     rest = 20 + size
     size, kind = struct.unpack_from("<I4s", data, rest)
-    assert kind == b"BIN\0"
-    assert rest + 8 + size == len(data)
+    assert (kind, rest + 8 + size) == (b"BIN\0", len(data))
     return json.loads(data[20:rest]), data[rest + 8 :]
 
 
-def test_the_arrays_lie_where_the_accessors_say(tmp_path: Path) -> None:
+def test_the_arrays_of_a_glb_lie_where_the_accessors_say(tmp_path: Path) -> None:
     write_glb(tmp_path / "mesh.glb", MESH)
     document, binary = read_chunks(tmp_path / "mesh.glb")
     primitive = document["meshes"][0]["primitives"][0]
+    attributes = primitive["attributes"]
 
     def array(index: int, dtype: type, width: int) -> np.ndarray:
         accessor = document["accessors"][index]
@@ -149,16 +130,13 @@ def test_the_arrays_lie_where_the_accessors_say(tmp_path: Path) -> None:
         assert len(values) == accessor["count"]
         return values
 
-    np.testing.assert_array_equal(
-        array(primitive["attributes"]["POSITION"], np.float32, 3), MESH.vertices
-    )
-    np.testing.assert_array_equal(
-        array(primitive["indices"], np.uint32, 1).reshape(-1, 3), MESH.faces
-    )
-    colours = array(primitive["attributes"]["COLOR_0"], np.uint16, 4) / 65535
+    np.testing.assert_array_equal(array(attributes["POSITION"], np.float32, 3), MESH.vertices)
+    faces = array(primitive["indices"], np.uint32, 1).reshape(-1, 3)
+    np.testing.assert_array_equal(faces, MESH.faces)
+    colours = array(attributes["COLOR_0"], np.uint16, 4) / 65535
     # sRGB 127/255 is 0.2122 in linear light.
-    np.testing.assert_allclose(colours, [[0, 0.2122, 1, 1]] * 4, atol=1e-4)
-    box = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_allclose(colours[2], [0, 0.2122, 1, 1], atol=1e-4)
+    box = document["accessors"][attributes["POSITION"]]
     assert (box["min"], box["max"]) == ([0, 0, 0], [1, 2, 3])
 
 
@@ -218,13 +196,65 @@ def test_decimation_keeps_a_flat_sheet_flat_and_its_border() -> None:
     np.testing.assert_allclose(np.ptp(vertices[:, :2], axis=0), 12, atol=0.5)
 
 
-def test_what_open3d_cannot_read_or_write_is_an_error_of_ours(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+def opened(project: Path) -> pymeshlab.MeshSet:
+    meshes = pymeshlab.MeshSet()
+    meshes.load_project(str(project))
+    return meshes
+
+
+def test_meshlab_opens_every_layer_after_the_folder_has_moved(tmp_path: Path) -> None:
+    cloud, mesh = tmp_path / "here/map/cloud & more.ply", tmp_path / "here/mesh/mesh.ply"
+    write_ply(cloud, PointCloud(np.tile(MESH.vertices, (3, 1))))
+    write_mesh(mesh, MESH)
+    write_mlp(mesh.with_name("a.mlp"), {"cloud": cloud, 'the "mesh"': mesh})
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    layers = opened(tmp_path / "there" / "mesh" / "a.mlp")
+    assert [(one.vertex_number(), one.face_number()) for one in layers] == [(12, 0), (4, 4)]
+
+
+def test_a_layer_that_does_not_exist_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="does not exist"):
+        write_mlp(tmp_path / "a.mlp", {"cloud": tmp_path / "none.ply"})
+    assert list(tmp_path.iterdir()) == []
+
+
+# x right, y up, z towards the viewer: what is ahead has a negative z.
+RIGHT, UP, AHEAD = [1, 0, 0], [0, 1, 0], [0, 0, -1]
+
+
+@pytest.mark.parametrize(
+    ("frame", "axes"),
+    [
+        ("camera", {(1, 0, 0): RIGHT, (0, -1, 0): UP, (0, 0, 1): AHEAD}),
+        ("map", {(0, -1, 0): RIGHT, (0, 0, 1): UP, (1, 0, 0): AHEAD}),
+        (None, {(1, 0, 0): RIGHT, (0, 1, 0): UP, (0, 0, -1): AHEAD}),
+    ],
+)
+def test_meshlab_shows_every_frame_upright_and_from_behind_the_camera(
+    tmp_path: Path, frame: Frame | None, axes: dict[tuple[int, ...], list[int]]
 ) -> None:
-    vertices, faces = sheet(1)
-    with pytest.raises(OutputError):
-        open3d_meshes.write_mesh(tmp_path / "none" / "a.stl", TriangleMesh(vertices, faces))
-    (tmp_path / "junk.obj").write_text("junk\n")
-    with pytest.raises(FormatError):
-        open3d_meshes.read_mesh(tmp_path / "junk.obj")
-    assert capfd.readouterr().out == ""
+    write_ply(tmp_path / "cloud.ply", PointCloud(np.array([*axes], dtype=np.float32)))
+    write_mlp(tmp_path / "a.mlp", {"cloud": tmp_path / "cloud.ply"}, frame)
+    meshes = opened(tmp_path / "a.mlp")  # which its meshes do not outlive
+    shown = meshes.current_mesh()
+    np.testing.assert_array_equal(shown.transformed_vertex_matrix(), [*axes.values()])
+    np.testing.assert_array_equal(shown.vertex_matrix(), [*axes])
+
+
+def test_meshlab_reads_the_camera_of_a_photo(tmp_path: Path) -> None:
+    camera = RectifiedCamera(120.0, 50.0, 20.0, 50.0, 0.1, 160, 120)
+    write_image(tmp_path / "left.png", np.zeros((120, 160), np.uint8))
+    write_ply(tmp_path / "cloud.ply", PointCloud(MESH.vertices))
+    layers = {"cloud": tmp_path / "cloud.ply"}
+    write_mlp(tmp_path / "a.mlp", layers, "camera", Photo(tmp_path / "left.png", camera))
+    meshes = opened(tmp_path / "a.mlp")
+    assert meshes.raster_number() == 1
+    meshes.save_project(str(tmp_path / "b.mlp"))
+    (camera_text,) = re.findall("<VCGCamera(.*?)/>", (tmp_path / "b.mlp").read_text())
+    found = dict(re.findall(r'(\w+)="(.*?)"', camera_text))
+    assert float(found["FocalMm"]) / float(found["PixelSizeMm"].split()[0]) == pytest.approx(120)
+    # From the lower left corner of the image; pixel centres are half a pixel from its borders.
+    assert (found["ViewportPx"], found["CenterPx"]) == ("160 120", "50.5 99.5")
+    assert found["TranslationVector"] == "0 0 0 1"
+    turn = np.array(found["RotationMatrix"].split(), float).reshape(4, 4)
+    np.testing.assert_array_equal(turn, np.eye(4))

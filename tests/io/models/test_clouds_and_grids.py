@@ -1,0 +1,414 @@
+"""Clouds (PLY, LAS), OctoMaps and Nav2 grids: round trips, other programs, and damaged files."""
+
+from __future__ import annotations
+
+import sys
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pymeshlab
+import pyoctomap
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from recon.core.errors import (
+    EvaluationError,
+    FormatError,
+    MappingError,
+    MissingDependencyError,
+    SettingsError,
+)
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels, PointCloud
+from recon.io.models.las import check_crs, check_inside, write_las
+from recon.io.models.nav2 import read_nav2, write_nav2
+from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
+from recon.io.models.ply import read_ply, write_ply
+from tests.scenery.octomaps import write_octomap
+
+FIELDS = ("rgb", "normals", "confidence", "sigma_m", "weight", "count")
+NUMBERS = st.floats(-1e6, 1e6, width=32)
+SHARES = st.floats(0, 1, width=32)
+
+
+@st.composite
+def clouds(draw: st.DrawFn) -> PointCloud:
+    n = draw(st.integers(0, 12))
+    parts = {
+        "rgb": arrays(np.uint8, (n, 3)),
+        "normals": arrays(np.float32, (n, 3), elements=NUMBERS),
+        "confidence": arrays(np.float32, n, elements=SHARES),
+        "sigma_m": arrays(np.float32, n, elements=SHARES),
+        "weight": arrays(np.float32, n, elements=NUMBERS),
+        "count": arrays(np.int32, n, elements=st.integers(0, 2**31 - 1)),
+    }
+    return PointCloud(
+        xyz=draw(arrays(np.float32, (n, 3), elements=NUMBERS)),
+        frame=draw(st.sampled_from(["camera", "world", "map"])),
+        **{name: draw(part) for name, part in parts.items() if draw(st.booleans())},
+    )
+
+
+def example_cloud(n: int = 20) -> PointCloud:
+    rng = np.random.default_rng(1)
+    normals = rng.standard_normal((n, 3))
+    return PointCloud(
+        xyz=rng.standard_normal((n, 3)).astype(np.float32),
+        rgb=rng.integers(0, 256, (n, 3), dtype=np.uint8),
+        normals=(normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
+        sigma_m=rng.random(n).astype(np.float32),
+        confidence=rng.random(n).astype(np.float32),
+        weight=rng.random(n).astype(np.float32),
+        count=rng.integers(1, 9, n).astype(np.int32),
+    )
+
+
+@pytest.mark.parametrize("ascii", [False, True])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cloud=clouds())
+def test_a_cloud_comes_back_bit_by_bit(tmp_path: Path, ascii: bool, cloud: PointCloud) -> None:  # noqa: A002
+    write_ply(tmp_path / "cloud.ply", cloud, ascii=ascii)
+    again = read_ply(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(again.xyz, cloud.xyz)
+    assert again.frame == cloud.frame
+    for name in FIELDS:
+        expected, got = getattr(cloud, name), getattr(again, name)
+        assert (got is None) == (expected is None)
+        if expected is not None:
+            np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize("ascii", [False, True])
+def test_meshlab_reads_positions_normals_colours_and_quality(tmp_path: Path, ascii: bool) -> None:  # noqa: A002
+    cloud = example_cloud()
+    write_ply(tmp_path / "cloud.ply", cloud, ascii=ascii)
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(tmp_path / "cloud.ply"))
+    seen = meshes.current_mesh()
+    np.testing.assert_array_equal(seen.vertex_matrix().astype(np.float32), cloud.xyz)
+    np.testing.assert_array_equal(seen.vertex_normal_matrix().astype(np.float32), cloud.normals)
+    np.testing.assert_array_equal(seen.vertex_scalar_array().astype(np.float32), cloud.confidence)
+    np.testing.assert_array_equal(np.rint(seen.vertex_color_matrix()[:, :3] * 255), cloud.rgb)
+
+
+def test_open3d_reads_it_as_float_with_every_scalar(tmp_path: Path) -> None:
+    o3d = pytest.importorskip("open3d")
+    cloud = example_cloud()
+    write_ply(tmp_path / "cloud.ply", cloud)
+    seen = o3d.t.io.read_point_cloud(str(tmp_path / "cloud.ply"))
+    assert seen.point.positions.numpy().dtype == np.float32
+    np.testing.assert_array_equal(seen.point.positions.numpy(), cloud.xyz)
+    np.testing.assert_array_equal(seen.point["sigma"].numpy()[:, 0], cloud.sigma_m)
+    np.testing.assert_array_equal(seen.point["count"].numpy()[:, 0], cloud.count)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_what_pymeshlab_writes_is_read(tmp_path: Path, binary: bool) -> None:
+    cloud = example_cloud()
+    xyz, normals = cloud.xyz.astype(np.float64), cloud.normals.astype(np.float64)
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=xyz, v_normals_matrix=normals))
+    meshes.save_current_mesh(str(tmp_path / "theirs.ply"), binary=binary, save_vertex_normal=True)
+    again = read_ply(tmp_path / "theirs.ply")
+    # Text holds six digits.
+    np.testing.assert_allclose(again.xyz, cloud.xyz, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(again.normals, cloud.normals, rtol=1e-4, atol=1e-5)
+
+
+def write_raw(path: Path, properties: str, body: bytes, count: int, kind: str = "ascii") -> Path:
+    head = f"ply\nformat {kind} 1.0\nelement vertex {count}\n{properties}\nend_header\n"
+    path.write_bytes(head.encode() + body)
+    return path
+
+
+XYZ = "property float x\nproperty float y\nproperty float z"
+DOUBLES = XYZ.replace("float", "double")
+
+
+def test_big_endian_doubles_and_unknown_properties_are_read(tmp_path: Path) -> None:
+    table = np.zeros(2, [("t", ">u2"), ("x", ">f8"), ("y", ">f8"), ("z", ">f8")])
+    table["x"], table["z"] = [1.5, -2.5], [3.25, 4.0]
+    properties = f"property ushort t\n{DOUBLES}"
+    path = write_raw(tmp_path / "a.ply", properties, table.tobytes(), 2, kind="binary_big_endian")
+    np.testing.assert_array_equal(read_ply(path).xyz, [[1.5, 0, 3.25], [-2.5, 0, 4]])
+
+
+def test_points_that_are_not_finite_are_dropped_and_a_quality_that_is_no_confidence(
+    tmp_path: Path,
+) -> None:
+    body = b"1 2 3 0.1\nnan 2 3 0.2\n4 5 inf 0.3\n7 8 9 0.4\n"
+    cloud = read_ply(write_raw(tmp_path / "a.ply", XYZ + "\nproperty float sigma", body, 4))
+    np.testing.assert_array_equal(cloud.xyz, [[1, 2, 3], [7, 8, 9]])
+    np.testing.assert_array_equal(cloud.sigma_m, np.float32([0.1, 0.4]))
+    path = write_raw(tmp_path / "b.ply", XYZ + "\nproperty float quality", b"1 2 3 17\n", 1)
+    assert read_ply(path).confidence is None
+
+
+@pytest.mark.parametrize("ascii", [False, True])
+def test_a_truncated_cloud_is_refused(tmp_path: Path, ascii: bool) -> None:  # noqa: A002
+    path = tmp_path / "cloud.ply"
+    write_ply(path, example_cloud(), ascii=ascii)
+    whole = path.read_bytes()
+    for cut in (40 if ascii else 1, 300):
+        path.write_bytes(whole[:-cut])
+        with pytest.raises(FormatError, match="truncated"):
+            read_ply(path)
+
+
+def test_a_header_that_promises_more_than_memory_is_refused(tmp_path: Path) -> None:
+    path = write_raw(tmp_path / "a.ply", XYZ, b"\0" * 24, 10**15, kind="binary_little_endian")
+    with pytest.raises(FormatError, match="truncated"):
+        read_ply(path)
+
+
+def test_survey_coordinates_that_would_become_steps_are_refused(tmp_path: Path) -> None:
+    xyz = np.array([4.5e5, 5.4e6, 300]) + np.random.default_rng(0).uniform(0, 10, (100, 3))
+    path, kind = tmp_path / "utm.ply", "binary_little_endian"
+    write_raw(path, DOUBLES, xyz.astype("<f8").tobytes(), 100, kind)
+    with pytest.raises(FormatError, match=r"utm\.ply: .* \(got x up to 4500.*subtract an offset"):
+        read_ply(path)
+    read_ply(write_raw(path, DOUBLES, (xyz - xyz[0]).astype("<f8").tobytes(), 100, kind))
+
+
+T_SURVEY_MAP = make_transform(
+    np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    np.array([456789.25, 5433210.5, 118.75]),
+)
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_points_of_a_survey_come_back_turned_and_moved(tmp_path: Path, suffix: str) -> None:
+    laspy = pytest.importorskip("laspy")
+    parts = [example_cloud(1000), example_cloud(10)]
+    path = tmp_path / f"cloud.{suffix}"
+    assert write_las(path, parts, T_SURVEY_MAP, "EPSG:25832") == 1010
+    found = laspy.read(path)
+    x, y, z = np.concatenate([cloud.xyz for cloud in parts]).astype(np.float64).T
+    expected = np.stack([456789.25 - y, 5433210.5 + x, 118.75 + z], axis=1)
+    assert np.abs(found.xyz - expected).max() <= 0.00051
+    rgb = np.concatenate([cloud.rgb for cloud in parts]).astype(np.uint16)
+    for n, name in enumerate(("red", "green", "blue")):
+        np.testing.assert_array_equal(found[name], rgb[:, n] * 257)
+    np.testing.assert_array_equal(found["sigma"], np.concatenate([c.sigma_m for c in parts]))
+    assert found.header.parse_crs().to_epsg() == 25832
+    np.testing.assert_allclose(found.header.maxs, expected.max(axis=0), atol=0.001)
+    # Each point is the only return of its ray; the specification permits no 0.
+    assert set(found.return_number) == set(found.number_of_returns) == {1}
+    assert found.header.number_of_points_by_return[0] == 1010
+    write_las(path, [PointCloud(np.ones((1, 3), np.float32))], np.eye(4))
+    found = laspy.read(path)
+    np.testing.assert_allclose(found.xyz, 1.0)
+    assert found.header.parse_crs() is None
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("EPSG:99", "unknown coordinate system"),
+        ("Gauss", "unknown coordinate system"),
+        ("EPSG:4326", "not metres"),  # degrees
+        ("EPSG:4978", "not metres"),  # metres, but from the centre of the earth
+        ("EPSG:2263", "not metres"),  # feet
+    ],
+)
+def test_other_coordinates_are_refused(tmp_path: Path, name: str, why: str) -> None:
+    pytest.importorskip("laspy")
+    with pytest.raises(SettingsError, match=why):
+        write_las(tmp_path / "cloud.laz", [], np.eye(4), name)
+    assert not list(tmp_path.iterdir())
+    assert check_crs("EPSG:25832+7837").to_epsg(min_confidence=0) is None  # one with heights
+
+
+@pytest.mark.parametrize(
+    ("name", "east", "north", "inside"),
+    [
+        ("EPSG:25832", 456789.0, 5433210.0, True),
+        ("EPSG:25832", 5433210.0, 456789.0, False),  # swapped
+        ("EPSG:25832", 8.4, 49.0, False),  # degrees
+        ("EPSG:3857", -1.9e7, -1.0e6, True),  # the whole world
+        ("EPSG:32760", 1.0e5, 8.0e6, True),  # beside the line where dates change
+        ("EPSG:3832", 3.0e6, 1.0e6, True),  # an area across that line
+        ("EPSG:3832", -1.6e7, 1.0e6, False),  # Greenwich
+        ("+proj=utm +zone=32 +ellps=GRS80 +units=m", 0.0, 0.0, True),  # no area is stated
+    ],
+)
+def test_positions_lie_in_the_area_of_their_system(
+    name: str, east: float, north: float, inside: bool
+) -> None:
+    pytest.importorskip("pyproj")
+    place = np.array([east, north, 100.0])
+    if inside:
+        check_inside(name, place, "gnss.txt")
+        return
+    with pytest.raises(EvaluationError, match=r"gnss\.txt: the positions lie outside the area"):
+        check_inside(name, place, "gnss.txt")
+
+
+def test_without_laspy_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(MissingDependencyError, match=r"recon\[survey\]"):
+        write_las(tmp_path / "cloud.laz", [], np.eye(4))
+
+
+# Row 0 has the smallest y. An obstacle at the right of the lowest row, unknown at the top left.
+CELLS = np.array([[FREE, FREE, FREE, OCCUPIED], [FREE] * 4, [UNKNOWN, FREE, FREE, FREE]], np.int8)
+GRID = OccupancyGrid(CELLS, 0.2, (-3.4, 1.25))
+
+
+def test_a_grid_is_written_as_nav2_and_a_gis_ask_and_read_back(tmp_path: Path) -> None:
+    image, description = write_nav2(tmp_path / "map" / "grid", GRID)
+    assert (image.name, description.name) == ("grid.pgm", "grid.yaml")
+    back = read_nav2(description)
+    np.testing.assert_array_equal(back.cells, GRID.cells)
+    assert (back.resolution_m, back.origin_m) == (GRID.resolution_m, GRID.origin_m)
+    # The first row of the image has the largest y.
+    pixels = [205, 254, 254, 254, 254, 254, 254, 254, 254, 254, 254, 0]
+    assert image.read_bytes() == b"P5\n4 3\n255\n" + bytes(pixels)
+    assert yaml.safe_load(description.read_text()) == {
+        "image": "grid.pgm", "mode": "trinary", "resolution": 0.2, "origin": [-3.4, 1.25, 0.0],
+        "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196,
+    }  # fmt: skip
+    x_step, y_turn, x_turn, y_step, x_m, y_m = map(
+        float, image.with_suffix(".wld").read_text().split()
+    )
+    # Of the centre of the upper left pixel, which is the first column of the last row.
+    assert (x_m, y_m) == pytest.approx((-3.4 + 0.1, 1.25 + 2.5 * 0.2))
+    assert (x_step, y_turn, x_turn, y_step) == (0.2, 0, 0, -0.2)
+
+
+def test_a_negated_map_with_comments_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.pgm").write_bytes(b"P5\n# made by hand\n2 1\n255\n\xff\x00")
+    fields = {"image": "a.pgm", "resolution": 0.5, "origin": [0, 0, 0], "negate": 1}
+    fields |= {"occupied_thresh": 0.65, "free_thresh": 0.196}
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(fields))
+    assert read_nav2(tmp_path / "a.yaml").cells.tolist() == [[OCCUPIED, FREE]]
+
+
+def test_the_origin_is_written_as_it_is_meant(tmp_path: Path) -> None:
+    origin_m = (-646 * 0.1, 3 * 0.1)
+    assert origin_m == (-64.60000000000001, 0.30000000000000004)
+    _, path = write_nav2(tmp_path / "grid", OccupancyGrid(np.zeros((2, 2), np.int8), 0.1, origin_m))
+    assert "-64.6\n" in path.read_text()
+    assert read_nav2(path).origin_m == (-64.6, 0.3)
+
+
+def random_voxels(seed: int, reach: int, number: int) -> OccupancyVoxels:
+    rng = np.random.default_rng(seed)
+    keys = np.unique(rng.integers(-reach, reach, (number, 3)), axis=0).astype(np.int32)
+    # Mostly free, and dense where the reach is small: many nodes are pruned.
+    log_odds = rng.choice([-1.0, -1.0, -1.0, -1.0, -1.0, -0.3, 2.0], len(keys))
+    return OccupancyVoxels(keys, log_odds.astype(np.float32), 0.2)
+
+
+def by_pyoctomap(voxels: OccupancyVoxels) -> tuple[bytes, bytes]:
+    """The contents of the ``.ot`` and the ``.bt`` file that OctoMap itself writes."""
+    tree = pyoctomap.OcTree(voxels.resolution_m)
+    tree.setClampingThresMin(1e-6)
+    tree.setClampingThresMax(1.0 - 1e-6)
+    cells = zip(voxels.centres_m.tolist(), voxels.log_odds.tolist(), strict=True)
+    for centre, value in cells:
+        tree.updateNode(centre, value, True)
+    tree.updateInnerOccupancy()
+    return bytes(tree.write()), bytes(tree.writeBinary())
+
+
+@pytest.mark.parametrize(
+    ("reach", "number"), [(5, 1), (6, 9000), (30, 20_000), (700, 3000), (KEY_LIMIT, 500)]
+)
+def test_files_are_those_of_octomap_byte_for_byte_and_keep_every_cell(
+    tmp_path: Path, reach: int, number: int
+) -> None:
+    voxels = random_voxels(reach, reach, number)
+    binary, full = write_octomap(tmp_path / "map", voxels)
+    assert (full.read_bytes(), binary.read_bytes()) == by_pyoctomap(voxels)
+    back = read_octomap(full)
+    assert back.resolution_m == 0.2
+    ours, theirs = (np.lexsort(each.keys.T) for each in (voxels, back))
+    np.testing.assert_array_equal(voxels.keys[ours], back.keys[theirs])
+    np.testing.assert_array_equal(voxels.log_odds[ours], back.log_odds[theirs])
+
+
+@pytest.mark.parametrize("depth", [1, 3, 6, 11])
+def test_a_map_in_tiles_gives_the_same_files(tmp_path: Path, depth: int) -> None:
+    voxels = random_voxels(2, 40, 6000)
+    write_octomap(tmp_path / "whole", voxels)
+    tile = voxels.keys[:, :2] >> depth
+    tiles = [
+        OccupancyVoxels(voxels.keys[inside], voxels.log_odds[inside], 0.2)
+        for column in np.unique(tile, axis=0)
+        for inside in [(tile == column).all(axis=1)]
+    ]
+    write_octomap_tiles(tmp_path / "tiled", tiles[::-1], depth, 0.2)
+    for end in ("bt", "ot"):
+        tiled, whole = (tmp_path / f"{name}.{end}" for name in ("tiled", "whole"))
+        assert tiled.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.parametrize("cell", [-KEY_LIMIT - 1, KEY_LIMIT])
+def test_a_map_too_large_for_octomap_is_refused(tmp_path: Path, cell: int) -> None:
+    voxels = OccupancyVoxels(np.array([[0, cell, 0]], np.int32), np.ones(1, np.float32), 0.2)
+    with pytest.raises(MappingError, match="too large"):
+        write_octomap(tmp_path / "map", voxels)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("nodes_each", [1, 7, 1000, 10**9])
+def test_a_file_is_read_in_pieces_in_its_order(tmp_path: Path, nodes_each: int) -> None:
+    _, full = write_octomap(tmp_path / "map", random_voxels(3, 8, 2000))
+    whole, pieces = read_octomap(full), list(octomap_pieces(full, nodes_each))
+    assert len(pieces) > 1 or nodes_each == 10**9
+    assert {piece.resolution_m for piece in pieces} == {0.2}
+    for name in ("keys", "log_odds"):
+        joined = np.concatenate([getattr(piece, name) for piece in pieces])
+        np.testing.assert_array_equal(joined, getattr(whole, name))
+
+
+def test_a_piece_takes_memory_for_its_cells_alone(tmp_path: Path) -> None:
+    _, full = write_octomap(tmp_path / "map", random_voxels(5, 60, 200_000))
+    cells = sum(len(piece) for piece in octomap_pieces(full, 1000))  # compiles the kernel
+    tracemalloc.start()
+    assert sum(len(piece) for piece in octomap_pieces(full, 1000)) == cells > 180_000
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # A cell is 16 bytes: the whole would be 3 MB, and twice that while it is made.
+    assert peak_bytes < 3e5
+
+
+def test_pruned_leaves_of_octomaps_own_files_are_expanded(tmp_path: Path) -> None:
+    keys = np.stack(np.unravel_index(np.arange(12**3), (12, 12, 12)), axis=1) - 4
+    tree = pyoctomap.OcTree(0.2)
+    for centre in ((keys + 0.5) * 0.2).tolist():
+        tree.updateNode(centre, 1.5)  # leaves that have become alike are pruned at once
+    pruned = bytes(tree.write())
+    assert pruned.count(np.float32(1.5).tobytes()) < len(keys) / 2
+    (tmp_path / "pruned.ot").write_bytes(pruned)
+    back = read_octomap(tmp_path / "pruned.ot")
+    assert sorted(back.keys.tolist()) == sorted(keys.tolist())
+    np.testing.assert_array_equal(back.log_odds, np.float32(1.5))
+
+
+@pytest.mark.parametrize(
+    "kind", ["cut", "no tree", "more nodes", "leaf near the root", "not a number", "another tree"]
+)
+def test_a_damaged_ot_file_is_a_format_error(tmp_path: Path, kind: str) -> None:
+    _, full = write_octomap(tmp_path / "map", random_voxels(4, 30, 3000))
+    content = full.read_bytes()
+    head, data, nodes = content.partition(b"data\n")
+    size = head[head.index(b"size ") :].split(b"\n")[0]
+    more = b"size %d" % (int(size.split()[1]) + 1)
+    damaged = {
+        "cut": content[:-3],
+        "no tree": head,
+        "more nodes": content.replace(size, more) + bytes(5),
+        "leaf near the root": head + data + nodes[:4] + b"\0" + nodes[5:],
+        "not a number": content[:-5] + np.float32(np.nan).tobytes() + content[-1:],
+        "another tree": content.replace(b"id OcTree", b"id ColorOcTree"),
+    }
+    full.write_bytes(damaged[kind])
+    words = "ColorOcTree" if kind == "another tree" else "truncated or damaged"
+    with pytest.raises(FormatError, match=words):
+        read_octomap(full)
