@@ -1,5 +1,6 @@
 """The public names of the package, each with its home. `__init__.py` reads them from here."""
 
+from recon.commands.cameras import run_audit as run_audit
 from recon.commands.config import ReconConfig as ReconConfig
 from recon.commands.config import load_config as load_config
 from recon.commands.evaluate_middlebury import run_middlebury as run_middlebury
@@ -14,7 +15,6 @@ from recon.commands.pair import match as match
 from recon.commands.pair import reconstruct as reconstruct
 from recon.commands.pair import run_disparity as run_disparity
 from recon.commands.pair import run_pair as run_pair
-from recon.commands.recording import run_audit as run_audit
 from recon.core.errors import ReconError as ReconError
 from recon.core.values import CameraIntrinsics as CameraIntrinsics
 from recon.core.values import Disparity as Disparity

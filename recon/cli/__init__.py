@@ -11,23 +11,21 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from recon import __version__
-from recon.cli import datasets, evaluate
 from recon.cli.batch import batch
-from recon.cli.cameras import board, calibrate, rectify
+from recon.cli.cameras import audit, board, calibrate, capture, rectify
 from recon.cli.errors import interrupt_on_signals, report_unforeseen
+from recon.cli.evaluate import app as evaluate
 from recon.cli.evaluate import paper
-from recon.cli.getting_started import demo, doctor, settings
-from recon.cli.live import live, localize
-from recon.cli.map import map_, merge, piece
-from recon.cli.options import Commands
+from recon.cli.getting_started import datasets, demo, doctor, settings
+from recon.cli.map import live, localize, map_, merge, piece
+from recon.cli.options import Commands, option
 from recon.cli.pair import disparity, pair
 from recon.cli.products import export, mesh, occupancy
-from recon.cli.recording import audit, capture
 
 app = Commands(
     name="recon",
@@ -36,32 +34,20 @@ app = Commands(
     help="Stereo reconstruction and mapping: from image pairs to maps.\n\nStart with recon demo, "
     "which needs no data. recon COMMAND --help has examples.",
 )
-_START = "Getting started"
-_RECONSTRUCT = "Reconstruction and mapping"
-_CAMERAS = "Cameras and recordings"
-_EVALUATE = "Evaluation"
-
-app.command(rich_help_panel=_START)(demo)
-app.command(rich_help_panel=_START)(doctor)
-app.command(rich_help_panel=_START)(settings)
-app.command(rich_help_panel=_RECONSTRUCT)(pair)
-app.command(rich_help_panel=_RECONSTRUCT)(disparity)
-app.command("map", rich_help_panel=_RECONSTRUCT)(map_)
-app.command(rich_help_panel=_RECONSTRUCT)(localize)
-app.command(rich_help_panel=_RECONSTRUCT)(live)
-app.command(rich_help_panel=_RECONSTRUCT)(merge)
-app.command(rich_help_panel=_RECONSTRUCT)(export)
-app.command(rich_help_panel=_RECONSTRUCT)(mesh)
-app.command(rich_help_panel=_RECONSTRUCT)(occupancy)
-app.command(rich_help_panel=_RECONSTRUCT)(batch)
-app.command(rich_help_panel=_CAMERAS)(board)
-app.command(rich_help_panel=_CAMERAS)(calibrate)
-app.command(rich_help_panel=_CAMERAS)(rectify)
-app.command(rich_help_panel=_CAMERAS)(capture)
-app.command(rich_help_panel=_CAMERAS)(audit)
-app.add_typer(datasets.app, name="datasets", rich_help_panel=_CAMERAS)
-app.add_typer(evaluate.app, name="evaluate", rich_help_panel=_EVALUATE)
-app.command(rich_help_panel=_EVALUATE)(paper)
+_PANELS: Final = {
+    "Getting started": (demo, doctor, settings),
+    "Reconstruction and mapping": (
+        pair, disparity, map_, localize, live, merge, export, mesh, occupancy, batch,
+    ),
+    "Cameras and recordings": (board, calibrate, rectify, capture, audit, datasets),
+    "Evaluation": (evaluate, paper),
+}  # fmt: skip
+for _panel, _commands in _PANELS.items():
+    for _command in _commands:
+        if isinstance(_command, Commands):
+            app.add_typer(_command, rich_help_panel=_panel)
+        else:
+            app.command(_command.__name__.rstrip("_"), rich_help_panel=_panel)(_command)
 app.command(hidden=True)(piece)
 
 
@@ -74,10 +60,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version."
-        ),
+        bool, option("Print the version.", "--version", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """Hold the options of the program itself."""

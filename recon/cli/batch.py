@@ -19,38 +19,33 @@ def batch(
     what: What = None,
     out: opt.Out = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Do what is missing of the batch in this folder.")
+        Path | None, opt.option("Do what is missing of the batch in this folder.")
     ] = None,
     scheduler: opt.Scheduler = None,
     workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Workers on this machine.", show_default="one per core"),
+        int | None, opt.option("Workers on this machine.", default="one per core", min=1)
     ] = None,
     threads: Annotated[
         int | None,
-        typer.Option(
+        opt.option(
+            "Threads of each job.",
+            default="cores divided by workers; on a scheduler, all cores of the machine",
             min=1,
-            help="Threads of each job.",
-            show_default="cores divided by workers; on a scheduler, all cores of the machine",
         ),
     ] = None,
     memory_limit: Annotated[
-        str | None,
-        typer.Option(help="Memory limit of each job that maps, e.g. 2G.", show_default="none"),
+        str | None, opt.option("Memory limit of each job that maps, e.g. 2G.", default="none")
     ] = None,
     timeout: Annotated[
-        float | None,
-        typer.Option(min=1e-3, help="Longest time of one try, in seconds.", show_default="none"),
+        float | None, opt.option("Longest time of one try, in seconds.", default="none", min=1e-3)
     ] = None,
-    retries: Annotated[
-        int, typer.Option(min=0, help="Tries after one that was killed or late.")
-    ] = 2,
+    retries: Annotated[int, opt.option("Tries after one that was killed or late.", min=0)] = 2,
     fail_fast: Annotated[
-        bool, typer.Option("--fail-fast", help="End the batch with the first job that fails.")
+        bool, opt.option("End the batch with the first job that fails.", "--fail-fast")
     ] = False,
     option: Annotated[
         list[str] | None,
-        typer.Option(help="Word for each command line, e.g. --option=--no-mesh. May be repeated."),
+        opt.option("Word for each command line, e.g. --option=--no-mesh. May be repeated."),
     ] = None,
     set_: opt.Set = None,
     json: opt.Json = False,

@@ -1,15 +1,23 @@
-"""`recon calibrate`: calibrate a rig from images of a board."""
+"""Cameras and what they record: `recon board`, `calibrate`, `rectify`, `audit` and `capture`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from recon.cli import options as opt
-from recon.cli.errors import one_line_errors
+from recon.cli.drive_options import SourceOptions, Start
+from recon.cli.errors import one_line_errors, until_interrupted
 from recon.cli.tables import print_figures, print_json, print_run
+from recon.core.errors import SettingsError
+from recon.core.text import is_count
+
+_BOARD = (
+    "chess:9x6:25mm (inner corners, square size) or charuco:8x6:30mm:22mm:5x5_100 (squares, "
+    "square size, marker size, dictionary)."
+)
 
 
 @opt.takes_groups
@@ -21,47 +29,37 @@ def calibrate(
             "one video with both views."
         ),
     ],
-    board: Annotated[
-        str,
-        typer.Option(
-            help="chess:9x6:25mm (inner corners, square size) or "
-            "charuco:8x6:30mm:22mm:5x5_100 (squares, square size, marker size, dictionary)."
-        ),
-    ],
+    board: Annotated[str, opt.option(_BOARD)],
     right: Annotated[
         str | None,
         typer.Argument(help="Right images, likewise.", show_default="both views are in LEFT"),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Calibration file to write.")
-    ] = None,
+    out: Annotated[Path | None, opt.option("Calibration file to write.", "--out", "-o")] = None,
     form: Annotated[
         Literal["recon", "opencv", "ros", "kalibr"],
-        typer.Option(
-            "--format", "-f", help="Format of that file; ros writes two, _left and _right."
-        ),
+        opt.option("Format of that file; ros writes two, _left and _right.", "--format", "-f"),
     ] = "recon",
     model: Annotated[
         Literal["radtan", "rational", "fisheye"] | None,
         opt.setting(
             "calibration.model",
-            help="Lens model: radtan, rational (wide angle) or fisheye (150 degrees or more).",
-            show_default="radtan",
+            "Lens model: radtan, rational (wide angle) or fisheye (150 degrees or more).",
+            default="radtan",
         ),
     ] = None,
     distance: Annotated[
         float | None,
         opt.setting(
             "calibration.working_m",
-            help="Distance in metres for which the verdict is made.",
-            show_default="where matching errs by 2 %",
+            "Distance in metres for which the verdict is made.",
+            default="where matching errs by 2 %",
         ),
     ] = None,
     report: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for the report, figures and pictures.",
-            show_default="outputs/calibrate/<UTC time stamp>",
+        opt.option(
+            "Folder for the report, figures and pictures.",
+            default="outputs/calibrate/<UTC time stamp>",
         ),
     ] = None,
     *,
@@ -79,7 +77,7 @@ def calibrate(
       recon calibrate both.mp4 --board chess:9x6:25mm
     """
     with shared.one_line_errors():
-        from recon.commands.calibrate import run_calibrate
+        from recon.commands.cameras import run_calibrate
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
         from recon.io.atomic import check_targets
@@ -90,16 +88,8 @@ def calibrate(
         if out is not None and shared.config is not None:
             check_targets([out], [shared.config])
         settings = load_config(shared.config, [*fitting, *shared.changes])
-        run = run_calibrate(
-            left,
-            right,
-            parse_board(board),
-            settings,
-            file=out,
-            form=form,
-            out=report,
-            threads=shared.threads,
-        )
+        how: Any = {"file": out, "form": form, "out": report, "threads": shared.threads}
+        run = run_calibrate(left, right, parse_board(board), settings, **how)
     if shared.json:
         print_json(run.summary)
     else:
@@ -113,28 +103,23 @@ def calibrate(
 def board(
     pattern: Annotated[
         str | None,
-        typer.Argument(
-            metavar="BOARD",
-            help="chess:9x6:25mm (inner corners, square size) or "
-            "charuco:8x6:30mm:22mm:5x5_100 (squares, square size, marker size, dictionary).",
-        ),
+        typer.Argument(metavar="BOARD", help=_BOARD),
     ] = None,
     same: Annotated[
-        str | None, typer.Option("--board", help="The board as an option, as in recon calibrate.")
+        str | None, opt.option("The board as an option, as in recon calibrate.", "--board")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="PDF or PNG file to write.")] = Path(
+    out: Annotated[Path, opt.option("PDF or PNG file to write.", "--out", "-o")] = Path(
         "board.pdf"
     ),
     paper: Annotated[
         str | None,
-        typer.Option(
-            help="a4, a3, a2, a1, a0, letter, legal, tabloid, or a size such as 600x400mm.",
-            show_default="smallest A size that fits",
+        opt.option(
+            "a4, a3, a2, a1, a0, letter, legal, tabloid, or a size such as 600x400mm.",
+            default="smallest A size that fits",
         ),
     ] = None,
     dpi: Annotated[
-        float,
-        typer.Option(min=30, max=2400, help="Approximate resolution of a PNG, in pixels per inch."),
+        float, opt.option("Approximate resolution of a PNG, in pixels per inch.", min=30, max=2400)
     ] = 300.0,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -166,13 +151,13 @@ def rectify(
     right: Annotated[str, typer.Argument(help="Right image, folder or pattern.")],
     calib: Annotated[
         Path | None,
-        typer.Option(
-            help="Calibration of the raw cameras. Without one, homographies are estimated from "
+        opt.option(
+            "Calibration of the raw cameras. Without one, homographies are estimated from "
             "image features, and depth has no scale."
         ),
     ] = None,
     unit_m: Annotated[
-        float, typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm.")
+        float, opt.option("Metres per unit in an OpenCV file, e.g. 0.001 for mm.", min=1e-6)
     ] = 1.0,
     out: opt.Out = None,
     *,
@@ -188,15 +173,109 @@ def rectify(
       recon rectify left.png right.png
     """
     with shared.one_line_errors():
-        from recon.commands.calibrate import run_rectify
+        from recon.commands.cameras import run_rectify
 
-        run = run_rectify(
-            left,
-            right,
-            shared.settings(),
-            calibration=calib,
-            metres_per_unit=unit_m,
-            out=out,
-            threads=shared.threads,
-        )
+        how: Any = {"calibration": calib, "metres_per_unit": unit_m, "out": out}
+        run = run_rectify(left, right, shared.settings(), threads=shared.threads, **how)
     shared.show(run.summary)
+
+
+@opt.takes_groups
+def audit(
+    source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
+    mend: Annotated[
+        Path | None, opt.option("Write a calibration that fits rows and motion to this file.")
+    ] = None,
+    out: Annotated[
+        Path | None, opt.option("Folder for a report with images.", "--out", "-o", default="none")
+    ] = None,
+    start: Start = None,
+    verbose: opt.Verbose = False,
+    *,
+    reading: SourceOptions,
+    shared: opt.Asked,
+) -> None:
+    """Check a recording before a long run: good, usable or not usable, and why.
+
+    Looks at row alignment, swapped, delayed or frozen cameras, missing and
+    repeated frames, exposure, focus and baseline, and predicts the depth error.
+    The motion of the drive shows how the right camera is turned; not the scale.
+    With --out, sample pairs, row errors and disparities are drawn in a report.
+
+    Examples:
+      recon audit drive.bag --calib camchain.yaml
+      recon audit rides/today --mend mended.yaml
+      recon audit rides/today --out audited
+    """
+    with shared.one_line_errors():
+        from recon.cli.progress import announce
+        from recon.commands.cameras import run_audit
+        from recon.io.atomic import check_targets
+        from recon.report.audit_page import audit_lines
+        from recon.sources.registry import open_source
+
+        if mend is not None and shared.config is not None:
+            check_targets([mend], [shared.config])
+        settings = shared.settings()
+        drive = open_source(source, reading.kind, settings.source)
+        announce(drive, quiet=shared.quiet, verbose=verbose)
+        found = run_audit(drive, settings, mend=mend, out=out)
+    if shared.json:
+        print_json(found.summary)
+        return
+    print_figures("", audit_lines(found.summary))
+    for finding in found.findings:
+        typer.echo(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}")
+    typer.echo(f"verdict: {found.verdict}")
+    if out is not None:
+        typer.echo(f"results: {out}")
+
+
+def _size(text: str) -> dict[str, str]:
+    width, _, height = text.partition("x")
+    if not (is_count(width) and is_count(height)):
+        raise SettingsError("cannot read this size", got=text, expected="WIDTHxHEIGHT: 1280x720")
+    return {"capture.width_px": width, "capture.height_px": height}
+
+
+@opt.takes_groups
+def capture(
+    left: Annotated[
+        str,
+        typer.Argument(help="Left camera (0, /dev/video0) or video, or one that has both views."),
+    ],
+    out: Annotated[Path, opt.option("New folder for the recording.", "--out", "-o")],
+    right: Annotated[str | None, typer.Argument(help="Right camera or video.")] = None,
+    calib: Annotated[
+        Path | None, opt.option("Calibration file to copy into the folder.", "--calib")
+    ] = None,
+    frames: Annotated[int | None, opt.option("Stop after this many pairs.", min=1)] = None,
+    seconds: Annotated[float | None, opt.option("Stop after this many seconds.")] = None,
+    size: Annotated[str | None, opt.setting(_size, "Requested image size, e.g. 1280x720.")] = None,
+    rate: Annotated[
+        float | None, opt.setting("capture.rate_hz", "Requested frame rate, in frames per second.")
+    ] = None,
+    preview: Annotated[int | None, opt.option("Update preview.jpg every N pairs.", min=1)] = None,
+    *,
+    shared: opt.Asked,
+) -> None:
+    """Record a drive from two cameras, or from one that has both views side by side.
+
+    Stop with Ctrl-C. The folder is valid at any moment, and recon map takes it
+    as it is.
+
+    Examples:
+      recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
+      recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
+    """
+    with shared.one_line_errors():
+        from recon.commands.cameras import run_capture
+        from recon.rig.capture import RecordingSettings
+
+        known = shared.settings().capture
+        limits = {"frames": frames, "seconds": seconds, "preview_every": preview}
+        settings = RecordingSettings.parse({**dict(known), **limits})
+        devices = [left] if right is None else [left, right]
+        with until_interrupted() as stopped:
+            summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)
+    print_json(summary) if shared.json else print_figures("", summary)

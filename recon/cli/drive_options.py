@@ -33,17 +33,17 @@ def _memory_limit(text: str) -> dict[str, Any]:
 
 
 Start = Annotated[
-    int | None, setting("source.start", "--start", help="First frame to use.", show_default="0")
+    int | None, setting("source.start", "First frame to use.", "--start", default="0")
 ]
 StartInMap = Annotated[
     str | None,
     setting(
         _first_frame,
-        "--start",
-        metavar="X,Y,YAW|FRAME",
-        help="Where the drive begins in map axes, if known: metres, and degrees from x to y. "
+        "Where the drive begins in map axes, if known: metres, and degrees from x to y. "
         "A single number is the first frame to use.",
-        show_default="anywhere in the map, frame 0",
+        "--start",
+        default="anywhere in the map, frame 0",
+        metavar="X,Y,YAW|FRAME",
     ),
 ]
 
@@ -56,32 +56,28 @@ class RectifiedOptions:
         float | None,
         setting(
             "source.focal_px",
+            "Focal length of images that are rectified already, without --calib.",
+            default="that of the calibration",
             metavar="PX",
-            help="Focal length of images that are rectified already, without --calib.",
-            show_default="that of the calibration",
         ),
     ] = None
     baseline: Annotated[
         float | None,
         setting(
             "source.baseline_m",
+            "Distance between their cameras in metres.",
+            default="that of the calibration",
             metavar="M",
-            help="Distance between their cameras in metres.",
-            show_default="that of the calibration",
         ),
     ] = None
     cx: Annotated[
         float | None,
         setting(
-            "source.cx_px",
-            metavar="PX",
-            help="Column of their principal points.",
-            show_default="middle",
+            "source.cx_px", "Column of their principal points.", default="middle", metavar="PX"
         ),
     ] = None
     cy: Annotated[
-        float | None,
-        setting("source.cy_px", metavar="PX", help="Row of it.", show_default="middle"),
+        float | None, setting("source.cy_px", "Row of it.", default="middle", metavar="PX")
     ] = None
 
 
@@ -91,46 +87,42 @@ class SourceOptions(RectifiedOptions):
 
     kind: Annotated[
         str | None,
-        typer.Option(
+        opt.option(
+            "Kind of source: kitti, kitti-raw, euroc, tum, folders, video, bag or middlebury.",
             "--source",
-            help="Kind of source: kitti, kitti-raw, euroc, tum, folders, video, bag or middlebury.",
-            show_default="detected from its files",
+            default="detected from its files",
         ),
     ] = None
     calib: Annotated[
         Path | None,
         setting(
-            "source.calibration",
-            help="Calibration file.",
-            show_default="the one that comes with the source",
+            "source.calibration", "Calibration file.", default="the one that comes with the source"
         ),
     ] = None
     left: Annotated[
-        str | None,
-        setting("source.left", help="Left image folder or topic.", show_default="found by name"),
+        str | None, setting("source.left", "Left image folder or topic.", default="found by name")
     ] = None
     right: Annotated[
         str | None,
         setting(
             "source.right",
-            help="Right image folder or topic, or the right video where SOURCE is the left one.",
-            show_default="found by name",
+            "Right image folder or topic, or the right video where SOURCE is the left one.",
+            default="found by name",
         ),
     ] = None
     tolerance: Annotated[
         float | None,
         setting(
             "source.tolerance_s",
-            help="Largest difference between the time stamps of a pair, in seconds.",
-            show_default="0.01",
+            "Largest difference between the time stamps of a pair, in seconds.",
+            default="0.01",
         ),
     ] = None
     end: Annotated[
-        int | None,
-        setting("source.end", help="Frame at which to stop.", show_default="after the last"),
+        int | None, setting("source.end", "Frame at which to stop.", default="after the last")
     ] = None
     stride: Annotated[
-        int | None, setting("source.stride", help="Use every so many frames.", show_default="1")
+        int | None, setting("source.stride", "Use every so many frames.", default="1")
     ] = None
 
 
@@ -143,9 +135,9 @@ class DriveOptions(SourceOptions):
         str | None,
         setting(
             _memory_limit,
-            help="Memory limit of the process, e.g. 2G or 1500M. A run that exceeds it stops and "
+            "Memory limit of the process, e.g. 2G or 1500M. A run that exceeds it stops and "
             "can be resumed.",
-            show_default="none",
+            default="none",
         ),
     ] = None
 

@@ -16,7 +16,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final, TextIO
+from typing import Final
 
 import typer
 
@@ -39,11 +39,12 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     not shown that kernels are being compiled.
     """
     for stream in (sys.stdout, sys.stderr):
-        _escape_what_is_not_unicode(stream)
+        if isinstance(stream, io.TextIOWrapper):  # bytes of file names may not be UTF-8
+            stream.reconfigure(errors="backslashreplace")
     try:
         _check_surroundings()
-        notice = _CompilingNotice(quiet)
-        with _standard_output_kept_clean(quiet), when_compiling(notice.show):
+        notice = _compiling_notice(quiet)
+        with _standard_output_kept_clean(quiet), when_compiling(notice):
             yield
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
@@ -108,19 +109,20 @@ def report_unforeseen(error: BaseException) -> int:
     return _BUG
 
 
-class _CompilingNotice:
-    """Says on a terminal, once, why a command waits for the compiler."""
+def _compiling_notice(quiet: bool) -> Callable[[str], None]:
+    """Return what says on a terminal, once, why a command waits for the compiler."""
+    silent = quiet or not sys.stderr.isatty()
 
-    def __init__(self, quiet: bool) -> None:
-        self._silent = quiet or not sys.stderr.isatty()
-
-    def show(self, kernel: str) -> None:
+    def show(kernel: str) -> None:
         del kernel
-        if not self._silent:
-            self._silent = True
+        nonlocal silent
+        if not silent:
+            silent = True
             typer.echo(
                 "compiling kernels, once after an installation: about two minutes …", err=True
             )
+
+    return show
 
 
 @contextmanager
@@ -135,12 +137,6 @@ def _standard_output_kept_clean(quiet: bool) -> Iterator[None]:
     finally:
         os.dup2(saved, 1)
         os.close(saved)
-
-
-def _escape_what_is_not_unicode(stream: TextIO) -> None:
-    """Print bytes of file names that are not UTF-8 as escapes, instead of failing."""
-    if isinstance(stream, io.TextIOWrapper):
-        stream.reconfigure(errors="backslashreplace")
 
 
 def _interrupted(error: BaseException) -> bool:

@@ -12,17 +12,17 @@ from recon.cli.errors import one_line_errors
 from recon.cli.options import Commands
 from recon.cli.tables import print_evaluation, print_figures, print_json
 
-app = Commands(no_args_is_help=True, help="Compare results with ground truth.")
+app = Commands(name="evaluate", no_args_is_help=True, help="Compare results with ground truth.")
 
 
 _NONE = "none"
 Matchers = Annotated[
     str | None,
-    typer.Option(
-        "--matcher",
-        help="Matchers, separated by commas: sad, sgm, opencv-bm, opencv-sgbm, onnx, or those of "
+    opt.option(
+        "Matchers, separated by commas: sad, sgm, opencv-bm, opencv-sgbm, onnx, or those of "
         "installed plug-ins; none for --results alone.",
-        show_default="matching.matcher, sad unless changed",
+        "--matcher",
+        default="matching.matcher, sad unless changed",
     ),
 ]
 
@@ -39,31 +39,29 @@ def middlebury(
     matcher: Matchers = None,
     results: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Folder with results of another program: SCENE.pfm or SCENE/disp0*.pfm, for a "
+        opt.option(
+            "Folder with results of another program: SCENE.pfm or SCENE/disp0*.pfm, for a "
             "column of its own. May be repeated."
         ),
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder with the same scenes at another size, for those without ground truth."
-        ),
+        opt.option("Folder with the same scenes at another size, for those without ground truth."),
     ] = None,
     parallel: Annotated[
-        int, typer.Option(min=1, help="Scenes to process at once. Above 1, the times mean nothing.")
+        int, opt.option("Scenes to process at once. Above 1, the times mean nothing.", min=1)
     ] = 1,
     range_: Annotated[
         Literal["scene", "auto"],
-        typer.Option(
-            "--range",
-            help="Disparity range: published with the scene (before 2014: from its ground "
+        opt.option(
+            "Disparity range: published with the scene (before 2014: from its ground "
             "truth), or estimated from each pair.",
+            "--range",
         ),
     ] = "scene",
     out: opt.Out = None,
     latex: Annotated[
-        bool, typer.Option("--latex", help="Print the tables in LaTeX, the best value in bold.")
+        bool, opt.option("Print the tables in LaTeX, the best value in bold.", "--latex")
     ] = False,
     *,
     shared: opt.Shared,
@@ -121,18 +119,15 @@ def disparity(
         Path, typer.Argument(help="Disparity map: PFM, or 16-bit PNG as used by KITTI.")
     ],
     truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
-    mask: Annotated[
-        Path | None, typer.Option(help="Image that is 255 at the pixels to compare.")
-    ] = None,
+    mask: Annotated[Path | None, opt.option("Image that is 255 at the pixels to compare.")] = None,
     scale: Annotated[
         float,
-        typer.Option(
-            min=1e-3,
-            help="Scale of the reported errors: 4 reports a quarter-size map at full size.",
+        opt.option(
+            "Scale of the reported errors: 4 reports a quarter-size map at full size.", min=1e-3
         ),
     ] = 1.0,
     confidence: Annotated[
-        Path | None, typer.Option(help="Confidence of the map (PFM), to be evaluated too.")
+        Path | None, opt.option("Confidence of the map (PFM), to be evaluated too.")
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -168,36 +163,31 @@ def trajectory(
     truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
     align: Annotated[
         Literal["none", "origin", "se3", "sim3", "upright"],
-        typer.Option(
-            help="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
+        opt.option(
+            "Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
             "rigid with scale (sim3), or rigid where z is up in both (upright)."
         ),
     ] = "se3",
     lengths: Annotated[
         str | None,
-        typer.Option(
-            help="Lengths of the segments in metres, e.g. 50,100.",
-            show_default="100 to 800, or shorter on short drives",
+        opt.option(
+            "Lengths of the segments in metres, e.g. 50,100.",
+            default="100 to 800, or shorter on short drives",
         ),
     ] = None,
     step: Annotated[
         int | None,
-        typer.Option(
-            help="Frames between the starts of segments.",
-            show_default="10, or 1 on short drives",
-        ),
+        opt.option("Frames between the starts of segments.", default="10, or 1 on short drives"),
     ] = None,
-    rpe_frames: Annotated[int, typer.Option(help="Frame distance of the RPE.")] = 1,
+    rpe_frames: Annotated[int, opt.option("Frame distance of the RPE.")] = 1,
     times: Annotated[
-        Path | None,
-        typer.Option(help="Times of the poses of a KITTI file, in seconds, one per line."),
+        Path | None, opt.option("Times of the poses of a KITTI file, in seconds, one per line.")
     ] = None,
     tolerance: Annotated[
-        float,
-        typer.Option(min=0, help="Largest time difference between two matched poses, in seconds."),
+        float, opt.option("Largest time difference between two matched poses, in seconds.", min=0)
     ] = 0.01,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for a report and its plots.")
+        Path | None, opt.option("Folder for a report and its plots.", "--out", "-o")
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -232,10 +222,10 @@ def trajectory(
 def occupancy(
     run: Annotated[Path, typer.Argument(help="Folder of a recon demo run.")],
     least_frames: Annotated[
-        int, typer.Option(min=1, help="Compare only what at least this many frames saw.")
+        int, opt.option("Compare only what at least this many frames saw.", min=1)
     ] = 3,
     picture: Annotated[
-        Path | None, typer.Option(help="PNG to draw: the grid with its errors in colour.")
+        Path | None, opt.option("PNG to draw: the grid with its errors in colour.")
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -272,29 +262,29 @@ def map_(
     reference: Annotated[Path, typer.Argument(help="Reference point cloud (PLY).")],
     reference_frame: Annotated[
         Literal["camera", "map"] | None,
-        typer.Option(
-            help="Frame of REFERENCE: the first left camera, or the map.",
-            show_default="camera, or the one in which --align icp finds more",
+        opt.option(
+            "Frame of REFERENCE: the first left camera, or the map.",
+            default="camera, or the one in which --align icp finds more",
         ),
     ] = None,
     threshold: Annotated[
         str,
-        typer.Option(
-            help="Distance in metres up to which a point counts as correct; several with commas."
+        opt.option(
+            "Distance in metres up to which a point counts as correct; several with commas."
         ),
     ] = "0.2",
     align_to: Annotated[
         Path | None,
-        typer.Option(
-            help="Ground-truth poses (KITTI or TUM): align the path of the run, and the map with "
+        opt.option(
+            "Ground-truth poses (KITTI or TUM): align the path of the run, and the map with "
             "it, to these first."
         ),
     ] = None,
     align: Annotated[
-        Literal["none", "icp"], typer.Option(help="Align the cloud to the reference with ICP.")
+        Literal["none", "icp"], opt.option("Align the cloud to the reference with ICP.")
     ] = "none",
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for clouds coloured by error.")
+        Path | None, opt.option("Folder for clouds coloured by error.", "--out", "-o")
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -336,8 +326,8 @@ def paper(
         bool,
         opt.setting(
             "paper.as_printed",
+            "Also run the method as printed, and compare the two.",
             "--as-printed",
-            help="Also run the method as printed, and compare the two.",
         ),
     ] = False,
     out: opt.Out = None,

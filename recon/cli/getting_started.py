@@ -1,14 +1,16 @@
-"""`recon demo`: the whole pipeline on a rendered street, compared with ground truth."""
+"""What needs no recording: `recon demo`, `doctor`, `settings`, and `datasets`, which gets some."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
-from recon.cli.tables import print_json
+from recon.cli.options import Commands
+from recon.cli.tables import print_datasets, print_json
 from recon.core.text import counted
 
 
@@ -16,10 +18,10 @@ from recon.core.text import counted
 def demo(
     out: opt.Out = None,
     frames: Annotated[
-        int | None, opt.setting("street.frames", min=1, help="Number of frames.", show_default="40")
+        int | None, opt.setting("street.frames", "Number of frames.", default="40", min=1)
     ] = None,
     seed: Annotated[
-        int | None, opt.setting("street.seed", min=0, help="Seed of the street.", show_default="0")
+        int | None, opt.setting("street.seed", "Seed of the street.", default="0", min=0)
     ] = None,
     mesh: opt.Mesh = True,
     *,
@@ -43,8 +45,7 @@ def demo(
 
 def doctor(
     compile_: Annotated[
-        bool,
-        typer.Option("--compile", help="Compile the kernels now, instead of checking anything."),
+        bool, opt.option("Compile the kernels now, instead of checking anything.", "--compile")
     ] = False,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -60,7 +61,16 @@ def doctor(
       recon doctor --compile
     """
     if compile_:
-        _compile(json=json, quiet=quiet)
+        with one_line_errors(quiet=quiet):
+            from recon.commands.demo import compile_kernels
+
+            done = compile_kernels()
+        kernels, seconds = done.values()
+        text = f"{counted(kernels, 'kernel')} compiled in {seconds:.0f} s, and kept"
+        if json:
+            print_json(done)
+        else:
+            typer.echo(text if kernels else "the kernels are compiled already")
         return
     with one_line_errors(quiet=quiet):
         from dataclasses import asdict
@@ -79,30 +89,14 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _compile(*, json: bool, quiet: bool) -> None:
-    with one_line_errors(quiet=quiet):
-        from recon.commands.demo import compile_kernels
-
-        done = compile_kernels()
-    if json:
-        print_json({"kernels": done.kernels, "seconds": round(done.seconds, 1)})
-    elif done.kernels:
-        typer.echo(f"{counted(done.kernels, 'kernel')} compiled in {done.seconds:.0f} s, and kept")
-    else:
-        typer.echo("the kernels are compiled already")
-
-
 def settings(
     name: Annotated[
         str | None,
         typer.Argument(
-            help="A setting, a group such as matching.sgm, or a part of a name.",
-            show_default="all",
+            help="A setting, a group such as matching.sgm, or a part of a name.", show_default="all"
         ),
     ] = None,
-    markdown: Annotated[
-        bool, typer.Option("--markdown", help="Print the page docs/settings.md.")
-    ] = False,
+    markdown: Annotated[bool, opt.option("Print the page docs/settings.md.", "--markdown")] = False,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
 ) -> None:
@@ -128,3 +122,95 @@ def settings(
         from recon.cli.tables import print_settings
 
         print_settings(groups)
+
+
+datasets = Commands(
+    name="datasets",
+    no_args_is_help=True,
+    help="Public data that recon reads: Middlebury, KITTI, EuRoC, TUM VI.",
+)
+Names = Annotated[
+    list[str],
+    typer.Argument(metavar="NAME...", help="Data sets, or parts: kitti-raw/2011_09_26_drive_0013."),
+]
+Folder = Annotated[Path, opt.option("Where data sets are kept.", "--folder")]
+_FOLDER = Path("datasets")
+
+
+@datasets.command("list")
+def list_(
+    name: Annotated[
+        str | None, typer.Argument(help="A data set, to list its parts.", show_default="all")
+    ] = None,
+    folder: Folder = _FOLDER,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+) -> None:
+    """List the data sets with size, licence and what is there already.
+
+    With a name, also its parts, what to cite, how its folder is laid out, and
+    the command that reads it.
+
+    Examples:
+      recon datasets list
+      recon datasets list kitti-raw
+    """
+    with one_line_errors(quiet=quiet):
+        from recon.commands.datasets import run_list
+
+        found = run_list(name, folder)
+    print_json(found) if json else print_datasets(found)
+
+
+@datasets.command()
+def fetch(
+    names: Names,
+    folder: Folder = _FOLDER,
+    address: Annotated[
+        str | None,
+        opt.option(
+            "A mirror: a folder on a server that has the archives by their names.",
+            default="the owners' server",
+            metavar="URL",
+        ),
+    ] = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+) -> None:
+    """Download, check and unpack data sets as recon reads them.
+
+    A download that broke off goes on where it was. What is there already is
+    left alone. The terms of the owners hold; `recon datasets list` shows them.
+
+    Examples:
+      recon datasets fetch middlebury-eval3/Q
+      recon datasets fetch kitti-raw/2011_09_26_drive_0013 tum-vi/room1
+      recon datasets fetch euroc/vicon_room1 --address http://mirror.example/data
+    """
+    with one_line_errors(quiet=quiet):
+        from recon.cli.progress import choose_viewer
+        from recon.commands.datasets import run_fetch
+
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        found = run_fetch(names, folder, address=address, progress=viewer)
+    print_json(found) if json else print_datasets(found)
+
+
+@datasets.command()
+def verify(
+    names: Names, folder: Folder = _FOLDER, json: opt.Json = False, quiet: opt.Quiet = False
+) -> None:
+    """Compare the files of fetched data sets with what was unpacked.
+
+    The first file that is missing or has changed is an error; of a data set
+    with parts, those that were fetched are compared.
+
+    Examples:
+      recon datasets verify middlebury-eval3/Q
+    """
+    with one_line_errors(quiet=quiet):
+        from recon.commands.datasets import run_verify
+
+        found = run_verify(names, folder)
+    print_json(found) if json else print_datasets(found)

@@ -1,18 +1,29 @@
-"""`recon map` and `recon merge`: map a stereo drive; make one map of several."""
+"""Drives and their maps: `recon map`, `merge`, `live` and `localize`."""
 
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive_options import DriveOptions, Start, open_drive, open_workers
-from recon.cli.errors import one_line_errors
+from recon.cli.drive_options import (
+    DriveOptions,
+    Start,
+    StartInMap,
+    open_drive,
+    open_workers,
+    read_start,
+)
+from recon.cli.errors import one_line_errors, until_interrupted
 from recon.cli.tables import print_json, print_run
+
+if TYPE_CHECKING:
+    from recon.sources.source import StereoSource
 
 
 @opt.takes_groups
@@ -24,39 +35,36 @@ def map_(
         Literal["visual", "kiss", "fused"] | None,
         opt.setting(
             "odometry.method",
-            help="visual: features followed from frame to frame; kiss: kiss-icp on the points that "
+            "visual: features followed from frame to frame; kiss: kiss-icp on the points that "
             "stereo measures well, to compare with; fused: earlier name of visual.",
-            show_default="visual",
+            default="visual",
         ),
     ] = None,
     poses: Annotated[
-        Path | None, typer.Option(help="Known poses (KITTI or TUM), used instead of odometry.")
+        Path | None, opt.option("Known poses (KITTI or TUM), used instead of odometry.")
     ] = None,
     prior: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE|TOPIC",
-            help="Trajectory from wheel odometry, an IMU or GNSS that guides the odometry: a TUM "
+        opt.option(
+            "Trajectory from wheel odometry, an IMU or GNSS that guides the odometry: a TUM "
             "file on the clock of the images, or a topic of the bag, such as /odom.",
+            metavar="FILE|TOPIC",
         ),
     ] = None,
     mesh: opt.Mesh = True,
     resume: Annotated[
-        Path | None,
-        typer.Option(help="Continue the interrupted run in this folder; without SOURCE."),
+        Path | None, opt.option("Continue the interrupted run in this folder; without SOURCE.")
     ] = None,
     into: Annotated[
         Path | None,
-        typer.Option(
-            help="Add the drive to the map of this finished run, which is replaced when all is "
+        opt.option(
+            "Add the drive to the map of this finished run, which is replaced when all is "
             "done; settings are those of the run."
         ),
     ] = None,
     remove: Annotated[
         int | None,
-        typer.Option(
-            metavar="SESSION", help="With --into, without SOURCE: take a drive out of its map."
-        ),
+        opt.option("With --into, without SOURCE: take a drive out of its map.", metavar="SESSION"),
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
@@ -82,7 +90,14 @@ def map_(
     """
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
-    _check_folders(source, out, resume, into, remove)
+    if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
+        raise typer.BadParameter("--out and --resume name different folders")
+    if into is not None and (resume is not None or out is not None):
+        raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")
+    if remove is not None and (into is None or source is not None):
+        raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
+    if source is None and resume is None and remove is None:
+        raise typer.BadParameter("give SOURCE, or --resume FOLDER")
     if into is not None and (workers or scheduler) is not None:
         raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
     with shared.one_line_errors():
@@ -112,36 +127,19 @@ def map_(
             summary = run_remove(into, remove, settings, options)
         else:
             drive, options = open_drive(options, settings, shared)
-            if into is not None:
-                summary = run_map_into(into, drive, settings, options)
-            else:
-                summary = run_map(drive, settings, options).summary
+            summary = (
+                run_map(drive, settings, options).summary
+                if into is None
+                else run_map_into(into, drive, settings, options)
+            )
     shared.show(summary)
-
-
-def _check_folders(
-    source: Path | None,
-    out: Path | None,
-    resume: Path | None,
-    into: Path | None,
-    remove: int | None,
-) -> None:
-    """Refuse options that say nothing together."""
-    if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
-        raise typer.BadParameter("--out and --resume name different folders")
-    if into is not None and (resume is not None or out is not None):
-        raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")
-    if remove is not None and (into is None or source is not None):
-        raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
-    if source is None and resume is None and remove is None:
-        raise typer.BadParameter("give SOURCE, or --resume FOLDER")
 
 
 def piece(
     plan: Annotated[Path, typer.Argument(help="Plan of the pieces, in the folder of the run.")],
     number: Annotated[int, typer.Argument(help="Number of the piece.")],
-    out: Annotated[Path | None, typer.Option(help="New folder of the piece.")] = None,
-    resume: Annotated[Path | None, typer.Option(help="Folder of one to go on with.")] = None,
+    out: Annotated[Path | None, opt.option("New folder of the piece.")] = None,
+    resume: Annotated[Path | None, opt.option("Folder of one to go on with.")] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
@@ -180,10 +178,10 @@ def merge(
     out: opt.Out = None,
     georeference: Annotated[
         Path | None,
-        typer.Option(
-            help="Measured positions, which the paths are bent to run through: rows of time, "
+        opt.option(
+            "Measured positions, which the paths are bent to run through: rows of time, "
             "easting, northing and height (s, m), on the clock of the images.",
-            show_default="none",
+            default="none",
         ),
     ] = None,
     antenna: opt.Antenna = None,
@@ -212,3 +210,102 @@ def merge(
         options = shared.options("merge", out, mesh=mesh)
         summary = run_merge(runs, settings, options, opt.survey_of(georeference, antenna))
     shared.show(summary)
+
+
+@opt.takes_groups
+def live(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Left camera (0, /dev/video0, address of a stream) or one that has both views; or "
+            "a recording. " + opt.SOURCES_HELP
+        ),
+    ],
+    right_camera: Annotated[
+        str | None, typer.Argument(help="Right camera, or the right video as if it were one.")
+    ] = None,
+    rate: Annotated[
+        float, opt.option("How many times as fast as recorded a recording is played.")
+    ] = 1.0,
+    map_: Annotated[
+        Path | None,
+        opt.option(
+            "Find the drive in this map, a run folder or a map file, and make none.",
+            "--map",
+            default="make a map",
+        ),
+    ] = None,
+    out: opt.Out = None,
+    start: StartInMap = None,
+    mesh: opt.Mesh = False,
+    *,
+    reading: DriveOptions,
+    shared: opt.Shared,
+) -> None:
+    """Map a drive while its images arrive, from cameras or from a recording.
+
+    A recording is played at its time stamps. The pose of each frame comes first;
+    matching follows as far as there is time. Where even poses take too long,
+    frames are dropped. summary.json counts both, and the time from an image to
+    its pose. Ctrl-C ends the drive, and its map is completed.
+
+    Examples:
+      recon live 0 2 --calib stereo.yaml
+      recon live rides/today --rate 2
+      recon live rides/today --map outputs/map/latest
+    """
+    with shared.one_line_errors(), ExitStack() as stack:
+        from recon.cli.progress import announce
+        from recon.commands.localize import run_live
+        from recon.rig.cameras import is_camera, open_camera_source
+
+        stopped = stack.enter_context(until_interrupted())
+        pose, _ = read_start(start)
+        settings = shared.settings()
+        options = shared.options("live", out, mesh=mesh, source=source, kind=reading.kind)
+        drive: StereoSource
+        if right_camera is not None or is_camera(source):
+            devices = [source] if right_camera is None else [source, right_camera]
+            cameras = open_camera_source(devices, settings.capture, settings.source, stopped)
+            drive = stack.enter_context(cameras)
+            announce(drive, quiet=shared.quiet, verbose=shared.verbose)
+        else:
+            drive, options = open_drive(options, settings, shared)
+        summary = run_live(
+            drive, settings, options, rate=rate, map_path=map_, start=pose, stopped=stopped
+        )
+    shared.show(summary)
+
+
+@opt.takes_groups
+def localize(
+    source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
+    map_: Annotated[
+        Path, opt.option("The map: folder of a recon map or recon demo run, or its file.", "--map")
+    ],
+    out: opt.Out = None,
+    start: StartInMap = None,
+    *,
+    reading: DriveOptions,
+    shared: opt.Shared,
+) -> None:
+    """Find a drive in a map that is there already: the pose of each frame.
+
+    The first frames are recognised by the keyframes of the map, later ones
+    tracked against its features and surfaces. Frames are searching (no pose),
+    tracking (the map confirms the pose), coasting (the pose is by odometry alone,
+    for some metres at most) or lost (no pose any more). The map is not changed.
+
+    Examples:
+      recon localize rides/today --map outputs/map/latest
+      recon localize rides/today --map outputs/map/latest --start 12.5,-3,90
+    """
+    with shared.one_line_errors():
+        from recon.commands.localize import run_localize
+
+        pose, _ = read_start(start)
+        settings = shared.settings()
+        options = shared.options("localize", out, source=source, kind=reading.kind)
+        drive, options = open_drive(options, settings, shared)
+        run = run_localize(drive, map_, settings, options, start=pose)
+    shared.show(run.summary)

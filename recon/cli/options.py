@@ -16,117 +16,108 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
 from recon.cli.errors import one_line_errors
 from recon.cli.tables import print_json, print_run
 from recon.core.errors import SettingsError
-from recon.core.text import parse_number
+from recon.core.text import parse_number, refuse_other_numbers
 
 if TYPE_CHECKING:
     from recon.commands.config import Changes, ReconConfig
     from recon.commands.map_options import MapOptions
     from recon.map.sessions.measured import Survey
     from recon.run.progress import Progress
-from typer.core import TyperCommand
-
-from recon.core.text import refuse_other_numbers
 
 _KEYWORD: Final = inspect.Parameter.KEYWORD_ONLY
 Read = str | Callable[[Any], Mapping[str, Any]]
 """The setting that an option stands for; or what makes of its value settings with theirs."""
 
 
-def setting(read: Read, *names: str, **how: Any) -> Any:
-    """Declare an option, as `typer.Option` does, that stands for a setting."""
-    option = typer.Option(*names, **how)
-    option.setting = read
-    return option
+def option(text: str, *names: str, default: str | None = None, **how: Any) -> Any:
+    """Declare an option, as `typer.Option` does, by its help and the default that this shows."""
+    return typer.Option(*names, help=text, show_default=default or True, **how)
+
+
+def setting(read: Read, text: str, *names: str, **how: Any) -> Any:
+    """Declare an option that stands for a setting."""
+    declared = option(text, *names, **how)
+    declared.setting = read
+    return declared
 
 
 Out = Annotated[
     Path | None,
-    typer.Option(
-        "--out",
-        "-o",
-        help="Folder for the results.",
-        show_default="outputs/<command>/<UTC time stamp>",
-    ),
+    option("Folder for the results.", "--out", "-o", default="outputs/<command>/<UTC time stamp>"),
 ]
 Config = Annotated[
     Path | None,
-    typer.Option(
-        "--config", "-c", help="YAML file with settings, such as the config.yaml of a run."
-    ),
+    option("YAML file with settings, such as the config.yaml of a run.", "--config", "-c"),
 ]
 Set = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", "-s", help="Change one setting, e.g. matching.sad.window_px=9. May be repeated."
-    ),
+    option("Change one setting, e.g. matching.sad.window_px=9. May be repeated.", "--set", "-s"),
 ]
 Matcher = Annotated[
     str | None,
     setting(
         "matching.matcher",
+        "Matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one of an installed plug-in.",
         "--matcher",
-        help="Matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one of an installed plug-in.",
-        show_default="matching.matcher, sad unless changed",
+        default="matching.matcher, sad unless changed",
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON and nothing else.")]
+Json = Annotated[bool, option("Print the summary as JSON and nothing else.", "--json")]
 Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Show no progress: only results, warnings and errors.")
+    bool, option("Show no progress: only results, warnings and errors.", "--quiet", "-q")
 ]
 Verbose = Annotated[
     bool,
-    typer.Option(
+    option(
+        "Also print the time spent in each stage; where standard error is no terminal, "
+        "print progress there as JSON lines.",
         "--verbose",
         "-v",
-        help="Also print the time spent in each stage; where standard error is no terminal, "
-        "print progress there as JSON lines.",
     ),
 ]
 Formats = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "Format of the mesh: ply, obj, stl or glb. May be repeated; PLY is always written.",
         "--format",
         "-f",
-        help="Format of the mesh: ply, obj, stl or glb. May be repeated; PLY is always written.",
-        show_default="ply",
+        default="ply",
     ),
 ]
-Mesh = Annotated[bool, typer.Option(help="Reconstruct the surface mesh.")]
+Mesh = Annotated[bool, option("Reconstruct the surface mesh.")]
 Antenna = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "Where that antenna or prism is, from the left camera: metres forward, left, up.",
+        default="0,0,0",
         metavar="X,Y,Z",
-        help="Where that antenna or prism is, from the left camera: metres forward, left, up.",
-        show_default="0,0,0",
     ),
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "Dask scheduler whose workers do the work, such as tcp://host:8786.",
+        default="workers on this machine",
         metavar="ADDRESS",
-        help="Dask scheduler whose workers do the work, such as tcp://host:8786.",
-        show_default="workers on this machine",
     ),
 ]
 Workers = Annotated[
     int | None,
-    typer.Option(
+    option(
+        "Processes that share the work; they need the extra cluster.",
+        default="1: this process",
         min=1,
-        help="Processes that share the work; they need the extra cluster.",
-        show_default="1: this process",
     ),
 ]
 Threads = Annotated[
     int | None,
-    typer.Option(
-        "--threads",
-        min=1,
-        help="Number of threads. Does not change the results.",
-        show_default="all cores",
+    option(
+        "Number of threads. Does not change the results.", "--threads", default="all cores", min=1
     ),
 ]
 SOURCES_HELP = (
@@ -193,7 +184,7 @@ class Asked:
         return load_config(self.config, self.changes, defaults)
 
     def one_line_errors(self) -> AbstractContextManager[None]:
-        """Return what the body of the command runs in; see `recon.cli.errors`."""
+        """Return what the body of the command runs in."""
         return one_line_errors(quiet=self.quiet)
 
 

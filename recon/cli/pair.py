@@ -33,9 +33,8 @@ def _settings(shared: opt.Shared, ndisp: int | None) -> ReconConfig:
     settings = shared.settings(PAIR_DEFAULTS)
     used = settings.matching.matcher
     if ndisp is not None and not hasattr(settings_of(used, settings.matching), "ndisp"):
-        raise SettingsError(
-            "the matcher has no such setting", where="--ndisp", got=f"matcher {name_of(used)!r}"
-        )
+        what, got = "the matcher has no such setting", f"matcher {name_of(used)!r}"
+        raise SettingsError(what, where="--ndisp", got=got)
     return settings
 
 
@@ -45,29 +44,31 @@ Ndisp = Annotated[
     int | None,
     opt.setting(
         _disparities,
+        "Number of disparities to search.",
+        default="from the calibration, else estimated from the pair",
         min=1,
-        help="Number of disparities to search.",
-        show_default="from the calibration, else estimated from the pair",
     ),
 ]
-_CALIB_HELP = "Calibration file: recon, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr."
+Calib = Annotated[
+    Path | None,
+    opt.option(
+        "Calibration file: recon, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr. "
+        "Without one, the pair must be rectified already."
+    ),
+]
 
 
 @opt.takes_groups
 def pair(
     left: Left,
     right: Right,
-    calib: Annotated[
-        Path | None,
-        typer.Option(help=_CALIB_HELP + " Without one, the pair must be rectified already."),
-    ] = None,
+    calib: Calib = None,
     unit_m: Annotated[
         float | None,
-        typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm. [1]"),
+        opt.option("Metres per unit in an OpenCV file, e.g. 0.001 for mm. [1]", min=1e-6),
     ] = None,
     truth: Annotated[
-        Path | None,
-        typer.Option(help="Ground-truth disparity (PFM or 16-bit PNG) to compare with."),
+        Path | None, opt.option("Ground-truth disparity (PFM or 16-bit PNG) to compare with.")
     ] = None,
     out: opt.Out = None,
     formats: opt.Formats = None,
@@ -117,10 +118,7 @@ def pair(
 def disparity(
     left: Left,
     right: Right,
-    calib: Annotated[
-        Path | None,
-        typer.Option(help=_CALIB_HELP + " Without one, the pair must be rectified already."),
-    ] = None,
+    calib: Calib = None,
     out: opt.Out = None,
     matcher: opt.Matcher = None,
     ndisp: Ndisp = None,

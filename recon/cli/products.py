@@ -16,10 +16,10 @@ def export(
     run: Annotated[Path, typer.Argument(help="Folder of a run of map, demo or pair.")],
     to: Annotated[
         list[str] | None,
-        typer.Option(
-            help="What to make: cloud, grid, octomap, mesh, and on request las or laz, the cloud "
+        opt.option(
+            "What to make: cloud, grid, octomap, mesh, and on request las or laz, the cloud "
             "for surveying programs; several separated by commas. A pair has cloud and mesh.",
-            show_default="cloud, grid, octomap, mesh",
+            default="cloud, grid, octomap, mesh",
         ),
     ] = None,
     out: opt.Out = None,
@@ -28,25 +28,22 @@ def export(
         float | None,
         opt.setting(
             "occupancy.resolution_m",
-            help="Cell size of grid and OctoMap in metres.",
-            show_default="as in the run",
+            "Cell size of grid and OctoMap in metres.",
+            default="as in the run",
         ),
     ] = None,
     georeference: Annotated[
         Path | None,
-        typer.Option(
-            help="Measured positions, in whose coordinates las and laz are written: rows of time, "
+        opt.option(
+            "Measured positions, in whose coordinates las and laz are written: rows of time, "
             "easting, northing and height (s, m), on the clock of the images.",
-            show_default="map coordinates",
+            default="map coordinates",
         ),
     ] = None,
     antenna: opt.Antenna = None,
     crs: Annotated[
         str | None,
-        typer.Option(
-            help="Coordinate system of the positions, such as EPSG:25832.",
-            show_default="not stated",
-        ),
+        opt.option("Coordinate system of the positions, such as EPSG:25832.", default="not stated"),
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
@@ -74,7 +71,7 @@ def export(
             run,
             run_settings(run, shared.config, shared.changes),
             products=[name.strip() for text in to or () for name in text.split(",")],
-            formats=tuple(formats or ("ply",)),
+            formats=formats or ("ply",),
             out=out,
             threads=shared.threads,
             workers=open_workers(workers, scheduler, shared),
@@ -115,7 +112,7 @@ def mesh(
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
         settings = shared.settings(defaults)
         summary = run_mesh(
-            source, settings, formats=tuple(formats or ("ply",)), out=out, threads=shared.threads
+            source, settings, formats=formats or ("ply",), out=out, threads=shared.threads
         )
     shared.show(summary)
 
@@ -126,25 +123,22 @@ def occupancy(
     out: opt.Out = None,
     resolution: Annotated[
         float | None,
-        opt.setting(
-            "occupancy.resolution_m", help="Cell size in metres.", show_default="as in the run"
-        ),
+        opt.setting("occupancy.resolution_m", "Cell size in metres.", default="as in the run"),
     ] = None,
     min_height: Annotated[
         float | None,
         opt.setting(
-            "grid.min_height_m",
-            help="Lower end of the obstacle height band, in metres above ground.",
+            "grid.min_height_m", "Lower end of the obstacle height band, in metres above ground."
         ),
     ] = None,
     max_height: Annotated[
-        float | None, opt.setting("grid.max_height_m", help="Upper end of the band, in metres.")
+        float | None, opt.setting("grid.max_height_m", "Upper end of the band, in metres.")
     ] = None,
     max_range: Annotated[
         float | None,
         opt.setting(
             "occupancy.max_range_m",
-            help="Ignore obstacles farther than this from the camera, in metres.",
+            "Ignore obstacles farther than this from the camera, in metres.",
         ),
     ] = None,
     *,

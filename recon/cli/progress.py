@@ -198,43 +198,31 @@ def _width(texts: Sequence[Text]) -> int:
     return sum(1 + text.cell_len for text in texts)
 
 
-def announce(
-    source: StereoSource,
-    *,
-    quiet: bool = False,
-    verbose: bool = False,
-    stream: TextIO | None = None,
-) -> None:
-    """Write one line about a source: text on a terminal, else a JSON object if verbose.
+def announce(source: StereoSource, **how: Any) -> None:
+    """Write one line about a source: text on a terminal, else a JSON object if ``verbose``.
 
-    ``stream`` None = standard error.
+    Nothing if ``quiet``; into ``stream``, None = standard error.
     """
-    event = {
-        "event": "source",
-        "name": source.name,
-        "description": source.description,
-        "frames": len(source),
-    }
-    if not quiet:
-        many = f", {counted(len(source), 'pair')}" if len(source) else ""
-        _write(f"{source.name}: {source.description}{many}", event, verbose, stream)
+    about = {"name": source.name, "description": source.description, "frames": len(source)}
+    many = f", {counted(len(source), 'pair')}" if len(source) else ""
+    _write(f"{source.name}: {source.description}{many}", {"event": "source", **about}, **how)
 
 
-def warn(
-    lines: Iterable[str],
-    *,
-    quiet: bool = False,
-    verbose: bool = False,
-    stream: TextIO | None = None,
-) -> None:
+def warn(lines: Iterable[str], **how: Any) -> None:
     """Write warnings before the run starts, each in the form of `announce`."""
     for line in lines:
-        if not quiet:
-            _write(f"warning: {line}", {"event": "warning", "text": line}, verbose, stream)
+        _write(f"warning: {line}", {"event": "warning", "text": line}, **how)
 
 
-def _write(text: str, event: dict[str, object], verbose: bool, stream: TextIO | None) -> None:
+def _write(
+    text: str,
+    event: dict[str, object],
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    stream: TextIO | None = None,
+) -> None:
     out = sys.stderr if stream is None else stream
-    if out.isatty() or verbose:
+    if not quiet and (out.isatty() or verbose):
         out.write((text if out.isatty() else json.dumps(event, ensure_ascii=False)) + "\n")
         out.flush()

@@ -68,20 +68,9 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
 
 _FRAME: Final = ("source", "rectification", "matching", "cloud", "filters")
 _DRIVE: Final = (
-    *_FRAME,
-    "map_filters",
-    "odometry",
-    "loops",
-    "axes",
-    "fusion",
-    "occupancy",
-    "submaps",
-    "memory",
-    "ground",
-    "grid",
-    "mesh",
-    "street",
-)
+    *_FRAME, "map_filters", "odometry", "loops", "axes", "fusion", "occupancy", "submaps",
+    "memory", "ground", "grid", "mesh", "street",
+)  # fmt: skip
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "map": _DRIVE,
     "demo": _DRIVE,
@@ -189,18 +178,16 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, Mapping):
-        raise SettingsError(
-            "configuration is not a mapping", where=path, got=type(content).__name__
-        )
+        got = type(content).__name__
+        raise SettingsError("configuration is not a mapping", where=path, got=got)
     return content
 
 
 def _parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or key.count(".") > _MOST_DOTS:
-        raise SettingsError(
-            "cannot read this setting", where="--set", got=repr(text), expected="key=value"
-        )
+        what, expected = "cannot read this setting", "key=value"
+        raise SettingsError(what, where="--set", got=repr(text), expected=expected)
     try:
         return key.strip(), parse_yaml(value, "--set")
     except FormatError as error:

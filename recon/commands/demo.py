@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -60,37 +59,24 @@ def demo_source(config: ReconConfig) -> SyntheticSource:
 
 _MATCHERS: Final = tuple(name for name in MATCHERS if name != "onnx")  # it needs a network
 _SMALL: Final = (
-    "street.frames=6",
-    "street.width_px=192",
-    "street.height_px=96",
-    "street.focal_px=120",
+    "street.frames=6", "street.width_px=192", "street.height_px=96", "street.focal_px=120",
     "submaps.length_m=2",
-)
+)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class WarmUp:
-    """How many kernels were not in the cache, and what compiling them took."""
-
-    kernels: int
-    seconds: float
-
-
-def compile_kernels() -> WarmUp:
+def compile_kernels() -> dict[str, Any]:
     """Compile the kernels that pairs, drives and occupancy maps run, for all matchers of ours.
 
-    The real stages run once, on small rendered images.
+    The real stages run once, on small rendered images. Returned is how many ``kernels`` were not in
+    the cache, and how many ``seconds`` it took.
     """
     begun, compiled = time.perf_counter(), set[str]()
     with when_compiling(compiled.add), tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         config = load_config(None, _SMALL)
         source = demo_source(config)
-        run_map(
-            source,
-            config,
-            MapOptions(audit=False, command="demo", out=folder / "drive", mesh=False),
-        )
+        options = MapOptions("demo", folder / "drive", mesh=False, audit=False)
+        run_map(source, config, options)
         run_occupancy(folder / "drive", out=folder / "occupancy")
         read_octomap(folder / "drive" / OCTOMAP)  # as an evaluation does
         _move_submaps(map_sequence(source, config))
@@ -101,7 +87,8 @@ def compile_kernels() -> WarmUp:
             for matcher in _MATCHERS:
                 config = load_config(None, [f"matching.matcher={matcher}"], PAIR_DEFAULTS)
                 FrameReconstructor(source.calibration, config).reconstruct(pair)
-    return WarmUp(len(compiled), time.perf_counter() - begun)
+    seconds = round(time.perf_counter() - begun, 1)
+    return {"kernels": len(compiled), "seconds": seconds}
 
 
 def _move_submaps(mapped: MappedSequence) -> None:

@@ -39,7 +39,7 @@ def examine(outputs: Path = Path("outputs")) -> list[Check]:
         *check_kernels(),
         *check_environment(),
         check_folder("results can be written", outputs, "use --out", needed=True),
-        check_disk(outputs),
+        check_size("free disk space", shutil.disk_usage(_nearest(outputs)).free, _DISK),
     ]
 
 
@@ -59,8 +59,9 @@ def check_kernels() -> Iterator[Check]:
 
 
 _MIN_PYTHON: Final = (3, 10)
-_MIN_MEMORY_GB: Final = 3.0
-_MIN_DISK_GB: Final = 1.0
+# GB that are needed, and what to do where there is less
+_MEMORY: Final = (3.0, "long drives need 3 GB: map fewer frames")
+_DISK: Final = (1.0, "free some space, or use --out on another disk")
 _NO_DATA: Final = "not set; only tests and benchmarks use it"
 _TIMEOUT_S: Final = 120.0
 #: Package name -> module name.
@@ -129,13 +130,11 @@ def check_machine() -> Iterator[Check]:
     """Check cores, memory and OpenCV's number of threads."""
     yield Check("cores", ok=True, found=str(available_cores()), needed=False)
     try:
-        memory_gb = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # not available on this system
         yield Check("memory", ok=True, found="unknown", needed=False)
     else:
-        hint = f"long drives need {_MIN_MEMORY_GB:g} GB: map fewer frames"
-        found = f"{memory_gb:.1f} GB"
-        yield Check("memory", memory_gb >= _MIN_MEMORY_GB, found, hint, needed=False)
+        yield check_size("memory", memory, _MEMORY)
     done, printed = run_python("import cv2; print(cv2.getNumThreads())")
     found = printed if done else "unknown"
     yield Check("OpenCV threads", done, found, "see opencv", needed=False)
@@ -163,11 +162,10 @@ def check_folder(name: str, folder: Path, hint: str, *, needed: bool) -> Check:
         return Check(name, ok=False, found=found, hint=hint, needed=needed)
 
 
-def check_disk(folder: Path) -> Check:
-    """Check the free disk space for results."""
-    free_gb = shutil.disk_usage(_nearest(folder)).free / 1e9
-    found, hint = f"{free_gb:.1f} GB", "free some space, or use --out on another disk"
-    return Check("free disk space", free_gb >= _MIN_DISK_GB, found, hint, needed=False)
+def check_size(name: str, size: int, least: tuple[float, str]) -> Check:
+    """Check whether there is enough memory or disk, in bytes."""
+    least_gb, hint = least
+    return Check(name, size >= 1e9 * least_gb, f"{size / 1e9:.1f} GB", hint, needed=False)
 
 
 def _nearest(folder: Path) -> Path:
@@ -178,13 +176,9 @@ def run_python(code: str, timeout_s: float = _TIMEOUT_S) -> tuple[bool, str]:
     """Run code in a new Python process: whether it ran, and the last line that it printed."""
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-            check=False,
-        )
+            [sys.executable, "-c", code], capture_output=True, text=True, errors="replace",
+            timeout=timeout_s, check=False,
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return False, f"no answer in {timeout_s:g} s"
     if done.returncode < 0:

@@ -143,9 +143,8 @@ def run_evaluate_map(
 ) -> dict[str, Any]:
     """Compare a map with a reference cloud: what `recon evaluate map` does.
 
-    The map is brought into the axes of the reference, and aligned if that is asked for. Precision,
-    recall and F-score are those of each threshold; with the path of a run also those of the points
-    that the reference could have seen. With a folder, both clouds are coloured by their errors.
+    Precision, recall and F-score are those of each threshold; with the path of a run also those of
+    the points that the reference could have seen. With a folder, both clouds are coloured by error.
 
     Args:
         run: A run's folder, or a PLY file. A PLY inside a run's folder is in that run's map axes;
@@ -214,35 +213,29 @@ def run_evaluate_disparity(
     values, true = read_disparity(estimate), read_disparity(truth)
     counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == 255
     if counted.shape != true.shape:
-        raise EvaluationError(
-            "mask and truth differ in size", where=mask, got=counted.shape, expected=true.shape
-        )
+        what, got = "mask and truth differ in size", counted.shape
+        raise EvaluationError(what, where=mask, got=got, expected=true.shape)
     known = DisparityTruth(true, counted)
     found = evaluate_disparity(values, known, scale=scale)
-    figures: dict[str, Any] = {"pixels": found.pixels, "invalid": found.invalid}
-    for name, metrics in (
-        ("sparse", found),
-        ("dense", evaluate_disparity(dense_map(values), known, scale=scale)),
-    ):
-        figures[name] = {**named_figures(metrics), "d1": metrics.d1}
+    dense = evaluate_disparity(dense_map(values), known, scale=scale)
+    figures: dict[str, Any] = {
+        "pixels": found.pixels,
+        "invalid": found.invalid,
+        "sparse": {**named_figures(found), "d1": found.d1},
+        "dense": {**named_figures(dense), "d1": dense.d1},
+    }
     if confidence is not None:
         compared = np.where(counted, true, np.float32(np.nan))
-        rated = _rated(values, confidence)
-        figures["confidence"] = curve_figures(
-            rated, DisparityTruth(compared, np.isfinite(compared)), limit_px=1.0
-        )
+        measured = DisparityTruth(compared, np.isfinite(compared))
+        figures["confidence"] = curve_figures(_rated(values, confidence), measured, limit_px=1.0)
     return dict(plain(figures))
 
 
 def _rated(values: Float32, path: Path) -> Disparity:
     confidence = read_pfm(path)
     if confidence.shape != values.shape:
-        raise EvaluationError(
-            "confidence and map differ in size",
-            where=path,
-            got=confidence.shape,
-            expected=values.shape,
-        )
+        what, got = "confidence and map differ in size", confidence.shape
+        raise EvaluationError(what, where=path, got=got, expected=values.shape)
     known = np.isfinite(values)
     if not ((confidence[known] >= 0) & (confidence[known] <= 1)).all():
         raise EvaluationError("confidence is not between 0 and 1", where=path)

@@ -74,14 +74,15 @@ def run_export(
     pair = is_pair_run(source)
     wanted = known_products(products, pair=pair)
     refuse_as_target(source, out)
-    if survey is not None:
-        _check_survey(survey, wanted)
+    if survey is not None and not set(wanted) & set(SURVEYED):
+        what, expected = "only LAS and LAZ have the coordinates of a survey", " or ".join(SURVEYED)
+        raise SettingsError(what, where="--to", got=", ".join(wanted), expected=expected)
+    if survey is not None and survey.crs is not None:
+        check_crs(survey.crs)
     if workers is not None and not need_rays(wanted):
-        raise SettingsError(
-            "only grids and OctoMaps are made on workers",
-            got=", ".join(wanted),
-            hint="drop --workers and --scheduler; a mesh uses --threads",
-        )
+        what = "only grids and OctoMaps are made on workers"
+        hint = "drop --workers and --scheduler; a mesh uses --threads"
+        raise SettingsError(what, got=", ".join(wanted), hint=hint)
     mapped_by = None if pair else command_of_map(source)
     ran = run_settings(source)
     settings = config or ran
@@ -107,25 +108,11 @@ def run_export(
 
 
 def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | None) -> PlacedMap:
-    """Cut a map into tiles, here or on workers."""
     if workers is None:
         return place_map(map_, settings, run.threads)
     with workers.connect() as cluster:
         folder = resolved(run.state("tiles"))
         return place_map_on(map_, settings, folder, cluster.each, cluster.at_once)
-
-
-def _check_survey(survey: Survey, products: Sequence[str]) -> None:
-    """Refuse an unknown coordinate system, and one of which no product would make use."""
-    if not set(products) & set(SURVEYED):
-        raise SettingsError(
-            "only LAS and LAZ have the coordinates of a survey",
-            where="--to",
-            got=", ".join(products),
-            expected=" or ".join(SURVEYED),
-        )
-    if survey.crs is not None:
-        check_crs(survey.crs)
 
 
 def run_mesh(
@@ -141,13 +128,6 @@ def run_mesh(
     A cloud file is meshed in one piece, since its scale is unknown; the cloud of a pair as
     `recon pair` does. The map of a run is meshed in pieces, and faces in observed free space are
     removed.
-
-    Args:
-        source: A PLY file, or the folder of a run of map, demo or pair.
-        config: Settings of the mesh; the rest is that of the run.
-        formats: As for `run_export`, like all that follows.
-        out: As before.
-        threads: As before.
     """
     check_mesh_formats(formats)
     cloud, camera = source, None

@@ -12,7 +12,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
-from recon.core.values import OccupancyGrid, StereoPair
+from recon.core.values import StereoPair
 from recon.export.trajectories import export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
@@ -60,7 +60,8 @@ def run_localize(
         run.check_targets(inputs)
         workspace = Workspace(map_, run.watch, run.threads)
         drive = localize_sequence(source, workspace, config, start=start, progress=options.progress)
-        grid = _grid_of(folder)
+        has_grid = folder is not None and (folder / GRID).is_file()
+        grid = read_nav2(map_path / GRID) if has_grid else None
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, map_run=str(map_path), **drive.figures())
         made.summary["T_map_world"] = drive.T_map_world.tolist()
@@ -73,12 +74,6 @@ def run_localize(
             write_localize_page(made, run)
         run.finish(made.summary, source=source.name, inputs=inputs)
     return made
-
-
-def _grid_of(folder: Path | None) -> OccupancyGrid | None:
-    if folder is None or not (folder / GRID).is_file():
-        return None
-    return read_nav2(folder / GRID)
 
 
 _SLOWEST: Final = 1e-3
@@ -123,7 +118,9 @@ def run_live(
         expected = f"{_SLOWEST:g} or more"
         raise SettingsError("not a rate", where="--rate", got=f"{rate:g}", expected=expected)
     config, options = config or load_config(), options or MapOptions(command="live")
-    _check_pose_first(config)
+    if config.odometry.method == "kiss":
+        what = "while images arrive, poses come before the points that kiss-icp needs"
+        raise SettingsError(what, where="odometry.method", got="kiss", expected="visual")
     _warm_up(LiveSource(_Beginning(source), stopped=stopped), config, map_path)
     played = LiveSource(source, None if source.live else rate, stopped)
     options = replace(options, audit=False)
@@ -132,15 +129,11 @@ def run_live(
     try:
         return run_map(played, config, options).summary
     except MappingError as error:
-        raise _because_it_was_too_fast(error, played) from error
-
-
-def _because_it_was_too_fast(error: MappingError, played: LiveSource) -> MappingError:
-    if not played.warnings():
-        return error
-    why = "; ".join(played.warnings())
-    hint = "play it more slowly, such as --rate 0.5, or take a smaller image or a faster matcher"
-    return MappingError(error.what, where=error.where, got=why, hint=hint)
+        if not played.warnings():
+            raise
+        why = "; ".join(played.warnings())
+        hint = "play it more slowly, such as --rate 0.5, or take a smaller image or faster matcher"
+        raise MappingError(error.what, where=error.where, got=why, hint=hint) from error
 
 
 class _Beginning(DerivedSource):
@@ -166,13 +159,3 @@ def _warm_up(source: LiveSource, config: ReconConfig, map_path: StrPath | None) 
     else:
         with Map.open(map_path) as map_:
             localize_sequence(source, Workspace(map_), config)
-
-
-def _check_pose_first(config: ReconConfig) -> None:
-    if config.odometry.method == "kiss":
-        raise SettingsError(
-            "while images arrive, poses come before the points that kiss-icp needs",
-            where="odometry.method",
-            got="kiss",
-            expected="visual",
-        )

@@ -16,12 +16,7 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.commands.config import Changes, ReconConfig, load_config
-from recon.core.errors import (
-    FormatError,
-    OutputError,
-    ReconError,
-    SettingsError,
-)
+from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import Trajectory
 from recon.export.make import USUAL
 from recon.io.files import StrPath, resolved

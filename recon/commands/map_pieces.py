@@ -80,7 +80,8 @@ def map_pieces(
     _refuse_what_does_not_combine(config, options)
     if len(session):
         return
-    began, folder, threads = time.perf_counter(), _folder(plan), spread.threads_of(options.threads)
+    began, threads = time.perf_counter(), spread.threads_of(options.threads)
+    folder = resolved(plan).with_suffix("")
     with run.stage("pieces"), spread.connect() as cluster:
         pieces = read_plan(plan)[0] if plan.is_file() else cut_drive(len(source), cluster.at_once)
         # Again for a run that is resumed, which may have another memory limit.
@@ -139,7 +140,6 @@ def run_piece(
 
 
 def _refuse_what_does_not_combine(config: ReconConfig, options: MapOptions) -> None:
-    """Refuse to cut a drive that cannot be cut."""
     if options.known_poses is not None or options.prior is not None:
         what = "a drive with --poses or --prior is mapped in one piece"
         raise SettingsError(what, hint="drop --workers and --scheduler")
@@ -178,8 +178,3 @@ def _opened(folder: Path, pieces: Sequence[Piece]) -> Iterator[tuple[Map, int]]:
     for number, piece in enumerate(pieces):
         with closing(Map.open(folder / str(number))) as map_:
             yield map_, piece.lead
-
-
-def _folder(plan: Path) -> Path:
-    """Return the folder that has the folders of the pieces."""
-    return resolved(plan).with_suffix("")

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
 from recon.core.values import (
     Disparity,
-    DisparityMetrics,
     RectifiedCamera,
+    RectifiedPair,
     StereoCalibration,
     StereoPair,
 )
@@ -80,32 +81,19 @@ def run_pair(
         with run.stage("write"):
             scale = write_disparity_files(frame.disparity, run)
             write_cloud_files(frame, mesh, formats, run)
-        warnings = (*given.notes, *(one.text for one in faults), *few, *frame.warnings, *unmeshed)
-        metrics, figures = _measure(given, frame.disparity)
-        summary = {
-            **figures,
+        figures = {
             **cloud_figures(frame),
             "faces": 0 if mesh is None else len(mesh.faces),
             "mesh_coverage": coverage,
             "up_to_scale": given.up_to_scale,
             "disparity_png_scale": scale,
-            "warnings": list(warnings),
         }
-        result = PairRun(
-            name=given.pair.name,
-            config=config,
-            pair=frame.pair,
-            disparity=frame.disparity,
-            summary=summary,
-            cloud=frame.cloud,
-            mesh=mesh,
-            truth=given.truth,
-            metrics=metrics,
-            warnings=warnings,
-        )
-        with run.report(summary):
+        warnings = (*given.notes, *(one.text for one in faults), *few, *frame.warnings, *unmeshed)
+        result = _compared(given, config, (frame.pair, frame.disparity), figures, warnings)
+        result = replace(result, cloud=frame.cloud, mesh=mesh)
+        with run.report(result.summary):
             write_pair_page(result, run)
-        run.finish(summary, source=result.name, inputs=given.files)
+        run.finish(result.summary, source=result.name, inputs=given.files)
     return result
 
 
@@ -130,29 +118,35 @@ def run_disparity(
         pair, disparity = reconstructor.match(given.pair)
         inspected = reconstructor.inspect(pair)
         few = check_found(disparity, given.pair, faults)
-        warnings = (*given.notes, *(fault.text for fault in faults), *few, *inspected)
         with run.stage("write"):
-            scale = write_disparity_files(disparity, run)
-        metrics, figures = _measure(given, disparity)
-        summary = {**figures, "disparity_png_scale": scale, "warnings": list(warnings)}
-        result = PairRun(
-            given.pair.name, config, pair, disparity, summary,
-            truth=given.truth, metrics=metrics, warnings=warnings,
-        )  # fmt: skip
-        with run.report(summary):
+            figures = {"disparity_png_scale": write_disparity_files(disparity, run)}
+        warnings = (*given.notes, *(fault.text for fault in faults), *few, *inspected)
+        result = _compared(given, config, (pair, disparity), figures, warnings)
+        with run.report(result.summary):
             write_disparity_images(result, run)
-        run.finish(summary, source=result.name, inputs=given.files)
+        run.finish(result.summary, source=result.name, inputs=given.files)
     return result
 
 
-def _measure(
-    given: PairInput, disparity: Disparity
-) -> tuple[DisparityMetrics | None, dict[str, Any]]:
-    figures = {"pair": given.pair.name, **disparity_figures(disparity)}
-    if given.truth is None:
-        return None, figures
-    metrics = evaluate_disparity(disparity, given.truth)
-    return metrics, {**figures, "disparity": plain(metrics)}
+def _compared(
+    given: PairInput,
+    config: ReconConfig,
+    matched: tuple[RectifiedPair, Disparity],
+    figures: dict[str, Any],
+    warnings: tuple[str, ...],
+) -> PairRun:
+    """Return the results of a run, compared with the truth if it is known."""
+    (pair, disparity), name = matched, given.pair.name
+    metrics = None if given.truth is None else evaluate_disparity(disparity, given.truth)
+    summary = {
+        "pair": name,
+        **disparity_figures(disparity),
+        **({} if metrics is None else {"disparity": plain(metrics)}),
+        **figures,
+        "warnings": list(warnings),
+    }
+    made: Any = {"truth": given.truth, "metrics": metrics, "warnings": warnings}
+    return PairRun(name, config, pair, disparity, summary, **made)
 
 
 def _reconstructor(given: PairInput, config: ReconConfig, run: Run) -> FrameReconstructor:

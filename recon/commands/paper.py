@@ -37,15 +37,8 @@ def run_paper(
     Each method is applied to each scene, alone and with all patch sizes, and compared with the
     truth where there is one. Maps, clouds and a report go to the result folder.
 
-    Args:
-        folder: Holds the scenes ArtL, Jadeplant and Pipes; None = MiddEval3's trainingQ in the
-            folder that ``RECON_DATA`` names.
-        config: Settings; ``paper`` selects methods and patch sizes. None = those of `recon paper`.
-        out: Result folder; None = a new one below ``outputs/``.
-        threads: Threads to use; None = all cores. Changes no result.
-
-    Returns:
-        The figures of ``summary.json``.
+    ``folder`` holds the scenes ArtL, Jadeplant and Pipes; None = MiddEval3's trainingQ in the
+    folder that ``RECON_DATA`` names. ``paper`` of the settings selects methods and patch sizes.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
     experiments = read_experiments(folder)

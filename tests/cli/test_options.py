@@ -10,8 +10,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from recon.cli import app, evaluate
+from recon.cli import app
 from recon.cli.drive_options import DriveOptions, StartInMap, read_start
+from recon.cli.evaluate import app as evaluate
 from recon.cli.options import Shared, survey_of, takes_groups
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import SettingsError
@@ -67,9 +68,7 @@ def test_what_is_no_value_of_its_setting_is_refused(line: str, words: str) -> No
 
 
 def test_every_option_that_names_a_setting_names_one_that_there_is() -> None:
-    commands = [
-        one.callback for one in (*app.registered_commands, *evaluate.app.registered_commands)
-    ]
+    commands = [one.callback for one in (*app.registered_commands, *evaluate.registered_commands)]
     options = [p for one in commands for p in inspect.signature(one or see).parameters.values()]
     marks = [mark for one in options for mark in getattr(one.annotation, "__metadata__", ())]
     named = [mark.setting for mark in marks if isinstance(getattr(mark, "setting", None), str)]

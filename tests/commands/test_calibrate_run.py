@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.commands.calibrate import run_calibrate
+from recon.commands.cameras import run_calibrate
 from recon.commands.config import load_config
 from recon.core.errors import CalibrationError, OutputError, ReconError, SourceError
 from recon.core.values import StereoCalibration
@@ -15,11 +15,7 @@ from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.io.images.image import read_image, write_image
 from recon.rig.calibrate.board_views import find_views
-from recon.rig.calibrate.result import (
-    CalibrationForm,
-    CalibrationRun,
-    write_calibration,
-)
+from recon.rig.calibrate.result import CalibrationForm, CalibrationRun, write_calibration
 from recon.sources.image_names import pair_images
 from recon.stereo.rectify.rectifier import Rectifier
 from tests.scenery.boards import board_rig, place_boards, render_views

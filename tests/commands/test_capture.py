@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.commands.recording import record, run_capture
+from recon.commands.cameras import record, run_capture
 from recon.core.errors import OutputError, ReconError, SourceError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io import atomic

@@ -77,10 +77,7 @@ def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("fusion: {voxels_m: 0.1}", r"unknown setting 'fusion\.voxels_m'"),
-        (
-            "fusion: {voxel_m: -1}",
-            r"setting 'fusion\.voxel_m': .*greater than or equal.*got -1",
-        ),
+        ("fusion: {voxel_m: -1}", r"setting 'fusion\.voxel_m': .*greater than or equal.*got -1"),
         ("fusion: [1", "not a YAML file"),
         ("- 1\n- 2", "not a mapping"),
     ],

@@ -72,9 +72,7 @@ def test_a_focal_length_in_millimetres_is_refused(images: tuple[Path, Path]) -> 
         read(images, SourceSettings(focal_px=4.5, baseline_m=0.2))
 
 
-def test_a_drive_takes_the_same_numbers_and_a_file_is_not_needed(
-    images: tuple[Path, Path],
-) -> None:
+def test_a_drive_takes_the_same_numbers_and_a_file_is_not_needed(images: tuple[Path, Path]) -> None:
     folder = images[0].parent
     with pytest.raises(ReconError, match=r"calibration is missing.*--focal PX and --baseline M"):
         open_source(folder)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.commands.calibrate import run_rectify
+from recon.commands.cameras import run_rectify
 from recon.commands.config import load_config
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedCamera

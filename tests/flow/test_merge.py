@@ -151,7 +151,7 @@ def test_a_drive_is_taken_out_of_a_map_that_began_with_chosen_frames(
     assert [drive["number"] for drive in summary_of(run)["sessions"]] == [0, 1]
 
 
-@pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.joined.place_map"])
+@pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.merge.place_map"])
 def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) -> None:
     before, short = content(run.parent), part(FIRST, frames=4)
     with patch(at, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):

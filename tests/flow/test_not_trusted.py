@@ -78,7 +78,7 @@ def test_a_merged_map_says_which_of_its_drives_is_not_to_be_trusted(
     assert [one["frames_not_trusted"] for one in merged["sessions"]] == [0, 4]
     assert [one["frames_placed"] for one in merged["sessions"]] == [6, 8]
     assert "PATH AND MAP ARE NOT TO BE TRUSTED" in (out / "report.html").read_text()
-    after = run_remove(out, 0, options=MapOptions(mesh=False))
+    after = run_remove(out, 0, None, MapOptions(mesh=False))
     assert after["warnings"][0].startswith("PATH AND MAP ARE NOT TO BE TRUSTED")
 
 

@@ -1,18 +1,25 @@
-"""`recon calibrate`: images of a board in, a calibration file and its verdict out."""
+"""Rigs and their recordings: `recon calibrate`, `rectify`, `capture` and `audit`."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import json
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig
-from recon.core.errors import OutputError, SourceError
+from recon.core.errors import FormatError, OutputError, SourceError
 from recon.core.values.board import CalibrationBoard
-from recon.io.atomic import check_targets
+from recon.io.atomic import check_targets, write_text
 from recon.io.cameras.ros import camera_info_paths
+from recon.io.files import StrPath
 from recon.io.images.image import write_image
+from recon.report.audit_page import write_audit_page
 from recon.report.calibration_page import write_calibration_page, write_epipolar_images
+from recon.rig.audit.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
 from recon.rig.calibrate.bootstrap import measure_spread
 from recon.rig.calibrate.result import (
@@ -23,6 +30,14 @@ from recon.rig.calibrate.result import (
 )
 from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
+from recon.rig.capture import (
+    CaptureFolder,
+    RecordingSettings,
+    capture_pairs,
+    open_cameras,
+    warm_up,
+    write_pairs,
+)
 from recon.rig.rectification import (
     RectifyRun,
     measure_rows,
@@ -34,6 +49,9 @@ from recon.run.run import Run
 from recon.run.threads import serial_algebra
 from recon.sources.image_names import ImagePairs, pair_images
 from recon.sources.one_pair import read_pair
+from recon.sources.opencv_camera import Camera
+from recon.sources.source import StereoSource
+from recon.stereo.match.registry import make_matcher
 
 
 def run_calibrate(
@@ -53,15 +71,9 @@ def run_calibrate(
     fitted to its corners, without the views that do not fit; drawing views at random says how
     sure the fit is. What it will do to depth gives the verdict.
 
-    Args:
-        left: Folder or pattern of the left images, or the left video, or one with both views.
-        right: The same of the right camera; None if one video has both views.
-        board: The board that they show.
-        config: The configuration.
-        file: The calibration file; None = only ``calibration.yaml`` in the result folder.
-        form: Its format.
-        out: Folder for report, images and figures; None = a new one below ``outputs/``.
-        threads: Threads to use; None = all cores. Does not change results.
+    ``left`` and ``right`` are folders, patterns or videos; ``right`` None: ``left`` is one video
+    with both views. The calibration is also written to ``file``, in its ``form``; ``out`` gets
+    report, images and figures.
     """
     _check_file(file)
     videos = _videos(left, right)
@@ -142,14 +154,8 @@ def run_rectify(
     A calibration file says how, or else the features of some of the pairs. All images are warped;
     then the row errors of the first pair are measured, and drawn with its epipolar lines.
 
-    Args:
-        left: Image, folder or pattern of the left camera.
-        right: The same for the right camera.
-        config: The configuration.
-        calibration: Calibration file; None = homographies from features.
-        metres_per_unit: Unit of the translation in an OpenCV file.
-        out: Result folder; None = a new one below ``outputs/``.
-        threads: Threads to use; None = all cores.
+    ``left`` and ``right`` are images, folders or patterns; ``metres_per_unit`` is the unit of the
+    translation in an OpenCV file.
     """
     images = pair_images(left, right)
     with Run("rectify", out, config, threads=threads) as run, serial_algebra():
@@ -201,3 +207,95 @@ def _warnings(summary: dict[str, Any], images: ImagePairs) -> list[str]:
     if images.by_order:
         lines.append("names do not tell which images belong together: paired by their order")
     return lines
+
+
+def run_capture(
+    devices: Iterable[str],
+    folder: Path,
+    settings: RecordingSettings,
+    *,
+    calibration: Path | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Record until stopped; with a calibration, the folder can be mapped as it is.
+
+    ``devices`` are left and right camera, or one with both views: numbers, paths or video files.
+    The folder must be new or empty; its ``capture.json`` gets the figures that are returned.
+    ``stopped`` is called before each pair.
+    """
+    if calibration is not None and not calibration.is_file():
+        raise FormatError("file does not exist", where=calibration)
+    with open_cameras(devices, settings) as cameras:
+        return record(cameras, folder, settings, calibration, stopped)
+
+
+def record(
+    cameras: tuple[Camera, ...],
+    folder: Path,
+    settings: RecordingSettings,
+    calibration: Path | None,
+    stopped: Callable[[], bool],
+) -> dict[str, Any]:
+    """Record from opened cameras; see `run_capture`."""
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    with CaptureFolder(folder, settings.suffix) as target:
+        if calibration is not None:
+            shutil.copyfile(calibration, folder / f"calibration{calibration.suffix}")
+        locked = warm_up(cameras, settings)
+        try:
+            write_pairs(capture_pairs(cameras, settings, stopped), target, settings.preview_every)
+        finally:
+            summary = {
+                "started_utc": started,
+                "devices": [camera.name for camera in cameras],
+                "exposure_locked": locked,
+                **target.figures,
+                "calibration": calibration is not None,
+                "out": str(folder),
+            }
+            if target.frames:  # else it has no summary
+                text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+                write_text(folder / "capture.json", text)
+    return summary
+
+
+def run_audit(
+    source: StereoSource,
+    config: ReconConfig,
+    *,
+    quick: bool = False,
+    mend: StrPath | None = None,
+    out: StrPath | None = None,
+) -> Audit:
+    """Check a recording before a long run: what `recon audit` does.
+
+    Some stretches of the recording are read, and features are matched in some of their pairs. What
+    they say of rows, time, exposure, focus and calibration gives findings and a verdict.
+
+    Args:
+        source: The recording.
+        config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
+        quick: A short check of a second or two, as `recon map` makes it.
+        mend: File for a calibration that fits rows and motion; None = none is written.
+        out: Folder for a report with images; None = none is written.
+
+    Raises:
+        CalibrationError: The calibration cannot rectify anything, or there are too few features to
+            correct it.
+        ReconError: The calibration or the report cannot be written, or would replace a file of the
+            recording.
+    """
+    if mend is not None:
+        check_targets([Path(mend)], source.files)
+    audit = audit_source(source, config, quick=quick)
+    if mend is not None:
+        audit = replace(audit, corrected=correct_calibration(source, config, audit, Path(mend)))
+    if out is not None:
+        matcher = make_matcher(config.matching.matcher, config.matching, None)
+        summary = audit.summary
+        with Run("audit", out, config) as run:
+            with run.report(summary):
+                write_audit_page(audit, source, matcher, run)
+            record = {"warnings": [finding.text for finding in audit.findings]}
+            run.finish(summary, source=source.name, inputs=source.files, record=record)
+    return audit
