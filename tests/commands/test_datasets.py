@@ -14,16 +14,13 @@ import pytest
 
 from recon.commands.datasets import run_fetch, run_list, run_verify
 from recon.core.errors import DownloadError, FormatError, OutputError, SettingsError
-from recon.core.values import RectifiedCamera
 from recon.io import download
 from recon.sources.datasets import RECORD, datasets, find_parts, parts_of
 from recon.sources.registry import open_source, recognise_source
-from tests.flow.test_paper import write_scene
 from tests.hostile.refusals import assert_refused, run
 from tests.io.mirror import Mirror, serving
-from tests.scenery.planes import slanted_pair
+from tests.scenery.middlebury import write_scene
 
-CAMERA = RectifiedCamera(180.0, 55.0, 40.0, 65.0, 0.2, 120, 80, 24)
 SCENE = "middlebury-2014/Pipes"
 
 
@@ -36,7 +33,7 @@ def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The archive of a scene."""
     folder = tmp_path_factory.mktemp("scene") / "Pipes"
-    write_scene(folder, slanted_pair(CAMERA, 1.5, (0.1, -0.1), seed=1))
+    write_scene(folder)
     return zipped({f"Pipes-perfect/{path.name}": path.read_bytes() for path in folder.iterdir()})
 
 

@@ -19,7 +19,7 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import invert, make_transform
-from recon.core.values import PointCloud, RectifiedCamera
+from recon.core.values import PointCloud
 from recon.core.values.board import parse_board
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.disparity import write_pfm
@@ -30,9 +30,10 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.docs.blocks import ROOT
 from tests.flow.test_newcomer import BOARD, photograph, take_images
-from tests.flow.test_paper import write_scene
 from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.scenery.kitti import write_kitti
+from tests.scenery.middlebury import CAMERA as SCENE_CAMERA
+from tests.scenery.middlebury import write_scene
 from tests.scenery.planes import slanted_pair
 from tests.sources import drives
 from tests.sources.bags import Recording, write_bag
@@ -176,9 +177,8 @@ def plugin(site: Path) -> None:
 
 def scenes(folder: Path) -> None:
     """Those of the paper, in Middlebury's layout."""
-    camera = RectifiedCamera(180.0, 55.0, 40.0, 65.0, 0.2, 120, 80, 24)
     for number, name in enumerate(SCENES):
-        pair = slanted_pair(camera, 1.5, (0.1 * number, -0.1), seed=number)
+        pair = slanted_pair(SCENE_CAMERA, 1.5, (0.1 * number, -0.1), seed=number)
         write_scene(folder / name, pair)
 
 

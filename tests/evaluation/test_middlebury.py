@@ -35,7 +35,7 @@ from recon.evaluation.middlebury.score import (
 from recon.io.images.disparity import write_pfm
 from recon.stereo.frame import StereoSettings
 from tests.evaluation.test_disparity import made
-from tests.flow.test_evaluate import write_scene
+from tests.scenery.middlebury import square, write_scene
 
 N = float("nan")
 SHAPE = (60, 100)
@@ -209,7 +209,7 @@ class Shifted:
 
 def test_scenes_and_results_of_a_folder_become_figures(tmp_path: Path) -> None:
     for name in ("Teddy", "Vintage"):
-        write_scene(tmp_path / "trainingQ" / name)
+        write_scene(tmp_path / "trainingQ" / name, square())
     paths = find_scenes(tmp_path / "trainingQ")
     scenes = {name: read_scored_scene(name, path, None) for name, path in paths.items()}
     teddy = scenes["Teddy"]
@@ -240,7 +240,7 @@ def test_scenes_and_results_of_a_folder_become_figures(tmp_path: Path) -> None:
 
 
 def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path: Path) -> None:
-    write_scene(tmp_path / "Teddy")
+    write_scene(tmp_path / "Teddy", square())
     paths = find_scenes(tmp_path)
     for folder, names, message in (
         ("none", (), "no result for any scene"),

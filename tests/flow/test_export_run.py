@@ -1,23 +1,25 @@
-"""`recon export` makes any product of a finished run again."""
+"""`recon export` and `recon mesh` make any product of a finished run again."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from recon.commands.config import PAIR_DEFAULTS, load_config, run_settings
-from recon.commands.export import run_export
+from recon.commands.export import run_export, run_mesh, run_occupancy
 from recon.commands.pair import run_pair
 from recon.core.errors import FormatError, SettingsError
-from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
+from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_tum
 from recon.map.store.records import Store
@@ -25,26 +27,18 @@ from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.sources.one_pair import PairInput
 from tests.hostile.refusals import assert_refused, run
 
+MAPS = ("map/grid.pgm", "map/grid.yaml", "map/octomap.bt", "map/octomap.ot")
 
-@pytest.fixture(scope="module")
-def pair_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of a pair that sees a plane of blurred noise."""
-    noise = np.random.default_rng(3).integers(0, 256, (120, 180)).astype(np.uint8)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
-    world = np.asarray(cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
-    pair = StereoPair(world[:, :160], world[:, 12:172], name="left.png")
-    camera = RectifiedCamera(150.0, 80.0, 60.0, 80.0, 0.1, 160, 120)
-    out = tmp_path_factory.mktemp("pair") / "run"
-    config = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
-    run_pair(PairInput(pair, camera), config, out=out)
-    return out
+
+def assert_equal(one: Path, other: Path, *names: str) -> None:
+    for name in names:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
 def test_all_products_come_in_one_go(small_demo: Path, tmp_path: Path) -> None:
     config = run_settings(small_demo, None, ["mesh.depth=5", "mesh.min_component_faces=10"])
     summary = run_export(small_demo, config, formats=("ply", "glb"), out=tmp_path / "out")
-    for name in ("map/cloud.ply", "map/grid.pgm", "map/grid.yaml", "map/octomap.bt"):
-        assert (tmp_path / "out" / name).read_bytes() == (small_demo / name).read_bytes()
+    assert_equal(tmp_path / "out", small_demo, "map/cloud.ply", *MAPS)
     assert len(read_mesh(tmp_path / "out/mesh/mesh.glb").faces) == summary["faces"] > 100
     assert summary["points"] == len(read_ply(small_demo / "map/cloud.ply"))
     assert {"voxels", "occupied_cells", "camera_height_m", "tiles", "frames"} <= set(summary)
@@ -68,9 +62,10 @@ def test_products_whose_tiles_workers_make_are_the_same_files(
         monkeypatch.setattr(BatchOptions, "connect", lambda options: there)
         products, out = ["grid", "octomap"], tmp_path / "out"
         run_export(small_demo, products=products, out=out, workers=BatchOptions(workers=2))
-    for name in ("map/grid.pgm", "map/grid.yaml", "map/octomap.bt", "map/octomap.ot"):
-        assert (out / name).read_bytes() == (small_demo / name).read_bytes()
-    assert not (out / ".partial").exists()
+    assert_equal(out, small_demo, *MAPS)
+    files = sorted(p.name for p in out.rglob("*") if p.is_file())
+    maps = [Path(name).name for name in MAPS]
+    assert files == sorted([*maps, "grid.wld", "config.yaml", "run.json", "summary.json"])
 
 
 def test_the_cloud_comes_as_laz_in_the_coordinates_of_a_survey(
@@ -86,101 +81,116 @@ def test_the_cloud_comes_as_laz_in_the_coordinates_of_a_survey(
     done = run("export", small_demo, "--to", "laz", *words, "--crs", "EPSG:25832", "--out", out)
     assert done.code == 0, done.err
     found, cloud = laspy.read(out / "map/cloud.laz"), read_ply(small_demo / "map/cloud.ply")
-    expected = cloud.xyz.astype(np.float64) + origin
-    assert np.abs(found.xyz - expected).max() < 0.002
+    assert np.abs(found.xyz - (cloud.xyz.astype(np.float64) + origin)).max() < 0.002
     assert found.header.parse_crs().to_epsg() == 25832
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["misfit_rms_m"] < 0.001
+    assert json.loads((out / "summary.json").read_text())["misfit_rms_m"] < 0.001
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("options", "said"),
     [
-        (["--to", "laz", "--crs", "EPSG:25832"], "--crs: there are no positions"),
-        (["--to", "laz", "--georeference", "none.txt", "--antenna", "1,2"], "not three numbers"),
-        (["--to", "grid", "--georeference", "none.txt"], "only LAS and LAZ"),
-        (["--to", "laz", "--georeference", "none.txt", "--crs", "EPSG:4326"], "not metres"),
-        (["--to", "laz", "--georeference", "none.txt"], "none.txt"),
-    ],
-)
-def test_what_says_nothing_of_a_survey_is_refused(
-    words: list[str], expected: str, small_demo: Path, tmp_path: Path
-) -> None:
-    if "EPSG:4326" in words:
-        pytest.importorskip("pyproj")
-    assert_refused(run("export", small_demo, *words, "--out", tmp_path / "out"), expected)
-    assert not (tmp_path / "out").exists()
-
-
-def test_workers_that_would_have_nothing_to_do_are_refused(
-    small_demo: Path, tmp_path: Path
-) -> None:
-    words = ("export", small_demo, "--to", "mesh", "--workers", "2", "--out", tmp_path / "out")
-    assert_refused(run(*words), "only grids and OctoMaps")
-
-
-def test_only_what_is_asked_for_is_made(small_demo: Path, tmp_path: Path) -> None:
-    higher = run_settings(small_demo, None, ["grid.min_height_m=2.2", "grid.max_height_m=6"])
-    run_export(small_demo, higher, products=["grid"], out=tmp_path / "out")
-    files = sorted(p.name for p in (tmp_path / "out").rglob("*") if p.is_file())
-    assert files == ["config.yaml", "grid.pgm", "grid.wld", "grid.yaml", "run.json", "summary.json"]
-    low, high = (read_nav2(f / "map/grid.yaml") for f in (small_demo, tmp_path / "out"))
-    assert ((low.cells == OCCUPIED) & (high.cells != OCCUPIED)).sum() > 10
-
-
-def test_a_cloud_needs_no_rays(small_demo: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(small_demo, tmp_path / "run")
-    with Store.open(run / "map/map.recon") as store:
-        store.delete("rays")
-        store.commit()
-    summary = run_export(run, products=["cloud"], out=tmp_path / "out")
-    assert summary["points"] > 1000
-    with pytest.raises(FormatError, match=r"kept no rays to build occupancy from"):
-        run_export(run, products=["grid"], out=tmp_path / "other")
-    (run / "map/map.recon").unlink()
-    with pytest.raises(FormatError, match=r"folder has no map \(expected a map/map\.recon"):
-        run_export(run, products=["cloud"], out=tmp_path / "other")
-    assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--to", "cloud,gird"], "--to: unknown product (got gird, expected cloud, octomap, grid"),
-        (["--to", "mesh", "--format", "step"], "unknown mesh format (got step"),
-        (["--to", "grid", "--set", "fusion.min_count=1"], "no effect here"),
+        ("laz --crs EPSG:25832", "--crs: there are no positions"),
+        ("laz --georeference none.txt --antenna 1,2", "not three numbers"),
+        ("grid --georeference none.txt", "only LAS and LAZ"),
+        ("laz --georeference none.txt --crs EPSG:4326", "not metres"),
+        ("laz --georeference none.txt", "none.txt"),
+        ("cloud,gird", "--to: unknown product (got gird, expected cloud, octomap, grid"),
+        ("mesh --format step", "unknown mesh format (got step"),
+        ("grid --set fusion.min_count=1", "no effect here"),
+        ("mesh --workers 2", "only grids and OctoMaps"),
     ],
 )
 def test_what_cannot_be_asked_for_is_one_line(
-    small_demo: Path, tmp_path: Path, options: list[str], told: str
+    small_demo: Path, tmp_path: Path, options: str, said: str
 ) -> None:
-    done = run("export", small_demo, *options, "--out", tmp_path / "out")
-    assert_refused(done, told)
+    if "EPSG:4326" in options:
+        pytest.importorskip("pyproj")
+    words = ("--to", *options.split(), "--out", tmp_path / "out")
+    assert_refused(run("export", small_demo, *words), said)
     assert not (tmp_path / "out").exists()
 
 
-def test_the_run_itself_is_never_replaced(small_demo: Path) -> None:
-    with pytest.raises(SettingsError, match="replace the run"):
-        run_export(small_demo, products=["cloud"], out=small_demo)
+@pytest.fixture
+def without_rays(small_demo: Path, tmp_path: Path) -> Path:
+    run = Path(shutil.copytree(small_demo, tmp_path / "run"))
+    with Store.open(run / "map/map.recon") as store:
+        store.delete("rays")
+        store.commit()
+    return run
 
 
-def test_a_run_without_a_map_is_told(tmp_path: Path) -> None:
-    (tmp_path / "run.json").write_text('{"command": "calibrate"}')
+def test_what_is_not_there_is_told(without_rays: Path, tmp_path: Path) -> None:
+    summary = run_export(without_rays, products=["cloud"], out=tmp_path / "out")
+    assert summary["points"] > 1000
+    other = tmp_path / "other"
+    with pytest.raises(FormatError, match=r"kept no rays to build occupancy from.*keep_rays=true"):
+        run_export(without_rays, products=["grid"], out=other)
+    (without_rays / "map/map.recon").unlink()
+    with pytest.raises(FormatError, match=r"folder has no map \(expected a map/map\.recon"):
+        run_export(without_rays, products=["cloud"], out=other)
+    (without_rays / "run.json").write_text('{"command": "calibrate"}')
     with pytest.raises(FormatError, match="made no map"):
-        run_export(tmp_path, out=tmp_path / "out")
+        run_export(without_rays, out=other)
     with pytest.raises(FormatError, match="not contain a finished run"):
-        run_export(tmp_path / "nothing", out=tmp_path / "out")
+        run_export(tmp_path / "nothing", out=other)
+    assert not other.exists()
 
 
-def test_a_pair_gives_its_cloud_and_mesh(pair_run: Path, tmp_path: Path) -> None:
-    config = run_settings(pair_run, None, ["mesh.max_depth=5"])
-    summary = run_export(pair_run, config, formats=("ply", "glb"), out=tmp_path / "out")
-    cloud = "clouds/cloud.ply"
-    assert (tmp_path / "out" / cloud).read_bytes() == (pair_run / cloud).read_bytes()
+@pytest.mark.parametrize("make", [run_export, run_mesh, run_occupancy])
+def test_the_run_itself_is_never_replaced(small_demo: Path, make: Callable[..., Any]) -> None:
+    with pytest.raises(SettingsError, match="replace the run"):
+        make(small_demo, run_settings(small_demo, None, []), out=small_demo)
+
+
+def test_a_pair_gives_its_cloud_and_mesh_and_no_grid(tmp_path: Path) -> None:
+    noise = np.random.default_rng(3).integers(0, 256, (120, 180)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    world = np.asarray(cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
+    pair = StereoPair(world[:, :160], world[:, 12:172], name="left.png")
+    camera, run = RectifiedCamera(150.0, 80.0, 60.0, 80.0, 0.1, 160, 120), tmp_path / "run"
+    shallow = ["mesh.max_depth=5"]
+    run_pair(PairInput(pair, camera), load_config(None, shallow, PAIR_DEFAULTS), out=run)
+    config = run_settings(run, None, shallow)
+    summary = run_export(run, config, formats=("ply", "glb"), out=tmp_path / "out")
+    assert_equal(tmp_path / "out", run, "clouds/cloud.ply")
     assert len(read_mesh(tmp_path / "out/mesh/mesh.glb").faces) == summary["faces"]
     assert summary["mesh_coverage"] > 0.5
-
-
-def test_a_pair_has_no_grid(pair_run: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"a pair has no such product .*grid.*cloud, mesh"):
-        run_export(pair_run, load_config(), products=["grid"], out=tmp_path / "out")
+        run_export(run, load_config(), products=["grid"], out=tmp_path / "out")
+
+
+def mesh_of(run: Path, out: Path, *settings: str) -> dict[str, Any]:
+    # What is written is asked, not how fine it is.
+    config = load_config(None, ["mesh.tile_m=10", "mesh.max_depth=5", *settings])
+    return run_mesh(run, config, out=out, formats=("ply", "glb"))
+
+
+def layers(out: Path) -> list[str]:
+    return re.findall(r'filename="(.*?)"', (out / "mesh/mesh.mlp").read_text())
+
+
+def test_the_map_of_a_run_is_meshed_in_pieces(small_demo: Path, tmp_path: Path) -> None:
+    summary = mesh_of(small_demo, tmp_path)
+    assert summary["tiles"] >= 2
+    assert not [text for text in summary["warnings"] if "free space" in text]
+    assert len(read_mesh(tmp_path / "mesh/mesh.glb").faces) == summary["faces"] > 100
+    assert len(layers(tmp_path)) == summary["tiles"] + 1
+    assert all((tmp_path / "mesh" / layer).is_file() for layer in layers(tmp_path))
+    cloud = small_demo / "map/cloud.ply"
+    assert (tmp_path / "mesh/cloud.ply").read_bytes() == cloud.read_bytes()
+    assert summary["points"] == len(read_ply(cloud))
+
+
+def test_one_piece_is_the_mesh_itself_without_the_faces_in_free_space(
+    small_demo: Path, without_rays: Path, tmp_path: Path
+) -> None:
+    one, out = "mesh.tile_m=1000", tmp_path / "cut"
+    cut = mesh_of(small_demo, out, one)
+    assert cut["tiles"] == 1
+    assert layers(out) == ["mesh.ply", "cloud.ply"]
+    files = sorted(p.name for p in (out / "mesh").iterdir() if p.is_file())
+    assert files == ["cloud.ply", "mesh.glb", "mesh.mlp", "mesh.ply"]
+    kept = mesh_of(small_demo, tmp_path / "kept", one, "mesh.free_space=false")
+    assert kept["faces"] > cut["faces"] > 100
+    [*_, warning] = mesh_of(without_rays, tmp_path / "unknown", one)["warnings"]
+    assert "free space is not known" in warning

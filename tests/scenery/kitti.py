@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from recon.io.files import StrPath
 from recon.io.images.image import write_image
 from recon.io.trajectory import write_kitti_poses
 from recon.sources.synthetic import SyntheticSource
+from recon.street.settings import StreetScene
 from tests.scenery.film import Film
 
 _BT601 = np.array([0.299, 0.587, 0.114])
@@ -31,6 +33,14 @@ def write_kitti(source: SyntheticSource | Film, folder: StrPath, *, grey: bool =
     times = source.trajectory.timestamps_s
     write_text(target / "times.txt", "".join(f"{time_s:.6e}\n" for time_s in times))
     write_kitti_poses(target / "poses.txt", source.trajectory)
+
+
+def street_drive(folder: Path, frames: int, width_px: int = 256, **street: Any) -> Path:
+    """Render a street, and write the drive through it; from 256 px on, every pose is trusted."""
+    size = {"width_px": width_px, "height_px": width_px * 3 // 8, "focal_px": width_px * 150 / 256}
+    scene = StreetScene(frames=frames, **{**size, "smooth_edges": False, **street})
+    write_kitti(SyntheticSource(scene), folder)
+    return folder
 
 
 def _grey(image: UInt8) -> UInt8:

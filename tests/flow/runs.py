@@ -1,0 +1,69 @@
+"""Runs that are broken off, and what they leave."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from recon.core.errors import FormatError
+from recon.map.drive.mapper import FrameResult
+from recon.map.map import Map
+from recon.run.progress import Silent
+
+ROOT = Path(__file__).parents[2]
+RECON = [sys.executable, "-m", "recon"]
+STATE = Path(".partial", ".state", "map.recon")
+
+
+class Breaks(Silent):
+    """A progress that ends a run before a frame is reported."""
+
+    def __init__(self, frame: int = -1, error: BaseException | None = None) -> None:
+        self.frame, self.error = frame, error or KeyboardInterrupt()
+
+    def on_step(self, result: FrameResult) -> None:
+        if result.index == self.frame:
+            raise self.error
+
+
+def broken(mode: str, at: int, out: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run a command that ends at its n-th write, as `break_at_write.py` says."""
+    breaker = Path(__file__).with_name("break_at_write.py")
+    command = map(str, (sys.executable, breaker, mode, at, *words, "--quiet"))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COUNT": f"{out}.count"}
+    return subprocess.run([*command], env=environment, capture_output=True, text=True, check=False)
+
+
+def count_writes(out: Path, *words: object) -> int:
+    """Run a command to its end, and count its writes."""
+    done = broken("count", 0, out, *words)
+    assert done.returncode == 0, done.stderr
+    return int(Path(f"{out}.count").read_text())
+
+
+def begun(out: Path) -> bool:
+    """Whether a run has committed what it was started with."""
+    try:
+        with Map.open(out / STATE) as unfinished:
+            return len(unfinished.sessions) > 0
+    except FormatError:
+        return False
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files of a run except those with timings."""
+    timed = {"summary.json", "run.json", "report.html"}
+    files = [path for path in folder.rglob("*") if path.is_file() and ".partial" not in path.parts]
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in files
+        if path.name not in timed
+    }
+
+
+def all_files(folder: Path) -> dict[str, bytes]:
+    """All files below a folder, hidden ones too."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
