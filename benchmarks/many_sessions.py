@@ -32,7 +32,7 @@ from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
 from recon.map.store.map_file import MAP_FILE
 from recon.run.run import Run
-from tests.map.sessions.test_map_of_several_drives import _drive, _links, _poses
+from tests.map import walls
 
 STEP_M = 12.0
 SETTINGS = ("submaps.length_m=8", "submaps.tile_m=25.6", "fusion.min_count=1")
@@ -59,12 +59,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def build(folder: Path, sessions: int) -> Path:
     """Make the run of a map of that many drives, linked one to the next."""
     config = load_config(None, SETTINGS)
-    true = [_poses(STEP_M * number) for number in range(sessions)]
+    true = [walls.poses(STEP_M * number) for number in range(sessions)]
     with Run("map", folder, config) as run, Map.create(run.path(MAP_FILE)) as map_:
         for number, poses in enumerate(true):
-            _drive(map_, poses, number)
+            walls.drive(map_, poses, number)
         pairs = zip(pairwise(range(sessions)), pairwise(true), strict=True)
-        join_sessions(map_, [link for ends, both in pairs for link in _links(*ends, both)])
+        links = [link for ends, both in pairs for link in walls.links_between(*ends, both)]
+        join_sessions(map_, links)
         map_.commit()
         make(Order(map_, place_map(map_, config), run, config.mesh), ("cloud", "octomap", "grid"))
         record = {"T_map_world": map_.first.T_map_world.tolist()}

@@ -17,7 +17,7 @@ from typing_extensions import Self
 from recon.core.geometry.se3 import apply
 from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.values import OccupancyVoxels
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, Int64
 from recon.map.fusion import KNOWABLE, FusedPart
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
@@ -67,7 +67,7 @@ class Cut:
         """Return whether every tile can be joined within some bytes; None = no limit."""
         return limit is None or max(self.nbytes.values(), default=0) <= limit
 
-    def submap_of_frame(self, drives: Sequence[int]) -> NDArray[np.int64]:
+    def submap_of_frame(self, drives: Sequence[int]) -> Int64:
         """Return int64 (N,), number of the submap of each frame; -1 between two drives.
 
         ``drives`` is the number of submaps of each drive; empty = all are of one.
@@ -280,7 +280,7 @@ class Rectangle:
         (x0, y0), (x1, y1) = self.low, self.high
         return type(self)((x0 - margin_m, y0 - margin_m), (x1 + margin_m, y1 + margin_m))
 
-    def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def contains(self, points: NDArray[np.floating]) -> Bool:
         """Return which points (N, 2 or 3) lie in the rectangle."""
         return np.asarray(((points[:, :2] >= self.low) & (points[:, :2] < self.high)).all(axis=1))
 

@@ -16,7 +16,7 @@ from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels import voxels
 from recon.core.settings import Settings
 from recon.core.values import PointCloud, RectifiedCamera
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, array_in
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, array_in
 
 _MIN_SIGMA_M: Final = 0.02  # points more precise than this count as this precise: bounds the weight
 _MAX_SIGMA_M: Final = 0.6
@@ -82,11 +82,6 @@ class CloudBuilder:
         points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), _values(cloud))
         self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
         self._frames += 1
-
-    def cloud(self, min_count: int | None = None) -> PointCloud:
-        """Return `FusedPart.cloud` of all so far; ``min_count`` None = that of the settings."""
-        s = self._settings
-        return self.part().cloud(s.voxel_m, min_count or s.min_count)
 
     def part(self) -> FusedPart:
         """Return what was seen since the start, or since the last `take`."""
@@ -176,7 +171,7 @@ class FusedPart:
     """Sums per voxel, one row each, in the order in which voxels were first seen."""
 
     # int64 (N,), packed cells in world axes (`recon.core.kernels.voxels`), each once
-    keys: NDArray[np.int64]
+    keys: Int64
     # float32 (N, 11): sum of weights; weighted sums of the offset from the voxel's centre and of
     # the values (colour, normal, confidence)
     sums: Float32

@@ -16,13 +16,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import Self
 
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
-from recon.core.values.arrays import Bool, Float32, Float64
+from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, TileParts
 from recon.map.fusion import KNOWABLE, FusedPart, join_fused
@@ -90,7 +89,7 @@ class Tiles:
         self._known: tuple[str, ...] = KNOWABLE
         self._looks: Looks | None = None
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
-        self.submap_of_frame: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.submap_of_frame: Int64 = np.zeros(0, np.int64)
 
     @classmethod
     def of_submaps(
@@ -314,7 +313,7 @@ class DriveChain:
 
     def __init__(self, parts: TileParts) -> None:
         self._parts = parts
-        self.drive_of: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.drive_of: Int64 = np.zeros(0, np.int64)
 
     def drive(self, numbered: tuple[int, Any]) -> int:
         """Return the drive of what is numbered by submap."""
@@ -362,7 +361,7 @@ class DriveChain:
         self,
         key: TileKey,
         after: Mapping[int, OccupancyPart] | None = None,
-        blocks: NDArray[np.int64] | None = None,
+        blocks: Int64 | None = None,
     ) -> Iterator[tuple[int, OccupancyPart]]:
         """Return what each drive observed in a tile, in their order.
 
@@ -377,7 +376,7 @@ class DriveChain:
             yield drive, join_occupancy(_in_blocks(part, blocks) for _, part in parts)
 
 
-def _in_blocks(part: OccupancyPart, blocks: NDArray[np.int64] | None) -> OccupancyPart:
+def _in_blocks(part: OccupancyPart, blocks: Int64 | None) -> OccupancyPart:
     return part if blocks is None else part.select(are_among(part.rows.blocks, blocks))
 
 
@@ -386,7 +385,7 @@ def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:
     return reduce(lambda old, new: join_occupancy([old, new.outdoing(_OLD)]), drives)
 
 
-def _grown(blocks: NDArray[np.int64], by: int) -> NDArray[np.int64]:
+def _grown(blocks: Int64, by: int) -> Int64:
     """Return packed blocks with those up to ``by`` blocks away from one on each axis."""
     steps = np.array(list(product(range(-by, by + 1), repeat=3)))
     around = unpack_keys(blocks)[:, None] + steps

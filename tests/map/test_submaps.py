@@ -1,66 +1,50 @@
-"""A drive divided into submaps gives the same map as an undivided one."""
+"""A drive divided into submaps, or cut into tiles, gives the same map as an undivided one."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from recon.core.geometry.se3 import apply, exp_so3, make_transform
-from recon.core.values import PointCloud
+from recon.commands.config import load_config
+from recon.core.errors import FormatError
+from recon.core.geometry.se3 import apply, exp_so3, make_transform, transform_cloud
+from recon.core.values import OccupancyVoxels, join_voxels
+from recon.core.values.arrays import Float64
 from recon.map import submaps as submaps_file
-from recon.map.fusion import CloudBuilder, FusionSettings, join_fused
-from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
-from recon.map.occupancy.part import OccupancyPart, join_occupancy
+from recon.map.cut import Rectangle
+from recon.map.fusion import CloudBuilder, join_fused
+from recon.map.ground.surface import find_floors
+from recon.map.map import Map
+from recon.map.occupancy.builder import OccupancyBuilder
+from recon.map.occupancy.part import free_part, join_occupancy
+from recon.map.store.session import Submaps
 from recon.map.submaps import Submap, SubmapBuilder, SubmapSettings
+from recon.map.tiles import Tiles
+from recon.stereo.cloud.back_project import filter_cloud
+from tests.map.walls import (
+    CONFIG,
+    T_MAP_WORLD,
+    TRUE,
+    WALL_M,
+    assert_same_voxels,
+    cloud_of,
+    drive,
+    frames,
+    voxels_of,
+)
 
-T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
-FUSION, OCCUPANCY = FusionSettings(min_count=1), OccupancySettings()
-FRAMES = 24
-Frame = tuple[PointCloud, PointCloud, np.ndarray]
-
-
-def _frames() -> list[Frame]:
-    """A wall to the right of a path of 1 m a frame."""
-    rng = np.random.default_rng(0)
-    frames = []
-    for number in range(FRAMES):
-        xyz = np.stack(
-            [np.full(800, 2.03), rng.uniform(-1, 1, 800), rng.uniform(2, 12, 800)], axis=1
-        )
-        fields = {
-            "rgb": rng.integers(0, 255, (800, 3)).astype(np.uint8),
-            "normals": np.tile(np.float32([-1, 0, 0]), (800, 1)),
-            "sigma_m": rng.uniform(0.05, 0.2, 800).astype(np.float32),
-            "confidence": rng.uniform(0.2, 1, 800).astype(np.float32),
-        }
-        T = make_transform(np.eye(3), np.array([0.0, 0.0, float(number)]))
-        here = PointCloud(xyz.astype(np.float32), **fields)
-        there = PointCloud(apply(T, xyz).astype(np.float32), frame="world", **fields)
-        frames.append((there, here, T))
-    return frames
+FUSION, OCCUPANCY = CONFIG.fusion, CONFIG.occupancy
+VOXEL_M, RESOLUTION_M = FUSION.voxel_m, OCCUPANCY.resolution_m
 
 
-def _noisy(frames: list[Frame]) -> list[Frame]:
-    """The frames with depths as wrong as they say."""
-    rng = np.random.default_rng(1)
-    noisy = []
-    for there, here, T in frames:
-        scale = 1 + here.sigma_m * rng.normal(size=len(here)) / here.xyz[:, 2]
-        xyz = here.xyz * scale[:, None].astype(np.float32)
-        noisy.append((there, replace(here, xyz=xyz), T))
-    return noisy
+def _builder(length_m: float, max_bytes: int | None = None) -> SubmapBuilder:
+    settings = SubmapSettings(length_m=length_m)
+    return SubmapBuilder(settings, FUSION, OCCUPANCY, T_MAP_WORLD, max_bytes)
 
 
-def _builder(**settings: float) -> SubmapBuilder:
-    return SubmapBuilder(SubmapSettings(**settings), FUSION, OCCUPANCY, T_MAP_WORLD)
-
-
-def _submaps(builder: SubmapBuilder, frames: list[Frame]) -> list[Submap]:
+def _submaps(builder: SubmapBuilder, seen: list) -> list[Submap]:
     done = []
-    for frame in frames:
+    for frame in seen:
         builder.integrate(*frame)
         if builder.full:
             done.append(builder.close())
@@ -68,103 +52,81 @@ def _submaps(builder: SubmapBuilder, frames: list[Frame]) -> list[Submap]:
 
 
 def test_submaps_put_together_are_the_map_of_the_whole_drive() -> None:
-    submaps = _submaps(_builder(length_m=5.0), _frames())
+    submaps = _submaps(_builder(5.0), frames(24))
     fused, occupancy = CloudBuilder(FUSION), OccupancyBuilder(OCCUPANCY, T_MAP_WORLD)
-    for there, here, T in _frames():
+    for there, here, T in frames(24):
         fused.integrate(there)
         occupancy.integrate(here, T)
-    whole = fused.cloud()
-    parts = join_fused(submap.fused for submap in submaps).cloud(FUSION.voxel_m, 1)
+    whole = fused.part().cloud(VOXEL_M, 1)
+    parts = join_fused(submap.fused for submap in submaps).cloud(VOXEL_M, 1)
     assert len(submaps) > 3
     np.testing.assert_array_equal(parts.count, whole.count)
     # float32 sums in another order, rounded as maps keep them.
     for name, rtol, atol in (
-        ("xyz", 0, 2e-5), ("normals", 0, 4e-3), ("sigma_m", 1e-4, 0), ("confidence", 3e-3, 0),
-        ("weight", 3e-4, 0),
+        ("xyz", 0, 2e-5), ("normals", 0, 4e-3), ("sigma_m", 1e-4, 0), ("weight", 3e-4, 0)
     ):  # fmt: skip
         got, expected = getattr(parts, name), getattr(whole, name)
         np.testing.assert_allclose(got, expected, rtol=rtol, atol=atol)
-    joined = join_occupancy(submap.occupancy for submap in submaps)
-    np.testing.assert_array_equal(joined.points.keys, occupancy.part().points.keys)
-    # float32 sums in another order.
-    np.testing.assert_allclose(
-        joined.points.sums, occupancy.part().points.sums, rtol=1e-4, atol=1e-2
+    joined, points = (
+        join_occupancy(submap.occupancy for submap in submaps),
+        occupancy.part().points,
     )
-    without = replace(submaps[1].occupancy, points=None)
-    assert join_occupancy([submaps[0].occupancy, without]).points is None
-    cells = joined.voxels(OCCUPANCY.resolution_m)
-    order, ours = np.lexsort(occupancy.voxels().keys.T), np.lexsort(cells.keys.T)
-    np.testing.assert_array_equal(cells.keys[ours], occupancy.voxels().keys[order])
-    np.testing.assert_allclose(
-        cells.log_odds[ours], occupancy.voxels().log_odds[order], atol=1e-5
-    )  # float32
+    np.testing.assert_array_equal(joined.points.keys, points.keys)
+    np.testing.assert_allclose(joined.points.sums, points.sums, rtol=1e-4, atol=1e-2)
+    assert_same_voxels(joined.voxels(RESOLUTION_M), occupancy.voxels(), atol=1e-5)  # float32
 
 
-@pytest.mark.parametrize(
-    ("settings", "sizes"), [({"length_m": 10.0}, [11, 10, 3]), ({"length_m": 1000.0}, [9, 9, 6])]
-)
-def test_a_submap_ends_after_its_path_or_its_frames(
-    settings: dict[str, float], sizes: list[int], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("length_m", "sizes"), [(10.0, [11, 10, 3]), (1000.0, [9, 9, 6])])
+def test_a_submap_ends_after_its_path_its_frames_or_its_bytes(
+    length_m: float, sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(submaps_file, "_MAX_FRAMES", 9 if sizes[0] == 9 else 100)
-    submaps = _submaps(_builder(**settings), _frames())
-    assert [submap.frames for submap in submaps] == sizes
-    assert [submap.index for submap in submaps] == [0, 1, 2]
+    submaps = _submaps(_builder(length_m), frames(24))
+    assert [(submap.index, submap.frames) for submap in submaps] == list(enumerate(sizes))
     assert [submap.first_frame for submap in submaps] == [0, sizes[0], sizes[0] + sizes[1]]
-    small = SubmapBuilder(SubmapSettings(), FUSION, OCCUPANCY, T_MAP_WORLD, max_bytes=1)
-    assert [submap.frames for submap in _submaps(small, _frames()[:3])] == [1, 1, 1]
+    small = _submaps(_builder(length_m, max_bytes=1), frames(3))
+    assert [submap.frames for submap in small] == [1, 1, 1]
 
 
 def test_a_builder_goes_on_from_the_state_of_another() -> None:
-    frames = _frames()
-    first = _builder(length_m=8.0)
-    done = _submaps(first, [])
-    for frame in frames[:13]:
+    first, second, done = _builder(8.0), _builder(8.0), []
+    for frame in frames(24)[:13]:
         first.integrate(*frame)
         if first.full:
             done.append(first.close())
-    second = _builder(length_m=8.0)
     second.restore(first.state())
-    unbroken = _submaps(_builder(length_m=8.0), frames)
-    resumed = [*done, *_submaps(second, frames[13:])]
-    resumed = [Submap.from_tree(submap.to_tree()) for submap in resumed]
+    unbroken = _submaps(_builder(8.0), frames(24))
+    resumed = [*done, *_submaps(second, frames(24)[13:])]
     assert len(resumed) == len(unbroken)
     for ours, theirs in zip(resumed, unbroken, strict=True):
-        np.testing.assert_array_equal(ours.fused.keys, theirs.fused.keys)
-        np.testing.assert_array_equal(ours.fused.sums, theirs.fused.sums)
-        np.testing.assert_array_equal(ours.fused.information, theirs.fused.information)
-        for mine, other in zip(ours.occupancy.rows, theirs.occupancy.rows, strict=True):
-            np.testing.assert_array_equal(mine, other)
-        np.testing.assert_array_equal(ours.occupancy.points.keys, theirs.occupancy.points.keys)
-        np.testing.assert_array_equal(ours.occupancy.points.sums, theirs.occupancy.points.sums)
+        np.testing.assert_equal(Submap.from_tree(ours.to_tree()).to_tree(), theirs.to_tree())
 
 
-def _occupied(part: OccupancyPart) -> np.ndarray:
-    """Centres of the voxels that are surely occupied, metres."""
-    voxels = part.voxels(OCCUPANCY.resolution_m)
-    return voxels.centres_m[voxels.log_odds > 0.2]
+def _moved(submap: Submap, turn: float, step_m: list[float]) -> tuple[Submap, Float64]:
+    T = make_transform(exp_so3(np.array([0.0, turn, 0.0])), np.array(step_m))
+    return submap.moved(T, T_MAP_WORLD, VOXEL_M, RESOLUTION_M), T
 
 
-def test_a_corrected_submap_keeps_its_wall_thin() -> None:
-    [submap] = _submaps(_builder(length_m=1000.0), _noisy(_frames()))
-    T = make_transform(exp_so3(np.array([0.0, 0.2, 0.0])), np.array([0.7, -0.2, 3.0]))
-    moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
-    places = _occupied(moved.occupancy)
+def test_a_corrected_submap_has_thin_walls_where_the_correction_puts_them() -> None:
+    [submap] = _submaps(_builder(1000.0), frames(24, noisy=True))
+    moved, T = _moved(submap, 0.2, [0.7, -0.2, 3.0])
+    before, after = (one.occupancy.voxels(RESOLUTION_M) for one in (submap, moved))
+    places = after.centres_m[after.log_odds > 0.2]
     back = apply(T_MAP_WORLD @ np.linalg.inv(T) @ np.linalg.inv(T_MAP_WORLD), places)
-    assert len(places) > 0.8 * len(_occupied(submap.occupancy))
+    assert len(places) > 0.8 * (before.log_odds > 0.2).sum()
     # A voxel that a plane crosses has its centre at most half a diagonal from it.
-    assert (np.abs(back[:, 1] + 2.03) < 0.18).mean() > 0.99
+    assert (np.abs(back[:, 1] + WALL_M) < 0.18).mean() > 0.99
+    # 2 m forward and 0.8 m to the right: map x + 10 cells, y - 4 cells.
+    after = _moved(submap, 0.0, [0.8, 0.0, 2.0])[0].occupancy.voxels(RESOLUTION_M)
+    expected = {(i + 10, j - 4, k) for i, j, k in before.keys.tolist()}
+    assert {tuple(key) for key in after.keys.tolist()} == expected
+    assert after.log_odds.sum() == pytest.approx(before.log_odds.sum(), rel=1e-3)
 
 
-@pytest.fixture(scope="module")
-def submap() -> Submap:
-    return _submaps(_builder(length_m=1000.0), _frames())[0]
-
-
-def test_a_corrected_submap_has_its_points_where_the_correction_puts_them(submap: Submap) -> None:
-    T = make_transform(exp_so3(np.array([0.0, 0.03, 0.0])), np.array([0.7, -0.2, 3.0]))
-    moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
-    before, after = (s.fused.cloud(FUSION.voxel_m, 1) for s in (submap, moved))
+def test_a_corrected_submap_has_its_points_where_the_correction_puts_them() -> None:
+    [submap] = _submaps(_builder(1000.0), frames(6))
+    moved, T = _moved(submap, 0.03, [0.7, -0.2, 3.0])
+    before, after = (one.fused.cloud(VOXEL_M, 1) for one in (submap, moved))
     assert 0.8 * len(before) < len(after) <= len(before)
     gaps = np.linalg.norm(apply(T, before.xyz)[:, None] - after.xyz[None], axis=2).min(axis=1)
     # Means of voxels that come to lie in one are at most a voxel's diagonal away.
@@ -176,11 +138,112 @@ def test_a_corrected_submap_has_its_points_where_the_correction_puts_them(submap
     assert moved.fused.frames.max() <= submap.frames
 
 
-def test_a_corrected_submap_has_its_walls_where_the_correction_puts_them(submap: Submap) -> None:
-    T = make_transform(np.eye(3), np.array([0.8, 0.0, 2.0]))
-    moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
-    before, after = (s.occupancy.voxels(OCCUPANCY.resolution_m) for s in (submap, moved))
-    # 2 m forward and 0.8 m to the right: map x + 10 cells, y - 4 cells.
-    expected = {(i + 10, j - 4, k) for i, j, k in before.keys.tolist()}
-    assert {tuple(key) for key in after.keys.tolist()} == expected
-    assert after.log_odds.sum() == pytest.approx(before.log_odds.sum(), rel=1e-4)
+CUT = load_config(None, ["submaps.length_m=4", "submaps.tile_m=6.4", "fusion.min_count=5"])
+EVERYWHERE = Rectangle((-1e3, -1e3), (1e3, 1e3))
+
+
+@pytest.fixture
+def store() -> Submaps:
+    """A drive along a wall and back, so that a place is in several submaps."""
+    there_and_back = np.concatenate([TRUE[0][:12], TRUE[0][11::-1]])
+    return drive(Map.temporary(), there_and_back, 1, config=CUT).submaps
+
+
+def _tiles(store: Submaps, T_corrected_world: Float64 | None = None) -> Tiles:
+    return Tiles.of_submaps(store, CUT, T_MAP_WORLD, T_corrected_world)
+
+
+def test_tiles_together_are_the_filtered_whole(store: Submaps) -> None:
+    tiles = _tiles(store, np.tile(np.eye(4), (len(store), 1, 1)))
+    fused = join_fused(submap.fused for submap in store).cloud(0.1, 5)
+    whole = transform_cloud(filter_cloud(fused, CUT.map_filters), T_MAP_WORLD, frame="map")
+    assert sum(len(tile.cloud) > 0 for tile in tiles) >= 3
+    assert 0 < len(whole) < len(fused)
+    ours, theirs = cloud_of(tiles), whole.select(np.lexsort(whole.xyz.T))
+    for name in ("xyz", "normals", "sigma_m", "weight", "count"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    occupancy = join_occupancy(submap.occupancy for submap in store)
+    assert_same_voxels(voxels_of(tiles), occupancy.voxels(0.2))
+
+
+def test_a_tile_is_made_once(store: Submaps, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiles = _tiles(store)
+    first = [(tile.cloud.xyz, tile.voxels.keys) for tile in tiles]
+    for name in ("join_fused", "join_occupancy"):
+        monkeypatch.delattr(f"recon.map.tiles.{name}")
+    np.testing.assert_equal([(tile.cloud.xyz, tile.voxels.keys) for tile in tiles], first)
+
+
+def test_what_is_observed_later_changes_a_tile_as_in_one_long_drive(store: Submaps) -> None:
+    tiles = _tiles(store)
+    seen = voxels_of(tiles)
+    # Cells in all parts of the wall; three quarters of the way, most submaps have passed them.
+    free = free_part(seen.keys[seen.log_odds > 0][::7], -2.0)
+    number = 3 * len(store) // 4
+    parts = [submap.occupancy for submap in store]
+    expected = join_occupancy([*parts[: number + 1], free, *parts[number + 1 :]]).voxels(0.2)
+    wide = [(tiles.bounds(tile.key), tiles.wide_voxels(tile.key, {number: free})) for tile in tiles]
+    changed = join_voxels((v.select(inside.contains(v.centres_m)) for inside, v in wide), 0.2)
+    assert_same_voxels(changed, expected)
+    assert (expected.log_odds < 0).sum() > (seen.log_odds < 0).sum()
+
+
+def test_a_rectangle_has_the_points_and_voxels_of_all_tiles_below_it(store: Submaps) -> None:
+    tiles = _tiles(store)
+    cloud, voxels = cloud_of(tiles), voxels_of(tiles)
+    rectangle = Rectangle((3.0, -4.0), (14.5, 3.0))
+    inside = rectangle.contains(cloud.xyz)
+    assert 0 < inside.sum() < len(cloud)
+    assert len(tiles.cloud_in(rectangle)) == inside.sum()
+    assert len(tiles.voxels_in(rectangle)) == rectangle.contains(voxels.centres_m).sum() > 0
+    floors = find_floors(voxels)
+    assert len(tiles.floors_in(rectangle)) == rectangle.contains(floors).sum()
+    assert len(tiles.cloud_in(Rectangle((600.0, 600.0), (610.0, 610.0)))) == 0
+
+
+def test_points_and_voxels_that_are_put_in_come_out(store: Submaps) -> None:
+    made, filled = _tiles(store), Tiles(CUT, T_MAP_WORLD)
+    cloud, voxels = cloud_of(made), voxels_of(made)
+    for part in np.array_split(np.arange(len(cloud)), 5):  # in pieces that do not know the tiles
+        filled.put_cloud(cloud.select(part))
+    for part in np.array_split(np.arange(len(voxels)), 5):
+        filled.put_voxels(voxels.select(part))
+    np.testing.assert_array_equal(cloud_of(filled).xyz, cloud.xyz)
+    assert_same_voxels(voxels_of(filled), voxels)
+    assert all(filled.bounds(tile.key).contains(tile.cloud.xyz).all() for tile in filled)
+    # A tile without points takes nothing from the others.
+    far = OccupancyVoxels(np.int32([[40, 3, 0]]), np.ones(1, np.float32), filled.resolution_m)
+    filled.put_voxels(far)
+    assert filled.cloud_in(EVERYWHERE).sigma_m is not None
+
+
+def test_corrections_move_the_submaps_apart(store: Submaps) -> None:
+    T = np.tile(np.eye(4), (len(store), 1, 1))
+    turned = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([30.0, 0.0, 0.0]))
+    T[len(store) // 2 :] = turned
+    to_right_m = -cloud_of(_tiles(store, T)).xyz[:, 1]
+    assert ((to_right_m < 4) | (to_right_m > 32)).all()
+    assert 0.2 < np.mean(to_right_m < 4) < 0.8
+
+
+def test_a_path_that_leaves_a_rectangle_and_comes_back_is_in_pieces() -> None:
+    path = np.array([[-5, 1, 0], [1, 1, 0], [2, 1, 0], [12, 1, 0], [15, 1, 0], [3, 2, 0]], float)
+    inside = Rectangle((0.0, 0.0), (10.0, 10.0)).path(path)
+    gap = [np.nan] * 3
+    np.testing.assert_array_equal(inside, [[1, 1, 0], [2, 1, 0], gap, [3, 2, 0]])
+
+
+def test_a_missing_or_foreign_submap_is_one_clear_line(store: Submaps) -> None:
+    again = Submaps(store.store)
+    assert again.entries == store.entries
+    assert [submap.index for submap in again] == list(range(len(again)))
+    np.testing.assert_equal(again[1].to_tree(), store[1].to_tree())
+    store.store.delete("submap", (0, 0))
+    with pytest.raises(FormatError, match=r"map.*lacks a record"):
+        store[0]
+    store.store.put("submap", (0, 0), {"a": 1})
+    with pytest.raises(FormatError, match="map"):
+        store[0]
+    store.store.delete("submap_entry", (0, 1))
+    with pytest.raises(FormatError, match="submaps of the drive are missing"):
+        Submaps(store.store)

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.values.arrays import Bool, Float64, Int32, freeze
+from recon.core.values.arrays import Bool, Float64, Int32, Int64, freeze
 from recon.map.ground.surface import GroundSurface
 
 _SAME_M: Final = 0.3
@@ -31,16 +31,14 @@ class DrivenPath:
     """
 
     points_m: Float64
-    submap: NDArray[np.int64]
+    submap: Int64
 
     def __post_init__(self) -> None:
         freeze(self, "points_m", np.float64, (None, 3))
         freeze(self, "submap", np.int64, (len(self.points_m),))
 
     @classmethod
-    def through(
-        cls, path_m: Float64, trusted: Bool, submap: NDArray[np.int64], step_m: float
-    ) -> DrivenPath:
+    def through(cls, path_m: Float64, trusted: Bool, submap: Int64, step_m: float) -> DrivenPath:
         """Fill in the path (N, 3) between neighbouring poses that are both trusted."""
         length_m = np.linalg.norm(np.diff(path_m, axis=0), axis=1)
         joined = trusted[:-1] & trusted[1:]
@@ -77,7 +75,9 @@ def sweep(points_m: Float64, ground: GroundSurface, width_m: float, resolution_m
     of it, from the ground up to the camera; none where something else than the ground was seen
     below it. ``points_m`` is its path, (P, 3), in steps of at most half a voxel; map axes.
     """
-    columns, top_m = _columns(points_m[_on_ground(points_m, ground)], width_m, resolution_m)
+    off_m = np.abs(ground.drop_at(points_m[:, :2]) - ground.camera_height_m)
+    on_ground = ~(off_m > _SAME_M)  # not above something else; ground that was not seen is ground
+    columns, top_m = _columns(points_m[on_ground], width_m, resolution_m)
     floor_m = ground.height_at((columns + 0.5) * resolution_m)
     known = np.isfinite(floor_m)
     columns, floor_m, top_m = columns[known], floor_m[known], top_m[known]
@@ -89,15 +89,7 @@ def sweep(points_m: Float64, ground: GroundSurface, width_m: float, resolution_m
     return keys.astype(np.int32)
 
 
-def _on_ground(points_m: Float64, ground: GroundSurface) -> Bool:
-    """Return which points are not above something else than the ground; unseen ground is ground."""
-    off_m = np.abs(ground.drop_at(points_m[:, :2]) - ground.camera_height_m)
-    return np.asarray(~(off_m > _SAME_M))
-
-
-def _columns(
-    points_m: Float64, width_m: float, resolution_m: float
-) -> tuple[NDArray[np.int64], Float64]:
+def _columns(points_m: Float64, width_m: float, resolution_m: float) -> tuple[Int64, Float64]:
     """Return columns (N, 2) near the path, each once, and its lowest height near each, (N,)."""
     reach = int(np.ceil(width_m / 2 / resolution_m)) + 1
     around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)

@@ -6,21 +6,18 @@ from typing import ClassVar, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.core.errors import MappingError
 from recon.core.settings import Settings
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, Int64
 from recon.core.values.grid import log_odds
 from recon.map.ground.surface import WINDOW_M, GroundSurface
 
 JOINED_CELLS: Final = 2
 """Cells that were hit, but not surely, belong to an obstacle that they hang together with over so
 many cells, unless they touch a free one."""
-
-
 FREE_HEIGHT_M: Final = 0.8
 """Free voxels below this height make a cell free; higher ones may be seen over an obstacle that
 hides what is behind it."""
@@ -112,9 +109,7 @@ def drop_undecided(voxels: OccupancyVoxels) -> OccupancyVoxels:
     return voxels.select(full | empty)
 
 
-def _columns(
-    voxels: OccupancyVoxels,
-) -> tuple[NDArray[np.int64], tuple[int, int], NDArray[np.int64]]:
+def _columns(voxels: OccupancyVoxels) -> tuple[Int64, tuple[int, int], Int64]:
     """Return the lowest column (2,), rows and columns of the grid, and the cell of each voxel."""
     low = voxels.keys[:, :2].min(axis=0).astype(np.int64)
     columns, rows = (voxels.keys[:, :2].max(axis=0) - low + 1).tolist()

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.core.errors import MappingError
-from recon.core.kernels.voxels import pack_keys
+from recon.core.kernels.voxels import find_keys, pack_keys
 from recon.core.settings import Settings
 from recon.core.values import OccupancyVoxels, PointCloud
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, freeze
 from recon.core.values.grid import log_odds
 
 _BIN_M: Final = 0.05
@@ -106,11 +106,8 @@ def estimate_ground_surface(
 ) -> GroundSurface:
     """Follow the ground along a path and to its sides; unknown everywhere without ground below it.
 
-    Args:
-        cloud: The fused cloud in map axes (z up). With normals, only points that face up count.
-        positions_m: float (N, 3), positions of the camera, map axes; N ≥ 1. A row of NaN separates
-            pieces of a path.
-        settings: How to follow it.
+    Of a fused cloud with normals, only points that face up count. ``positions_m``, float (N, 3),
+    are those of the camera, map axes; a row of NaN separates pieces of a path.
     """
     field = _field(cloud, positions_m, settings)
     camera_height = settings.camera_height_m or field.camera_height()
@@ -209,8 +206,8 @@ class _Field:
     ) -> None:
         slot = np.searchsorted(cells, self._cell[points])
         z = self._z[points]
-        height, window = expected, WINDOW_M
-        for width in (window, window / 2):
+        height = expected
+        for width in (WINDOW_M, WINDOW_M / 2):
             near = np.abs(z - height[slot]) <= width
             number = np.bincount(slot[near], minlength=len(cells))
             total = np.bincount(slot[near], weights=z[near], minlength=len(cells))
@@ -256,7 +253,7 @@ class _Field:
         reached = self._ring.ravel()[cells] < np.iinfo(np.int32).max
         return cells[reached], z[reached]
 
-    def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], Bool]:
         """Return flat index of the cell of each point, and whether it lies on the field."""
         rows, columns = self.heights.shape
         place = np.floor((xyz[:, :2] - self.origin) / CELL_M)
@@ -282,14 +279,14 @@ def _densify(path: Float64, step_m: float) -> Float64:
     return np.stack([np.interp(wanted, along, path[:, axis]) for axis in range(3)], axis=1)
 
 
-def _rings(seeds: NDArray[np.bool_], reach: int) -> NDArray[np.int32]:
+def _rings(seeds: Bool, reach: int) -> Int32:
     """Return steps (to 8 neighbours) from the nearest seed; the largest int32 beyond ``reach``."""
     away = np.where(seeds, 0, 255).astype(np.uint8)
     steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
     return np.where(steps <= reach, steps, np.iinfo(np.int32).max).astype(np.int32)
 
 
-def _smooth(heights: Float64, measured: NDArray[np.bool_]) -> Float64:
+def _smooth(heights: Float64, measured: Bool) -> Float64:
     """Blur the known heights with their neighbours; carried ones count a tenth."""
     known = np.isfinite(heights)
     weight = known * np.where(measured, 1.0, 0.1)
@@ -309,7 +306,17 @@ def find_floors(voxels: OccupancyVoxels) -> Float32:
 
     Walls have none. Voxels on another column do not matter, so tiles can be looked at alone.
     """
-    return ((_floors(voxels) + 0.5) * voxels.resolution_m).astype(np.float32)
+    packed = pack_keys(voxels.keys)
+    order = np.argsort(packed)
+    packed, log_odds = packed[order], voxels.log_odds[order]
+    full = np.flatnonzero(log_odds > _FULL)
+    free, roofed = np.zeros((2, len(full)), np.bool_)
+    for up in range(1, _REACH + 1):
+        place, observed = find_keys(packed[full] + up, packed)
+        free |= observed & ~roofed & (log_odds[place] < _EMPTY)
+        roofed |= observed & (log_odds[place] > _FULL)
+    floors = voxels.keys[order[full[free]]]
+    return ((floors + 0.5) * voxels.resolution_m).astype(np.float32)
 
 
 def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
@@ -320,7 +327,8 @@ def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
     known = cloud.xyz
     if cloud.normals is not None:
         known = known[cloud.normals[:, 2] >= math.cos(math.radians(MAX_TILT_DEG))]
-    floors = floors[_unknown(floors, known)]
+    cells, counts = np.unique(_columns(known), return_counts=True)
+    floors = floors[np.isin(_columns(floors), cells[counts >= MIN_POINTS], invert=True)]
     xyz = np.concatenate([cloud.xyz, floors])
     if cloud.normals is None:
         return PointCloud(xyz, frame=cloud.frame)
@@ -328,37 +336,7 @@ def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
     return PointCloud(xyz, normals=np.concatenate([cloud.normals, up]), frame=cloud.frame)
 
 
-def _floors(voxels: OccupancyVoxels) -> Int32:
-    """Return int32 (N, 3), the occupied voxels that are free above."""
-    if len(voxels) == 0:
-        return voxels.keys
-    packed = pack_keys(voxels.keys)
-    order = np.argsort(packed)
-    packed, log_odds = packed[order], voxels.log_odds[order]
-    full = np.flatnonzero(log_odds > _FULL)
-    free = np.zeros(len(full), dtype=np.bool_)
-    roofed = np.zeros(len(full), dtype=np.bool_)
-    for up in range(1, _REACH + 1):
-        value = _value_at(packed, log_odds, packed[full] + up)
-        free |= ~roofed & (value < _EMPTY)
-        roofed |= value > _FULL
-    return np.asarray(voxels.keys[order[full[free]]])
-
-
-def _value_at(packed: NDArray[np.int64], log_odds: Float32, wanted: NDArray[np.int64]) -> Float32:
-    """Return log-odds of cells among sorted ones; NaN where they were not observed."""
-    place = np.minimum(np.searchsorted(packed, wanted), len(packed) - 1)
-    return np.where(packed[place] == wanted, log_odds[place], np.float32(np.nan))
-
-
-def _unknown(floors: Float32, known: Float32) -> Bool:
-    """Return which floors lie in cells of the ground where fewer than ``min_points`` are known."""
-    cells, counts = np.unique(_columns(known, CELL_M), return_counts=True)
-    measured = cells[counts >= MIN_POINTS]
-    return np.isin(_columns(floors, CELL_M), measured, invert=True)
-
-
-def _columns(xyz: Float32, cell_m: float) -> NDArray[np.int64]:
+def _columns(xyz: Float32) -> Int64:
     """Return one number for each point's cell of the ground."""
-    cells = np.floor(xyz[:, :2].astype(np.float64) / cell_m).astype(np.int64)
+    cells = np.floor(xyz[:, :2].astype(np.float64) / CELL_M).astype(np.int64)
     return np.asarray((cells[:, 0] << 32) + cells[:, 1])

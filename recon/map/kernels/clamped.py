@@ -5,8 +5,6 @@ of this form are closed under composition, ``x → min(max(x + sum, low), high)`
 cell describe what a part of a drive did to it, whatever was known before, and chaining the parts in
 order gives exactly what one long drive would have given. Adding up clamped log-odds would not: a
 car that was seen ten times in one part, and looked through ten times in the next, would stay.
-
-The reference implementations in plain Python are in `tests/map/kernels/reference.py`.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Float32, Float64, Int64, UInt16, kernel
 from recon.core.kernels.voxels import (
     EMPTY,
     enter_keys,
@@ -44,34 +42,22 @@ _LOW: Final = BLOCK_EDGE - 1
 class ClampedBlocks(NamedTuple):
     """Blocks of cells, one row each.
 
-    Attributes:
-        table: int64 (C, 2), hash from packed block index to row.
-        keys: int64 (B,), packed index of each block.
-        cells: float32 (B, 512, 3): sum, low and high of each cell; a sum of NaN = never observed.
-            Cell (i, j, k) of a block is column ``(i·8 + j)·8 + k``.
-        used: int64 (1,), number of rows in use.
+    Cell (i, j, k) of a block is column ``(i·8 + j)·8 + k``.
     """
 
-    table: NDArray[np.int64]
-    keys: NDArray[np.int64]
-    cells: NDArray[np.float32]
-    used: NDArray[np.int64]
+    table: Int64  # (C, 2), hash from packed block index to row
+    keys: Int64  # (B,), packed index of each block
+    cells: Float32  # (B, 512, 3): sum, low, high of each cell; sum NaN = never observed
+    used: Int64  # (1,), number of rows in use
 
 
 class CellRows(NamedTuple):
-    """The observed cells of some blocks, one after the other.
+    """The observed cells of some blocks, one after the other."""
 
-    Attributes:
-        blocks: int64 (B,), packed index of each block.
-        starts: int64 (B + 1,), where the cells of each block begin and the last ones end.
-        cells: uint16 (N,), column of each cell in its block.
-        values: float32 (N, 3), sum, low and high.
-    """
-
-    blocks: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    cells: NDArray[np.uint16]
-    values: NDArray[np.float32]
+    blocks: Int64  # (B,), packed index of each block
+    starts: Int64  # (B + 1,), where the cells of each block begin and the last ones end
+    cells: UInt16  # (N,), column of each cell in its block
+    values: Float32  # (N, 3), sum, low and high
 
 
 def make_clamped(rows: int) -> ClampedBlocks:
@@ -89,8 +75,7 @@ def add_evidence(
 ) -> ClampedBlocks:
     """Add a frame's evidence to the map, and clear it; return the stores that hold the map.
 
-    The map is written, or replaced by larger stores where it is full; its log-odds stay between
-    ``lowest`` and ``highest``.
+    Where the map is full, larger ones take its place; log-odds are clamped to the limits.
     """
     blocks = reserve(blocks, int(blocks.used[0]) + int(evidence.used[0]), make_clamped)
     # Plain tuples: numba's cache on disk would remember the classes by name, and break when one
@@ -122,12 +107,7 @@ def _add_evidence(
 
 @kernel
 def _chain(
-    cells: NDArray[np.float32],
-    row: int,
-    cell: int,
-    change: np.float32,
-    low: np.float32,
-    high: np.float32,
+    cells: Float32, row: int, cell: int, change: np.float32, low: np.float32, high: np.float32
 ) -> None:
     """Compose what was done to a cell with ``x → min(max(x + change, low), high)``."""
     before = cells[row, cell, 0]
@@ -154,10 +134,7 @@ def observed_rows(blocks: ClampedBlocks) -> CellRows:
 
 
 def chain_rows(blocks: ClampedBlocks, rows: CellRows) -> ClampedBlocks:
-    """Chain a later part of a drive: what it did to each cell is done to the map.
-
-    The map is written, or replaced by larger stores where it is full.
-    """
+    """Chain a later part of a drive: do to the returned map what it did to each cell."""
     blocks = reserve(blocks, int(blocks.used[0]) + len(rows.blocks), make_clamped)
     _chain_rows(tuple(blocks), tuple(rows))
     return blocks
@@ -173,7 +150,7 @@ def _chain_rows(blocks: tuple[NDArray[Any], ...], rows: tuple[NDArray[Any], ...]
             _chain(cells, row, columns[n], values[n, 0], values[n, 1], values[n, 2])
 
 
-def move_blocks(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> ClampedBlocks:
+def move_blocks(blocks: ClampedBlocks, T_new_old: Float64) -> ClampedBlocks:
     """The map turned and shifted: each new cell takes what the old cell at its centre has.
 
     ``T_new_old`` is a rigid motion with its translation in cells.
@@ -188,7 +165,7 @@ def move_blocks(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> Clampe
     return moved
 
 
-def _blocks_reached(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> NDArray[np.int64]:
+def _blocks_reached(blocks: ClampedBlocks, T_new_old: Float64) -> Int64:
     """Packed indices of all blocks that a moved block may touch, in order."""
     corners = unpack_keys(blocks.keys[: int(blocks.used[0])]) * BLOCK_EDGE
     centres = corners + BLOCK_EDGE / 2
@@ -199,7 +176,7 @@ def _blocks_reached(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> ND
 
 @kernel
 def _fill_moved(
-    old: tuple[NDArray[Any], ...], new: tuple[NDArray[Any], ...], T_old_new: NDArray[np.float64]
+    old: tuple[NDArray[Any], ...], new: tuple[NDArray[Any], ...], T_old_new: Float64
 ) -> None:
     table, _, old_cells, _ = old
     _, keys, new_cells, used = new

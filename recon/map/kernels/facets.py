@@ -15,9 +15,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Bool, Float32, Float64, Int32, Int64, kernel
 from recon.core.kernels.voxels import EMPTY, enter_keys, find, make_table, pack_key
 
 AROUND: Final = 27
@@ -25,20 +24,13 @@ LEAST: Final = 3
 """Points that a plane needs; with fewer, a cell counts as crossed if it holds one."""
 
 
-def crossed_cells(
-    cells: NDArray[np.int32], keys: NDArray[np.int64], sums: NDArray[np.float32]
-) -> NDArray[np.bool_]:
-    """Fit a plane to the points in and around each cell, and test whether it crosses the cell.
+def crossed_cells(cells: Int32, keys: Int64, sums: Float32) -> Bool:
+    """Fit a plane to the points in and around each cell (N, 3), and test whether it crosses it.
 
     The normal is that of the weighted covariance of the points. The plane's distance from the
     centre of the cell is their weighted mean; points beside the normal count less, by a Gaussian of
-    one cell.
-
-    Args:
-        cells: int32 (N, 3), the cells asked about.
-        keys: int64 (M,), packed cells that hold points, each once.
-        sums: float32 (M, 4), sum of the weights of their points, above 0, and weighted sums of the
-            offsets from the centre of the cell.
+    one cell. ``keys`` (M,) are the packed cells that hold points, each once; ``sums`` (M, 4) the
+    sum of their weights, above 0, and weighted sums of the offsets from the centre of the cell.
     """
     table = make_table(len(keys))
     enter_keys(table, keys)
@@ -52,12 +44,7 @@ def crossed_cells(
 
 
 @kernel
-def _measure_spreads(
-    cells: NDArray[np.int32],
-    table: NDArray[np.int64],
-    sums: NDArray[np.float32],
-    spreads: NDArray[np.float64],
-) -> None:
+def _measure_spreads(cells: Int32, table: Int64, sums: Float32, spreads: Float64) -> None:
     """Write the covariance (N, 3, 3) of the points around each cell; 0 where they are too few."""
     points, weights = np.empty((AROUND, 3)), np.empty(AROUND)
     for n in range(len(cells)):
@@ -67,13 +54,7 @@ def _measure_spreads(
 
 
 @kernel
-def _test_cells(
-    cells: NDArray[np.int32],
-    table: NDArray[np.int64],
-    sums: NDArray[np.float32],
-    normals: NDArray[np.float64],
-    crossed: NDArray[np.bool_],
-) -> None:
+def _test_cells(cells: Int32, table: Int64, sums: Float32, normals: Float64, crossed: Bool) -> None:
     """Test whether the plane with the normal (N, 3) of each cell crosses it."""
     points, weights = np.empty((AROUND, 3)), np.empty(AROUND)
     for n in range(len(cells)):
@@ -86,11 +67,7 @@ def _test_cells(
 
 @kernel
 def _gather(
-    cell: NDArray[np.int32],
-    table: NDArray[np.int64],
-    sums: NDArray[np.float32],
-    points: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    cell: Int32, table: Int64, sums: Float32, points: Float64, weights: Float64
 ) -> tuple[int, bool]:
     """Write the points in and around a cell; their number, and whether one is in the cell."""
     i, j, k = np.int64(cell[0]), np.int64(cell[1]), np.int64(cell[2])
@@ -111,9 +88,7 @@ def _gather(
 
 
 @kernel
-def _crosses(
-    points: NDArray[np.float64], weights: NDArray[np.float64], normal: NDArray[np.float64]
-) -> bool:
+def _crosses(points: Float64, weights: Float64, normal: Float64) -> bool:
     """Whether the plane through points around a cell's centre crosses the cell."""
     total, distance = 0.0, 0.0
     for n in range(len(points)):
@@ -127,9 +102,7 @@ def _crosses(
 
 
 @kernel
-def _add_spread(
-    points: NDArray[np.float64], weights: NDArray[np.float64], spread: NDArray[np.float64]
-) -> None:
+def _add_spread(points: Float64, weights: Float64, spread: Float64) -> None:
     """Add up the covariance of weighted points."""
     total = weights.sum()
     mean = np.zeros(3)

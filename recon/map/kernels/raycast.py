@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Float32, Float64, Int64, kernel
 from recon.core.kernels.voxels import find_or_add, make_table, pack_key, reserve
 
 BLOCK_BITS: Final = 3
@@ -33,57 +33,37 @@ _SQRT2: Final = math.sqrt(2.0)
 class Blocks(NamedTuple):
     """The evidence of one frame: blocks of cells, one row each.
 
-    Attributes:
-        table: int64 (C, 2), hash from packed block index to row.
-        keys: int64 (B,), packed index of each block.
-        values: float32 (B, 512), change of the log-odds; 0 = not touched. Cell (i, j, k) of a
-            block is column ``(i·8 + j)·8 + k``.
-        used: int64 (1,), number of rows in use.
+    Cell (i, j, k) of a block is column ``(i·8 + j)·8 + k``.
     """
 
-    table: NDArray[np.int64]
-    keys: NDArray[np.int64]
-    values: NDArray[np.float32]
-    used: NDArray[np.int64]
+    table: Int64  # (C, 2), hash from packed block index to row
+    keys: Int64  # (B,), packed index of each block
+    values: Float32  # (B, 512), change of the log-odds; 0 = not touched
+    used: Int64  # (1,), number of rows in use
 
 
 class Rays(NamedTuple):
-    """Rays from one origin; lengths in cells.
+    """Rays from one origin; lengths in cells."""
 
-    Attributes:
-        origin: float64 (3,).
-        ends: float64 (N, 3), the measured points.
-        free: float64 (N,), length before which every cell is free.
-        sigma: float64 (N,), standard deviation of the measured length; 0 = exact.
-        hit: float32 (N,), log-odds of a certain hit; 0 = the ray ends in nothing.
-        miss: float32 (N,), log-odds of a miss, not above 0.
-    """
-
-    origin: NDArray[np.float64]
-    ends: NDArray[np.float64]
-    free: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    hit: NDArray[np.float32]
-    miss: NDArray[np.float32]
+    origin: Float64  # (3,)
+    ends: Float64  # (N, 3), the measured points
+    free: Float64  # (N,), length before which every cell is free
+    sigma: Float64  # (N,), standard deviation of the measured length; 0 = exact
+    hit: Float32  # (N,), log-odds of a certain hit; 0 = the ray ends in nothing
+    miss: Float32  # (N,), log-odds of a miss, not above 0
 
 
 def measure_points(
-    xyz: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    T: NDArray[np.float64],
-    max_range: float,
-    margin: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    xyz: Float32, sigma: Float32, confidence: Float32, T: Float64, max_range: float, margin: float
+) -> tuple[Float32, Float32]:
     """Turn points (N, 3) of a camera in metres into rays: their ends, and what is known of each.
 
     A point farther than ``max_range`` is moved along its ray to that range and is no hit. Free
     space ends ``margin`` standard deviations before a point. ``T`` is from camera axes to cells of
     the map, a rotation times a scale.
 
-    Returns:
-        float32 (N, 3), ends in cells of the map, and float32 (N, 4): standard deviation of the
-        length and free length (cells), confidence, and 1 where the ray hits or 0.
+    Returns float32 (N, 3), ends in cells of the map, and float32 (N, 4): standard deviation of the
+    length and free length (cells), confidence, and 1 where the ray hits or 0.
     """
     ends = np.empty((len(xyz), 3), np.float32)
     values = np.empty((len(xyz), 4), np.float32)
@@ -95,12 +75,12 @@ def measure_points(
 
 @kernel
 def _measure_points(
-    xyz: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    T: NDArray[np.float64],
+    xyz: Float32,
+    sigma: Float32,
+    confidence: Float32,
+    T: Float64,
     limits: tuple[float, float, float],
-    out: tuple[NDArray[np.float32], NDArray[np.float32]],
+    out: tuple[Float32, Float32],
 ) -> None:
     scale, max_range, margin = limits
     ends, values = out
@@ -124,12 +104,8 @@ def _measure_points(
 
 @kernel
 def limit_points(
-    xyz: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    max_range: float,
-    beyond: float,
-    margin: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    xyz: Float32, sigma: Float32, max_range: float, beyond: float, margin: float
+) -> tuple[Float32, Float32]:
     """Move points (N, 3) out of range along their rays to the distance ``beyond``.
 
     They are no hits anyway, and at one distance they can be averaged. A ray must stay free as far

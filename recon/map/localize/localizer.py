@@ -42,19 +42,12 @@ _LOST_SIGMA_DEG: Final = 0.3  # that of its rotation
 
 
 class State(str, Enum):
-    """What is known of a frame's place.
+    """What is known of a frame's place."""
 
-    Attributes:
-        SEARCHING: Nothing; no place has been recognised for certain.
-        TRACKING: Its pose; views or surfaces of the map confirm it.
-        COASTING: Its pose by odometry alone since the last one that was confirmed.
-        LOST: Nothing any more; the pose of the frame before was the last one.
-    """
-
-    SEARCHING = "searching"
-    TRACKING = "tracking"
-    COASTING = "coasting"
-    LOST = "lost"
+    SEARCHING = "searching"  # nothing; no place has been recognised for certain
+    TRACKING = "tracking"  # its pose; views or surfaces of the map confirm it
+    COASTING = "coasting"  # its pose by odometry alone since the last one that was confirmed
+    LOST = "lost"  # nothing any more; the pose of the frame before was the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,16 +174,12 @@ class Localizer:
             loops.append(verdict.loop)
             if frame.rough:  # one tells most of it, and in a hurry time counts
                 break
-        by_surfaces = self._by_surfaces(belief, frame, seen=bool(loops))
-        return _Confirmed(by_surfaces or belief, tuple(loops), refused, by_surfaces is not None)
-
-    def _by_surfaces(self, belief: Belief, frame: OdometryFrame, *, seen: bool) -> Belief | None:
-        """Return the belief corrected by the surfaces of the map; None = not."""
         # Aligning takes as long as several frames may, where they are in a hurry.
-        due = not seen or (not frame.rough and self._frames % _SURFACES_EVERY == 0)
-        if self._surroundings is None or not due:
-            return None
-        return self._surroundings.correct(belief, frame, learn=seen)
+        due = not loops or (not frame.rough and self._frames % _SURFACES_EVERY == 0)
+        by_surfaces = None
+        if self._surroundings is not None and due:
+            by_surfaces = self._surroundings.correct(belief, frame, learn=bool(loops))
+        return _Confirmed(by_surfaces or belief, tuple(loops), refused, by_surfaces is not None)
 
     def _result(self, confirmed: _Confirmed) -> Located:
         belief, seen = confirmed.belief, bool(confirmed.loops) or confirmed.surfaces

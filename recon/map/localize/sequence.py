@@ -39,7 +39,8 @@ class StartPose:
     def near(self, T_map_camera: Float64) -> Bool:
         """Return bool (N,), which of these poses (N, 4, 4) are near."""
         off = T_map_camera[:, :2, 3] - (self.x_m, self.y_m)
-        ahead = T_map_camera[:, :2, 2] @ _turned_back(self.yaw_deg)
+        c, s = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
+        ahead = T_map_camera[:, :2, 2] @ np.array([[c, -s], [s, c]])
         turned = np.abs(np.arctan2(ahead[:, 1], ahead[:, 0]))
         near_m = np.hypot(off[:, 0], off[:, 1])
         return np.asarray((near_m <= START_WITHIN_M) & (turned <= math.radians(START_WITHIN_DEG)))
@@ -110,11 +111,9 @@ class LocalizedDrive:
     @property
     def trajectory(self) -> Trajectory:
         """The poses of the frames that are placed, in the world of the map; perhaps none."""
-        poses = [
-            f.located.T_world_camera for f in self.placed if f.located.T_world_camera is not None
-        ]
+        poses = np.array([frame.located.T_world_camera for frame in self.placed], np.float64)
         times_s = np.array([frame.time_s for frame in self.placed])
-        return Trajectory(np.array(poses).reshape(-1, 4, 4), times_s)
+        return Trajectory(poses.reshape(-1, 4, 4), times_s)
 
     def figures(self) -> dict[str, Any]:
         """Return the figures for ``summary.json``."""
@@ -142,14 +141,12 @@ class LocalizedDrive:
             return ["the drive was not found in the map: no frame has a pose"]
         times = "once" if lost == 1 else f"{lost} times"
         of = f"{coasting} of {counted(len(states), 'pose')} are by odometry alone"
-        return [
-            *([f"{of}: nothing in the map confirms them (coasting)"] if coasting else ()),
-            *(
-                [f"the drive was lost {times}; frames without a pose are not in the trajectory"]
-                if lost
-                else ()
-            ),
-        ]
+        lines = [f"{of}: nothing in the map confirms them (coasting)"] if coasting else []
+        if lost:
+            lines += [
+                f"the drive was lost {times}; frames without a pose are not in the trajectory"
+            ]
+        return lines
 
 
 def open_localizer(
@@ -201,31 +198,22 @@ def localize_sequence(
         with serial_algebra():
             # What is matched ahead of its turn would be old when it is located.
             pairs = source.frames()
-            for frame in map(match, pairs) if source.live else look_ahead(match, pairs):
+            matched = map(match, pairs) if source.live else look_ahead(match, pairs)
+            for index, frame in enumerate(matched):
                 with watch.stage("localize"):
-                    frames.append(_located(localizer, frame, len(frames), source))
-                source.note_located(len(frames) - 1)
+                    start_s = time.perf_counter()
+                    located = localizer.add(frame, hurried=source.hurried)
+                    seconds = time.perf_counter() - start_s
+                frames.append(LocalizedFrame(index, frame.pair.timestamp_s, seconds, located))
+                source.note_located(index)
                 progress.on_step(frames[-1])
-                config.memory.check(f"frame {len(frames) - 1}")
+                config.memory.check(f"frame {index}")
     finally:
         progress.on_finish()
     if not frames:
         raise RegistrationError("the source has no frame", where=source.name)
     T_map_world = map_.first.T_map_world
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
-
-
-def _located(
-    localizer: Localizer, frame: OdometryFrame, index: int, source: StereoSource
-) -> LocalizedFrame:
-    begun = time.perf_counter()
-    located = localizer.add(frame, hurried=source.hurried)
-    return LocalizedFrame(index, frame.pair.timestamp_s, time.perf_counter() - begun, located)
-
-
-def _turned_back(yaw_deg: float) -> Float64:
-    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    return np.array([[c, -s], [s, c]])
 
 
 @dataclass(frozen=True, eq=False)

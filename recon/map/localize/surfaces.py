@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import step_jacobian
 from recon.core.kernels.voxels import pack_keys
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, Int64
 
 MIN_POINTS = 10  # least number of points in a cell with a surface
 THIN_SHARE = 0.1
@@ -26,7 +25,7 @@ class Surfaces:
     """Cells of a map, each with its mean and its surface."""
 
     edge_m: float  # edge of a cell
-    keys: NDArray[np.int64]  # int64 (M,), packed cell indices, ascending
+    keys: Int64  # int64 (M,), packed cell indices, ascending
     means: Float64  # (M, 3), mean of the points in each cell
     # float64 (M, 3, 3), inverse covariance along the thin axes, zero along the others: a wall fixes
     # one direction, a pole two, a bush none
@@ -99,7 +98,7 @@ def _distance_m(off: Float64, information: Float64) -> Float64:
     return distance
 
 
-def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]:
+def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[Int64, Bool]:
     """Return the index of the cell of each point, and whether there is one."""
     if not len(surfaces.keys):
         return np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.bool_)
@@ -108,11 +107,11 @@ def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]
     return cell, surfaces.keys[cell] == keys
 
 
-def _keys(xyz: Float64, edge_m: float) -> NDArray[np.int64]:
+def _keys(xyz: Float64, edge_m: float) -> Int64:
     return pack_keys(np.floor(xyz / edge_m).astype(np.int64))
 
 
-def _sums(cell: NDArray[np.int64], values: Float64, cells: int) -> Float64:
+def _sums(cell: Int64, values: Float64, cells: int) -> Float64:
     """Sum of the rows of ``values`` in each cell."""
     columns = [np.bincount(cell, weights=column, minlength=cells) for column in values.T]
     return np.stack(columns, axis=1)

@@ -85,7 +85,9 @@ class Surroundings:
         measured = self._measure(belief, points.xyz.astype(np.float64))
         correction = replace(measured, step=measured.step - self._offset)
         if learn:
-            self._learn(measured.step)
+            self._measured += 1
+            share = 1.0 / min(self._measured, _OFFSET_FRAMES)
+            self._offset = (1.0 - share) * self._offset + share * measured.step
         if not is_worthwhile(correction, belief.covariance):
             return None
         T = belief.T_world_camera @ as_transform(correction.step)
@@ -106,11 +108,6 @@ class Surroundings:
             after=_fit(alignment.source, T_icp, self._surfaces),
             contrast=contrast(alignment.source, T_icp, self._surfaces),
         )
-
-    def _learn(self, step: Float64) -> None:
-        self._measured += 1
-        share = 1.0 / min(self._measured, _OFFSET_FRAMES)
-        self._offset = (1.0 - share) * self._offset + share * step
 
     def _load(self, camera_m: Float64) -> None:
         """Take the points around a position into the map of ICP, unless they are there."""

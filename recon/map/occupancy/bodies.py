@@ -15,7 +15,6 @@ Ref: P. A. P. Moran, "The interpretation of statistical maps", J. R. Statist. So
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import product
 from typing import Final, NamedTuple
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 from recon.core.geometry.se3 import apply, invert
 from recon.core.kernels.voxels import find_keys, pack_keys, unpack_keys
 from recon.core.values import PointCloud, RayCloud
-from recon.core.values.arrays import Bool, Float64, Int8
+from recon.core.values.arrays import Bool, Float32, Float64, Int8, Int64
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE, cast_rays, make_blocks
 from recon.map.occupancy.builder import SPREAD_SIGMAS, OccupancySettings, frame_rays
 
@@ -52,21 +51,19 @@ class _Seen(NamedTuple):
     saw both cells of a pair, ``differed`` those that hit one and looked through the other.
     """
 
-    hit: NDArray[np.int64]
-    through: NDArray[np.int64]
-    runs: NDArray[np.int64]
-    both: NDArray[np.int64]
-    differed: NDArray[np.int64]
+    hit: Int64
+    through: Int64
+    runs: Int64
+    both: Int64
+    differed: Int64
 
 
-def came_or_went(keys: NDArray[np.int64], placed: Bool, looks: Iterable[Int8]) -> Bool:
+def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     """Return bool (N,), the cells of pieces of surface that were there at one time only.
 
-    Args:
-        keys: int64 (N,), packed cells with points that were seen through as often as hit, sorted.
-        placed: bool (N,), cells with points that their frames could place in one cell, which are
-            the better evidence.
-        looks: What each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
+    ``keys`` are sorted packed cells with points that were seen through as often as hit; ``placed``
+    those with points that their frames could place in one cell, the better evidence; ``looks`` what
+    each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
     """
     pairs, upright = _pairs(keys)
     seen = _count(len(keys), pairs, looks)
@@ -81,10 +78,10 @@ def came_or_went(keys: NDArray[np.int64], placed: Bool, looks: Iterable[Int8]) -
     return np.asarray(body | (~known & alone))
 
 
-def _pairs(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], Bool]:
+def _pairs(keys: Int64) -> tuple[Int64, Bool]:
     """Return int64 (P, 2), rows of cells that touch; and which pairs lie one above the other."""
-    origin, found, upright = pack_keys(np.zeros((1, 3), np.int64)), [], []
-    for step, stride in zip(_HALF, pack_keys(_HALF) - origin, strict=True):
+    found, upright = [], []
+    for step, stride in zip(_HALF, strides(_HALF), strict=True):
         place, known = find_keys(keys + stride, keys)
         rows = np.flatnonzero(known)
         found.append(np.stack([rows, place[rows]], axis=1))
@@ -92,7 +89,7 @@ def _pairs(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], Bool]:
     return np.concatenate(found), np.concatenate(upright)
 
 
-def _count(cells: int, pairs: NDArray[np.int64], looks: Iterable[Int8]) -> _Seen:
+def _count(cells: int, pairs: Int64, looks: Iterable[Int8]) -> _Seen:
     hit, through, runs = (np.zeros(cells, np.int64) for _ in range(3))
     both, differed = np.zeros((2, len(pairs)), np.int64)
     before = np.zeros(cells, np.int8)
@@ -107,9 +104,7 @@ def _count(cells: int, pairs: NDArray[np.int64], looks: Iterable[Int8]) -> _Seen
     return _Seen(hit, through, runs, both, differed)
 
 
-def _disagreement(
-    seen: _Seen, pairs: NDArray[np.int64], upright: Bool, placed: Bool, piece: NDArray[np.int64]
-) -> Float64:
+def _disagreement(seen: _Seen, pairs: Int64, upright: Bool, placed: Bool, piece: Int64) -> Float64:
     """Return float64, the disagreement in each piece; NaN where too little is known.
 
     Cells whose points were not placed count where a piece has no others.
@@ -133,7 +128,7 @@ def _disagreement(
     return np.where(np.isfinite(surely), surely, at_all)
 
 
-def _pieces(cells: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+def _pieces(cells: int, pairs: Int64) -> Int64:
     """Return int64 (N,), number of the piece of each cell: cells that touch are of one."""
     label = np.arange(cells)
     while True:
@@ -146,13 +141,18 @@ def _pieces(cells: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
         label = least
 
 
-def _near(keys: NDArray[np.int64], body: Bool) -> Bool:
+def _near(keys: Int64, body: Bool) -> Bool:
     """Return bool (N,), cells with one of a body within the gap."""
     steps = np.array(list(product(range(-_GAP_CELLS, _GAP_CELLS + 1), repeat=3)))
     near, among = np.zeros(len(keys), np.bool_), keys[body]
-    for stride in pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64)):
+    for stride in strides(steps):
         near |= find_keys(keys + stride, among)[1]
     return near
+
+
+def strides(steps: Int64) -> Int64:
+    """Return by how much packed cells differ that are some steps (N, 3) apart."""
+    return pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64))
 
 
 _KEPT_FRAMES: Final = 64  # frames whose rays stay in memory: neighbouring tiles need the same ones
@@ -161,7 +161,6 @@ _BINS: Final = 128  # directions on each axis, by which rays that may matter are
 _WIDEST: Final = 1.5  # largest slope of a ray against the optical axis that has a bin of its own
 
 
-@dataclass(frozen=True, eq=False)
 class Looks:
     """The frames of all drives of a map, in order, taken at ``T_map_camera`` (F, 4, 4).
 
@@ -169,15 +168,13 @@ class Looks:
     occupancy.
     """
 
-    settings: OccupancySettings
-    T_map_camera: Float64
-    rays: Callable[[int], RayCloud]
-    _read: Callable[[int], RayCloud] = field(init=False, repr=False)
+    def __init__(
+        self, settings: OccupancySettings, T_map_camera: Float64, rays: Callable[[int], RayCloud]
+    ) -> None:
+        self.settings, self.T_map_camera = settings, T_map_camera
+        self._read = lru_cache(_KEPT_FRAMES)(rays)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_read", lru_cache(_KEPT_FRAMES)(self.rays))
-
-    def at(self, keys: NDArray[np.int64]) -> Iterator[Int8]:
+    def at(self, keys: Int64) -> Iterator[Int8]:
         """Yield what each frame near some packed cells saw in them, int8 (N,).
 
         1 where it hit something, -1 where it looked through, 0 where it saw neither.
@@ -196,7 +193,7 @@ class Looks:
                 chosen = _towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
                 yield self._cast(cloud.select(chosen), T, cells)
 
-    def _cast(self, cloud: PointCloud, T_map_camera: Float64, cells: NDArray[np.int64]) -> Int8:
+    def _cast(self, cloud: PointCloud, T_map_camera: Float64, cells: Int64) -> Int8:
         """Return what the rays of one frame did to cells (N, 3)."""
         rays = frame_rays(cloud, T_map_camera, self.settings)
         evidence = cast_rays(make_blocks(_FIRST_BLOCKS), rays, SPREAD_SIGMAS)
@@ -209,7 +206,7 @@ class Looks:
         return seen
 
 
-def _towards(xyz: NDArray[np.float32], cells_m: Float64, edge_m: float) -> Bool:
+def _towards(xyz: Float32, cells_m: Float64, edge_m: float) -> Bool:
     """Return which points (N, 3) lie on rays that may cross cells (M, 3); camera axes."""
     depth = np.maximum(cells_m[:, 2:], edge_m)
     slopes = cells_m[:, :2] / depth
@@ -226,7 +223,7 @@ def _towards(xyz: NDArray[np.float32], cells_m: Float64, edge_m: float) -> Bool:
     return ahead & chosen
 
 
-def _bins(slopes: NDArray[np.floating]) -> NDArray[np.int64]:
+def _bins(slopes: NDArray[np.floating]) -> Int64:
     """Return the bins of slopes (N, 2); what is steeper shares the outermost."""
     places = np.floor((slopes + _WIDEST) * (_BINS / (2 * _WIDEST)))
     return np.asarray(np.clip(places, 0, _BINS - 1), np.int64)

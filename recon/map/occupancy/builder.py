@@ -55,11 +55,8 @@ class OccupancyBuilder:
     is updated at most once per frame, and a hit outweighs misses (OctoMap's rule).
     """
 
-    def __init__(
-        self, settings: OccupancySettings, T_map_world: NDArray[Any], *, thin: bool = True
-    ) -> None:
+    def __init__(self, settings: OccupancySettings, T_map_world: NDArray[Any]) -> None:
         self._settings = settings
-        self._thin = thin
         self._T_map_world = np.asarray(T_map_world, dtype=np.float64)
         self._map = clamped.make_clamped(256)
         self._evidence = raycast.make_blocks(256)
@@ -75,8 +72,7 @@ class OccupancyBuilder:
         _check_pose(T_world_camera, self._settings.resolution_m)
         rays = frame_rays(cloud, self._T_map_world @ T_world_camera, self._settings)
         self._evidence = raycast.cast_rays(self._evidence, rays, SPREAD_SIGMAS)
-        if self._thin:
-            self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
+        self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
         low, high = log_odds(MIN_PROBABILITY), log_odds(MAX_PROBABILITY)
         self._map = clamped.add_evidence(self._map, self._evidence, low, high)
 
@@ -86,8 +82,7 @@ class OccupancyBuilder:
 
     def part(self) -> OccupancyPart:
         """Return what was observed since the start, or since the last `take`."""
-        points = points_of(self._points) if self._thin else None
-        return OccupancyPart(clamped.observed_rows(self._map), points)
+        return OccupancyPart(clamped.observed_rows(self._map), points_of(self._points))
 
     def take(self) -> OccupancyPart:
         """Return the part so far; the builder starts a new one."""

@@ -23,13 +23,12 @@ from itertools import product
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import are_among, find_keys, pack_keys
 from recon.core.values import OccupancyVoxels
-from recon.core.values.arrays import Bool, Float32, Float64
+from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
-from recon.map.occupancy.bodies import Looks, came_or_went
+from recon.map.occupancy.bodies import Looks, came_or_went, strides
 from recon.map.occupancy.builder import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
 from recon.map.occupancy.part import OccupancyPart
 
@@ -47,7 +46,7 @@ _AROUND: Final = np.array(list(product((-1, 0, 1), repeat=3)))
 """Steps to a cell itself and to those that touch it."""
 _BESIDE: Final = _AROUND[(_AROUND[:, 2] == 0) & _AROUND[:, :2].any(axis=1)]
 """Steps to the cells that touch a cell at its own height."""
-CellEvidence = tuple[NDArray[np.int64], Float32]
+CellEvidence = tuple[Int64, Float32]
 """Packed cells int64 (N,), sorted, and what a drive saw in each, log-odds float32 (N,)."""
 
 
@@ -69,15 +68,11 @@ def find_moved(
     evidence: CellEvidence,
     looks: Looks,
 ) -> Bool:
-    """Return bool (N,), the points of a drive that something left which has moved.
+    """Return bool (N,), the points (N, 3) fused by a drive that something left which has moved.
 
-    Args:
-        points: float64 (N, 3), what the drive fused, map axes.
-        sigma_m: float32 (N,), standard deviation of each in a frame.
-        counted: bool (N,), which of them enough frames saw; the voxels of others do not count.
-        voxels: What all drives observed, map axes.
-        evidence: The `cell_evidence` of the same drive.
-        looks: What single frames of all drives saw.
+    ``sigma_m`` (N,) is the standard deviation of each in a frame; ``counted`` (N,) are those that
+    enough frames saw, the voxels of others do not count. ``evidence`` is of the same drive;
+    ``voxels`` and ``looks`` are what all drives and their frames observed. All is in map axes.
     """
     places = points / voxels.resolution_m
     packed = pack_keys(np.floor(places).astype(np.int64))
@@ -96,16 +91,14 @@ def find_moved(
     return moved
 
 
-def _among(home: NDArray[np.int64], points: Bool) -> Bool:
+def _among(home: Int64, points: Bool) -> Bool:
     """Return bool (cells,), which cells have one of the points; ``home`` is the cell of each."""
     found = np.zeros(int(home.max(initial=-1)) + 1, np.bool_)
     found[home[points]] = True
     return found
 
 
-def _mostly_free(
-    keys: NDArray[np.int64], tells: Bool, voxels: OccupancyVoxels, evidence: CellEvidence
-) -> Bool:
+def _mostly_free(keys: Int64, tells: Bool, voxels: OccupancyVoxels, evidence: CellEvidence) -> Bool:
     """Return bool (N,), sorted cells with points around which most of those that tell are free."""
     place, known = find_keys(keys, evidence[0])
     seen = np.full(len(keys), _MOST)
@@ -118,7 +111,7 @@ def _mostly_free(
     return _grown(keys, mean <= 0, mean <= _UNSURE)
 
 
-def _grown(keys: NDArray[np.int64], sure: Bool, unsure: Bool) -> Bool:
+def _grown(keys: Int64, sure: Bool, unsure: Bool) -> Bool:
     """Return bool (N,), the sure ones of sorted keys, and the unsure ones that join a body."""
     body = np.zeros(len(keys), np.bool_)
     # More than that, as it is among them itself.
@@ -130,31 +123,25 @@ def _grown(keys: NDArray[np.int64], sure: Bool, unsure: Bool) -> Bool:
     return sure | body
 
 
-def _touching(
-    wanted: NDArray[np.int64], keys: NDArray[np.int64], steps: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _touching(wanted: Int64, keys: Int64, steps: Int64) -> Int64:
     """Return int64 (N,), how many of the sorted keys are some steps away from each wanted one."""
     number = np.zeros(len(wanted), np.int64)
-    for stride in _strides(steps):
+    for stride in strides(steps):
         number += find_keys(wanted + stride, keys)[1]
     return number
 
 
-def _mean_around(wanted: NDArray[np.int64], keys: NDArray[np.int64], values: Float32) -> Float32:
+def _mean_around(wanted: Int64, keys: Int64, values: Float32) -> Float32:
     """Return float32 (N,), mean value of the sorted keys that touch each wanted one, or NaN."""
     total, number = np.zeros((2, len(wanted)), np.float32)
-    for stride in _strides(_AROUND):
+    for stride in strides(_AROUND):
         place, known = find_keys(wanted + stride, keys)
         total[known] += values[place[known]]
         number += known
     return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
 
 
-def _strides(steps: NDArray[np.int64]) -> NDArray[np.int64]:
-    return pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64))
-
-
-def _in_reach(places: Float64, reach: Float32, keys: NDArray[np.int64]) -> Bool:
+def _in_reach(places: Float64, reach: Float32, keys: Int64) -> Bool:
     """Return bool (N,): places with one of the adjacent sorted keys in reach; in cells."""
     cells = np.floor(places).astype(np.int64)
     inside, near = places - cells, np.zeros(len(places), np.bool_)

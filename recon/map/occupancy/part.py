@@ -17,7 +17,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.kernels import voxels
 from recon.core.kernels.voxels import are_among
 from recon.core.values import OccupancyVoxels
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, array_in, frozen_array
+from recon.core.values.arrays import Float32, Float64, Int32, Int64, array_in, frozen_array
 from recon.map.kernels import clamped, facets, raycast
 from recon.map.kernels.raycast import BLOCK_BITS
 
@@ -127,7 +127,8 @@ def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
     hit = np.flatnonzero(log_odds > _UNSURE)
     # What was hit and then looked through is no surface: a car that drove off, an outlier.
     points = points.select(are_among(points.keys, voxels.pack_keys(cells[hit])))
-    log_odds[hit[~points.cross(cells[hit])]] = _UNSURE
+    crossed = facets.crossed_cells(cells[hit], points.keys, points.sums)
+    log_odds[hit[~crossed]] = _UNSURE
     return log_odds
 
 
@@ -165,7 +166,7 @@ class SurfacePoints:
     """Sums per cell over the hits of all frames, in the order in which cells were first hit."""
 
     # int64 (N,), packed cells in map axes (`recon.core.kernels.voxels`), each once
-    keys: NDArray[np.int64]
+    keys: Int64
     # float32 (N, 4), sum of weights, and weighted sums of the offset from the centre of the cell,
     # in cells
     sums: Float32
@@ -186,7 +187,7 @@ class SurfacePoints:
         """Return the rows of a boolean mask or of an index array, in that order."""
         return SurfacePoints(self.keys[which], self.sums[which])
 
-    def in_blocks(self, blocks: NDArray[np.int64]) -> SurfacePoints:
+    def in_blocks(self, blocks: Int64) -> SurfacePoints:
         """Return the cells that lie in some packed blocks."""
         home = voxels.pack_keys(voxels.unpack_keys(self.keys) >> BLOCK_BITS)
         return self.select(are_among(home, blocks))
@@ -199,10 +200,6 @@ class SurfacePoints:
         cells = np.floor(places).astype(np.int64)
         sums = np.concatenate([weight, weight * (places - cells - 0.5)], axis=1)
         return join_points([SurfacePoints(voxels.pack_keys(cells), sums.astype(np.float32))])
-
-    def cross(self, cells: Int32) -> Bool:
-        """Return bool (N,): cells (N, 3) that the surface through points around them crosses."""
-        return facets.crossed_cells(cells, self.keys, self.sums)
 
 
 def join_points(parts: Iterable[SurfacePoints]) -> SurfacePoints:

@@ -42,7 +42,7 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
         source.store.copy(kind, target.store, _renumbered(source.store.keys(kind), numbers))
     linked = [numbers[s.number] for s in source.linked if s.number in numbers]
     links = [
-        link.between(*(numbers[number] for number in link.sessions))
+        replace(link, sessions=(numbers[link.sessions[0]], numbers[link.sessions[1]]))
         for link in source.links
         if numbers.keys() >= {*link.sessions}
     ]

@@ -27,7 +27,7 @@ from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
 from recon.map.store.trees import Link
 from recon.odometry.health import stretches
 from recon.places.closure import DrivePath, Tie, join_drives
-from recon.places.detector import KnownPlaces, KnownView
+from recon.places.detector import KnownPlaces
 from recon.places.fixes import Held
 from recon.places.loop import Loop, agreeing_loops
 from recon.places.places import path_lengths
@@ -179,25 +179,19 @@ def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
         own |= {last for _, last in shared}
     views = MapViews(map_, group)
     # What a frame that both have shows again is a loop of either drive alone, which knows it.
+    known = KnownPlaces(views)
     loops = [
-        loop for loop in _recognised(views, new, own) if _frame_of(views[loop.first]) not in theirs
+        loop
+        for stored in (new.keyframes if len(known) else ())
+        if stored.keyframe.frame not in own
+        for loop in known.recognise(stored.keyframe, new.camera).loops
+        if views.keys[loop.first] not in theirs
     ]
     return links + _confirmed(loops, views, new)
 
 
-def _recognised(views: MapViews, new: Session, without: Collection[int]) -> list[Loop]:
-    """Return what keyframes of a drive show of the places of others; ``first`` is a view."""
-    known = KnownPlaces(views)
-    loops: list[Loop] = []
-    if len(known):
-        for stored in new.keyframes:
-            if stored.keyframe.frame not in without:
-                loops += known.recognise(stored.keyframe, new.camera).loops
-    return loops
-
-
 def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Link]:
-    """Return links by the loops that neighbouring ones confirm."""
+    """Return links by the loops from views that neighbouring ones confirm."""
     if not loops:
         return []
     path_m, poses = path_up_to(new), new.odometry.T_world_camera
@@ -206,14 +200,9 @@ def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Lin
     lasts = {loop.last: (poses[loop.last], float(path_m[loop.last])) for loop in loops}
     links = []
     for loop in agreeing_loops(loops, firsts, lasts):
-        number, frame = _frame_of(views[loop.first])
+        number, frame = views.keys[loop.first]
         links.append(Link((number, new.number), replace(loop, first=frame)))
     return links
-
-
-def _frame_of(view: KnownView) -> tuple[int, int]:
-    """Return the drive and the frame of a view."""
-    return view.session, view.keyframe.frame
 
 
 def _held_together(

@@ -196,7 +196,10 @@ def measure_along(session: Session, survey: Survey) -> Measured:
     agree = find_agreeing(ours_m, position_m, LARGEST_MISFIT * span_m(ours_m))
     stated_m = None if np.isnan(sigma_m).any() else float(np.sqrt(np.mean(sigma_m[agree] ** 2)))
     measured = Measured(here[:, 0], position_m, ours_m, agree, stated_m)
-    measured.check(_drift_m(session), survey.positions)
+    path = session.odometry
+    stated = expected_drift(path, session.health, session.camera)
+    drift_m = drift_at_end(path, session.trusted, None if stated is None else stated.percent)
+    measured.check(drift_m, survey.positions)
     return measured
 
 
@@ -266,13 +269,6 @@ def _in_camera(survey: Survey, T_map_world: Float64) -> Float64:
 
 def _trusted_path(session: Session) -> Trajectory:
     return session.trajectory.select(session.trusted)
-
-
-def _drift_m(session: Session) -> float:
-    """Return by how much the path of a drive may be off at its end, standard deviation."""
-    path = session.odometry
-    stated = expected_drift(path, session.health, session.camera)
-    return drift_at_end(path, session.trusted, None if stated is None else stated.percent)
 
 
 def span_m(positions: Float64) -> float:

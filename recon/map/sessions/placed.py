@@ -19,13 +19,14 @@ import numpy as np
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply
+from recon.core.values import RayCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.io.files import resolved
 from recon.map.cut import Cutter, TileKey, TileParts
 from recon.map.occupancy.bodies import Looks
 from recon.map.sessions.joining import seen_before
 from recon.map.settings import DriveSettings
-from recon.map.store.finished import CastSubmaps, check_rays, looks_of
+from recon.map.store.finished import CastSubmaps, check_rays
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Store
 from recon.map.store.session import Session, Submaps
@@ -107,10 +108,8 @@ class PlacedSubmaps:
     the world of the first: sums are moved, rays cast where they were seen. Frames without a place
     in the map give none, and their submaps, in which frames cannot be told apart, no sums.
 
-    Attributes:
-        drives: Number of submaps of each drive.
-        corrections: float64 (S, 4, 4), what is still to be applied to each; None = nothing.
-        ready: Whether they are read as they are, without a ray being cast.
+    ``drives`` are the numbers of submaps of each, ``corrections`` (S, 4, 4) what is still to be
+    applied to each (None = nothing); they are ``ready`` where no ray is to be cast.
     """
 
     def __init__(self, map_: MapFile, settings: DriveSettings) -> None:
@@ -188,11 +187,22 @@ def _beside(
 
 
 def _looks(map_: MapFile, settings: DriveSettings) -> Looks | None:
-    """Return what single frames of the linked drives saw, where they lie; None = not known."""
-    seen = (
-        (s, s.T_map_world @ s.trajectory.T_world_camera, _no_evidence(map_, s)) for s in map_.linked
-    )
-    return looks_of(seen, settings.occupancy)
+    """Return what frames of the linked drives saw, by their rays; None where a drive kept none."""
+    seen: list[tuple[Session, int]] = []
+    poses = []
+    for session in map_.linked:
+        if session.ray_frames != len(session):
+            return None
+        T_map_camera, without = session.trajectory.T_world_camera, _no_evidence(map_, session)
+        frames = [frame for frame in range(len(session)) if frame not in without]
+        seen += [(session, frame) for frame in frames]
+        poses.append((session.T_map_world @ T_map_camera)[frames])
+
+    def rays(number: int) -> RayCloud:
+        session, frame = seen[number]
+        return session.rays(frame)[0]
+
+    return Looks(settings.occupancy, np.concatenate(poses), rays)
 
 
 def _no_evidence(map_: MapFile, session: Session) -> frozenset[int]:

@@ -168,8 +168,3 @@ def writing(path: Path | None) -> Iterator[None]:
         raise OutputError(
             "cannot write the map", where=where, got=error.strerror, hint=_ROOM
         ) from error
-
-
-def beside(path: Path) -> list[Path]:
-    """Return what SQLite keeps beside a file that is being written."""
-    return [path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal")]

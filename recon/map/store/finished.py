@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.values import RayCloud
 from recon.core.values.arrays import Float64
 from recon.map.kernels import clamped
-from recon.map.occupancy.bodies import Looks
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
+from recon.map.occupancy.builder import OccupancyBuilder
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
@@ -54,29 +52,6 @@ class CastSubmaps:
             if frame not in self.without:
                 builder.integrate(session.rays(frame)[0].cloud(), poses[frame])
         return replace(kept, occupancy=builder.take())
-
-
-def looks_of(
-    drives: Iterable[tuple[Session, Float64, Collection[int]]], settings: OccupancySettings
-) -> Looks | None:
-    """Return what single frames of drives saw, from their kept rays; None where a drive kept none.
-
-    ``drives`` gives each session, its ``T_map_camera`` (N, 4, 4), and the frames to leave out.
-    """
-    found: list[tuple[Session, int]] = []
-    poses = []
-    for session, T_map_camera, without in drives:
-        if session.ray_frames != len(session):
-            return None
-        frames = [frame for frame in range(len(session)) if frame not in without]
-        found += [(session, frame) for frame in frames]
-        poses.append(T_map_camera[frames])
-
-    def read(number: int) -> RayCloud:
-        session, frame = found[number]
-        return session.rays(frame)[0]
-
-    return Looks(settings, np.concatenate(poses), read)
 
 
 def check_rays(session: Session, settings: DriveSettings) -> None:

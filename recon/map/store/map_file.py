@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Final, overload
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import Self
 
 from recon.core.errors import FormatError, MappingError
 from recon.core.geometry.se3 import invert
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Trajectory
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, Int64
 from recon.io.files import StrPath, reading
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
@@ -76,9 +75,8 @@ class MapFile:
         return cls(Store.temporary())
 
     def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}({self.store.name!r}, {counted(len(self.sessions), 'session')})"
-        )
+        sessions = counted(len(self.sessions), "session")
+        return f"{type(self).__name__}({self.store.name!r}, {sessions})"
 
     def session(self, number: int = 0) -> Session:
         """Return a drive in the map; `FormatError` if there is none of this number."""
@@ -204,7 +202,7 @@ _FEWEST_FIXES: Final = 2  # measured positions that say where a stretch is, and 
 
 
 def _ties(
-    sessions: Sequence[Session], links: Sequence[Link], of: Mapping[int, NDArray[np.int64]]
+    sessions: Sequence[Session], links: Sequence[Link], of: Mapping[int, Int64]
 ) -> Iterator[tuple[_Stretch, _Stretch]]:
     """Yield pairs of stretches that loops, links and measured positions hold together."""
 
@@ -237,7 +235,7 @@ def known_places(map_: MapFile) -> KnownPlaces:
 
 
 class MapViews(Sequence[KnownView]):
-    """What a map can recognise; each view is read when it is asked for.
+    """What a map can recognise, with the ``keys`` (drive, frame); each is read when asked for.
 
     ``sessions`` are the numbers of the drives to take; None = those that share the axes of the map,
     as far as they have a place in it.
@@ -245,7 +243,7 @@ class MapViews(Sequence[KnownView]):
 
     def __init__(self, map_: MapFile, sessions: Collection[int] | None = None) -> None:
         self._map = map_
-        self._keys: list[tuple[int, int]] = []
+        self.keys: list[tuple[int, int]] = []
         self._poses: dict[int, Float64] = {}
         self._cameras: dict[int, RectifiedCamera] = {}
         taken = map_.linked if sessions is None else map(map_.session, sorted(sessions))
@@ -258,10 +256,10 @@ class MapViews(Sequence[KnownView]):
                 T_world_session = map_.T_world_session(session)
                 self._poses[session.number] = T_world_session @ session.trajectory.T_world_camera
                 self._cameras[session.number] = session.camera
-                self._keys.extend((session.number, frame) for frame in frames)
+                self.keys.extend((session.number, frame) for frame in frames)
 
     def __len__(self) -> int:
-        return len(self._keys)
+        return len(self.keys)
 
     @overload
     def __getitem__(self, number: int) -> KnownView: ...
@@ -270,7 +268,7 @@ class MapViews(Sequence[KnownView]):
     def __getitem__(self, number: int | slice) -> KnownView | list[KnownView]:
         if isinstance(number, slice):
             return [self[n] for n in range(*number.indices(len(self)))]
-        session, frame = self._keys[number]
+        session, frame = self.keys[number]
         stored = self._map.session(session).keyframes.get(frame)
         pose = self._poses[session][frame]
         return KnownView(stored.keyframe, self._cameras[session], pose, session)

@@ -23,7 +23,6 @@ from recon.map.store.database import (
     Content,
     begin_to_read,
     begin_to_write,
-    beside,
     check_format,
     closed_on_error,
     connect,
@@ -46,11 +45,8 @@ class Store:
     What is put or deleted is on disk, and visible to other programs, when it is committed. A
     program that is killed, or meets a full disk, leaves the last commit. One program writes at a
     time; others may read meanwhile, and see what was committed when they opened it. Threads share a
-    store.
-
-    Attributes:
-        path: The file; None = a temporary one.
-        cache: What was read last, and whatever else is derived from the records.
+    store. ``path`` None = a temporary file; ``cache`` keeps what was read last, and whatever else
+    is derived from the records.
     """
 
     def __init__(self, database: sqlite3.Connection, path: Path | None, cache_bytes: int) -> None:
@@ -65,8 +61,8 @@ class Store:
         """Begin a store; a file at ``path`` is replaced."""
         check_targets([path])
         with writing(path):
-            for stale in (path, *beside(path)):
-                stale.unlink(missing_ok=True)
+            for end in ("", "-wal", "-shm", "-journal"):  # what SQLite keeps beside a file
+                path.with_name(path.name + end).unlink(missing_ok=True)
             path.parent.mkdir(parents=True, exist_ok=True)
             with closed_on_error(connect(path)) as database:
                 make_tables(database)
@@ -280,7 +276,14 @@ class Cache:
                 found: Value = self._held[key][0]
                 return found
         value = make()
-        self._keep(key, value)
+        size = size_of(value)
+        if size > self._limit:  # would drive out everything else, and then itself
+            return value
+        with self._lock:
+            self._size += size - self._held.pop(key, (None, 0))[1]
+            self._held[key] = value, size
+            while self._size > self._limit:
+                self._size -= self._held.popitem(last=False)[1][1]
         return value
 
     def drop(self, key: Hashable) -> None:
@@ -293,16 +296,6 @@ class Cache:
         with self._lock:
             self._held.clear()
             self._size = 0
-
-    def _keep(self, key: Hashable, value: object) -> None:
-        size = size_of(value)
-        if size > self._limit:  # would drive out everything else, and then itself
-            return
-        with self._lock:
-            self._size += size - self._held.pop(key, (None, 0))[1]
-            self._held[key] = value, size
-            while self._size > self._limit:
-                self._size -= self._held.popitem(last=False)[1][1]
 
 
 def size_of(value: object) -> int:

@@ -130,9 +130,8 @@ class Session:
     def T_map_world(self) -> Float64:
         """float64 (4, 4), from the world of the session to map axes; known after one frame."""
         with reading(self._store.name):
-            T: Float64 = array_in(
-                self._store.get(AXES, self.number), "T_map_world", np.float64, (4, 4)
-            ).copy()
+            axes = self._store.get(AXES, self.number)
+            T: Float64 = array_in(axes, "T_map_world", np.float64, (4, 4)).copy()
             check_rigid("T_map_world", T)
         return T
 
@@ -176,8 +175,7 @@ class Session:
 
     def add_rays(self, frame: int, rays: RayCloud, grain: RayGrain) -> None:
         """Keep the rays of a frame."""
-        key = (self.number, frame)
-        self._store.put(RAYS, key, rays_record(rays, grain), compress=True)
+        self._store.put(RAYS, (self.number, frame), rays_record(rays, grain), compress=True)
 
     def rays(self, frame: int) -> tuple[RayCloud, RayGrain]:
         """Return the rays of a frame, as they were kept."""
@@ -346,8 +344,7 @@ class Keyframes:
             "loops": [asdict(loop) for loop in stored.loops],
             "refused": list(stored.refused),
         }
-        key = (self._session, stored.keyframe.frame)
-        self._store.put(KEYFRAME, key, content, compress=True)
+        self._store.put(KEYFRAME, (self._session, stored.keyframe.frame), content, compress=True)
 
     def get(self, frame: int) -> StoredKeyframe:
         """Return the keyframe of a frame, kept in the cache."""
@@ -364,9 +361,8 @@ class Keyframes:
 
     def _read(self, frame: int) -> StoredKeyframe:
         with reading(self._store.name):
-            content: dict[str, Any] = self._store.read(
-                KEYFRAME, (self._session, frame), most_bytes=_MOST_BYTES
-            )
+            key = (self._session, frame)
+            content = self._store.read(KEYFRAME, key, most_bytes=_MOST_BYTES)
             return StoredKeyframe(
                 value_in(Keyframe, {**content["keyframe"], "frame": frame}),
                 array_in(content, "T_world_camera", np.float64, (4, 4)),

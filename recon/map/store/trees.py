@@ -6,7 +6,7 @@ import json
 import math
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, TypeVar, get_origin, get_type_hints
 
@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from recon.core.errors import FormatError, ShapeError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RayCloud, RayGrain, Trajectory
-from recon.core.values.arrays import Float64, array_in, frozen_array
+from recon.core.values.arrays import Float64, UInt8, array_in, frozen_array
 from recon.odometry.protocol import OdometryHealth
 from recon.places.loop import Loop
 
@@ -151,7 +151,7 @@ def _columns(shape: Sequence[int]) -> int:
     return shape[1] if len(shape) == 2 and 0 < shape[1] <= _NARROW else 1
 
 
-def _planes(array: NDArray[Any]) -> NDArray[np.uint8]:
+def _planes(array: NDArray[Any]) -> UInt8:
     """Return uint8 (columns, bytes of a number, N)."""
     size = array.dtype.itemsize
     columns = array.reshape(-1, _columns(array.shape))
@@ -246,21 +246,17 @@ def rays_record(rays: RayCloud, grain: RayGrain) -> dict[str, Any]:
 
 def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
     """Return the rays in what `rays_record` gave."""
-    grain = _checked(value_in(RayGrain, content["grain"]))
+    grain = value_in(RayGrain, content["grain"])
+    sizes_m = (grain.cell_m, grain.unit_m, grain.max_range_m)
+    ordered = 0 < min(sizes_m) <= max(sizes_m) <= grain.max_range_m <= FARTHEST_M
+    if not (ordered and np.isfinite(sizes_m).all()):
+        raise FormatError("sizes of the rays are impossible", got=sizes_m)
     steps = frozen_array("steps", content["steps"], np.uint16, (None, 3))
     places = np.cumsum(_unzigzag(steps), axis=0, dtype=np.int16)
     if array_in(content, "sigma_m", np.float16, (len(places),)).min(initial=0.0) < 0:
         raise FormatError("a ray of the map has a negative deviation")
     parts = {name: content[name] for name in ("sigma_m", "confidence", "count")}
     return value_in(RayCloud, {"places": places, **parts, "unit_m": grain.unit_m}), grain
-
-
-def _checked(grain: RayGrain) -> RayGrain:
-    sizes_m = (grain.cell_m, grain.unit_m, grain.max_range_m)
-    ordered = 0 < min(sizes_m) <= max(sizes_m) <= grain.max_range_m <= FARTHEST_M
-    if not (ordered and np.isfinite(sizes_m).all()):
-        raise FormatError("sizes of the rays are impossible", got=sizes_m)
-    return grain
 
 
 def _zigzag(steps: NDArray[np.int16]) -> NDArray[np.uint16]:
@@ -295,10 +291,6 @@ class Link:
     sessions: tuple[int, int]
     loop: Loop
     kept: bool = True
-
-    def between(self, one: int, other: int) -> Link:
-        """Return the link with other numbers of its drives."""
-        return replace(self, sessions=(one, other))
 
     def to_tree(self) -> dict[str, Any]:
         """Return all of it as a tree of arrays and plain values."""

@@ -62,14 +62,14 @@ def test_the_driven_road_is_free_and_has_obstacles_beside_it(recon_data: Path) -
     poses = _poses(drive)[FRAMES]
     clouds = [_cloud(drive, index) for index in FRAMES]
     T_map_world = map_axes(estimate_ground(clouds[0]), AxesSettings())
-    fused = CloudBuilder(FusionSettings(min_count=2))
+    fused = CloudBuilder(FusionSettings())
     occupancy = OccupancyBuilder(OccupancySettings(), T_map_world)
     for cloud, T in zip(clouds, poses, strict=True):
         world = PointCloud(apply(T, cloud.xyz), sigma_m=cloud.sigma_m, frame="world")
         fused.integrate(world)
         occupancy.integrate(cloud, T)
     path = apply(T_map_world, poses[:, :3, 3])
-    cloud_map = PointCloud(apply(T_map_world, fused.cloud().xyz), frame="map")
+    cloud_map = PointCloud(apply(T_map_world, fused.part().cloud(0.1, 2).xyz), frame="map")
     ground = estimate_ground_surface(cloud_map, path, GroundSettings())
     grid = flatten(occupancy.voxels(), ground, GridSettings())
     # KITTI's cameras are mounted 1.65 m above ground.

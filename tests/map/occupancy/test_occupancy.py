@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyoctomap
@@ -15,6 +16,7 @@ from recon.core.values import OccupancyVoxels, PointCloud
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.occupancy import builder as occupancy
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
+from recon.map.occupancy.part import OccupancyPart
 
 Cell = tuple[int, int, int]
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
@@ -32,16 +34,17 @@ def _cells(voxels: OccupancyVoxels) -> dict[Cell, float]:
     return dict(zip(keys, voxels.log_odds.tolist(), strict=True))
 
 
-def _map(
-    *frames: tuple[PointCloud, np.ndarray],
-    T_map_world: np.ndarray = HERE,
-    thin: bool = True,
-    **settings: float,
-) -> OccupancyVoxels:
-    builder = OccupancyBuilder(OccupancySettings(**settings), T_map_world, thin=thin)
+def _part(
+    *frames: tuple[PointCloud, np.ndarray], T_map_world: np.ndarray = HERE, **settings: float
+) -> OccupancyPart:
+    builder = OccupancyBuilder(OccupancySettings(**settings), T_map_world)
     for cloud, T in frames:
         builder.integrate(cloud, T)
-    return builder.voxels()
+    return builder.part()
+
+
+def _map(*frames: tuple[PointCloud, np.ndarray], **settings: Any) -> dict[Cell, float]:
+    return _cells(_part(*frames, **settings).voxels(0.2))
 
 
 def _points(*xyz: tuple[float, float, float], sigma: float | None = None) -> PointCloud:
@@ -50,17 +53,25 @@ def _points(*xyz: tuple[float, float, float], sigma: float | None = None) -> Poi
     return PointCloud(points, sigma_m=given)
 
 
+def _noisy(xyz: np.ndarray, error: float, rng: np.random.Generator) -> PointCloud:
+    """Points whose depth is as wrong as that of stereo; ``error`` times the squared depth."""
+    sigma = error * xyz[:, 2] ** 2
+    scale = 1 + sigma * rng.normal(size=len(xyz)) / xyz[:, 2]
+    return PointCloud((xyz * scale[:, None]).astype("f4"), sigma_m=sigma.astype("f4"))
+
+
 def test_a_point_ahead_lies_forward_in_the_map() -> None:
     T = make_transform(exp_so3(np.array([0, math.pi / 2, 0])), np.array([10.0, 0, 0]))
-    turned = _cells(_map((_points((0.1, 0.1, 5.1)), T)))
+    turned = _map((_points((0.1, 0.1, 5.1)), T))
     # Looking along +x from x = 10: the point lies at x = 15.1, z = -0.1.
     assert [cell for cell, value in turned.items() if value > 0] == [(75, 0, -1)]
-    cells = _cells(_map((_points((0.1, 0.1, 5.1)), HERE), T_map_world=T_MAP_WORLD))
-    occupied = [cell for cell, value in cells.items() if value > 0]
+    frame = (_points((0.1, 0.1, 5.1)), HERE)
+    cells = _map(frame, (_points(), HERE), T_map_world=T_MAP_WORLD)
     # 5.1 m forward, 0.1 m right and down: x = 25.5 cells, y and z in cell -1.
-    assert occupied == [(25, -1, -1)]
+    assert [cell for cell, value in cells.items() if value > 0] == [(25, -1, -1)]
     # Cells are left one by one; every cell of the corridor ahead is free.
     assert {cell[0] for cell, value in cells.items() if value < 0} == set(range(25))
+    assert not _map()
 
 
 def test_log_odds_follow_the_settings_and_their_clamps() -> None:
@@ -69,23 +80,17 @@ def test_log_odds_follow_the_settings_and_their_clamps() -> None:
     for clouds, share, hit, miss in (
         ([cloud], 1.0, 0.7, 0.4), ([half], 0.5, 0.7, 0.4), ([cloud] * 40, 1.0, 0.97, 0.12)
     ):  # fmt: skip
-        cells = _cells(_map(*((one, HERE) for one in clouds)))
+        cells = _map(*((one, HERE) for one in clouds))
         assert cells[0, 0, 25] == pytest.approx(share * math.log(hit / (1 - hit)), rel=1e-5)
         assert cells[0, 0, 10] == pytest.approx(share * math.log(miss / (1 - miss)), rel=1e-5)
 
 
-def test_free_space_ends_before_an_uncertain_point() -> None:
-    cells = _cells(_map((_points((0.1, 0.1, 10.1), sigma=0.5), HERE)))
-    free = max(cell[2] for cell, value in cells.items() if value < 0)
+def test_free_space_ends_before_an_uncertain_point_and_at_the_range() -> None:
+    cells = _map((_points((0.1, 0.1, 10.1), sigma=0.5), HERE))
     # 10.1 - 2 · 0.5 = 9.1 m lies in cell 45, which is not wholly free.
-    assert free == 44
-    unknown = set(range(free + 1, 48)) - {cell[2] for cell in cells}
-    assert unknown == {45, 46, 47} - {cell[2] for cell in cells}
-    assert len(unknown) >= 2
-
-
-def test_points_beyond_the_range_free_and_hit_nothing() -> None:
-    cells = _cells(_map((_points((0.1, 0.1, 30.1)), HERE), max_range_m=10.0))
+    assert max(cell[2] for cell, value in cells.items() if value < 0) == 44
+    assert len({45, 46, 47} - {cell[2] for cell in cells}) >= 2
+    cells = _map((_points((0.1, 0.1, 30.1)), HERE), max_range_m=10.0)
     assert all(value < 0 for value in cells.values())
     # One cell of margin: the range itself is not reached.
     assert 47 <= max(cell[2] for cell in cells) <= 49
@@ -93,20 +98,15 @@ def test_points_beyond_the_range_free_and_hit_nothing() -> None:
 
 def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
     # A wall 1 m to the right, seen at a flat angle by points whose error is that of stereo.
-    rng = np.random.default_rng(0)
-    frames = []
+    rng, frames = np.random.default_rng(0), []
     for step in range(30):
-        z = rng.uniform(3.0, 15.0, 400)
-        y = rng.uniform(-1.0, 1.0, 400)
-        sigma = 0.002 * z**2
-        scale = 1 + sigma * rng.normal(size=400) / z
-        xyz = (np.stack([np.full(400, 1.1), y, z], 1) * scale[:, None]).astype(np.float32)
-        cloud = PointCloud(xyz, sigma_m=sigma.astype(np.float32))
+        z, y = rng.uniform(3.0, 15.0, 400), rng.uniform(-1.0, 1.0, 400)
+        cloud = _noisy(np.stack([np.full(400, 1.1), y, z], 1), 0.002, rng)
         frames.append((cloud, make_transform(np.eye(3), np.array([0, 0, 0.3 * step]))))
 
     def kept() -> float:
         """Share of the wall's cells, well inside, that are occupied."""
-        cells = _cells(_map(*frames))
+        cells = _map(*frames)
         wall = [cells.get((5, j, k), 0.0) for j in range(-4, 4) for k in range(30, 70)]
         return float(np.mean(np.array(wall) > 0))
 
@@ -118,23 +118,19 @@ def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma(monkeypatch: pytest.M
 
 
 def _wall_ahead(frames: int, error: float) -> list[tuple[PointCloud, np.ndarray]]:
-    """A wall across the view at 12.1 m, approached to 6 m; ``error`` times the squared depth."""
-    rng = np.random.default_rng(0)
-    seen = []
+    """A wall across the view at 12.1 m, approached to 6 m."""
+    rng, seen = np.random.default_rng(0), []
     for step in range(frames):
         x, y = rng.uniform(-2.0, 2.0, (2, 3000))
-        z = np.full(3000, 12.1 - 6.0 * step / frames)
-        sigma = error * z**2
-        scale = 1 + sigma * rng.normal(size=3000) / z
-        xyz = (np.stack([x, y, z], 1) * scale[:, None]).astype(np.float32)
-        cloud = PointCloud(xyz, sigma_m=sigma.astype(np.float32))
-        seen.append((cloud, make_transform(np.eye(3), np.array([0, 0, 12.1 - z[0]]))))
+        gone_m = 6.0 * step / frames
+        cloud = _noisy(np.stack([x, y, np.full(3000, 12.1 - gone_m)], 1), error, rng)
+        seen.append((cloud, make_transform(np.eye(3), np.array([0, 0, gone_m]))))
     return seen
 
 
 def test_a_wall_seen_often_is_thin_and_has_no_holes() -> None:
-    frames = _wall_ahead(20, 0.002)
-    thin, thick = (_cells(_map(*frames, thin=thinned)) for thinned in (True, False))
+    part = _part(*_wall_ahead(20, 0.002))
+    thin, thick = (_cells(each.voxels(0.2)) for each in (part, replace(part, points=None)))
     layers = [
         [k for (i, j, k), value in cells.items() if value > 0.2 and -9 <= i < 9 and -9 <= j < 9]
         for cells in (thin, thick)
@@ -153,7 +149,7 @@ def test_what_was_looked_through_does_not_bend_a_surface() -> None:
     rng = np.random.default_rng(1)
     xyz = np.stack([*rng.uniform(-1, 1, (2, 3000)), np.full(3000, 11.9)], 1).astype(np.float32)
     board = (PointCloud(xyz, sigma_m=np.full(3000, 0.001, np.float32)), HERE)
-    cells = _cells(_map(*[board] * 3, *_wall_ahead(20, 0.0003)))
+    cells = _map(*[board] * 3, *_wall_ahead(20, 0.0003))
     left = [cell for cell, value in cells.items() if value > 0.2 and abs(cell[0]) < 4]
     assert {cell[2] for cell in left if abs(cell[1]) < 4} == {60}
 
@@ -161,14 +157,7 @@ def test_what_was_looked_through_does_not_bend_a_surface() -> None:
 def test_lone_points_start_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = _points((0.1, 0.1, 5.1), (0.11, 0.1, 5.1), (2.1, 0.1, 5.1))
     monkeypatch.setattr(occupancy, "_MIN_POINTS", 2)
-    cells = _cells(_map((cloud, HERE)))
-    assert [cell for cell, value in cells.items() if value > 0] == [(0, 0, 25)]
-
-
-def test_an_empty_frame_changes_nothing() -> None:
-    frame = (_points((0.1, 0.1, 5.1)), HERE)
-    assert _cells(_map(frame, (_points(), HERE))) == _cells(_map(frame))
-    assert len(_map()) == 0
+    assert [cell for cell, value in _map((cloud, HERE)).items() if value > 0] == [(0, 0, 25)]
 
 
 def test_cells_agree_with_those_of_octomap() -> None:
@@ -187,7 +176,7 @@ def test_cells_agree_with_those_of_octomap() -> None:
         cell = np.floor(np.array(leaf.getCoordinate()) / 0.2).astype(int).tolist()
         theirs[tuple(cell)] = leaf.current_node.getLogOdds()
     xyz = ((ends + 0.5) * 0.2 - origin).astype(np.float32)
-    ours = _cells(_map((PointCloud(xyz), make_transform(np.eye(3), origin))))
+    ours = _map((PointCloud(xyz), make_transform(np.eye(3), origin)))
     hits = [{c for c, v in cells.items() if v > 0} for cells in (ours, theirs)]
     misses = [{c for c, v in cells.items() if v < 0} for cells in (ours, theirs)]
     assert hits[0] == hits[1]
@@ -195,6 +184,10 @@ def test_cells_agree_with_those_of_octomap() -> None:
     # edge, they take different cells.
     assert len(misses[0] & misses[1]) > 0.99 * len(misses[0] | misses[1])
     assert len(misses[0]) > 10_000
+
+
+SETTINGS = OccupancySettings(resolution_m=0.2, max_range_m=20.0)
+POSE = make_transform(np.eye(3), np.array([0.11, 0.09, 0.1]))  # no ray along an edge of cells
 
 
 @pytest.mark.parametrize(
@@ -216,28 +209,12 @@ def test_frames_that_would_spoil_the_map_are_refused(
             thin_rays(cloud, SETTINGS)
 
 
-SETTINGS = OccupancySettings(resolution_m=0.2, max_range_m=20.0)
-POSE = make_transform(np.eye(3), np.array([0.11, 0.09, 0.1]))  # no ray along an edge of cells
-
-
-def _wall(seed: int = 0, n: int = 40_000, depth_m: float = 12.0) -> PointCloud:
-    """A wall ahead that is measured with noise."""
-    rng = np.random.default_rng(seed)
-    xy = rng.uniform(-4, 4, (n, 2))
-    sigma = rng.uniform(0.05, 0.3, n)
-    xyz = np.column_stack([xy, depth_m + rng.normal(0, sigma)]).astype(np.float32)
-    sure = rng.choice([0.0, 0.4, 1.0], n).astype(np.float32)
-    return PointCloud(xyz, sigma_m=sigma.astype(np.float32), confidence=sure)
-
-
-def _map_of(cloud: PointCloud, settings: OccupancySettings = SETTINGS) -> OccupancyVoxels:
-    builder = OccupancyBuilder(settings, np.eye(4))
-    builder.integrate(cloud, POSE)
-    return builder.voxels()
-
-
-def _cells_with(voxels: OccupancyVoxels, which: np.ndarray) -> set[tuple[int, ...]]:
-    return {tuple(key) for key in voxels.keys[which].tolist()}
+def _signs(cloud: PointCloud, resolution_m: float = 0.2) -> list[set[Cell]]:
+    """The cells that are occupied, and those that are free."""
+    settings = {"resolution_m": resolution_m, "max_range_m": 20.0}
+    seen = _part((cloud, POSE), **settings).voxels(resolution_m)
+    signs = (seen.log_odds > 0, seen.log_odds < 0)
+    return [{tuple(key) for key in seen.keys[which].tolist()} for which in signs]
 
 
 def test_there_is_one_ray_for_each_cube_and_it_counts_its_sure_points() -> None:
@@ -256,28 +233,28 @@ def test_there_is_one_ray_for_each_cube_and_it_counts_its_sure_points() -> None:
 
 @pytest.mark.parametrize("resolution_m", [0.2, 0.5])
 def test_a_map_of_rays_is_the_map_of_the_points(resolution_m: float) -> None:
-    cloud, settings = _wall(), SETTINGS.model_copy(update={"resolution_m": resolution_m})
-    rays = thin_rays(cloud, SETTINGS)
+    rng = np.random.default_rng(0)
+    sigma = rng.uniform(0.05, 0.3, 40_000).astype(np.float32)
+    xyz = np.column_stack([rng.uniform(-4, 4, (40_000, 2)), 12.0 + rng.normal(0, sigma)])
+    sure = rng.choice([0.0, 0.4, 1.0], 40_000).astype(np.float32)
+    cloud = PointCloud(xyz.astype(np.float32), sigma_m=sigma, confidence=sure)
+    rays = thin_rays(cloud, SETTINGS).cloud()
     assert len(rays) < len(cloud) / 2
-    for kind in (np.greater, np.less):
-        ours, theirs = (
-            _cells_with(seen, kind(seen.log_odds, 0))
-            for seen in (_map_of(cloud, settings), _map_of(rays.cloud(), settings))
-        )
+    both = (_signs(cloud, resolution_m), _signs(rays, resolution_m))
+    for ours, theirs in zip(*both, strict=True):
         assert len(ours & theirs) / len(ours | theirs) > 0.97
 
 
 @pytest.mark.parametrize("depth_m", [20.5, 24.0, 60.0, 3000.0])
 @pytest.mark.parametrize("sigma_m", [0.0, 0.5, 4.0])
 def test_points_out_of_range_free_what_they_freed_and_hit_nothing(
-    depth_m: float, sigma_m: float, monkeypatch: pytest.MonkeyPatch
+    depth_m: float, sigma_m: float
 ) -> None:
-    monkeypatch.setattr(occupancy, "_MIN_POINTS", 1)
     xyz = (np.float32([[0.013, 0.017, 1.0], [0.1, -0.05, 1.0]]) * np.float32(depth_m)).astype("f4")
     cloud = PointCloud(xyz, sigma_m=np.full(2, sigma_m, np.float32))
-    points, rays = _map_of(cloud, SETTINGS), _map_of(thin_rays(cloud, SETTINGS).cloud(), SETTINGS)
-    assert not (rays.log_odds > 0).any()
-    ours, theirs = _cells_with(points, points.log_odds < 0), _cells_with(rays, rays.log_odds < 0)
+    _, ours = _signs(cloud)
+    hit, theirs = _signs(thin_rays(cloud, SETTINGS).cloud())
+    assert not hit
     # A thousandth of a radian turns a ray by a cell's edge now and then.
     assert len(ours ^ theirs) <= 0.05 * len(ours) + 1
 
@@ -286,7 +263,6 @@ def test_points_out_of_range_free_what_they_freed_and_hit_nothing(
 def test_the_farthest_point_has_a_place(max_range_m: float) -> None:
     settings = SETTINGS.model_copy(update={"max_range_m": max_range_m})
     corner = np.float32([[1, -1, 1], [-1, 1, 1], [0, 0, 1]]) * np.float32(2 * max_range_m)
-    ends = thin_rays(PointCloud(corner), settings).cloud().xyz
-    length = np.linalg.norm(ends, axis=1)
+    length = np.linalg.norm(thin_rays(PointCloud(corner), settings).cloud().xyz, axis=1)
     assert (length > max_range_m).all()
     assert (length < max_range_m + 3 * ray_grain(settings).cell_m).all()

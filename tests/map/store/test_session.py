@@ -1,7 +1,8 @@
-"""What a session of a map keeps comes back as it was: frames, rays, keyframes, loops, axes."""
+"""What a session of a map keeps comes back as it was, also from the map of a finished run."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,13 @@ import pytest
 
 from recon.core.errors import FormatError, ShapeError
 from recon.core.geometry import se3
-from recon.core.values import RayCloud, RayGrain, RectifiedCamera
+from recon.core.values import PointCloud, RayCloud, RayGrain, RectifiedCamera
+from recon.map.fusion import join_fused
 from recon.map.map import Map
+from recon.map.occupancy.part import join_occupancy
 from recon.map.sessions.joining import path_up_to
+from recon.map.sessions.placed import PlacedSubmaps
+from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MapViews
 from recon.map.store.session import Session, SessionInfo
 from recon.map.store.trees import Link
@@ -19,9 +24,9 @@ from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 from recon.places.loop import Loop
+from tests.map.walls import CAMERA, CONFIG, drives
 
 GRAIN = RayGrain(0.1, 0.1 / 64, 25.0)
-CAMERA = RectifiedCamera(100.0, 9.0, 5.0, 9.5, 0.5, 20, 12)
 FIELDS = ("places", "sigma_m", "confidence", "count")
 
 
@@ -240,3 +245,60 @@ def test_what_follows_a_lost_pose_is_not_to_be_recognised_among_several_drives()
 
     assert seen == [(0, 0), (0, 2), (0, 5), (1, 0), (1, 2)]
     assert [view.keyframe.frame for view in MapViews(map_, [1])] == [0, 2, 5]
+
+
+BEND = se3.make_transform(se3.exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.0, 0.0, 0.31]))
+VOXEL_M = CONFIG.fusion.voxel_m
+
+
+def _cloud(session: Session) -> PointCloud:
+    corrections = session.corrections()
+    parts = [submap.fused for submap in session.submaps]
+    if corrections is not None:
+        parts = [part.moved(T, VOXEL_M) for part, T in zip(parts, corrections, strict=True)]
+    cloud = join_fused(parts).cloud(VOXEL_M, 1)
+    return cloud.select(np.lexsort(np.floor(cloud.xyz / VOXEL_M).T))
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_finished_map_gives_the_cloud_of_the_run_and_its_occupancy(
+    tmp_path: Path, closed: bool
+) -> None:
+    with drives(1) as made:
+        session = made.session()
+        session.info = replace(session.info, start={"identity": {}})
+        session.set_state({"odometry": None})
+        if closed:
+            path = session.odometry.T_world_camera
+            path = np.concatenate([path[:10], BEND @ path[10:]])
+            session.set_loops({"closed": [], "refused": [], "T_world_camera": path})
+        keep_map(made, tmp_path / "map.recon")
+        poses, cloud = session.trajectory.T_world_camera, _cloud(session)
+        voxels = join_occupancy(submap.occupancy for submap in session.submaps).voxels(0.2)
+    with Map.open(tmp_path / "map.recon", read_only=False) as kept:
+        again = kept.session()
+        assert len(again.submaps) >= 3
+        assert not any(len(submap.occupancy) for submap in again.submaps)
+        # What only resuming needs is left out.
+        assert "state" not in kept.store.kinds()
+        assert again.info.start == {}
+        np.testing.assert_array_equal(again.trajectory.T_world_camera, poses)
+        for name in ("xyz", "rgb", "sigma_m", "count"):
+            np.testing.assert_array_equal(getattr(_cloud(again), name), getattr(cloud, name))
+        cast = join_occupancy(one.occupancy for one in PlacedSubmaps(kept, CONFIG)).voxels(0.2)
+        np.testing.assert_array_equal(cast.keys, voxels.keys)
+        np.testing.assert_array_equal(cast.log_odds, voxels.log_odds)
+        kept.store.delete("submap_entry", (0, len(again.submaps) - 1))
+        kept.commit()
+    with Map.open(tmp_path / "map.recon") as lacking, pytest.raises(FormatError, match="submaps"):
+        PlacedSubmaps(lacking, CONFIG)
+
+
+def test_submaps_move_with_their_middle_frames() -> None:
+    session = drives(1).session()
+    assert session.corrections() is None
+    path = session.odometry.T_world_camera
+    bent = np.stack([BEND @ T if n % 2 else T for n, T in enumerate(path)])
+    session.set_loops({"closed": [], "refused": [], "T_world_camera": bent})
+    for entry, T in zip(session.submaps.entries, session.corrections(), strict=True):
+        np.testing.assert_allclose(T @ path[entry.middle], bent[entry.middle], atol=1e-9)
