@@ -9,19 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
-from recon.odometry.protocol import OdometryFrame
+from recon.odometry.protocol import OdometryFrame, OdometryResult
 
-CAMERA = RectifiedCamera(
-    focal_px=260.0,
-    cx_px=199.5,
-    cy_px=79.5,
-    cx_right_px=199.5,
-    baseline_m=0.5,
-    width_px=400,
-    height_px=160,
-)
+See = Callable[..., OdometryFrame]
+CAMERA = RectifiedCamera(260.0, 199.5, 79.5, 199.5, 0.5, 400, 160)
+# 0.5 m a frame along a gentle bend.
+STEP = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 0.5]))
 
 # Normal, offset (n·x = c) and the two axes of the texture: ground, side walls, ceiling, end wall.
 PLANES = (
@@ -49,8 +44,8 @@ TEXELS_PER_M = 24.0
 def _render(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Grey image, averaged over 3 by 3 rays in a pixel, and depth, seen from a pose."""
     thirds = [(du, dv) for du in (-1 / 3, 0.0, 1 / 3) for dv in (-1 / 3, 0.0, 1 / 3)]
-    grey = np.mean([_cast(T_world_camera, shift)[0] for shift in thirds], axis=0)
-    return np.rint(grey).astype(np.uint8), _cast(T_world_camera, (0.0, 0.0))[1]
+    seen = [_cast(T_world_camera, shift) for shift in thirds]
+    return np.rint(np.mean([grey for grey, _ in seen], axis=0)).astype(np.uint8), seen[4][1]
 
 
 def _cast(T_world_camera: np.ndarray, shift: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -74,22 +69,22 @@ def _cast(T_world_camera: np.ndarray, shift: tuple[float, float]) -> tuple[np.nd
     return grey, depth
 
 
-def make_disparity(values: np.ndarray, sigma_px: float = 0.1) -> Disparity:
-    """A disparity map of plain values."""
-    values = values.astype(np.float32)
-    valid = np.isfinite(values)
-    return Disparity(
-        values=values,
-        confidence=valid.astype(np.float32),
-        sigma_px=np.where(valid, np.float32(sigma_px), np.float32(np.nan)),
-        reason=np.where(valid, np.uint8(Reason.VALID), np.uint8(Reason.LOW_TEXTURE)),
-    )
+def steps(count: int, step: np.ndarray = STEP) -> np.ndarray:
+    return np.stack([np.linalg.matrix_power(step, n) for n in range(count)])
+
+
+def off_m(result: OdometryResult, truth: np.ndarray) -> float:
+    return float(np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]))
 
 
 def make_frame(grey: np.ndarray, values: np.ndarray, index: int = 0) -> OdometryFrame:
     """A frame; odometry on exact disparities does not use the right image."""
+    values = values.astype(np.float32)
+    valid = np.isfinite(values)
+    sigma_px = np.where(valid, np.float32(0.1), np.float32(np.nan))
+    reason = np.where(valid, np.uint8(Reason.VALID), np.uint8(Reason.LOW_TEXTURE))
     pair = RectifiedPair(grey, grey, CAMERA, timestamp_s=0.1 * index, index=index)
-    return OdometryFrame(pair, make_disparity(values))
+    return OdometryFrame(pair, Disparity(values, valid.astype(np.float32), sigma_px, reason))
 
 
 @pytest.fixture(scope="session")
@@ -98,7 +93,7 @@ def camera() -> RectifiedCamera:
 
 
 @pytest.fixture(scope="session")
-def see() -> Callable[..., OdometryFrame]:
+def see() -> See:
     """See the street from a pose: a frame with exact disparity."""
 
     def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
@@ -109,7 +104,7 @@ def see() -> Callable[..., OdometryFrame]:
 
 
 @pytest.fixture(scope="session")
-def see_both(see: Callable[..., OdometryFrame]) -> Callable[..., OdometryFrame]:
+def see_both(see: See) -> See:
     """See the street from a pose with both cameras."""
 
     def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
@@ -122,7 +117,7 @@ def see_both(see: Callable[..., OdometryFrame]) -> Callable[..., OdometryFrame]:
 
 
 @pytest.fixture(scope="session")
-def blind() -> Callable[..., OdometryFrame]:
+def blind() -> See:
     """A frame that shows nothing: one grey level, no disparity."""
 
     def blind_frame(level: int = 0, index: int = 0) -> OdometryFrame:
@@ -134,13 +129,10 @@ def blind() -> Callable[..., OdometryFrame]:
 
 @pytest.fixture(scope="session")
 def street_poses() -> np.ndarray:
-    """float64 (12, 4, 4): 0.5 m a frame along a gentle bend; the first is the identity."""
-    step = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 0.5]))
-    return np.stack([np.linalg.matrix_power(step, n) for n in range(12)])
+    """float64 (12, 4, 4); the first is the identity."""
+    return steps(12)
 
 
 @pytest.fixture(scope="session")
-def street(
-    see: Callable[..., OdometryFrame], street_poses: np.ndarray
-) -> tuple[OdometryFrame, ...]:
+def street(see: See, street_poses: np.ndarray) -> tuple[OdometryFrame, ...]:
     return tuple(see(T, index) for index, T in enumerate(street_poses))

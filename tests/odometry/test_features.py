@@ -1,13 +1,27 @@
-from __future__ import annotations
+"""Features of an image, and where they are in the next one."""
 
-from collections.abc import Callable
+from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
+from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.core.values import RectifiedCamera
 from recon.odometry import features
-from recon.odometry.features import find_corners, find_fewer_corners, follow, in_crowd
+from recon.odometry.features import (
+    find_again,
+    find_corners,
+    find_fewer_corners,
+    follow,
+    in_crowd,
+    measure_disparity,
+    surface_slopes,
+    warp_of,
+)
 from recon.odometry.protocol import OdometryFrame
+from tests.odometry.conftest import See
 
 NONE = np.zeros((0, 2), np.float32)
 
@@ -17,15 +31,11 @@ def per_cell(uv: np.ndarray) -> np.ndarray:
     return np.unique(cells, return_counts=True)[1]
 
 
-def test_no_cell_holds_more_than_its_share(see: Callable[..., OdometryFrame]) -> None:
-    uv = find_corners(see(np.eye(4)).pair.left, NONE)
-    assert len(uv) > 50
-    assert per_cell(uv).max() <= features._PER_CELL
-
-
-def test_features_already_followed_fill_their_cells(see: Callable[..., OdometryFrame]) -> None:
+def test_no_cell_holds_more_than_its_share_also_with_features_already_followed(see: See) -> None:
     grey = see(np.eye(4)).pair.left
     first = find_corners(grey, NONE)
+    assert len(first) > 50
+    assert per_cell(first).max() <= features._PER_CELL
     more = find_corners(grey, first)
     assert per_cell(np.concatenate([first, more])).max() <= features._PER_CELL
     distance = np.linalg.norm(first[:, None] - more[None], axis=2)
@@ -48,17 +58,13 @@ def test_the_corners_of_a_square_are_found() -> None:
     assert len(uv) >= 4
     assert distance.min(axis=0).max() < 3.0
     assert distance.min(axis=1).max() < 3.0
+    for nothing in (np.full((80, 90), 128, np.uint8), np.zeros((5, 5), np.uint8)):
+        assert find_corners(nothing, NONE).shape == (0, 2)
 
 
-def test_nothing_is_found_where_nothing_is() -> None:
-    assert find_corners(np.full((80, 90), 128, np.uint8), NONE).shape == (0, 2)
-    assert find_corners(np.zeros((5, 5), np.uint8), NONE).shape == (0, 2)
-
-
-def test_fewer_corners_are_corners_too(see: Callable[..., OdometryFrame]) -> None:
+def test_fewer_corners_are_corners_too(see: See) -> None:
     grey = see(np.eye(4)).pair.left
     many, few = find_corners(grey, NONE), find_fewer_corners(grey, NONE)
-
     assert 0.15 < len(few) / len(many) < 0.6
     score = cv2.cornerMinEigenVal(grey, 5)
     column, row = few.astype(int).T
@@ -67,7 +73,7 @@ def test_fewer_corners_are_corners_too(see: Callable[..., OdometryFrame]) -> Non
     assert len(more) < 0.2 * len(few)
 
 
-def test_what_leaves_the_image_is_not_followed(see: Callable[..., OdometryFrame]) -> None:
+def test_what_leaves_the_image_is_not_followed(see: See) -> None:
     grey = see(np.eye(4)).pair.left
     uv = find_corners(grey, NONE)
     shift = np.array([30, 12])
@@ -78,3 +84,100 @@ def test_what_leaves_the_image_is_not_followed(see: Callable[..., OdometryFrame]
     assert found[inside].mean() > 0.9
     assert np.median(np.abs(there - uv - shift)[found & inside]) < 0.01
     assert not found[((there > [width - 1, height - 1]) | (there < 0)).any(axis=1)].any()
+
+
+TURN = exp_so3(np.array([0.004, 0.01, 0.02]))
+
+
+def corners(frame: OdometryFrame) -> np.ndarray:
+    return find_corners(frame.pair.left, NONE).astype(np.float64)
+
+
+def seen_features(
+    frame: OdometryFrame, T_now_then: np.ndarray, camera: RectifiedCamera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners with one surface around them, their places in space, and where they are next."""
+    uv = corners(frame)
+    column, row = uv.astype(int).T
+    depth = camera.focal_px * camera.baseline_m / frame.disparity.values[row, column]
+    xyz = unproject(uv[:, 0], uv[:, 1], depth.astype(np.float64), camera)
+    there = np.stack(project(apply(T_now_then, xyz), camera)[:2], axis=1)
+    margin = 14  # a patch, and how much it grows
+    inside = (there > margin).all(axis=1) & (uv > 20).all(axis=1)
+    inside &= (there < [camera.width_px - margin, camera.height_px - margin]).all(axis=1)
+    inside &= depth < 20.0
+    return uv[inside], xyz[inside], there[inside]
+
+
+def test_slopes_of_the_road_are_those_of_its_plane(see: See, camera: RectifiedCamera) -> None:
+    frame = see(np.eye(4))
+    uv = np.array([[150.0, 130.0], [200.0, 140.0], [250.0, 120.0]])
+    # A plane 1.6 m below the camera: d = f·b/Z and v - cy = f·1.6/Z, so d = (v - cy)·b/1.6.
+    np.testing.assert_allclose(
+        surface_slopes(frame.disparity, uv), np.tile([0.0, 0.5 / 1.6], (3, 1)), atol=2e-3
+    )
+
+
+def test_the_warp_is_the_derivative_of_the_motion(camera: RectifiedCamera) -> None:
+    T = make_transform(TURN, np.array([0.1, -0.05, -1.5]))
+    uv, slope = np.array([[150.0, 130.0]]), np.array([[0.02, 0.3]])
+
+    def seen(offset: np.ndarray) -> np.ndarray:
+        d = 20.0 + offset @ slope[0]
+        depth = np.array([camera.focal_px * camera.baseline_m / d])
+        xyz = unproject(*(uv + offset).T, depth, camera)
+        return np.concatenate(project(apply(T, xyz), camera)[:2])
+
+    h = 1e-4
+    numeric = [(seen(h * axis) - seen(-h * axis)) / (2 * h) for axis in np.eye(2)]
+    depth = np.array([camera.focal_px * camera.baseline_m / 20.0])
+    found = warp_of(uv, unproject(*uv.T, depth, camera), slope, T, camera)[0]
+    np.testing.assert_allclose(found, np.stack(numeric, axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize(("step_m", "off_px"), [(0.5, 0.1), (2.0, 0.2)])
+def test_features_are_found_however_long_the_step(
+    step_m: float, off_px: float, see: See, camera: RectifiedCamera
+) -> None:
+    T_then_now = make_transform(TURN, np.array([0.05, 0.0, step_m]))
+    then, now = see(np.eye(4)), see(T_then_now)
+    uv, xyz, there = seen_features(then, invert(T_then_now), camera)
+    warp = warp_of(uv, xyz, surface_slopes(then.disparity, uv), invert(T_then_now), camera)
+    images = then.pair.left, now.pair.left
+    guess = there + np.random.default_rng(3).uniform(-1, 1, there.shape)
+    found = find_again(*images, uv, warp, guess)
+    off = np.linalg.norm(found - there, axis=1)
+    # At an edge between two planes part of a patch moves differently, and may not be alike.
+    assert np.isfinite(off).mean() > 0.8
+    assert np.nanmedian(off) < off_px
+    if step_m > 1:  # near patches are a third larger: tracking, which looks for equal ones, fails
+        near = xyz[:, 2] < 12.0
+        followed, ok = follow(*images, uv.astype(np.float32), there.astype(np.float32))
+        assert (ok & (np.linalg.norm(followed - there, axis=1) < 0.5))[near].mean() < 0.2
+        assert (off < 0.5)[near].mean() > 0.7
+
+
+def test_a_darker_image_changes_no_place(see: See, camera: RectifiedCamera) -> None:
+    frame = see(np.eye(4))
+    uv, _, _ = seen_features(frame, np.eye(4), camera)
+    darker = np.rint(0.6 * frame.pair.left + 20).astype(np.uint8)
+    warp = np.tile(np.eye(2), (len(uv), 1, 1))
+    found = find_again(frame.pair.left, darker, uv, warp, uv + 0.7)
+    assert np.nanmax(np.abs(found - uv)) < 0.05
+    assert np.isfinite(found).mean() > 0.9
+
+
+def test_disparities_are_measured_near_rough_ones(see_both: See) -> None:
+    frame = see_both(np.eye(4))
+    uv = corners(frame)
+    uv = uv[uv[:, 0] > 80]  # seen in the right image, too
+    column, row = uv.astype(int).T
+    true = frame.disparity.values[row, column].astype(np.float64)
+    off = np.random.default_rng(0).uniform(-1.0, 1.0, len(uv))
+    found = measure_disparity(frame.pair, uv, true + off, surface_slopes(frame.disparity, uv))
+    near = np.isfinite(found)
+    assert near.mean() > 0.6
+    assert np.median(np.abs(found - true)[near]) < 0.05
+    flat = np.zeros((len(uv), 2))
+    assert np.isnan(measure_disparity(frame.pair, uv, true + 30.0, flat)).mean() > 0.8
+    assert np.isnan(measure_disparity(frame.pair, uv, np.full(len(uv), np.nan), flat)).all()

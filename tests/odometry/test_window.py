@@ -1,12 +1,17 @@
+"""Poses: one camera localised from the inliers of its points, and a window adjusted."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from recon.core.geometry.projection import project
+from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Float64
 from recon.odometry import window as bundle_window
+from recon.odometry.features import MIN_DISPARITY_PX
+from recon.odometry.locate_camera import REPROJECTION_PX, Motion, locate_camera, part_of
 from recon.odometry.window import (
     TrackWindow,
     adjust,
@@ -23,6 +28,10 @@ def _to_the_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """Adjust until nothing changes any more, not only as far as a drive needs."""
     monkeypatch.setattr(bundle_window, "_ITERATIONS", 30)
     monkeypatch.setattr(bundle_window, "_MIN_GAIN", 1e-9)
+
+
+def seen_as(right: TrackWindow, uvd: np.ndarray) -> TrackWindow:
+    return TrackWindow(right.T_world_camera, uvd, right.xyz_world)
 
 
 def truth(camera: RectifiedCamera, frames: int = 4, points: int = 150) -> TrackWindow:
@@ -51,17 +60,14 @@ def newest_error(window: TrackWindow, right: TrackWindow) -> tuple[float, float]
 
 def test_exact_observations_give_exact_poses_and_points(camera: RectifiedCamera) -> None:
     right = truth(camera)
-    found = adjust(disturbed(right), camera)
+    start = disturbed(right)
+    found = adjust(start, camera)
     error_m, error_rad = newest_error(found, right)
     # The cost is flat at its minimum: square roots of float64's accuracy are left.
     assert error_m < 1e-5
     assert error_rad < 1e-6
     np.testing.assert_allclose(found.xyz_world, right.xyz_world, atol=1e-3)
-
-
-def test_the_oldest_pose_stays(camera: RectifiedCamera) -> None:
-    start = disturbed(truth(camera))
-    found = adjust(start, camera)
+    # The oldest pose stays.
     np.testing.assert_array_equal(found.T_world_camera[0], start.T_world_camera[0])
 
 
@@ -69,9 +75,8 @@ def test_some_wrong_tracks_hardly_matter(camera: RectifiedCamera) -> None:
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[-1, :20, 0] += 15.0
-    found = adjust(disturbed(TrackWindow(right.T_world_camera, uvd, right.xyz_world)), camera)
-    error_m, _ = newest_error(found, right)
-    assert error_m < 0.02
+    found = adjust(disturbed(seen_as(right, uvd)), camera)
+    assert newest_error(found, right)[0] < 0.02
     wrong = misfits(found, camera)
     assert wrong[:20].all()
     assert not wrong[20:].any()
@@ -81,7 +86,7 @@ def test_a_track_without_disparity_still_counts(camera: RectifiedCamera) -> None
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[1:, :, 2] = np.nan
-    found = adjust(disturbed(TrackWindow(right.T_world_camera, uvd, right.xyz_world)), camera)
+    found = adjust(disturbed(seen_as(right, uvd)), camera)
     assert newest_error(found, right)[0] < 1e-3
     assert np.isnan(reprojection(found, camera)[-1, :, 2]).all()
 
@@ -90,13 +95,11 @@ def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
     """Noise of the stated size in the newest frame alone: scatter against the covariance."""
     right = truth(camera, frames=2)
     rng = np.random.default_rng(13)
-    sigmas = np.array(
-        [bundle_window.SIGMA_UV_PX, bundle_window.SIGMA_UV_PX, bundle_window.SIGMA_D_PX]
-    )
+    sigmas = np.array([bundle_window.SIGMA_UV_PX] * 2 + [bundle_window.SIGMA_D_PX])
     offs = []
     for _ in range(60):
         uvd = right.uvd + sigmas * rng.normal(size=right.uvd.shape)
-        found = adjust(TrackWindow(right.T_world_camera, uvd, right.xyz_world), camera)
+        found = adjust(seen_as(right, uvd), camera)
         offs.append((invert(right.T_world_camera[-1]) @ found.T_world_camera[-1])[:3, 3])
     covariance = np.linalg.inv(pose_information(right, camera))
     ratio = np.std(offs, axis=0) / np.sqrt(np.diag(covariance)[:3])
@@ -111,7 +114,7 @@ def test_health_states_the_certainty_that_the_misfit_of_the_features_gives(
     right, sigma_px = truth(camera), 0.4
     uvd = right.uvd.copy()
     uvd[-1, :, :2] += np.random.default_rng(14).normal(0.0, sigma_px, uvd[-1, :, :2].shape)
-    noisy = TrackWindow(right.T_world_camera, uvd, right.xyz_world)
+    noisy = seen_as(right, uvd)
     found = newest_health(noisy, camera, tracks=200, note="noted")
     covariance = np.linalg.inv(newest_information(noisy, camera, sigma_px))
     # The median of 150 errors is known to 6 %.
@@ -129,7 +132,7 @@ def test_trimming_keeps_what_is_followed_and_what_was_seen_twice(camera: Rectifi
     uvd[3, 0] = uvd[3, 1] = np.nan
     uvd[:2, 1] = np.nan
     uvd[:3, 2] = np.nan
-    trimmed = TrackWindow(window.T_world_camera, uvd, window.xyz_world).trimmed(3)
+    trimmed = seen_as(window, uvd).trimmed(3)
     assert len(trimmed.T_world_camera) == 3
     # Point 0 was seen in frames 1 and 2, point 1 in frame 2 alone; 2 and 3 are followed.
     np.testing.assert_array_equal(trimmed.xyz_world, window.xyz_world[[0, 2, 3]])
@@ -140,3 +143,83 @@ def test_a_window_without_points_stays_as_it_is(frames: int, camera: RectifiedCa
     poses = truth(camera).T_world_camera[:frames]
     window = TrackWindow(poses, np.zeros((frames, 0, 3)), np.zeros((0, 3)))
     np.testing.assert_array_equal(adjust(window, camera).T_world_camera, poses)
+
+
+CAMERA = RectifiedCamera(360.0, 320.0, 120.0, 320.0, 0.54, 640, 240)
+T_TRUE = make_transform(exp_so3(np.array([0.002, 0.01, -0.003])), np.array([-0.03, -0.02, 1.0]))
+
+
+def street(seed: int, wrong: int = 12) -> tuple[Float64, Float64]:
+    """Points triangulated with 0.3 px of error in the first camera, seen by the second.
+
+    The last two are as far as the horizon, as bundle adjustment makes points of no parallax.
+    """
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(0, 640, 150), rng.uniform(0, 240, 150)
+    depth = CAMERA.focal_px * CAMERA.baseline_m / rng.uniform(1.0, 40.0, 150)
+    depth[-2:] = 20_000.0
+    xyz = unproject(u, v, depth, CAMERA)
+    seen_u, seen_v, _ = project(apply(invert(T_TRUE), xyz), CAMERA)
+    uv = np.stack([seen_u, seen_v], axis=1) + rng.normal(0, 0.15, (150, 2))
+    uv[:wrong] += rng.uniform(5, 60, (wrong, 2))
+    disparity = CAMERA.focal_px * CAMERA.baseline_m / depth + rng.normal(0, 0.3, 150)
+    disparity = np.maximum(disparity, MIN_DISPARITY_PX)
+    measured = depth_from_disparity(disparity, CAMERA).astype(np.float64)
+    measured[-2:] = depth[-2:]
+    return unproject(u, v, measured, CAMERA), uv
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_noisy_depths_do_not_throw_the_camera(seed: int) -> None:
+    # Regression: a point on the horizon throws RANSAC's own pose, a closed form, by kilometres.
+    xyz, uv = street(seed)
+    found = locate_camera(xyz, uv, CAMERA, np.eye(4))
+    assert found is not None
+    error = invert(T_TRUE) @ found.T_world_camera
+    assert np.linalg.norm(error[:3, 3]) < 0.12
+    assert np.rad2deg(angle_rad(error)) < 0.3
+    assert found.agree.sum() > 120
+    assert found.agree[:12].sum() <= 1
+    u, v, _ = project(apply(invert(found.T_world_camera), xyz), CAMERA)
+    error_px = np.hypot(u - uv[:, 0], v - uv[:, 1])
+    np.testing.assert_array_equal(found.agree, error_px <= REPROJECTION_PX)
+
+
+def test_a_guess_that_is_far_off_does_no_harm() -> None:
+    xyz, uv = street(1)
+    far = make_transform(exp_so3(np.array([0.0, 0.3, 0.0])), np.array([3.0, 0.0, -4.0]))
+    found = locate_camera(xyz, uv, CAMERA, far)
+    assert found is not None
+    assert np.linalg.norm((invert(T_TRUE) @ found.T_world_camera)[:3, 3]) < 0.12
+
+
+def test_points_that_agree_on_nothing_and_too_few_give_no_pose() -> None:
+    xyz, uv = street(2)
+    wrong = np.random.default_rng(2).permutation(uv)
+    assert locate_camera(xyz, wrong, CAMERA, np.eye(4)) is None
+    assert locate_camera(xyz[-10:], uv[-10:], CAMERA, np.eye(4)) is None
+
+
+STEP = make_transform(exp_so3(np.array([0.0, 0.03, 0.01])), np.array([0.1, 0.0, 1.2]))
+
+
+def test_with_known_times_the_velocity_goes_on() -> None:
+    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1)
+    np.testing.assert_allclose(motion.predict(0.2), STEP @ STEP, atol=1e-12)
+    np.testing.assert_allclose(motion.predict(0.4), STEP @ part_of(STEP, 3.0), atol=1e-12)
+    half = part_of(STEP, 0.5)
+    np.testing.assert_allclose((half @ half)[:3, :3], STEP[:3, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("after_s", "time_s"), [(0.1, 0.0), (0.1, 0.1), (0.1, 1000.0), (0.1, -5.0), (0.0, 0.0)]
+)
+def test_times_that_give_no_answer_repeat_the_last_motion(after_s: float, time_s: float) -> None:
+    motion = Motion(np.eye(4), 0.0).moved(STEP, after_s)
+    np.testing.assert_allclose(motion.predict(time_s), STEP @ STEP, atol=1e-12)
+
+
+def test_frames_that_are_not_seen_keep_the_velocity() -> None:
+    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1).drifted(0.2).drifted(0.3)
+    np.testing.assert_allclose(motion.T_world_camera, np.linalg.matrix_power(STEP, 3), atol=1e-12)
+    np.testing.assert_allclose(motion.predict(0.4), np.linalg.matrix_power(STEP, 4), atol=1e-12)

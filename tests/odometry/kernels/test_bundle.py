@@ -8,21 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.odometry.kernels.bundle import (
     MIN_DEPTH_M,
+    RIDGE,
     BundleModel,
     NormalEquations,
     cost,
     linearise,
     solve_step,
-)
-from tests.odometry.kernels.bundle_reference import (
-    cost_reference,
-    linearise_reference,
-    solve_step_reference,
-    whole_system,
 )
 
 MODEL = BundleModel(
@@ -35,22 +31,18 @@ Window = tuple[np.ndarray, np.ndarray, np.ndarray]
 def make_window(seed: int, frames: int, points: int, seen_share: float = 0.7) -> Window:
     """Poses, observations with noise, holes and outliers, and points; some behind the camera."""
     rng = np.random.default_rng(seed)
-    poses = np.stack(
-        [
-            make_transform(exp_so3(0.05 * rng.normal(size=3)), [*0.1 * rng.normal(size=2), 0.4 * w])
-            for w in range(frames)
-        ]
-    )
+    poses = [
+        make_transform(exp_so3(0.05 * rng.normal(size=3)), [*0.1 * rng.normal(size=2), 0.4 * w])
+        for w in range(frames)
+    ]
     xyz = rng.uniform([-5, -3, -1], [5, 2, 30], (points, 3))
-    T = invert(poses)
+    T = invert(np.stack(poses))
     places = np.einsum("wij,nj->wni", T[:, :3, :3], xyz) + T[:, None, :3, 3]
     z = np.maximum(places[:, :, 2], 0.1)
-    uvd = np.stack(
-        [300 * places[:, :, 0] / z + 200, 300 * places[:, :, 1] / z + 90, 150 / z - 3], axis=-1
-    )
-    uvd += (
-        rng.normal(0, 0.5, uvd.shape) * np.where(rng.random(uvd.shape[:2]) < 0.1, 40, 1)[..., None]
-    )
+    u, v = 300 * places[:, :, 0] / z + 200, 300 * places[:, :, 1] / z + 90
+    uvd = np.stack([u, v, 150 / z - 3], axis=-1)
+    noise = rng.normal(0, 0.5, uvd.shape)
+    uvd += noise * np.where(rng.random(uvd.shape[:2]) < 0.1, 40, 1)[..., None]
     uvd[rng.random(uvd.shape[:2]) > seen_share] = np.nan
     uvd[rng.random(uvd.shape[:2]) < 0.2, 2] = np.nan
     return T, uvd, xyz
@@ -65,8 +57,7 @@ windows = st.builds(
 )
 
 
-U = 2.0**-53
-"""Rounding of one operation, as a share of its result (float64)."""
+U = 2.0**-53  # rounding of one operation, as a share of its result (float64)
 
 
 class Magnitudes(NamedTuple):
@@ -76,12 +67,9 @@ class Magnitudes(NamedTuple):
     keeps their rounding; so relative to itself there is no bound.
     """
 
-    residual: np.ndarray
-    """(W, N, 3), in standard deviations; 0 where not seen."""
-    camera: np.ndarray
-    """(W, N, 3, 3), of the derivatives by the point in camera axes."""
-    place: np.ndarray
-    """(W, N, 3), of the point in camera axes."""
+    residual: np.ndarray  # (W, N, 3), in standard deviations; 0 where not seen
+    camera: np.ndarray  # (W, N, 3, 3), of the derivatives by the point in camera axes
+    place: np.ndarray  # (W, N, 3), of the point in camera axes
 
 
 def magnitudes(window: Window) -> Magnitudes:
@@ -138,14 +126,7 @@ def rounding_of_the_normal_equations(window: Window) -> NormalEquations:
     weight_errs = 2 * 10 * size.residual.sum(axis=2) / MODEL.cauchy + 8
     operations = 2 * 20 + size.residual.shape[0] * size.residual.shape[1] + weight_errs
     pose, point = (J * operations[:, :, None, None] for J in (J_pose, J_point))
-    r = size.residual
-    entries = NormalEquations(
-        H_pose=np.einsum("wnki,wnkj->wij", pose, J_pose),
-        g_pose=np.einsum("wnki,wnk->wi", pose, r),
-        H_point=np.einsum("wnki,wnkj->nij", point, J_point),
-        g_point=np.einsum("wnki,wnk->ni", point, r),
-        H_cross=np.einsum("wnki,wnkj->wnij", pose, J_point),
-    )
+    entries = summed((pose, J_pose), (point, J_point), size.residual)
     return NormalEquations(*(2 * U * entry for entry in entries))
 
 
@@ -199,13 +180,10 @@ def test_reduced_step_equals_that_of_the_whole_system(
     assert error <= condition(H[6:, 6:]) * unsolved
 
 
-def test_the_first_pose_does_not_step() -> None:
+def test_the_first_pose_and_an_empty_system_make_no_step() -> None:
     step_pose, _ = solve_step(linearise(*make_window(3, 4, 25), MODEL), 1e-4)
     assert not step_pose[0].any()
     assert step_pose[1:].all()
-
-
-def test_an_empty_system_makes_no_step() -> None:
     step_pose, step_point = solve_step(linearise(*make_window(3, 3, 0), MODEL), 1e-4)
     assert not step_pose.any()
     assert step_point.shape == (0, 3)
@@ -216,29 +194,102 @@ def test_gradient_is_the_slope_of_the_cost() -> None:
     T, uvd, xyz = make_window(5, 3, 20)
     keep = np.einsum("j,nj->n", T[0, 2, :3], xyz) > 3.0
     uvd, xyz = uvd[:, keep], xyz[keep]
-    normal = linearise(T, uvd, xyz, MODEL)
-    e = 1e-6
-    for i in range(6):
-        step = np.zeros(6)
-        step[i] = e
-        moved = []
-        for sign in (1, -1):
-            M = make_transform(exp_so3(sign * step[3:]), sign * step[:3])
-            poses = T.copy()
-            poses[1] = invert(invert(T[1]) @ M)
-            moved.append(cost(poses, uvd, xyz, tuple(MODEL)))
+
+    def cost_after(step: np.ndarray) -> float:
+        poses, points = T.copy(), xyz.copy()
+        poses[1] = invert(invert(T[1]) @ make_transform(exp_so3(step[3:6]), step[:3]))
+        points[0] += step[6:]
+        return cost(poses, uvd, points, tuple(MODEL))
+
+    normal, e = linearise(T, uvd, xyz, MODEL), 1e-6
+    for axis, g in zip(e * np.eye(9), [*normal.g_pose[1], *normal.g_point[0]], strict=True):
         # d log1p(r²/c²) = 2·w·r·dr/c²; g sums -w·J·r with r = observed - predicted.
-        slope = (moved[0] - moved[1]) / (2 * e)
-        assert slope == pytest.approx(
-            -2 * normal.g_pose[1, i] / MODEL.cauchy**2, rel=1e-4, abs=1e-3
-        )
-    for i in range(3):
-        shifted = []
-        for sign in (1, -1):
-            points = xyz.copy()
-            points[0, i] += sign * e
-            shifted.append(cost(T, uvd, points, tuple(MODEL)))
-        slope = (shifted[0] - shifted[1]) / (2 * e)
-        assert slope == pytest.approx(
-            -2 * normal.g_point[0, i] / MODEL.cauchy**2, rel=1e-4, abs=1e-3
-        )
+        slope = (cost_after(axis) - cost_after(-axis)) / (2 * e)
+        assert slope == pytest.approx(-2 * g / MODEL.cauchy**2, rel=1e-4, abs=1e-3)
+
+
+Float64 = NDArray[np.float64]
+
+
+def linearise_reference(
+    T_camera_world: Float64, uvd: Float64, xyz_world: Float64, model: BundleModel
+) -> NormalEquations:
+    """Reference implementation of `recon.odometry.kernels.bundle.linearise`."""
+    white, xyz = _white(T_camera_world, uvd, xyz_world, model)
+    weight = 1.0 / (1.0 + np.square(white).sum(axis=2) / model.cauchy**2)
+    J_camera = _projection_jacobian(xyz, model) * np.isfinite(uvd)[:, :, :, None]
+    J_point = J_camera @ T_camera_world[:, None, :3, :3]
+    J_pose = np.concatenate([-J_camera, np.cross(J_camera, xyz[:, :, None, :])], axis=-1)
+    pose, point = ((J * weight[:, :, None, None], J) for J in (J_pose, J_point))
+    return summed(pose, point, white)
+
+
+def summed(
+    pose: tuple[Float64, Float64], point: tuple[Float64, Float64], residual: Float64
+) -> NormalEquations:
+    """Sum products of derivatives, weighted and not, and residuals over all observations."""
+    return NormalEquations(
+        H_pose=np.einsum("wnki,wnkj->wij", *pose),
+        g_pose=np.einsum("wnki,wnk->wi", pose[0], residual),
+        H_point=np.einsum("wnki,wnkj->nij", *point),
+        g_point=np.einsum("wnki,wnk->ni", point[0], residual),
+        H_cross=np.einsum("wnki,wnkj->wnij", pose[0], point[1]),
+    )
+
+
+def solve_step_reference(normal: NormalEquations, damping: float) -> tuple[Float64, Float64]:
+    """Return the reference of `bundle.solve_step`: the whole system, not reduced."""
+    H, g = whole_system(normal, damping)
+    step = np.concatenate([np.zeros(6), np.linalg.solve(H[6:, 6:], g[6:])])
+    size = 6 * len(normal.H_pose)
+    return step[:size].reshape(-1, 6), step[size:].reshape(-1, 3)
+
+
+def whole_system(normal: NormalEquations, damping: float) -> tuple[Float64, Float64]:
+    """The damped equations of all poses, then all points: a matrix and its right-hand side."""
+    frames, points = len(normal.H_pose), len(normal.H_point)
+    size = 6 * frames
+    H = np.zeros((size + 3 * points, size + 3 * points))
+    for w, block in enumerate(normal.H_pose):
+        H[6 * w : 6 * w + 6, 6 * w : 6 * w + 6] = block
+    for n, block in enumerate(normal.H_point):
+        at = size + 3 * n
+        H[at : at + 3, at : at + 3] = block
+        for w in range(frames):
+            cross = normal.H_cross[w, n]
+            H[6 * w : 6 * w + 6, at : at + 3] = cross
+            H[at : at + 3, 6 * w : 6 * w + 6] = cross.T
+    H[np.diag_indices_from(H)] += damping * np.diag(H) + RIDGE
+    return H, np.concatenate([normal.g_pose.ravel(), normal.g_point.ravel()])
+
+
+def cost_reference(
+    T_camera_world: Float64, uvd: Float64, xyz_world: Float64, model: BundleModel
+) -> float:
+    """Reference implementation of `recon.odometry.kernels.bundle.cost`."""
+    white, _ = _white(T_camera_world, uvd, xyz_world, model)
+    return float(np.log1p(np.square(white).sum(axis=2) / model.cauchy**2).sum())
+
+
+def _white(
+    T_camera_world: Float64, uvd: Float64, xyz_world: Float64, model: BundleModel
+) -> tuple[Float64, Float64]:
+    """Residuals in standard deviations (W, N, 3), 0 where not seen; points in camera axes."""
+    xyz = np.einsum("wij,nj->wni", T_camera_world[:, :3, :3], xyz_world)
+    xyz += T_camera_world[:, None, :3, 3]
+    z = np.maximum(xyz[:, :, 2], MIN_DEPTH_M)
+    u, v = (model.focal * xyz[:, :, k] / z + c for k, c in enumerate((model.cx, model.cy)))
+    predicted = np.stack([u, v, model.fb / z - model.doffs], axis=-1)
+    sigmas = np.array([model.sigma_uv, model.sigma_uv, model.sigma_d])
+    return np.where(np.isfinite(uvd), (uvd - predicted) / sigmas, 0.0), xyz
+
+
+def _projection_jacobian(xyz: Float64, model: BundleModel) -> Float64:
+    """Return whitened derivative (W, N, 3, 3) of column, row and disparity by the point."""
+    z = np.maximum(xyz[:, :, 2], MIN_DEPTH_M)
+    J = np.zeros((*xyz.shape, 3))
+    J[:, :, 0, 0] = J[:, :, 1, 1] = model.focal / z / model.sigma_uv
+    J[:, :, 0, 2] = -model.focal * xyz[:, :, 0] / z**2 / model.sigma_uv
+    J[:, :, 1, 2] = -model.focal * xyz[:, :, 1] / z**2 / model.sigma_uv
+    J[:, :, 2, 2] = -model.fb / z**2 / model.sigma_d
+    return J
