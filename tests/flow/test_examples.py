@@ -4,57 +4,35 @@ from __future__ import annotations
 
 import runpy
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetScene
-from tests.scenery.kitti import write_kitti
+from tests.flow.runs import ROOT
+from tests.scenery.kitti import street_drive
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture
-def kitti_drive(tmp_path: Path) -> Path:
-    """Six frames of the synthetic street as a KITTI folder."""
-    folder = tmp_path / "drive"
-    street = StreetScene(frames=6, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
-    write_kitti(SyntheticSource(street), folder)
-    return folder
+EXAMPLES = {
+    "01_one_pair.py": ("% of the pixels have a disparity", ["cloud.ply"]),
+    "02_map_a_drive.py": (
+        "position error",
+        ["trajectory_kitti.txt", "map/cloud.ply", "map/grid.yaml", "map/octomap.bt"],
+    ),
+}
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run an example as the program that it is; what it prints."""
-
-    def run_example(name: str, *arguments: str) -> str:
-        monkeypatch.setattr(sys, "argv", [name, *arguments])
-        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
-        return capsys.readouterr().out
-
-    return run_example
-
-
-def test_one_pair_gives_a_cloud(run: Callable[..., str], tmp_path: Path) -> None:
-    output = run("01_one_pair.py", str(tmp_path))
-
-    assert "% of the pixels have a disparity" in output
-    assert (tmp_path / "cloud.ply").stat().st_size > 0
-
-
-def test_a_drive_gives_maps(run: Callable[..., str], tmp_path: Path, kitti_drive: Path) -> None:
-    folder = tmp_path / "run"
-
-    output = run("02_map_a_drive.py", str(kitti_drive), str(folder))
-
-    assert "position error" in output
-    for name in ("trajectory_kitti.txt", "map/cloud.ply", "map/grid.yaml", "map/octomap.bt"):
-        assert (folder / name).stat().st_size > 0
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_prints_and_writes_what_it_says(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said, files = EXAMPLES[name]
+    words = [str(tmp_path / "out")]
+    if "drive" in name:
+        words.insert(0, str(street_drive(tmp_path / "drive", 6)))
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+    assert said in capsys.readouterr().out
+    assert all((tmp_path / "out" / file).stat().st_size > 0 for file in files)
 
 
 def test_every_example_is_tested() -> None:
-    tested = Path(__file__).read_text()
-
-    assert [path.name for path in EXAMPLES.glob("*.py") if path.name not in tested] == []
+    assert {path.name for path in (ROOT / "examples").glob("*.py")} == EXAMPLES.keys()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,20 @@ from recon.commands.demo import demo_source
 from recon.commands.export import run_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.geometry.se3 import invert
+from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
 from recon.io.trajectory import read_tum
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.records import Store
 from recon.sources.kitti import open_kitti
 from recon.sources.source import StereoSource
-from tests.flow.rooms import RoomSource
+from recon.sources.synthetic import SyntheticSource
+from recon.street.settings import StreetScene
+from recon.street.shapes import Material, Paint, boxes, merge
+from recon.street.street import StreetWorld, rig
+from tests.flow.conftest import SMALL_STREET
 
 FOOTPRINT_M = 0.3
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -54,10 +60,9 @@ class ServedMap:
     def at(self, xy: np.ndarray) -> np.ndarray:
         """The cells of places (N, 2); fails outside of the map."""
         column, row = np.floor((xy - self._corner) / self._resolution).astype(int).T
-        row = len(self.cells) - 1 - row
         assert (column >= 0).all()
-        assert (row >= 0).all()
-        return self.cells[row, column]
+        assert (row < len(self.cells)).all()
+        return self.cells[len(self.cells) - 1 - row, column]
 
 
 def _disc(centre: np.ndarray, radius_m: float) -> np.ndarray:
@@ -84,26 +89,22 @@ def _check_start(run: Path, least_free: float = 1.0) -> None:
     assert (served.at(path) == FREE).mean() >= least_free
 
 
-def test_a_robot_starts_in_free_space_inside_the_map(small_demo: Path) -> None:
-    _check_start(small_demo)
-
-
 def test_a_remade_map_has_the_same_start(small_demo: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    summary = run_occupancy(
-        small_demo, run_settings(small_demo, None, ["grid.vehicle_width_m=1.8"]), out=out
-    )
+    wider = run_settings(small_demo, None, ["grid.vehicle_width_m=1.8"])
+    summary = run_occupancy(small_demo, wider, out=out)
     # Poses come from a file with 13 digits.
     T_base_camera = _summary(small_demo)["T_base_camera"]
     np.testing.assert_allclose(summary["T_base_camera"], T_base_camera, atol=1e-9)
     served = ServedMap(out)
     assert (served.at(_disc(np.zeros(2), 0.75)) == FREE).all()
-    nothing = ("grid.vehicle_width_m=0",)
-    run_occupancy(small_demo, run_settings(small_demo, None, nothing), out=tmp_path / "seen")
+    nothing = run_settings(small_demo, None, ["grid.vehicle_width_m=0"])
+    run_occupancy(small_demo, nothing, out=tmp_path / "seen")
     assert (ServedMap(tmp_path / "seen").at(np.zeros((1, 2))) == UNKNOWN).all()
 
 
-def test_the_base_is_where_the_camera_stands_on_the_road(small_demo: Path) -> None:
+def test_a_robot_starts_in_free_space_where_the_camera_stands_on_the_road(small_demo: Path) -> None:
+    _check_start(small_demo)
     summary = _summary(small_demo)
     # 1.65 m in the street's settings; the ground is measured to a few centimetres.
     assert summary["camera_height_m"] == pytest.approx(1.65, abs=0.06)
@@ -136,17 +137,10 @@ def test_frames_that_are_not_trusted_free_nothing(small_demo: Path, tmp_path: Pa
 
 @pytest.mark.slow
 def test_the_map_can_have_its_origin_on_the_ground(tmp_path: Path) -> None:
-    street = [
-        "street.frames=8",
-        "street.width_px=256",
-        "street.height_px=96",
-        "street.focal_px=150",
-    ]
-    config = load_config(None, [*street, "axes.origin=ground"])
-    out = tmp_path / "run"
-    run = run_map(
-        demo_source(config), config, MapOptions(audit=False, command="demo", out=out, mesh=False)
-    )
+    street = [f"street.{key}={value}" for key, value in SMALL_STREET.items()]
+    config, out = load_config(None, [*street, "axes.origin=ground"]), tmp_path / "run"
+    options = MapOptions(audit=False, command="demo", out=out, mesh=False)
+    run = run_map(demo_source(config), config, options)
     base = read_tum(out / "trajectory_map_base_tum.txt")
     # One frame's ground plane against the ground of the whole drive: some centimetres apart.
     assert abs(base.positions_m[0, 2]) < 0.1
@@ -159,6 +153,47 @@ def test_the_map_can_have_its_origin_on_the_ground(tmp_path: Path) -> None:
 FRAMES = 20
 CARRIED = 1.1 + 0.03 * np.sin(np.arange(FRAMES))
 FLOWN = 1.4 + 0.8 * np.sin(np.arange(FRAMES) / 3)
+ROOM_M = (9.0, 8.0, 3.2)
+TABLE_M = ((3.6, 3.4, 0.0), (4.6, 4.4, 0.75))
+
+
+class RoomSource(SyntheticSource):
+    """A walk around the table of a room, with a rig like that of EuRoC at a height per frame."""
+
+    def __init__(self, heights_m: Float64) -> None:
+        like_euroc = {"width_px": 376, "height_px": 240, "focal_px": 229.0, "baseline_m": 0.11}
+        super().__init__(StreetScene(frames=len(heights_m), **like_euroc))
+        self.heights_m = heights_m
+
+    @cached_property
+    def world(self) -> StreetWorld:
+        """The room, in coarse textures, and the path through it."""
+        x, y, z = ROOM_M
+        sides = (
+            ((0, 0, -0.1), (x, y, 0), Material.ASPHALT),
+            ((-0.1, 0, 0), (0, y, z), Material.POSTER),
+            ((x, 0, 0), (x + 0.1, y, z), Material.BRICK),
+            ((0, -0.1, 0), (x, 0, z), Material.POSTER),
+            ((0, y, 0), (x, y + 0.1, z), Material.BRICK),
+            (*TABLE_M, Material.POSTER),
+        )
+        room = merge(
+            boxes(low, high, Paint(material, (0.6, 0.5, 0.4), part))
+            for part, (low, high, material) in enumerate(sides)
+        )
+        up = np.array([0.0, 0.0, 1.0])
+        return StreetWorld(self.settings, room, rig(self.settings), np.stack(self._poses()), up)
+
+    def _poses(self) -> list[Float64]:
+        """Counter-clockwise, three quarters of a circle, looking along the path."""
+        poses, angles = [], np.linspace(-np.pi / 2, np.pi, FRAMES)
+        for angle, height in zip(angles, self.heights_m, strict=True):
+            forward = np.array([-np.sin(angle), np.cos(angle), 0.0])
+            right = np.array([np.cos(angle), np.sin(angle), 0.0])
+            rotation = np.stack([right, [0.0, 0.0, -1.0], forward], axis=1)
+            place = np.mean(TABLE_M, axis=0)[:2] + 2.2 * right[:2]
+            poses.append(make_transform(rotation, np.array([*place, height])))
+        return poses
 
 
 def _mapped(source: StereoSource, out: Path, poses: Trajectory | None = None) -> Path:
