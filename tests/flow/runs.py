@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from recon.core.errors import FormatError
 from recon.map.drive.mapper import FrameResult
@@ -61,6 +63,10 @@ def content(folder: Path) -> dict[str, bytes]:
         for path in files
         if path.name not in timed
     }
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "summary.json").read_text()))
 
 
 def all_files(folder: Path) -> dict[str, bytes]:

@@ -15,6 +15,7 @@ import pytest
 import recon
 from recon.io.images.disparity import read_pfm, write_disparity_png, write_pfm
 from recon.io.images.image import read_image
+from tests.flow.runs import summary_of
 from tests.hostile.refusals import Ended, assert_refused, run
 from tests.scenery.middlebury import FAR, HEIGHT, WIDTH, noise, square, write_scene
 
@@ -64,13 +65,13 @@ def matched(scenes: Path, quarter: Path, tmp_path_factory: pytest.TempPathFactor
         "evaluate", "middlebury", scenes, "--matcher", ",".join(MATCHERS), "--out", out, "--json",
         "--truth", quarter, "--parallel", "2",
     )  # fmt: skip
-    assert json.loads((out / "summary.json").read_text()) == printed(done)
+    assert summary_of(out) == printed(done)
     assert "warning: MiddEval3/trainingH/Piano: no truth" in done.err
     return out
 
 
 def test_every_matcher_has_all_scenes_and_matches_them_nearly_everywhere(matched: Path) -> None:
-    summary = json.loads((matched / "summary.json").read_text())
+    summary = summary_of(matched)
     assert tuple(summary["matchers"]) == MATCHERS
     assert summary["skipped"] == ["MiddEval3/trainingH/Piano"]
     for name, found in summary["matchers"].items():
@@ -100,7 +101,7 @@ def test_every_matcher_has_all_scenes_and_matches_them_nearly_everywhere(matched
 
 
 def test_tables_maps_and_images_are_written(matched: Path) -> None:
-    weighted = json.loads((matched / "summary.json").read_text())["matchers"]["sad"]["weighted"]
+    weighted = summary_of(matched)["matchers"]["sad"]["weighted"]
     assert "| sad |" in (matched / "tables.md").read_text()
     assert "Weighted mean, nonocc, dense" in (matched / "tables.txt").read_text()
     rows = list(csv.DictReader((matched / "figures.csv").open()))
@@ -119,7 +120,7 @@ def test_figures_do_not_depend_on_what_runs_beside(
 ) -> None:
     done = middlebury(quarter, "--out", tmp_path / "run", "--json", "--threads", "1")
     alone = printed(done)["matchers"]["sad"]["scenes"]["Vintage"]["nonocc"]
-    beside = json.loads((matched / "summary.json").read_text())["matchers"]["sad"]["scenes"]
+    beside = summary_of(matched)["matchers"]["sad"]["scenes"]
     assert alone == beside["MiddEval3/trainingQ/Vintage"]["nonocc"]
     assert done.err == ""
 
@@ -216,7 +217,7 @@ def test_missing_scenes_are_named_and_left_out_of_all_means(
     means = "means are over 1 of 2 scenes, which all have"
     assert f"a/maps: no result for Vintage; {means}" in done.err
     assert "Weighted mean of 1 of 2 scenes, nonocc, dense" in done.out
-    found = json.loads((tmp_path / "o/summary.json").read_text())
+    found = summary_of(tmp_path / "o")
     assert found["mean_over"] == ["Teddy"]
     assert list(found["matchers"])[:2] == ["a/maps", "b/maps"]  # of one name, so of two parts
     scenes = [list(one["scenes"]) for one in found["matchers"].values()]
@@ -308,5 +309,5 @@ def test_a_pair_is_matched_by_the_matcher_that_is_named(
     done = run("disparity", *images, "--matcher", name, "--ndisp", "16", "--out", tmp_path / "o")
     assert done.code == 0, done.err
     assert f"matcher: {name}" in (tmp_path / "o" / "config.yaml").read_text()
-    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "o")
     assert summary["disparity_median_px"] == pytest.approx(FAR, abs=0.2)

@@ -25,6 +25,7 @@ from recon.io.trajectory import read_tum
 from recon.map.store.records import Store
 from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.sources.one_pair import PairInput
+from tests.flow.runs import summary_of
 from tests.hostile.refusals import assert_refused, run
 
 MAPS = ("map/grid.pgm", "map/grid.yaml", "map/octomap.bt", "map/octomap.ot")
@@ -75,7 +76,7 @@ def test_the_cloud_comes_as_laz_in_the_coordinates_of_a_survey(
     path, origin = read_tum(small_demo / "trajectory_map_base_tum.txt"), np.array([4e5, 5e6, 100])
     there = np.column_stack([path.timestamps_s, path.positions_m + origin])
     np.savetxt(tmp_path / "gnss.txt", there, fmt="%.6f")
-    height_m = json.loads((small_demo / "summary.json").read_text())["camera_height_m"]
+    height_m = summary_of(small_demo)["camera_height_m"]
     words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}"]
     out = tmp_path / "out"
     done = run("export", small_demo, "--to", "laz", *words, "--crs", "EPSG:25832", "--out", out)
@@ -83,7 +84,7 @@ def test_the_cloud_comes_as_laz_in_the_coordinates_of_a_survey(
     found, cloud = laspy.read(out / "map/cloud.laz"), read_ply(small_demo / "map/cloud.ply")
     assert np.abs(found.xyz - (cloud.xyz.astype(np.float64) + origin)).max() < 0.002
     assert found.header.parse_crs().to_epsg() == 25832
-    assert json.loads((out / "summary.json").read_text())["misfit_rms_m"] < 0.001
+    assert summary_of(out)["misfit_rms_m"] < 0.001
 
 
 @pytest.mark.parametrize(

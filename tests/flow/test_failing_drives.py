@@ -6,7 +6,6 @@ rail, grey asphalt, sky. kiss-icp stands still on it and is sure of that.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source
 from recon.stereo.match.registry import make_matcher
+from tests.flow.runs import summary_of
 from tests.scenery.kitti import street_drive
 from tests.sources import drives
 
@@ -280,7 +280,7 @@ def runs(seen: list[RectifiedPair], tmp_path_factory: pytest.TempPathFactory) ->
 
 def _said(summary: dict[str, Any], out: Path) -> str:
     """The first warning of a run, which its record has, too."""
-    assert summary["warnings"] == json.loads((out / "summary.json").read_text())["warnings"]
+    assert summary["warnings"] == summary_of(out)["warnings"]
     return str(summary["warnings"][0])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings
 from recon.sources.source import DerivedSource, StereoSource
 from tests.commands.test_capture import FakeCamera
+from tests.flow.runs import summary_of
 from tests.hostile.refusals import assert_refused, run
 from tests.scenery.film import Film
 from tests.scenery.patience import be_patient
@@ -88,7 +88,7 @@ def test_a_drive_that_is_kept_up_with_gives_the_same_map(
     street: Film, mapped: Path, patient: None, play: Play, tmp_path: Path
 ) -> None:
     """But for the poses, which rest on features alone."""
-    summary, usual = play(street), json.loads((mapped / "summary.json").read_text())
+    summary, usual = play(street), summary_of(mapped)
     assert summary["points"] == pytest.approx(usual["points"], rel=0.05)
     assert summary["odometry"] == "visual"
     found_m = read_tum(tmp_path / "live" / "trajectory_tum.txt").positions_m
@@ -96,7 +96,7 @@ def test_a_drive_that_is_kept_up_with_gives_the_same_map(
     assert summary["live"]["frames_arrived"] == 8
     assert summary["live"]["frames_dropped"] == summary["live"]["frames_not_matched"] == 0
     assert summary["live"]["latency_ms"]["p95"] > 0
-    assert json.loads((tmp_path / "live" / "summary.json").read_text()) == summary
+    assert summary_of(tmp_path / "live") == summary
 
 
 def test_a_machine_that_is_much_too_slow_has_poses_and_is_told_why_there_is_no_map(
@@ -174,7 +174,7 @@ def test_two_cameras_are_mapped(
     assert done.code == 0, done.err
     path = read_tum(out / "trajectory_tum.txt")
     # The first pair gives the image size, three more warm up.
-    frames = json.loads((out / "summary.json").read_text())["frames"]
+    frames = summary_of(out)["frames"]
     assert frames == len(path) == len(street_film) - 4
     truth = street_film.trajectory.positions_m
     length_m = np.linalg.norm(np.diff(truth[4:], axis=0), axis=1).sum()

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from recon.io.trajectory import read_tum
 from recon.street.settings import StreetScene
-from tests.flow.runs import all_files
+from tests.flow.runs import all_files, summary_of
 from tests.hostile.refusals import assert_refused, run
 from tests.scenery.film import RIG, Film, film
 from tests.scenery.kitti import write_kitti
@@ -37,10 +35,6 @@ def mapped(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         content[place] ^= 255
     (out.parent / "damaged.recon").write_bytes(content)
     return out
-
-
-def summary_of(folder: Path) -> dict[str, Any]:
-    return dict(json.loads((folder / "summary.json").read_text()))
 
 
 def test_a_run_leaves_path_states_summary_and_report_and_the_map_as_it_was(

@@ -17,7 +17,7 @@ from recon.core.values import SequenceTruth
 from recon.io.trajectory import read_tum
 from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import CORNER_M, StreetScene
-from tests.flow.runs import Breaks, content
+from tests.flow.runs import Breaks, content, summary_of
 from tests.scenery.film import Film, film
 
 pytestmark = pytest.mark.slow
@@ -74,7 +74,7 @@ def test_a_drive_around_a_block_closes_to_a_fifth_of_a_percent(closed: tuple[Pat
     assert after_m < 0.002 * truth.path_length_m
     # Odometry alone is as good after one lap, but it goes on to drift: what is left is far less.
     assert after_m < before_m / 3
-    figures = json.loads((folder / "summary.json").read_text())["loops"]
+    figures = summary_of(folder)["loops"]
     edges = json.loads((folder / "loops.json").read_text())
     assert figures["closed"] == len(edges["closed"]) >= 5
     assert figures["refused_by_graph"] == len(edges["refused"]) == 0

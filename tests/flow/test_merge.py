@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from functools import cache
 from pathlib import Path
@@ -11,9 +10,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from recon.cli import app
 from recon.commands.config import load_config
 from recon.commands.export import run_occupancy
 from recon.commands.map import run_map
@@ -24,8 +21,10 @@ from recon.io.trajectory import read_trajectory
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.map import Map
 from recon.map.sessions.measured import Survey
-from recon.sources.source import SourcePart, StereoSource
+from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
+from tests.flow.runs import all_files, summary_of
+from tests.hostile import refusals
 from tests.scenery.film import RIG, Film, film
 
 FIRST, FRAMES = 4, 11
@@ -42,18 +41,13 @@ def part(first: int, frames: int = FRAMES) -> SourcePart:
     return SourcePart(street(2, first + FRAMES), first, first + frames)
 
 
-def _map(source: StereoSource, out: Path) -> Path:
-    run_map(source, load_config(), MapOptions(out=out, mesh=False, audit=False))
-    return out
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs of two drives that overlap; a third one is elsewhere. They must not be changed."""
     folder = tmp_path_factory.mktemp("runs")
-    _map(part(0), folder / "first")
-    _map(part(FIRST), folder / "second")
-    _map(street(9, 5), folder / "elsewhere")
+    drives = {"first": part(0), "second": part(FIRST), "elsewhere": street(9, 5)}
+    for name, drive in drives.items():
+        run_map(drive, load_config(), MapOptions(out=folder / name, mesh=False, audit=False))
     return folder
 
 
@@ -68,14 +62,6 @@ def merged(runs: Path) -> Path:
 def run(runs: Path, tmp_path: Path) -> Path:
     """A run of the first drive that may be changed."""
     return Path(shutil.copytree(runs / "first", tmp_path / "run"))
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-def summary_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
 
 
 def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path) -> None:
@@ -119,16 +105,12 @@ def test_the_folder_of_a_merged_map_is_a_run_like_others(merged: Path, tmp_path:
         assert sum(len(tile.cloud) for tile in map_.tiles()) > 1000
 
 
-def test_maps_are_merged_in_python(runs: Path) -> None:
-    with Map.temporary() as other:
-        for name in ("first", "second"):
-            with Map.open(runs / name) as one:
-                other.merge(one)
-        assert [session.number for session in other.linked] == [0, 1]
-
-
 def test_a_drive_is_added_to_a_run_and_taken_out_again(run: Path, runs: Path) -> None:
     (run / "notes.txt").write_text("mine")
+    before = all_files(run.parent)
+    with pytest.raises(FormatError, match=r"^film 0 to 10: the map has this"):
+        run_map_into(run, part(0), None, OPTIONS)
+    assert all_files(run.parent) == before
     added = run_map_into(run, part(FIRST), None, OPTIONS)
     assert [drive["linked"] for drive in added["sessions"]] == [True, True]
     assert summary_of(run)["sessions"] == added["sessions"]
@@ -146,33 +128,26 @@ def test_a_drive_is_taken_out_of_a_map_that_began_with_chosen_frames(
     run = Path(shutil.copytree(merged, tmp_path / "run"))
     chosen = load_config(run / "config.yaml", [f"source.end={FRAMES}"]).model_dump(mode="json")
     (run / "config.yaml").write_text(yaml.safe_dump(chosen))
-    done = CliRunner().invoke(app, ["map", "--into", str(run), "--remove", "2", "--no-mesh"])
-    assert done.exit_code == 0, done.output
+    done = refusals.run("map", "--into", run, "--remove", "2", "--no-mesh")
+    assert done.code == 0, done.err
     assert [drive["number"] for drive in summary_of(run)["sessions"]] == [0, 1]
 
 
 @pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.merge.place_map"])
 def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) -> None:
-    before, short = content(run.parent), part(FIRST, frames=4)
+    before, short = all_files(run.parent), part(FIRST, frames=4)
     with patch(at, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
         run_map_into(run, short, None, OPTIONS)
-    assert content(run.parent) == before
+    assert all_files(run.parent) == before
     run_map_into(run, short, None, OPTIONS)  # and it can be tried again
     assert len(summary_of(run)["sessions"]) == 2
 
 
-def test_a_drive_that_the_run_has_already_is_named(run: Path) -> None:
-    before = content(run.parent)
-    with pytest.raises(FormatError, match=r"^film 0 to 10: the map has this"):
-        run_map_into(run, part(0), None, OPTIONS)
-    assert content(run.parent) == before
-
-
-def _refused(*arguments: object) -> str:
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert done.exit_code in (1, 2), done.output
-    assert "Traceback" not in done.output
-    return " ".join(done.output.replace("\u2502", " ").split())
+def _refused(*words: str | Path) -> str:
+    done = refusals.run(*words)
+    assert done.code in (1, 2), done.err
+    assert "Traceback" not in done.err
+    return " ".join(done.err.replace("\u2502", " ").split())
 
 
 @pytest.mark.parametrize(
@@ -182,11 +157,8 @@ def _refused(*arguments: object) -> str:
         ("first", "the same run twice"),
         ("copy", "has this drive already"),
         ("pair", "the run made no map"),
-        ("unfinished", "does not contain a finished run"),
         ("coarse", "voxels of different sizes"),
         ("newer", "newer version of recon"),
-        ("no map", "map.recon"),
-        ("damaged", "damaged/map/map.recon: a record of the map is damaged (got rays 0,0)"),
         ("odd", "odd/map/map.recon: content cannot be read (got KeyError: 'grain')"),
     ],
 )
@@ -194,15 +166,11 @@ def test_what_cannot_be_merged_is_one_line(
     runs: Path, tmp_path: Path, second: str, message: str
 ) -> None:
     other = runs / "first" if second == "first" else tmp_path / second
-    if second not in ("missing", "unfinished", "first"):
+    if second not in ("missing", "first"):
         shutil.copytree(runs / ("first" if second == "copy" else "second"), other)
     if second == "pair":
         (other / "run.json").write_text('{"command": "pair"}')
-    elif second == "unfinished":
-        (other / ".partial/.state").mkdir(parents=True)
-    elif second == "no map":
-        (other / "map/map.recon").unlink()
-    elif second in ("coarse", "newer", "damaged", "odd"):
+    elif second in ("coarse", "newer", "odd"):
         with Map.open(other, read_only=False) as map_:
             if second == "coarse":
                 info = map_.store.read("session", 0)
@@ -210,10 +178,8 @@ def test_what_cannot_be_merged_is_one_line(
                 map_.store.put("session", 0, info)
             elif second == "newer":
                 map_.store._database.execute("PRAGMA user_version = 99")
-            else:  # with a wrong checksum, and with one that is right
+            else:
                 map_.store.put("rays", (0, 0), {})
-            if second == "damaged":
-                map_.store._database.execute("UPDATE record SET checksum = 0 WHERE kind = 'rays'")
             map_.commit()
     told = _refused("merge", runs / "first", other, "--out", tmp_path / "out", "--no-mesh")
     assert message in told
@@ -223,22 +189,22 @@ def test_what_cannot_be_merged_is_one_line(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["merge", "RUN"], "nothing to merge"),
-        (["merge", "RUN", "OTHER", "--out", "OTHER"], "would replace the run"),
-        (["map", "x", "--into", "RUN", "--resume", "OTHER"], "--into changes RUN"),
-        (["map", "x", "--into", "RUN", "--out", "OTHER"], "--into changes RUN"),
-        (["map", "x", "--into", "RUN", "--remove", "0"], "maps no SOURCE"),
-        (["map", "--remove", "0"], "--into"),
-        (["map", "--into", "RUN", "--remove", "5"], "no such session"),
-        (["map", "--into", "RUN", "--remove", "0"], "only this session"),
-        (["map", "--into", "RUN", "--remove", "0", "--end", "3"], "no effect here"),
-        (["map", "x", "--into", "nowhere"], "does not contain a finished run"),
+        ("merge RUN", "nothing to merge"),
+        ("merge RUN OTHER --out OTHER", "would replace the run"),
+        ("map x --into RUN --resume OTHER", "--into changes RUN"),
+        ("map x --into RUN --out OTHER", "--into changes RUN"),
+        ("map x --into RUN --remove 0", "maps no SOURCE"),
+        ("map --remove 0", "--into"),
+        ("map --into RUN --remove 5", "no such session"),
+        ("map --into RUN --remove 0", "only this session"),
+        ("map --into RUN --remove 0 --end 3", "no effect here"),
+        ("map x --into nowhere", "does not contain a finished run"),
     ],
 )
 def test_options_that_say_nothing_together_are_one_line(
-    runs: Path, arguments: list[str], message: str
+    runs: Path, arguments: str, message: str
 ) -> None:
     places = {"RUN": str(runs / "first"), "OTHER": str(runs / "second")}
-    before = content(runs / "first")
-    assert message in _refused(*(places.get(part, part) for part in arguments))
-    assert content(runs / "first") == before
+    before = all_files(runs / "first")
+    assert message in _refused(*(places.get(part, part) for part in arguments.split()))
+    assert all_files(runs / "first") == before

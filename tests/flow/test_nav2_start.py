@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -32,6 +30,7 @@ from recon.street.settings import StreetScene
 from recon.street.shapes import Material, Paint, boxes, merge
 from recon.street.street import StreetWorld, rig
 from tests.flow.conftest import SMALL_STREET
+from tests.flow.runs import summary_of
 
 FOOTPRINT_M = 0.3
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -72,10 +71,6 @@ def _disc(centre: np.ndarray, radius_m: float) -> np.ndarray:
     return centre + xy[np.linalg.norm(xy, axis=1) <= radius_m]
 
 
-def _summary(run: Path) -> dict[str, Any]:
-    return json.loads((run / "summary.json").read_text())
-
-
 def _check_start(run: Path, least_free: float = 1.0) -> None:
     """The start and all trusted poses are free, with room for a robot around the start."""
     served, base = ServedMap(run), read_tum(run / "trajectory_map_base_tum.txt")
@@ -94,7 +89,7 @@ def test_a_remade_map_has_the_same_start(small_demo: Path, tmp_path: Path) -> No
     wider = run_settings(small_demo, None, ["grid.vehicle_width_m=1.8"])
     summary = run_occupancy(small_demo, wider, out=out)
     # Poses come from a file with 13 digits.
-    T_base_camera = _summary(small_demo)["T_base_camera"]
+    T_base_camera = summary_of(small_demo)["T_base_camera"]
     np.testing.assert_allclose(summary["T_base_camera"], T_base_camera, atol=1e-9)
     served = ServedMap(out)
     assert (served.at(_disc(np.zeros(2), 0.75)) == FREE).all()
@@ -105,7 +100,7 @@ def test_a_remade_map_has_the_same_start(small_demo: Path, tmp_path: Path) -> No
 
 def test_a_robot_starts_in_free_space_where_the_camera_stands_on_the_road(small_demo: Path) -> None:
     _check_start(small_demo)
-    summary = _summary(small_demo)
+    summary = summary_of(small_demo)
     # 1.65 m in the street's settings; the ground is measured to a few centimetres.
     assert summary["camera_height_m"] == pytest.approx(1.65, abs=0.06)
     T_base_camera = np.array(summary["T_base_camera"])
@@ -206,8 +201,8 @@ def _mapped(source: StereoSource, out: Path, poses: Trajectory | None = None) ->
 def test_a_carried_rig_frees_its_way_through_a_room(tmp_path: Path) -> None:
     source = RoomSource(CARRIED)
     run = _mapped(source, tmp_path / "run", source.trajectory)
-    assert _summary(run)["camera_height_m"] == pytest.approx(1.1, abs=0.05)
-    assert _summary(run)["warnings"] == []
+    assert summary_of(run)["camera_height_m"] == pytest.approx(1.1, abs=0.05)
+    assert summary_of(run)["warnings"] == []
     _check_start(run)
 
 
@@ -215,7 +210,7 @@ def test_a_carried_rig_frees_its_way_through_a_room(tmp_path: Path) -> None:
 def test_a_flown_rig_frees_nothing_below_it(tmp_path: Path) -> None:
     source = RoomSource(FLOWN)
     run = _mapped(source, tmp_path / "run", source.trajectory)
-    summary = _summary(run)
+    summary = summary_of(run)
     assert summary["camera_height_m"] is None
     assert "not carried at one height" in summary["warnings"][0]
     # Its base is the camera itself.
@@ -228,6 +223,6 @@ def test_a_flown_rig_frees_nothing_below_it(tmp_path: Path) -> None:
 def test_a_real_car_starts_in_free_space(recon_data: Path, tmp_path: Path) -> None:
     drive = open_kitti(recon_data / "driven" / "kitti_raw_0013")
     run = _mapped(drive, tmp_path / "run")
-    assert _summary(run)["camera_height_m"] == pytest.approx(1.65, abs=0.1)  # KITTI's setup paper
+    assert summary_of(run)["camera_height_m"] == pytest.approx(1.65, abs=0.1)  # KITTI's setup paper
     # Of what was seen to be occupied after the car was there, nothing is freed.
     _check_start(run, least_free=0.99)

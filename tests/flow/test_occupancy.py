@@ -25,15 +25,12 @@ from recon.io.models.octomap import read_octomap
 from recon.map.store.records import Store
 from recon.report.style import GRID_ERRORS, GRID_NOT_COUNTED
 from recon.stereo import frame
+from tests.flow.runs import summary_of
 from tests.hostile.refusals import assert_refused, run
 
 
 def _remake(run: Path, out: Path, *overrides: str) -> dict[str, Any]:
     return run_occupancy(run, run_settings(run, None, overrides), out=out)
-
-
-def _told(run: Path) -> dict[str, Any]:
-    return dict(json.loads((run / "summary.json").read_text()))
 
 
 @pytest.fixture
@@ -51,7 +48,7 @@ def test_the_same_settings_give_the_same_map_and_nothing_is_matched(
     for name in made:
         assert (tmp_path / "same" / name).read_bytes() == (small_demo / name).read_bytes()
     assert summary["frames"] == 12
-    assert summary["voxels"] == _told(small_demo)["voxels"] > 10_000
+    assert summary["voxels"] == summary_of(small_demo)["voxels"] > 10_000
 
 
 def test_another_height_band_changes_the_grid_alone(small_demo: Path, tmp_path: Path) -> None:
@@ -85,7 +82,7 @@ def test_another_resolution_is_right_too(
 
 def test_a_shorter_range_knows_less(small_demo: Path, tmp_path: Path) -> None:
     near = _remake(small_demo, tmp_path / "near", "occupancy.max_range_m=12")
-    assert near["voxels"] < _told(small_demo)["voxels"] / 2
+    assert near["voxels"] < summary_of(small_demo)["voxels"] / 2
 
 
 @pytest.mark.parametrize(
@@ -121,13 +118,13 @@ def test_the_command_prints_json_and_says_what_is_wrong(small_demo: Path, tmp_pa
     command = ("occupancy", small_demo, "--out", out)
     good = run(*command, "--json", "--resolution", "0.5", "--min-height", "0.5")
     assert good.code == 0, good.err
-    assert json.loads(good.out) == _told(out)
+    assert json.loads(good.out) == summary_of(out)
     record = json.loads((out / "run.json").read_text())
     assert (record["command"], record["mapped_by"]) == ("occupancy", "demo")
     files = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert set(record["files"]) == files
     assert_refused(run(*command, "--resolution", "0.01"))
-    assert _told(out)["resolution_m"] == 0.5  # the earlier result stays
+    assert summary_of(out)["resolution_m"] == 0.5  # the earlier result stays
 
 
 def test_the_files_of_a_run_give_its_own_figures_and_a_drawing_of_what_is_wrong(
@@ -138,7 +135,7 @@ def test_the_files_of_a_run_give_its_own_figures_and_a_drawing_of_what_is_wrong(
     assert done.code == 0, done.err
     printed = json.loads(done.out)
     assert printed.pop("warnings") == []
-    assert printed == _told(small_demo)["occupancy"]
+    assert printed == summary_of(small_demo)["occupancy"]
     assert 0 < printed["voxels"]["precision"] < 1
     few, many = (run_evaluate_occupancy(small_demo, least).metrics for least in (1, 6))
     assert few.voxels.true_voxels > many.voxels.true_voxels > 0

@@ -17,6 +17,7 @@ from recon.commands.paper import headline, run_paper
 from recon.io.images.disparity import read_pfm
 from recon.io.models.ply import read_ply
 from recon.report import paper_page
+from tests.flow.runs import summary_of
 from tests.hostile import refusals
 from tests.scenery.middlebury import CAMERA, write_scene
 from tests.scenery.planes import slanted_pair, step_pair
@@ -100,7 +101,7 @@ def test_its_configuration_gives_the_same_figures(
     scenes: Path, run: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     printed = run[1]["experiments"]
-    assert json.loads((run[0] / "summary.json").read_text())["experiments"] == printed
+    assert summary_of(run[0])["experiments"] == printed
     config = load_config(run[0] / "config.yaml", ["paper.as_printed=false"])
     again = run_paper(scenes, config, out=tmp_path / "again", threads=1)
     assert next(iter(headline(again))) == "2 ArtL, corrected"
