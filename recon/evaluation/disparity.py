@@ -177,16 +177,12 @@ def measure_reliability(
     Ref: C. Guo et al., "On calibration of modern neural networks", ICML 2017, section 2.
     """
     both, error_px = _pixels(estimate, truth)
-    confidence = estimate.confidence[both]
-    right = error_px <= limit_px
+    confidence, right = estimate.confidence[both], error_px <= limit_px
     place = np.minimum((confidence.astype(np.float64) * _BINS).astype(np.int64), _BINS - 1)
     pixels = np.bincount(place, minlength=_BINS).astype(np.float64)
     with np.errstate(invalid="ignore"):
-        return Reliability(
-            confidence=np.bincount(place, weights=confidence, minlength=_BINS) / pixels,
-            right=np.bincount(place, weights=right, minlength=_BINS) / pixels,
-            pixels=pixels,
-        )
+        mean, share = (np.bincount(place, x, _BINS) / pixels for x in (confidence, right))
+    return Reliability(mean, share, pixels)
 
 
 def measure_sparsification(
@@ -201,24 +197,17 @@ def measure_sparsification(
     wrong = (error_px > limit_px).astype(np.float64)
     removed = np.arange(_STEPS) / _STEPS
     kept = np.maximum(np.ceil((1 - removed) * wrong.size).astype(np.int64), 1)
-    return Sparsification(
-        removed=removed,
-        wrong=np.cumsum(_shared_by_equals(estimate.confidence[both], wrong))[kept - 1] / kept,
-        best=np.cumsum(np.sort(wrong))[kept - 1] / kept,
-    )
+    sure = -estimate.confidence[both]
+    _, group, size = np.unique(sure, return_inverse=True, return_counts=True)
+    shared = np.repeat(np.bincount(group, weights=wrong) / size, size)
+    by_confidence, best = (np.cumsum(each)[kept - 1] / kept for each in (shared, np.sort(wrong)))
+    return Sparsification(removed, by_confidence, best)
 
 
 def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
     """Return the share of the pixels, in [0, 1], whose error is within some standard deviations."""
     both, error_px = _pixels(estimate, truth)
     return float(np.mean(error_px < sigmas * estimate.sigma_px[both]))
-
-
-def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
-    """Return wrong pixels in order of decreasing confidence, averaged over equal confidences."""
-    _, group, size = np.unique(-confidence, return_inverse=True, return_counts=True)
-    share = np.bincount(group, weights=wrong) / size
-    return np.asarray(np.repeat(share, size), dtype=np.float64)
 
 
 def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Bool, Float64]:

@@ -15,6 +15,7 @@ from recon.stereo.cloud import open3d_clouds
 
 _BAND_PERCENT: Final = (0.1, 99.9)
 _BAND_M: Final = 0.2
+_ITERATIONS, _NORMAL_NEIGHBOURS, _CONVERGED = 60, 20, 1e-7  # of ICP
 
 
 def evaluate_map(
@@ -87,8 +88,6 @@ def register_cloud(
 
 def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
     """Return float32 (N,), the distance of each point to the nearest of the reference, metres."""
-    if len(reference_xyz) == 0:
-        raise EvaluationError("the reference cloud is empty")
     return open3d_clouds.nearest(xyz, reference_xyz)[1][:, 0]
 
 
@@ -110,13 +109,7 @@ def _check(cloud: PointCloud, reference: PointCloud, threshold_m: float) -> None
 
 
 def _thinned(cloud: PointCloud, voxel_m: float) -> Float32:
-    """Return float32 (M, 3), the mean point of each voxel."""
     return open3d_clouds.voxel_downsample(cloud.xyz, np.zeros((len(cloud), 0)), voxel_m)[0]
-
-
-_ITERATIONS = 60
-_NORMAL_NEIGHBOURS = 20
-_CONVERGED = 1e-7
 
 
 def icp(

@@ -22,6 +22,9 @@ from recon.places.places import drift_at_end, fit_to_path
 
 # On a shorter path, relative errors would be dominated by the noise of the ground truth.
 MIN_PATH_M: Final = 1.0
+_STRAIGHT: Final = 0.05  # largest width of a straight path, as share of its length (both rms)
+# The positions fix the roll to about their error over the width of the path, in radians.
+_FIXED_RAD: Final = float(np.radians(0.5))
 
 
 class TrajectoryRules(Settings):
@@ -47,22 +50,27 @@ class TrajectoryComparison:
     estimate: Trajectory  # aligned
     truth: Trajectory
     segments: Segments  # of the relative errors
+    position_errors_m: Float64  # (F,), distance of each position from the true one
     segment_percent: Float64  # (N,), translation error of each segment, per cent of its length
     segment_deg_per_100m: Float64  # (N,), rotation error of each segment
     metrics: TrajectoryMetrics
     motion: Similarity  # what aligned the estimate
 
     @property
-    def position_errors_m(self) -> Float64:
-        """float64 (N,): distance of each position from the true one."""
-        away = self.estimate.positions_m - self.truth.positions_m
-        return np.asarray(np.linalg.norm(away, axis=1))
-
-    @property
     def roll_axis(self) -> Float64 | None:
-        """`open_roll_axis`; None if the positions are not what was aligned, too."""
-        by_positions = self.metrics.alignment in ("se3", "sim3")
-        return open_roll_axis(self.estimate, self.truth) if by_positions else None
+        """Direction of a straight path, about which the alignment of positions leaves it open.
+
+        float64 (3,), world axes of ``truth``; None if the alignment fixes every rotation.
+        """
+        if self.metrics.alignment not in ("se3", "sim3"):
+            return None
+        true_m = self.truth.positions_m
+        centred = true_m - true_m.mean(axis=0)
+        along = np.linalg.svd(centred, full_matrices=False)[2][0]
+        length_m, width_m = _extent(centred @ along), _extent(_across(centred, along))
+        away_m = _extent(_across(self.estimate.positions_m - true_m, along))
+        fixed = away_m < _FIXED_RAD * width_m
+        return None if fixed or width_m > _STRAIGHT * length_m else np.asarray(along)
 
     @property
     def rotation_errors_rad(self) -> Float64:
@@ -152,7 +160,9 @@ def compare_paths(
             for m, of in ((m, segments.length_m == m) for m in lengths_m)
         ),
     )
-    return TrajectoryComparison(estimate, truth, segments, percent, degrees, metrics, motion)
+    return TrajectoryComparison(
+        estimate, truth, segments, away_m, percent, degrees, metrics, motion
+    )
 
 
 def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity:
@@ -193,11 +203,9 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
         got, expected = counted(len(truth), "pose"), f"{least} or more"
         raise EvaluationError("too few poses to compare", got=got, expected=expected)
     if truth.path_length_m < MIN_PATH_M:
-        raise EvaluationError(
-            "true path is too short for errors relative to its length",
-            got=f"{truth.path_length_m:.2f} m",
-            expected=f"{MIN_PATH_M:g} m or more",
-        )
+        what = "true path is too short for errors relative to its length"
+        got, expected = f"{truth.path_length_m:.2f} m", f"{MIN_PATH_M:g} m or more"
+        raise EvaluationError(what, got=got, expected=expected)
     drift_m = min(drift_at_end(estimate), drift_at_end(truth))
     fit = fit_to_path(estimate.positions_m, truth.positions_m, drift_m)
     if fit.other_unit and rules.alignment != "sim3":
@@ -206,25 +214,6 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
             got=f"{fit.scale:.4g} times as large, {fit.scaled_m:.3g} m apart if that is undone",
             hint="both are in metres; sim3 compares an estimate whose scale is unknown",
         )
-
-
-_STRAIGHT: Final = 0.05  # largest width of a straight path, as share of its length (both rms)
-# The positions fix the roll to about their error over the width of the path, in radians.
-_FIXED_RAD: Final = float(np.radians(0.5))
-
-
-def open_roll_axis(estimate: Trajectory, truth: Trajectory) -> Float64 | None:
-    """Return the direction of a straight path, about which aligned positions leave the roll open.
-
-    float64 (3,), world axes of ``truth``; None if the positions fix every rotation.
-    """
-    centred = truth.positions_m - truth.positions_m.mean(axis=0)
-    _, _, directions = np.linalg.svd(centred, full_matrices=False)
-    along = directions[0]
-    length_m, width_m = _extent(centred @ along), _extent(_across(centred, along))
-    away_m = _extent(_across(estimate.positions_m - truth.positions_m, along))
-    fixed = away_m < _FIXED_RAD * width_m
-    return None if fixed or width_m > _STRAIGHT * length_m else np.asarray(along)
 
 
 def without_roll(estimate: Trajectory, truth: Trajectory, axis: Float64) -> Trajectory:

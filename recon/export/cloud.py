@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
@@ -17,8 +16,7 @@ from recon.map.tiles import Tiles
 
 SAMPLE_POINTS: Final = 300_000  # points of the fused cloud that are kept for display
 _GROWTH: Final = 1.25
-_MUCH: Final = 0.02
-"""Share of the points that can be left out without a word; a busy street has less."""
+_MUCH: Final = 0.02  # share of the points left out without a word; a busy street has less
 
 
 def cloud_product(order: Order) -> Made:
@@ -91,10 +89,7 @@ class CloudSample:
         return thinned
 
     def _thinned(self, cloud: PointCloud) -> PointCloud:
-        return cloud if self._cell_m is None else cloud.select(_first_of_cells(cloud, self._cell_m))
-
-
-def _first_of_cells(cloud: PointCloud, cell_m: float) -> NDArray[np.intp]:
-    """Return indices of the first point in each cell, in order."""
-    keys = voxels.pack_keys(np.floor(cloud.xyz / cell_m).astype(np.int64))
-    return np.sort(np.unique(keys, return_index=True)[1])
+        if self._cell_m is None:
+            return cloud
+        keys = voxels.pack_keys(np.floor(cloud.xyz / self._cell_m).astype(np.int64))
+        return cloud.select(np.sort(np.unique(keys, return_index=True)[1]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from recon.core.errors import MeshingError, SettingsError
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
@@ -16,6 +16,7 @@ from recon.export.survey import survey_product
 from recon.map.sessions.placed import has_occupancy
 from recon.map.store.finished import check_rays
 
+# In the order in which they are made.
 PRODUCTS: Final[Mapping[str, Product]] = {
     "cloud": Product(cloud_product),
     "octomap": Product(octomap_product, needs_occupancy=True),
@@ -24,9 +25,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "las": Product(survey_product("las")),
     "laz": Product(survey_product("laz")),
 }
-"""In the order in which they are made."""
-USUAL: Final = ("cloud", "octomap", "grid", "mesh")
-"""What is made of a map unless something else is asked for."""
+USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")
 
 
@@ -45,20 +44,17 @@ class Products:
     @property
     def cloud(self) -> PointCloud:
         """Even sample of the fused cloud, all points of a small one; frame ``map``."""
-        found: PointCloud = self.made["cloud"].value
-        return found
+        return cast("PointCloud", self.made["cloud"].value)
 
     @property
     def grid(self) -> OccupancyGrid:
         """The flat grid."""
-        found: OccupancyGrid = self.made["grid"].value
-        return found
+        return cast("OccupancyGrid", self.made["grid"].value)
 
     @property
     def camera_height_m(self) -> float | None:
         """Height of the camera above the ground; None = unknown, or not steady."""
-        found: float | None = self.made["grid"].figures["camera_height_m"]
-        return found
+        return cast("float | None", self.made["grid"].figures["camera_height_m"])
 
     @property
     def mesh(self) -> TriangleMesh | None:
@@ -96,14 +92,11 @@ def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:
     possible = OF_A_PAIR if pair else (*PRODUCTS,)
     for product in products:
         if product not in possible:
-            unknown = product not in PRODUCTS
-            raise SettingsError(
-                "unknown product" if unknown else "a pair has no such product",
-                where="--to",
-                got=product,
-                expected=", ".join(possible),
-                hint=None if unknown else "recon map makes it of a drive",
-            )
+            what, hint = "unknown product", None
+            if product in PRODUCTS:
+                what, hint = "a pair has no such product", "recon map makes it of a drive"
+            expected = ", ".join(possible)
+            raise SettingsError(what, where="--to", got=product, expected=expected, hint=hint)
     return list(dict.fromkeys(products)) or (OF_A_PAIR if pair else USUAL)
 
 

@@ -33,14 +33,12 @@ from recon.map.occupancy.builder import MIN_PROBABILITY
 from recon.map.occupancy.part import OccupancyPart, free_part
 from recon.map.sessions.placed import PlacedMap
 
+# A city of 6 by 6 km at 0.2 m; each is a byte of memory and of the file.
 _MOST_CELLS: Final = 1_000_000_000
-"""A city of 6 by 6 km at 0.2 m; each is a byte of memory and of the file."""
+# Share of the ground that must lie below the height band: else parts of it become obstacles.
 _GROUND_SHARE: Final = 0.95
-"""Share of the ground that must lie below the height band: else parts of it become obstacles."""
+# Least distance from the path to the edge of the grid: a footprint must fit in at the start.
 _MARGIN_M: Final = 5.0
-"""Least distance from the path to the edge of the grid: a footprint must fit in at the start."""
-
-
 WrittenGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
 
 
@@ -87,14 +85,14 @@ class _Flattening:
         low, high = self._extent()
         shape = (high[1] - low[1], high[0] - low[0])
         if math.prod(shape) > _MOST_CELLS:
-            raise MappingError(
-                "the grid would be too large",
-                got=f"{shape[1]} x {shape[0]} cells",
-                expected=f"at most {_MOST_CELLS:g} cells",
-                hint="a pose or a point may be far off; or set a coarser occupancy.resolution_m",
-            )
+            got, expected = f"{shape[1]} x {shape[0]} cells", f"at most {_MOST_CELLS:g} cells"
+            hint = "a pose or a point may be far off; or set a coarser occupancy.resolution_m"
+            raise MappingError("the grid would be too large", got=got, expected=expected, hint=hint)
         cells = np.full(shape, UNKNOWN, np.int8)
-        path = self._driven_path() if driven else None
+        path = None
+        if driven and self._config.grid.vehicle_width_m > 0:
+            submap, step_m = self._tiles.submap_of_frame, self._resolution_m / 2
+            path = DrivenPath.through(self._path_m, self._trusted, submap, step_m)
         keys = [tile.key for tile in self._tiles]
         for key in dict.fromkeys((*keys, *self._crossed(_MARGIN_M))):
             part = self._flat(key, settings, path)
@@ -104,11 +102,15 @@ class _Flattening:
         origin_m = (low[0] * self._resolution_m, low[1] * self._resolution_m)
         grid = OccupancyGrid(cells, self._resolution_m, origin_m)
         height_m = settings.camera_height_m
-        warnings = (*_warnings(height_m, driven), *self._band_warnings())
-        return grid, height_m if driven else None, warnings
+        return grid, height_m if driven else None, tuple(self._warnings(height_m, driven))
 
-    def _band_warnings(self) -> Iterator[str]:
-        """Yield what is wrong with a height band that is too low or too thin for the cells."""
+    def _warnings(self, camera_height_m: float | None, driven: bool) -> Iterator[str]:
+        """Yield what a user should know, such as a height band too low or thin for the cells."""
+        if camera_height_m is None and not driven:
+            yield "no ground was found below the path, so every cell of the grid is unknown"
+        elif not driven:
+            text = "the camera was not carried at one height above the ground: the grid has only "
+            yield text + "what was seen, and the base of the trajectory in the map is the camera"
         settings, cell_m = self._config.grid, self._resolution_m
         depths_m = np.concatenate(self._ground_depths)
         if len(depths_m):
@@ -162,8 +164,7 @@ class _Flattening:
     ) -> dict[int, OccupancyPart]:
         """Return the space that the vehicle took up in a tile and its margin, by submap."""
         path = path.select(self._tiles.bounds(key).wider(_MARGIN_M).contains(path.points_m))
-        width_m = self._config.grid.vehicle_width_m
-        free = log_odds(MIN_PROBABILITY)
+        width_m, free = self._config.grid.vehicle_width_m, log_odds(MIN_PROBABILITY)
         passed = {}
         for submap in np.unique(path.submap).tolist():
             points_m = path.points_m[path.submap == submap]
@@ -171,45 +172,28 @@ class _Flattening:
             passed[submap] = free_part(keys, free)
         return passed
 
-    def _driven_path(self) -> DrivenPath | None:
-        """Return the path, if the vehicle has a width."""
-        if self._config.grid.vehicle_width_m == 0:
-            return None
-        submap, step_m = self._tiles.submap_of_frame, self._resolution_m / 2
-        return DrivenPath.through(self._path_m, self._trusted, submap, step_m)
-
     def _crossed(self, margin_m: float) -> list[TileKey]:
         """Return the tiles that the path touches, or comes near to at one of its poses."""
         corners = [np.array(side) * margin_m for side in product((-1, 1), repeat=2)]
         path_m = self._path_m[np.isfinite(self._path_m[:, 0]), :2]
         near = np.concatenate([path_m + corner for corner in corners])
-        return [
-            (x, y) for x, y in np.unique((near // self._tiles.edge_m).astype(int), axis=0).tolist()
-        ]
+        keys = np.unique((near // self._tiles.edge_m).astype(int), axis=0)
+        return [(x, y) for x, y in keys.tolist()]
 
     def _along_the_path(self) -> tuple[GroundSettings, bool]:
         """Return the settings with one camera height for the drive, and whether it is driven."""
-        settings, heights, drops = self._config.ground, [], [np.zeros(0)]
+        settings, known, drops = self._config.ground, [], [np.zeros(0)]
         for key in self._crossed(0.0):
             area = self._tiles.bounds(key)
             cloud, path_m = self._ground_points(area), area.path(self._path_m)
             height, along = measure_camera_height(cloud, path_m, settings)
-            heights.append(height)
             drops.append(along)
-        known = [height for height in heights if math.isfinite(height)]
+            if math.isfinite(height):
+                known.append(height)
         if settings.camera_height_m is None and known:
             settings = settings.model_copy(update={"camera_height_m": float(np.median(known))})
         found = settings.camera_height_m or math.nan
         return settings, is_driven(np.concatenate(drops), found)
-
-
-def _warnings(camera_height_m: float | None, driven: bool) -> tuple[str, ...]:
-    if driven:
-        return ()
-    if camera_height_m is None:
-        return ("no ground was found below the path, so every cell of the grid is unknown",)
-    text = "the camera was not carried at one height above the ground: the grid has only what "
-    return (text + "was seen, and the base of the trajectory in the map is the camera",)
 
 
 def _paste(

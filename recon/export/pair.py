@@ -9,7 +9,7 @@ from typing import Any
 
 from recon.core.errors import MeshingError
 from recon.core.geometry.projection import depth_from_disparity
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair, TriangleMesh
+from recon.core.values import Disparity, RectifiedCamera, TriangleMesh
 from recon.core.values.cloud import Frame
 from recon.export.mesh.pieces import LAYER, WHOLE, in_other_formats
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
@@ -62,18 +62,14 @@ def write_cloud_files(
     """Write depth, cloud and mesh (PLY and ``formats``), and a project with the left image."""
     depth_m = depth_from_disparity(frame.disparity.values, frame.pair.camera)
     write_pfm(run.path("disparity/depth.pfm"), depth_m)
-    write_ply(run.path("clouds/cloud.ply"), frame.cloud)
+    write_ply(run.path(PAIR_CLOUD), frame.cloud)
     if mesh is not None:
         for suffix in dict.fromkeys(("ply", *formats)):
             write_mesh(run.path(f"mesh/mesh.{suffix}"), mesh, "camera")
-        _write_project(frame.pair, run)
-
-
-def _write_project(pair: RectifiedPair, run: RunDirectory) -> None:
-    path = run.path
-    layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("clouds/cloud.ply")}
-    write_image(path("mesh/left.png"), pair.colours)
-    write_mlp(path("mesh/mesh.mlp"), layers, "camera", Photo(path("mesh/left.png"), pair.camera))
+        layers, left = {"mesh": run.path(WHOLE), "cloud": run.path(PAIR_CLOUD)}, "mesh/left.png"
+        write_image(run.path(left), frame.pair.colours)
+        photo = Photo(run.path(left), frame.pair.camera)
+        write_mlp(run.path("mesh/mesh.mlp"), layers, "camera", photo)
 
 
 def mesh_cloud(
@@ -103,14 +99,6 @@ def mesh_cloud(
     return {**figures, "mesh_coverage": coverage, "warnings": list(check_coverage(coverage))}
 
 
-def copy_file(file: Path, target: Path) -> None:
-    """Copy a file, atomically."""
-    with reading(file):
-        file.stat()
-    with atomic_path(target) as temporary:
-        copyfile(file, temporary)
-
-
 def export_pair(
     source: Path, settings: MeshSettings, products: Sequence[str], run: Run, formats: Sequence[str]
 ) -> dict[str, Any]:
@@ -118,7 +106,10 @@ def export_pair(
     cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
     figures: dict[str, Any] = {"run": str(source), "warnings": []}
     if "cloud" in products:
-        copy_file(cloud, run.path(PAIR_CLOUD))
+        with reading(cloud):
+            cloud.stat()
+        with atomic_path(run.path(PAIR_CLOUD)) as temporary:
+            copyfile(cloud, temporary)
     if "mesh" in products:
         figures |= mesh_cloud(cloud, camera, settings, run, formats)
     return finish_cloud_run(source, cloud, run, figures)

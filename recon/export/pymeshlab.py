@@ -29,10 +29,8 @@ _POINTS, _SURFACE = "points.npz", "surface.npz"
 def screened_poisson(
     xyz: NDArray[Any],
     normals: NDArray[Any],
-    *,
     depth: int,
     scale: float,
-    samples_per_node: float,
     point_weight: float,
 ) -> tuple[Float32, Int32, Float32]:
     """Return the closed surface through points (N, 3) with outward unit normals, all finite.
@@ -42,7 +40,6 @@ def screened_poisson(
         normals: Of the points.
         depth: Depth of the octree: its edge has 2^depth cells.
         scale: Edge of the octree, as a multiple of the longest side of the cloud.
-        samples_per_node: Minimum number of points per octree cell; larger for noisy points.
         point_weight: Weight of interpolating the points relative to fitting the normals.
 
     Returns:
@@ -55,7 +52,7 @@ def screened_poisson(
     options = {
         "depth": depth,
         "scale": scale,
-        "samplespernode": samples_per_node,
+        "samplespernode": 1.5,  # points that an octree cell should hold: more for noisy ones
         "pointweight": point_weight,
         # More threads make the result non-deterministic, and busy-wait: on a loaded machine, two
         # took twenty times as long as one.
@@ -66,14 +63,10 @@ def screened_poisson(
         np.savez(Path(folder) / _POINTS, xyz=xyz, normals=normals)
         _run_child(folder, options)
         with np.load(Path(folder) / _SURFACE) as surface:
-            vertices, faces = surface["vertices"], surface["faces"]
-            density = surface["density"]
+            vertices, faces, density = (surface[x] for x in ("vertices", "faces", "density"))
     if len(faces) == 0:
-        raise MeshingError(
-            "Poisson reconstruction found no surface",
-            got=counted(len(xyz), "point"),
-            hint="check that the normals point out of the surface",
-        )
+        got, hint = counted(len(xyz), "point"), "check that the normals point out of the surface"
+        raise MeshingError("Poisson reconstruction found no surface", got=got, hint=hint)
     return vertices, faces, density
 
 
@@ -92,11 +85,9 @@ def _run_child(folder: str, options: dict[str, Any]) -> None:
     )
     if child.returncode:
         lines = child.stderr.strip().splitlines()
-        raise MeshingError(
-            "Poisson reconstruction failed in MeshLab",
-            got=lines[-1] if lines else f"exit code {child.returncode}",
-            hint="try a smaller depth" if child.returncode < 0 else None,
-        )
+        got = lines[-1] if lines else f"exit code {child.returncode}"
+        hint = "try a smaller depth" if child.returncode < 0 else None
+        raise MeshingError("Poisson reconstruction failed in MeshLab", got=got, hint=hint)
 
 
 def _reconstruct(folder: Path, options: dict[str, Any]) -> None:

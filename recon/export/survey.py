@@ -67,10 +67,9 @@ def survey_product(suffix: str) -> Callable[[Order], Made]:
     """Return what writes ``map/cloud.las`` or ``.laz``, perhaps in survey coordinates."""
 
     def write(order: Order) -> Made:
-        survey, T_file_map = order.survey, np.eye(4)
+        survey = order.survey
         placed = None if survey is None else georeference(order.map, survey)
-        if placed is not None:
-            T_file_map = placed.T_survey_map
+        T_file_map = np.eye(4) if placed is None else placed.T_survey_map
         clouds = (tile.cloud for tile in order.placed.tiles)
         path, crs = order.run.path(f"map/cloud.{suffix}"), None if survey is None else survey.crs
         points = write_las(path, clouds, T_file_map, crs)

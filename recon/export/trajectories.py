@@ -82,17 +82,13 @@ def _of_base(path: Trajectory, T_map_world: Float64, camera_height_m: float | No
 
 
 def _line(frame: LocalizedFrame) -> str:
-    found = frame.located
+    found, numbers = frame.located, [""] * _UNKNOWN
     words = [str(frame.index), f"{frame.time_s:.9f}", found.state.value]
     words += [str(found.views), str(found.inliers), str(int(found.surfaces))]
     words.append(f"{frame.seconds:.4f}")
-    if found.T_world_camera is None or found.covariance is None:
-        return ",".join([*words, *[""] * _UNKNOWN])
-    return ",".join([*words, *_numbers(found.T_world_camera, found.covariance)])
-
-
-def _numbers(T_world_camera: Float64, covariance: Float64) -> list[str]:
-    """Return pose, standard deviations and the upper half of the covariance, row by row."""
-    pose = [*T_world_camera[:3, 3], *quaternion_from_rotation(T_world_camera[:3, :3])]
-    spread = [*np.sqrt(np.diag(covariance)), *(covariance[i, j] for i, j in _ENTRIES)]
-    return [*(f"{value:.9f}" for value in pose), *(f"{value:.6e}" for value in spread)]
+    T, covariance = found.T_world_camera, found.covariance
+    if T is not None and covariance is not None:
+        pose = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
+        spread = [*np.sqrt(np.diag(covariance)), *(covariance[i, j] for i, j in _ENTRIES)]
+        numbers = [*(f"{value:.9f}" for value in pose), *(f"{value:.6e}" for value in spread)]
+    return ",".join([*words, *numbers])

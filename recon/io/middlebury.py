@@ -126,10 +126,8 @@ def find_layout(folder: Path) -> Layout | None:
     """Return the layout that matches the files of a folder, or None; one of the images suffices."""
 
     def with_image(*layouts: Layout) -> Layout | None:
-        there = (
-            one for one in layouts if any(find_image(folder, s) for s in (one.left, one.right))
-        )
-        return next(there, None)
+        images = ((one, stem) for one in layouts for stem in (one.left, one.right))
+        return next((one for one, stem in images if find_image(folder, stem)), None)
 
     if (folder / "disp0GT.pfm").is_file():
         return with_image(_EVAL3)
@@ -153,18 +151,16 @@ def scene_root(folder: Path) -> Path:
 
 
 def _read_pair(path: Path, layout: Layout) -> StereoPair:
-    left, right = (_read_image(path, stem) for stem in (layout.left, layout.right))
+    images = []
+    for stem in (layout.left, layout.right):
+        if (file := find_image(path, stem)) is None:
+            raise FormatError("image is missing", where=path, expected=f"{stem}.png")
+        images.append(read_image(file))
+    left, right = images
     if left.shape != right.shape:
         got = f"{layout.left} {size_text(left)}, {layout.right} {size_text(right)}"
         raise FormatError("left and right images differ in size", where=path, got=got)
     return StereoPair(left, right, name=path.name)
-
-
-def _read_image(path: Path, stem: str) -> UInt8:
-    file = find_image(path, stem)
-    if file is None:
-        raise FormatError("image is missing", where=path, expected=f"{stem}.png")
-    return read_image(file)
 
 
 class Units(NamedTuple):
@@ -249,12 +245,8 @@ def nominal_camera_2005(
 ) -> RectifiedCamera:
     """Return the camera of 2005 or 2006; disparities are ``dmin_px`` full-size pixels too small."""
     camera = stand_in_camera(width_px, height_px)
-    return replace(
-        camera,
-        focal_px=_2005_FOCAL_PX / factor,
-        cx_right_px=camera.cx_px + dmin_px / factor,
-        baseline_m=_2005_BASELINE_M,
-    )
+    focal_px, cx_right_px = _2005_FOCAL_PX / factor, camera.cx_px + dmin_px / factor
+    return replace(camera, focal_px=focal_px, cx_right_px=cx_right_px, baseline_m=_2005_BASELINE_M)
 
 
 def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:

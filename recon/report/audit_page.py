@@ -77,10 +77,8 @@ def frames_figure(looks: Sequence[Look]) -> bytes:
     labels = ("mean grey level", "sharpness (0 to 1)", "row error (px)\nmedian, middle half")
     figure, (brightness, sharpness, rows) = style.stacked(6.4, "frame", labels)
     frames = [look.index for look in looks]
-    for axes, measured in (
-        (brightness, [look.brightness_dn for look in looks]),
-        (sharpness, [look.sharpness for look in looks]),
-    ):
+    grey, sharp = [look.brightness_dn for look in looks], [look.sharpness for look in looks]
+    for axes, measured in ((brightness, grey), (sharpness, sharp)):
         axes.plot(frames, measured, "o-", linewidth=1.3, label=("left", "right"))
         axes.legend(ncols=2)
     brightness.set_ylim(0, 255)
@@ -162,11 +160,8 @@ def _frames(summary: Mapping[str, Any]) -> str:
     frozen = max(summary["frozen_left_frames"], summary["frozen_right_frames"])
     step_s = summary["usual_step_s"]
     rate = "" if step_s is None else f" at {1 / step_s:.3g} Hz, {counted(summary['gaps'], 'gap')}"
-    return (
-        f"{summary['frames']}{rate}; {summary['frames_read']} examined, "
-        f"{summary['repeated_frames']} repeated"
-        + (f", one camera frozen for {frozen}" if frozen else "")
-    )
+    text = "{frames}" + rate + "; {frames_read} examined, {repeated_frames} repeated"
+    return text.format_map(summary) + (f", one camera frozen for {frozen}" if frozen else "")
 
 
 def _time(summary: Mapping[str, Any]) -> str:
@@ -185,7 +180,6 @@ def _rig(summary: Mapping[str, Any]) -> str:
 
 
 def _length(metres: float) -> str:
-    """Return a length in a readable unit."""
     for unit, factor, under in (("mm", 1000.0, 0.01), ("cm", 100.0, 1.0)):
         if metres < under:
             return f"{metres * factor:.2g} {unit}"

@@ -52,16 +52,11 @@ def _table(command: str, results: Sequence[JobResult]) -> Table:
     columns = [name for name in _COLUMNS if any(name in one.figures for one in jobs)]
     rows = []
     for one in jobs:
-        facts, figures = one.facts, (one.figures.get(name) for name in columns)
+        facts, figures = one.facts, (one.figures.get(name, NOT_KNOWN) for name in columns)
+        cells = (f"{x:.4g}" if isinstance(x, float) else str(x) for x in figures)
         shown = (facts["state"], str(facts["tries"]), f"{one.seconds:.1f}")
-        rows.append((one.job.name, one.last.error or one.remark, *shown, *map(_cell, figures)))
+        rows.append((one.job.name, one.last.error or one.remark, *shown, *cells))
     return Table(command, ("job", "remark", "state", "tries", "seconds", *columns), rows)
-
-
-def _cell(value: float | None) -> str:
-    if value is None:
-        return NOT_KNOWN
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def batch_csv(results: Sequence[JobResult]) -> str:

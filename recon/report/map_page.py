@@ -21,19 +21,8 @@ from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
+from recon.report import drive_figures as figures
 from recon.report import style
-from recon.report.drive_figures import (
-    ESTIMATE_LINE,
-    TRUTH_LINE,
-    drift_figure,
-    errors_along,
-    grid_figure,
-    health_figure,
-    loops_figure,
-    path_figure,
-    seen_from_above,
-    top_view,
-)
 from recon.report.page import write_page
 from recon.report.pair_page import stereo_figures
 from recon.report.scene import Json, Scene, plot_scene
@@ -68,10 +57,10 @@ def map_content(
         "health": health,
         "metrics": errors.path,
         "figures": {
-            "path": path_figure(path, truth, T_map_world, health, radius_share),
+            "path": figures.path_figure(path, truth, T_map_world, health, radius_share),
             "loops": _loops(session),
-            "drift": None if truth is None else drift_figure(path, truth, health),
-            "health": health_figure(health) if health else None,
+            "drift": None if truth is None else figures.drift_figure(path, truth, health),
+            "health": figures.health_figure(health) if health else None,
         },
         "sample": stereo_figures(sample.pair, sample.disparity),
         "sample_frame": sample.pair.index,
@@ -93,7 +82,7 @@ def _map_content(
     """Return what the pages of all maps show: paths on the grid, and with others in 3-D."""
     ways = {n: apply(T_map_world, one.positions_m) for n, one in (paths | only_in_3d).items()}
     return {
-        "grid": grid_figure(made.grid, {name: ways[name][:, :2] for name in paths}),
+        "grid": figures.grid_figure(made.grid, {name: ways[name][:, :2] for name in paths}),
         "resolution_m": made.grid.resolution_m,
         "view": plot_scene(Scene(np.eye(4), made.cloud, made.mesh, [*ways.items()])),
     }
@@ -103,7 +92,7 @@ def _loops(session: Session) -> bytes | None:
     pairs = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
     if not pairs:
         return None
-    return loops_figure(session.odometry, session.trajectory, pairs, session.T_map_world)
+    return figures.loops_figure(session.odometry, session.trajectory, pairs, session.T_map_world)
 
 
 def write_map_errors(comparison: MapComparison, run: RunDirectory) -> None:
@@ -121,35 +110,38 @@ def write_trajectory_page(
     comparison: TrajectoryComparison, names: tuple[str, str], summary: Json, run: RunDirectory
 ) -> None:
     """Write ``report.html`` of a path compared with its truth, and its figures as PNG files."""
-    figures = {
+    drawn = {
         "path": compared_paths_figure(comparison),
         "error_along_path": pose_errors_figure(comparison),
         "translation_by_length": errors_by_length_figure(comparison, rotation=False),
         "rotation_by_length": errors_by_length_figure(comparison, rotation=True),
     }
-    for name, png in figures.items():
+    for name, png in drawn.items():
         write_bytes(run.path(f"{name}.png"), png)
-    content = {"comparison": comparison, "names": names, "figures": figures}
+    content = {"comparison": comparison, "names": names, "figures": drawn}
     write_page("trajectory", run, summary, **content)
 
 
 def compared_paths_figure(comparison: TrajectoryComparison) -> bytes:
     """Draw both paths on the two world axes along which the true one extends farthest."""
-    axes = widest_axes(comparison.truth.positions_m)
-    truth = comparison.truth.positions_m[:, axes]
-    estimate = comparison.estimate.positions_m[:, axes]
+    true_m = comparison.truth.positions_m
+    axes = widest_axes(true_m)
+    truth, estimate = true_m[:, axes], comparison.estimate.positions_m[:, axes]
     first, second = (f"{'xyz'[axis]} (m)" for axis in axes)
-    return top_view([(truth, TRUTH_LINE), (estimate, ESTIMATE_LINE)], truth, (first, second))
+    return figures.top_view(
+        [(truth, figures.TRUTH_LINE), (estimate, figures.ESTIMATE_LINE)], truth, (first, second)
+    )
 
 
 @style.styled
 def pose_errors_figure(comparison: TrajectoryComparison) -> bytes:
     """Draw position and rotation error of each aligned pose, along the true path."""
     degrees = np.degrees(comparison.rotation_errors_rad)
-    figure, (upper, _) = errors_along(comparison.truth, comparison.position_errors_m, degrees)
-    upper.axhline(
-        comparison.metrics.ate_m, color=style.FAINT, linestyle="--", label="root mean square"
+    figure, (upper, _) = figures.errors_along(
+        comparison.truth, comparison.position_errors_m, degrees
     )
+    mean_m = comparison.metrics.ate_m
+    upper.axhline(mean_m, color=style.FAINT, linestyle="--", label="root mean square")
     upper.legend(loc="best")
     return style.to_png(figure)
 
@@ -182,15 +174,14 @@ _SHADES: Final = {State.SEARCHING: style.FAINT, State.COASTING: style.TRUTH, Sta
 
 def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a drive in a map."""
-    figures = {"path": _path(result), "certainty": certainty_figure(result.drive)}
-    write_page("localize", run, result.summary, result=result, figures=figures)
-
-
-def _path(result: LocalizeRun) -> bytes | None:
     path, T_map_world = result.drive.trajectory, result.drive.T_map_world
+    drawn = {"certainty": certainty_figure(result.drive), "path": None}
     if result.grid is not None:
-        return grid_figure(result.grid, {"path": seen_from_above(path, T_map_world)})
-    return path_figure(path, None, T_map_world) if len(path) else None
+        ways = {"path": figures.seen_from_above(path, T_map_world)}
+        drawn["path"] = figures.grid_figure(result.grid, ways)
+    elif len(path):
+        drawn["path"] = figures.path_figure(path, None, T_map_world)
+    write_page("localize", run, result.summary, result=result, figures=drawn)
 
 
 @style.styled

@@ -97,8 +97,7 @@ def sparsification_figure(matchers: Mapping[str, Figures]) -> bytes:
 
 
 def _floats(curves: Figures, *names: str) -> Any:
-    # None becomes NaN.
-    return np.array([curves[name] for name in names], dtype=np.float64)
+    return np.array([curves[name] for name in names], dtype=np.float64)  # None becomes NaN
 
 
 def _scene(scene: str, summary: Mapping[str, Any], run: RunDirectory) -> dict[str, Any]:
@@ -112,9 +111,8 @@ def _scene(scene: str, summary: Mapping[str, Any], run: RunDirectory) -> dict[st
 
 def _small_images(run: RunDirectory, stem: str) -> list[UInt8]:
     """Return disparity and error in one size, with a white strip to the right and below."""
-    # The error has the size of the ground truth, which is that of no or every matcher's result.
     images = [Image.open(run.path(f"{stem}_{name}.png")) for name in ("disparity", "error")]
-    width, height = images[1].size
+    width, height = images[1].size  # that of the ground truth
     shown = min(_WIDTH_PX, width)
     size = (shown, max(1, round(height * shown / width)))
     small = [np.asarray(image.resize(size, Image.Resampling.NEAREST)) for image in images]
@@ -143,8 +141,12 @@ def middlebury_tables(summary: Figures) -> list[Table]:
     for name, path in _ERRORS.items():
         title = f"{name} of each scene, nonocc, dense"
         tables.append(_scene_table(title, matchers, ("nonocc", "dense", *path)))
-    if any(_at(found, ("weighted", "confidence")) for found in matchers.values()):
-        tables.append(_confidence_table(f"Confidence, {mean.lower()}, all, sparse", matchers))
+    rated = {name: one["weighted"].get("confidence") for name, one in matchers.items()}
+    if any(rated.values()):
+        rows = [(m, *(number(_at(one, (n,)), 3) for n in _CONFIDENCE)) for m, one in rated.items()]
+        # The shares within sigma are best near those of a normal distribution, not at 0.
+        title = f"Confidence, {mean.lower()}, all, sparse"
+        tables.append(Table(title, ("matcher", *_CONFIDENCE), rows))
         for name in ("ece", "ause"):
             path = ("confidence", name)
             tables.append(_scene_table(f"{name} of each scene", matchers, path, digits=3))
@@ -201,13 +203,6 @@ def _weighted_table(title: str, matchers: Figures, kind: tuple[str, str]) -> Tab
         cells = [number(_at(figures, path)) for path in columns.values()]
         rows.append((name, *cells, shown, number(figures["seconds"], 3)))
     return Table(title, ("matcher", *columns, "depth error", "seconds"), rows, best="columns")
-
-
-def _confidence_table(title: str, matchers: Figures) -> Table:
-    paths = [("weighted", "confidence", name) for name in _CONFIDENCE]
-    rows = [(m, *(number(_at(one, path), 3) for path in paths)) for m, one in matchers.items()]
-    # The shares within sigma are best near those of a normal distribution, not at 0.
-    return Table(title, ("matcher", *_CONFIDENCE), rows)
 
 
 def _scene_table(title: str, matchers: Figures, path: Path, digits: int = 2) -> Table:

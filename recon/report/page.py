@@ -66,8 +66,11 @@ def page_environment() -> Environment:
     )
     environment.tests["finite"] = _is_number
     environment.filters.update(
-        counted=counted, embedded=_embedded, known=_known, leaves=summary_rows, words=_words,
-        last_part=lambda name: Path(name).name or name, shortest="{:.3g}".format, timing=_timing,
+        counted=counted, embedded=_embedded, leaves=summary_rows, timing=_timing,
+        known=lambda value, form: NOT_KNOWN if value is None else form % value,
+        last_part=lambda name: Path(name).name or name, shortest="{:.3g}".format,
+        # A line may break between the words of the name of a figure.
+        words=re.compile(r"(?<=[._])(?=[a-z])").split,
     )  # fmt: skip
     # Sections add their titles to the contents.
     environment.globals.update(
@@ -102,10 +105,6 @@ def summary_rows(summary: Mapping[Any, Any], prefix: str = "") -> list[tuple[str
     return rows
 
 
-def _known(value: Any, form: str) -> str:
-    return NOT_KNOWN if value is None else form % value
-
-
 def _text(value: Any) -> str:
     if value is None:
         return NOT_KNOWN
@@ -117,9 +116,8 @@ def _text(value: Any) -> str:
 
 
 def _timing(summary: Mapping[str, Any]) -> bytes:
-    # Empty if no stage was measured.
     stages = {name: s for name, s in (summary.get("stages") or {}).items() if _is_number(s)}
-    return timing_figure(stages) if stages else b""
+    return timing_figure(stages) if stages else b""  # no stage was measured
 
 
 def _is_number(value: Any) -> bool:
@@ -139,11 +137,6 @@ def _embedded(png: bytes) -> str:
         image.convert("RGB").save(buffer, "WEBP", quality=_WEBP_QUALITY)
     kind, smaller = min(("webp", buffer.getvalue()), ("png", png), key=lambda one: len(one[1]))
     return f"data:image/{kind};base64,{base64.b64encode(smaller).decode('ascii')}"
-
-
-def _words(name: str) -> list[str]:
-    """Return the parts of the name of a figure, between which a line may break."""
-    return re.split(r"(?<=[._])(?=[a-z])", name)
 
 
 @style.styled

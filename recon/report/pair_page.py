@@ -33,12 +33,11 @@ def write_pair_page(result: PairRun, run: RunDirectory) -> None:
 def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
     """Write disparity, confidence and reasons of a pair as colour images."""
     disparity = result.disparity
-    images = {
-        "disparity": style.colour_disparity(disparity.values),
-        "confidence": style.colour_confidence(disparity.confidence),
-        "reason": style.colour_reasons(disparity.reason),
-    }
-    for name, image in images.items():
+    for name, image in (
+        ("disparity", style.colour_disparity(disparity.values)),
+        ("confidence", style.colour_confidence(disparity.confidence)),
+        ("reason", style.colour_reasons(disparity.reason)),
+    ):
         write_image(run.path(f"disparity/{name}_colour.png"), image)
 
 

@@ -12,26 +12,9 @@ import numpy as np
 from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float32
-from recon.evaluation.paper import (
-    ABSOLUTE,
-    AS_PRINTED,
-    BAD_PX,
-    CORRECTED,
-    TITLES,
-    Experiment,
-    MethodResult,
-    camera_of_table_1,
-)
-from recon.report import style
+from recon.evaluation import paper
+from recon.report import pair_page, style
 from recon.report.page import write_page
-from recon.report.pair_page import (
-    ERROR_LIMIT_PX,
-    depth_figure,
-    disparity_figure,
-    error_figure,
-    is_wide,
-    pair_figure,
-)
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 
@@ -39,9 +22,9 @@ _MAX_POINTS: Final = 20_000
 _NEAR_SHARE: Final = 0.9  # as the caption says
 # Dashed, as both printed methods give a value to the same pixels.
 _LINES: Final = {
-    CORRECTED: (style.ESTIMATE, "-"),
-    ABSOLUTE: (style.TRUTH, "-"),
-    AS_PRINTED: (style.BAD, "--"),
+    paper.CORRECTED: (style.ESTIMATE, "-"),
+    paper.ABSOLUTE: (style.TRUTH, "-"),
+    paper.AS_PRINTED: (style.BAD, "--"),
 }
 _SURFACE_COLUMNS: Final = 220
 _CURVE_SAMPLES: Final = 400
@@ -49,7 +32,7 @@ _CURVE_SAMPLES: Final = 400
 
 def write_paper_page(
     folder: Path,
-    results: Sequence[tuple[Experiment, Sequence[MethodResult]]],
+    results: Sequence[tuple[paper.Experiment, Sequence[paper.MethodResult]]],
     summary: Mapping[str, Any],
     run: RunDirectory,
 ) -> None:
@@ -59,41 +42,41 @@ def write_paper_page(
         run,
         summary,
         folder=folder.name or folder,
-        titles=TITLES,
+        titles=paper.TITLES,
         drawn=[
             {
                 "experiment": one,
-                "pair": pair_figure(methods[0].pair),
+                "pair": pair_page.pair_figure(methods[0].pair),
                 "methods": {each.method: _draw_method(one, each) for each in methods},
                 "patches": patches_figure(summary["experiments"][str(one.number)]["patches"]),
                 "curve": depth_curve_figure(one.camera, methods[0].disparity.values),
             }
             for one, methods in results
         ],
-        limit_px=ERROR_LIMIT_PX,
-        bad_px=BAD_PX,
+        limit_px=pair_page.ERROR_LIMIT_PX,
+        bad_px=paper.BAD_PX,
         # Experiments have their own sections.
         of_the_run={k: v for k, v in summary.items() if k not in {"experiments", "table_1"}},
     )
 
 
-def _draw_method(one: Experiment, result: MethodResult) -> dict[str, Any]:
+def _draw_method(one: paper.Experiment, result: paper.MethodResult) -> dict[str, Any]:
     """Draw disparity, depth, error and surface of one method."""
     values, truth = result.disparity.values, one.truth
     return {
-        "wide": is_wide(values.shape),
-        "disparity": disparity_figure(result.disparity, result.pair.camera),
-        "depth": depth_figure(result.depth_m),
+        "wide": pair_page.is_wide(values.shape),
+        "disparity": pair_page.disparity_figure(result.disparity, result.pair.camera),
+        "depth": pair_page.depth_figure(result.depth_m),
         "surface": surface_figure(result.disparity),
-        "error": None if truth is None else error_figure(np.abs(values - truth.values)),
+        "error": None if truth is None else pair_page.error_figure(np.abs(values - truth.values)),
         # The cloud of the method as printed is not worth turning.
-        "view": None if result.method == AS_PRINTED else _view(result),
+        "view": None if result.method == paper.AS_PRINTED else _view(result),
     }
 
 
-def _view(result: MethodResult) -> Json | None:
+def _view(result: paper.MethodResult) -> Json | None:
     cloud = result.cloud
-    if len(cloud) and result.method != CORRECTED:
+    if len(cloud) and result.method != paper.CORRECTED:
         # Integer disparities near 0 give layers far behind everything, which would shrink the rest.
         cloud = cloud.select(cloud.xyz[:, 2] <= np.quantile(cloud.xyz[:, 2], _NEAR_SHARE))
     return plot_scene(Scene(T_UPRIGHT_CAMERA, cloud), _MAX_POINTS)
@@ -133,13 +116,12 @@ def depth_curve_figure(camera: RectifiedCamera, disparities_px: Float32) -> byte
     d = np.linspace(last / _CURVE_SAMPLES, last, _CURVE_SAMPLES)
     figure, axes = style.subplots(style.HALF_IN, 4.2)
     f, doffs = f"f = {camera.focal_px:.7g} px", f"doffs = {camera.doffs_px:.7g} px"
-    lines = [(camera, style.ESTIMATE, f"Z = f·b / (d + doffs), {f}, {doffs}")]
+    look = {"linewidth": 2.2, "label": f"Z = f·b / (d + doffs), {f}, {doffs}"}
+    axes.plot(d, depth_from_disparity(d, camera), color=style.ESTIMATE, **look)
     if camera.doffs_px > 0:
-        believed = camera_of_table_1(camera)
-        f = f"f = {believed.focal_px:.7g} px"
-        lines.append((believed, style.BAD, f"as printed: Z = f·b / d, {f}"))
-    for each, colour, label in lines:
-        axes.plot(d, depth_from_disparity(d, each), color=colour, linewidth=2.2, label=label)
+        believed = paper.camera_of_table_1(camera)
+        look["label"] = f"as printed: Z = f·b / d, f = {believed.focal_px:.7g} px"
+        axes.plot(d, depth_from_disparity(d, believed), color=style.BAD, **look)
     known = disparities_px[np.isfinite(disparities_px)]
     if known.size:
         low, high = np.percentile(known, (1.0, 99.0))
@@ -155,7 +137,7 @@ def depth_curve_figure(camera: RectifiedCamera, disparities_px: Float32) -> byte
 def patches_figure(patches: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
     """Draw the effect of the patch size: wrong pixels, mean error, pixels with a value."""
     panels = {
-        f"off by more than {BAD_PX:g} px (%)": "bad_percent",
+        f"off by more than {paper.BAD_PX:g} px (%)": "bad_percent",
         "mean error (px)": "avgerr_px",
         "pixels with a value (%)": "valid_percent",
     }
@@ -168,6 +150,6 @@ def patches_figure(patches: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
         if all(one[name] is None for tried in patches.values() for one in tried):
             style.write_note(axes, "no truth to compare with")
         axes.set(xlabel="patch (px)", ylabel=label, ylim=(0, None))
-    titles = [TITLES[name] for name in patches]
+    titles = [paper.TITLES[name] for name in patches]
     figure.legend(row[-1].lines, titles, loc="outside lower center", ncols=3)
     return style.to_png(figure)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -125,8 +125,7 @@ def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> go.Mesh3d:
     colouring: Json = {"color": "#b8c4ce"}
     if mesh.rgb is not None:
         # One colour per face, as palette indices cannot be interpolated.
-        of_faces = np.rint(mesh.rgb[mesh.faces].mean(axis=1)).astype(np.uint8)
-        colouring = _palette_scale(of_faces)
+        colouring = _palette_scale(np.rint(mesh.rgb[mesh.faces].mean(axis=1)).astype(np.uint8))
         colouring |= {"intensity": colouring.pop("color"), "intensitymode": "cell"}
     return go.Mesh3d(
         name=f"mesh ({counted(len(mesh.faces), 'triangle', form=',')})",
@@ -142,11 +141,7 @@ def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> go.Mesh3d:
 
 
 def _xyz(points: NDArray[Any]) -> Json:
-    return _named(points.astype(np.float32).T)
-
-
-def _named(values: Iterable[Any]) -> Json:
-    return dict(zip("xyz", values, strict=True))
+    return dict(zip("xyz", points.astype(np.float32).T, strict=True))
 
 
 def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
@@ -178,13 +173,12 @@ def _without_outliers(cloud: PointCloud) -> PointCloud:
 
 def _visible_points(cloud: PointCloud | None, scene: Scene) -> Float64:
     """Return float64 (N, 3): the initially visible points, view axes."""
-    shown: NDArray[Any] = np.zeros((0, 3))
+    points: list[NDArray[Any]] = [np.zeros((0, 3)), *(path for _, path in scene.paths)]
     if cloud is not None and len(cloud):
-        shown = cloud.xyz
+        points.append(cloud.xyz)
     elif scene.mesh is not None:
-        shown = scene.mesh.vertices
-    points = np.concatenate([np.zeros((0, 3)), *(path for _, path in scene.paths), shown])
-    return np.asarray(apply(scene.T_view_frame, points))
+        points.append(scene.mesh.vertices)
+    return np.asarray(apply(scene.T_view_frame, np.concatenate(points)))
 
 
 def _set_view(figure: go.Figure, scene: Scene, seen: Float64) -> None:
@@ -197,10 +191,10 @@ def _set_view(figure: go.Figure, scene: Scene, seen: Float64) -> None:
         eye, look_at = (np.asarray(scene.eye_m) - box.mean(axis=0)) * unit, _LOOK_AT
         # Seen from the position of a long lens, everything would be small in this wider view.
         eye *= min(1.0, _FARTHEST_EYE / max(float(np.linalg.norm(eye)), 1e-9))
-    figure.update_layout(
-        scene_aspectratio=_named((unit * np.ptp(box, axis=0)).tolist()),
-        scene_camera={"eye": _named(eye.tolist()), "center": _named(look_at.tolist())},
-    )
+    sides = unit * np.ptp(box, axis=0)
+    aspect, *view = (dict(zip("xyz", x.tolist(), strict=True)) for x in (sides, eye, look_at))
+    camera = dict(zip(("eye", "center"), view, strict=True))
+    figure.update_layout(scene_aspectratio=aspect, scene_camera=camera)
     for n, (axis, title) in enumerate(_TITLES.items()):
         axes = {"title_text": title, "range": box[:, n].tolist(), **_AXIS}
         figure.layout.scene[f"{axis}axis"].update(axes)

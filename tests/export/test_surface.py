@@ -165,9 +165,7 @@ def test_points_of_one_plane_give_that_plane() -> None:
 
 
 def poisson(xyz: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, ...]:
-    return screened_poisson(
-        xyz, normals, depth=5, scale=1.1, samples_per_node=1.5, point_weight=4.0
-    )
+    return screened_poisson(xyz, normals, depth=5, scale=1.1, point_weight=4.0)
 
 
 def test_arrays_come_back_typed_and_matching_and_pymeshlab_is_not_loaded_here() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.text import counted
-from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair
+from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float32
 from recon.evaluation.middlebury.score import (
     MASKS,
@@ -45,6 +45,8 @@ from recon.stereo.rectify.rectifier import Rectifier
 
 _WARM_UP_ROWS: Final = 64
 _FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")
+_STEP: Final = 16  # of a range that is that of the truth
+_DISPARITY: Final = "disp0"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,26 +81,23 @@ class Bench:
                 sure = disparity.confidence[disparity.valid]
                 # Not where the matcher gives all matches the same confidence.
                 rates = sure.size and sure.min() < sure.max()
-                figures = _figures(
-                    scene,
-                    disparity.values,
-                    ndisp=searched_ndisp(given, self.config.matching, pair),
-                    confidence=confidence_figures(disparity, scene.truth) if rates else None,
-                    seconds=round(seconds, 4),
-                )
-                yield SceneResult(scene, name_of(given), disparity.values, figures)
+                measured = {
+                    "ndisp": searched_ndisp(given, self.config.matching, pair),
+                    "confidence": confidence_figures(disparity, scene.truth) if rates else None,
+                    "seconds": round(seconds, 4),
+                }
+                yield _scored(scene, name_of(given), disparity.values, measured)
 
     def _matchers(self, pair: RectifiedPair) -> list[Matcher]:
-        # Kernels are compiled and networks loaded before anything is timed.
-        made: list[Matcher] | None = getattr(self._own, "matchers", None)
-        if made is None:
+        if not hasattr(self._own, "matchers"):
             made = [make_matcher(n, self.config.matching, self.threads) for n in self.given]
+            # Kernels are compiled and networks loaded before anything is timed.
             rows = min(_WARM_UP_ROWS, pair.camera.height_px)
             camera = replace(pair.camera, height_px=rows)
             for matcher in made:
                 matcher.match(RectifiedPair(pair.left[:rows], pair.right[:rows], camera))
             self._own.matchers = made
-        return made
+        return list(self._own.matchers)
 
 
 def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
@@ -109,7 +108,7 @@ def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
     values = read_pfm(file)
     with naming(file):
         measured = {"ndisp": None, "confidence": None, "seconds": read_seconds(file)}
-        return SceneResult(scene, given.name, values, _figures(scene, values, **measured))
+        return _scored(scene, given.name, values, measured)
 
 
 def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
@@ -127,8 +126,8 @@ def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
     return names
 
 
-def _figures(scene: ScoredScene, values: Float32, **measured: Any) -> Figures:
-    return {
+def _scored(scene: ScoredScene, name: str, values: Float32, measured: Figures) -> SceneResult:
+    figures = {
         **score_result(scene, values),
         **measured,
         "width_px": scene.camera.width_px,
@@ -136,6 +135,7 @@ def _figures(scene: ScoredScene, values: Float32, **measured: Any) -> Figures:
         "full_size_factor": scene.rules.full_size_factor,
         "weight": scene_weight(scene.name),
     }
+    return SceneResult(scene, name, values, figures)
 
 
 SceneFigures = dict[str, Figures]  # Figures of one scene, by matcher
@@ -172,12 +172,9 @@ def summarise_scenes(
     skipped = [name for name, figures in found.items() if figures is None]
     scenes = {name: figures for name, figures in found.items() if figures is not None}
     if not scenes:
-        raise SourceError(
-            "no scene has ground truth to compare with",
-            where=folder,
-            got=", ".join(skipped),
-            hint="name a folder of scenes that have one with --truth",
-        )
+        what, got = "no scene has ground truth to compare with", ", ".join(skipped)
+        hint = "name a folder of scenes that have one with --truth"
+        raise SourceError(what, where=folder, got=got, hint=hint)
     common = [name for name, figures in scenes.items() if all(one in figures for one in names)]
     if not common:
         what = "there is no scene that all have a result for"
@@ -203,18 +200,11 @@ def summarise_scenes(
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:
     """Return the entry of one matcher in ``summary.json``."""
     own = {name: figures[matcher] for name, figures in scenes.items() if matcher in figures}
-    weighted = {
-        **weighted_figures({name: {mask: own[name][mask] for mask in MASKS} for name in common}),
-        "confidence": weighted_confidence({name: own[name]["confidence"] for name in common}),
-        # Not a number, so null, where one is not known.
-        "seconds": weighted_figures({name: own[name]["seconds"] for name in common}),
-    }
-    return {"scenes": own, "weighted": weighted}
-
-
-_STEP: Final = 16
-_DISPARITY: Final = "disp0"
-_SPARSE: Final = "_s"
+    meant = (*MASKS, "seconds")  # seconds are not a number, so null, where one is not known
+    figures = weighted_figures({name: {key: own[name][key] for key in meant} for name in common})
+    confidence = weighted_confidence({name: own[name]["confidence"] for name in common})
+    seconds = figures.pop("seconds")
+    return {"scenes": own, "weighted": {**figures, "confidence": confidence, "seconds": seconds}}
 
 
 @dataclass(frozen=True)
@@ -266,12 +256,15 @@ def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene 
     judge = scene if scene.truth is not None else _judge(name, truth)
     if judge is None or judge.truth is None:
         return None
-    width_px, truth_width_px = scene.pair.left.shape[1], judge.truth.values.shape[1]
+    height_px, width_px = scene.pair.left.shape[:2]
     # Sizes may be off by a row or column; real mismatches are rejected by the comparison.
-    factor = max(round(4 * truth_width_px / width_px), 1) / 4
+    factor = max(round(4 * judge.truth.values.shape[1] / width_px), 1) / 4
     largest_px = None if scene.ndisp is None else scene.ndisp * factor
     rules = MiddleburyRules(judge.full_size_factor, largest_px, judge.isint)
-    camera = _matching_camera(scene, judge.truth, factor)
+    camera = scene.camera or stand_in_camera(width_px, height_px)
+    searched_px = float(np.nanmax(judge.truth.values, initial=0.0)) / factor
+    ndisp = scene.ndisp or camera.ndisp or _STEP * int(searched_px // _STEP + 1)
+    camera = replace(camera, ndisp=ndisp)
     return ScoredScene(name, scene.pair, camera, judge.truth, judge.camera, rules)
 
 
@@ -281,17 +274,6 @@ def _judge(name: str, folder: Path | None) -> MiddleburyScene | None:
         if path.name == last and path.is_dir() and find_layout(path) is not None:
             return read_middlebury_scene(path)
     return None
-
-
-def _matching_camera(
-    scene: MiddleburyScene, truth: DisparityTruth, factor: float
-) -> RectifiedCamera:
-    """Return the camera with the published disparity range, else that of the ground truth."""
-    height_px, width_px = scene.pair.left.shape[:2]
-    camera = scene.camera or stand_in_camera(width_px, height_px)
-    largest_px = float(np.nanmax(truth.values, initial=0.0)) / factor
-    of_truth = _STEP * int(largest_px // _STEP + 1)
-    return replace(camera, ndisp=scene.ndisp or camera.ndisp or of_truth)
 
 
 def find_results(
@@ -332,8 +314,7 @@ def _file_of(folder: Path, scene: str, path: Path) -> Path | None:
     root = scene_root(path)
     for name in (scene, f"{root.parent.name}/{root.name}", root.name):
         file = folder / f"{name}.pfm"
-        found = file if file.is_file() else _submitted(folder / name)
-        if found is not None:
+        if (found := file if file.is_file() else _submitted(folder / name)) is not None:
             return found
     return None
 
@@ -342,8 +323,7 @@ def _submitted(folder: Path) -> Path | None:
     """Return the dense result in the folder of one scene; not its ground truth."""
     truth = {"disp0GT", "disp0"} if find_image(folder, "im0") else {"disp0GT"}
     stems = {file.stem for file in folder.glob(f"{_DISPARITY}*.pfm")}
-    sparse = {f"{stem}{_SPARSE}" for stem in stems}
-    found = [f"{stem}.pfm" for stem in sorted(stems - truth - sparse)]
+    found = [f"{stem}.pfm" for stem in sorted(stems - truth - {f"{stem}_s" for stem in stems})]
     if len(found) > 1:
         what, hint = "folder has several results", "keep each method in a folder of its own"
         raise SourceError(f"{what} for one scene", where=folder, got=", ".join(found), hint=hint)

@@ -23,15 +23,7 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import Float32, Float64, frozen_array
-from recon.evaluation.disparity import (
-    evaluate_depth,
-    evaluate_disparity,
-    measure_reliability,
-    measure_sparsification,
-    share_within_sigma,
-    truth_of,
-    values_of,
-)
+from recon.evaluation import disparity as errors
 
 # Pixels that are scored: those seen by both cameras, or occluded ones as well.
 MASKS: Final = {"nonocc": False, "all": True}
@@ -70,10 +62,10 @@ def score_result(scene: ScoredScene, values: Float32) -> Figures:
     for name, holed in {"dense": dense_map(values), "sparse": values}.items():
         compared = values_compared(holed, truth.values.shape, scene.rules)
         for mask, occluded in MASKS.items():
-            metrics = evaluate_disparity(compared, truth, occluded=occluded, scale=factor)
+            metrics = errors.evaluate_disparity(compared, truth, occluded=occluded, scale=factor)
             figures[mask][name] = named_figures(metrics)
             if camera is not None:
-                depth = evaluate_depth(compared, truth, camera, occluded=occluded)
+                depth = errors.evaluate_depth(compared, truth, camera, occluded=occluded)
                 figures[mask][name]["depth"] = asdict(depth)
             figures[mask]["invalid"] = metrics.invalid
     return figures
@@ -104,14 +96,14 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
     )
     if not (sized.valid & np.isfinite(truth.values)).any():
         return None
-    shares = {f"within_{n}_sigma": share_within_sigma(sized, truth, n) for n in (1, 2)}
+    shares = {f"within_{n}_sigma": errors.share_within_sigma(sized, truth, n) for n in (1, 2)}
     return {**curve_figures(sized, truth, _RIGHT_PX / step), **shares}
 
 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
     """Return the same for the confidence alone, of maps of equal size."""
-    bins = measure_reliability(estimate, truth, limit_px)
-    steps = measure_sparsification(estimate, truth, limit_px)
+    bins = errors.measure_reliability(estimate, truth, limit_px)
+    steps = errors.measure_sparsification(estimate, truth, limit_px)
     share = bins.pixels / bins.pixels.sum()
     reliability = {"confidence": bins.confidence, "right": bins.right, "share": share}
     return {
@@ -187,9 +179,10 @@ def evaluate_middlebury(
     Raises:
         EvaluationError: The sizes do not fit, or no pixel has a known truth.
     """
-    known, rules = truth_of(truth), rules or MiddleburyRules()
-    compared = values_compared(values_of(estimate), known.values.shape, rules)
-    return evaluate_disparity(compared, known, occluded=occluded, scale=rules.full_size_factor)
+    known, rules = errors.truth_of(truth), rules or MiddleburyRules()
+    compared = values_compared(errors.values_of(estimate), known.values.shape, rules)
+    scale = rules.full_size_factor
+    return errors.evaluate_disparity(compared, known, occluded=occluded, scale=scale)
 
 
 def values_compared(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
@@ -254,20 +247,13 @@ def _weights(scenes: Iterable[str]) -> Float64:
 
 def _step(shape: tuple[int, ...], truth_shape: tuple[int, ...]) -> float:
     """Return pixels of a result for each pixel of the truth, along a row: 4, 2, 1, 0.5 or 0.25."""
-
-    def fits(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
-        return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))
-
     for factor in (1, 2, 4):
-        if fits(truth_shape, shape, factor):
-            return 1 / factor
-        if fits(shape, truth_shape, factor):
-            return factor
-    raise EvaluationError(
-        "result and truth differ in size",
-        got=f"{shape[1]}x{shape[0]} against {truth_shape[1]}x{truth_shape[0]}",
-        expected="one 1, 2 or 4 times the other",
-    )
+        for step, large, small in ((1 / factor, truth_shape, shape), (factor, shape, truth_shape)):
+            if all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True)):
+                return step
+    got = f"{shape[1]}x{shape[0]} against {truth_shape[1]}x{truth_shape[0]}"
+    expected = "one 1, 2 or 4 times the other"
+    raise EvaluationError("result and truth differ in size", got=got, expected=expected)
 
 
 def _taken(values: NDArray[Any], shape: tuple[int, ...], step: float) -> NDArray[Any]:

@@ -14,6 +14,10 @@ from recon.core.values.arrays import Bool, Float32, Float64, Int32
 from recon.io.models import open3d_meshes
 from recon.stereo.cloud import open3d_clouds
 
+_CANDIDATES: Final = 8
+_SAME_M: Final = 1e-5
+Places = np.ndarray[tuple[int], np.dtype[np.int64]]
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -44,14 +48,8 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
     edges, where = np.unique(np.sort(cut, axis=1), axis=0, return_inverse=True)
     new = (len(mesh.vertices) + where.ravel()).astype(np.int32)
     a, b, c, d = np.split(new, np.cumsum([len(one), len(one), len(two)]))
-    faces = np.concatenate(
-        [
-            whole,
-            np.stack([one[:, 0], a, b], axis=1),
-            np.stack([two[:, 0], two[:, 1], c], axis=1),
-            np.stack([two[:, 0], c, d], axis=1),
-        ]
-    )
+    split = ((one[:, 0], a, b), (two[:, 0], two[:, 1], c), (two[:, 0], c, d))
+    faces = np.concatenate([whole, *(np.stack(corners, axis=1) for corners in split)])
     return _compact(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
 
 
@@ -79,9 +77,9 @@ def between(values: NDArray[Any], edges: Int32, share: Float64) -> Float64:
 
 def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
     """Return faces (F, 3), each rotated so that its ``corners`` corners inside come first."""
-    odd = inside[faces] if corners == 1 else ~inside[faces]
     # The odd corner comes first if it is inside, last if it is outside.
-    start = (np.argmax(odd, axis=1) + (0 if corners == 1 else 1)) % 3
+    odd = inside[faces] == (corners == 1)
+    start = (np.argmax(odd, axis=1) + corners - 1) % 3
     order = (start[:, None] + np.arange(3)) % 3
     return np.asarray(np.take_along_axis(faces, order, axis=1), dtype=np.int32)
 
@@ -100,16 +98,9 @@ def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     used, faces = renumbered(faces)
-    return TriangleMesh(
-        mesh.vertices[used],
-        faces,
-        None if mesh.normals is None else mesh.normals[used],
-        None if mesh.rgb is None else mesh.rgb[used],
-    )
-
-
-_CANDIDATES: Final = 8
-_SAME_M: Final = 1e-5
+    normals = None if mesh.normals is None else mesh.normals[used]
+    rgb = None if mesh.rgb is None else mesh.rgb[used]
+    return TriangleMesh(mesh.vertices[used], faces, normals, rgb)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +110,7 @@ class OnEdges:
     ``feet`` are the projected points, float64 (N, 3), at ``distance_m`` from the points.
     """
 
-    edge: np.ndarray[tuple[int], np.dtype[np.int64]]
+    edge: Places
     share: Float64
     feet: Float64
     distance_m: Float64
@@ -188,9 +179,7 @@ def _with_inserted(
     return replace(grown, faces=_split_faces(mesh.faces, corners, found.edge[chosen], new))
 
 
-def _split_faces(
-    faces: Int32, corners: Int32, edge: np.ndarray[tuple[int], np.dtype[np.int64]], new: Int32
-) -> Int32:
+def _split_faces(faces: Int32, corners: Int32, edge: Places, new: Int32) -> Int32:
     """Split faces with new vertices on boundary edges, ascending, into fans."""
     kept = np.ones(len(faces), dtype=bool)
     fans = [faces[:0]]
@@ -242,10 +231,8 @@ def vertex_normals(vertices: Float32, faces: Int32) -> Float32:
 def _without_loose(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
     """Drop the vertices that no face uses and renumber the rest."""
     if len(faces) == 0:
-        raise MeshingError(
-            "trimming left no face of the surface",
-            hint="raise mesh.max_depth or mesh.max_distance_spacings, or filter less",
-        )
+        hint = "raise mesh.max_depth or mesh.max_distance_spacings, or filter less"
+        raise MeshingError("trimming left no face of the surface", hint=hint)
     used, faces = renumbered(faces)
     return vertices[used], faces
 

@@ -111,7 +111,7 @@ def export_mesh(
 
 
 def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:
-    """Return the number of points in each piece. Pieces are centred at multiples of their edge."""
+    """Return the points in each piece, which are centred at multiples of their edge."""
     found: Counter[PieceKey] = Counter()
     for tile in tiles:
         homes = np.floor(tile.cloud.xyz[:, :2] / settings.tile_m + 0.5).astype(np.int64)
@@ -162,40 +162,31 @@ class _Mesher:
         return [f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})"]
 
     def _surface(self, key: PieceKey) -> TriangleMesh | MeshingError:
-        """Return the surface of a piece, or the error why there is none, raised at its turn."""
-        try:
-            return self._cut(key)
-        except MeshingError as error:
-            return error
-
-    def _cut(self, key: PieceKey) -> TriangleMesh:
-        """Return the surface of a piece with its margin, cut at the sides of the piece."""
+        """Return the surface of a piece with its margin, cut at its sides, or why there is none."""
         wide = self._bounds(key).wider(OVERLAP_M)
         cloud = self.tiles.cloud_in(wide)
         wrong = None
         if self.settings.free_space:
             voxels = self.tiles.voxels_in(wide.wider(_BULGE_M))
             wrong = partial(looked_through, voxels=voxels) if len(voxels) else None
-        settings = self.settings.model_copy(update={"target_faces": self._target(len(cloud))})
-        mesh = reconstruct_mesh(cloud, settings, wrong=wrong)
+        settings, target = self.settings, self.settings.target_faces
+        if target is not None:
+            # By its share of the points.
+            target = max(4, round(target * len(cloud) / self.points.total()))
+            settings = settings.model_copy(update={"target_faces": target})
+        try:
+            mesh = reconstruct_mesh(cloud, settings, wrong=wrong)
+        except MeshingError as error:
+            return error
         for axis, far in _SIDES:
             mesh = cut_mesh(mesh, self._plane(key, axis, far), keep_above=not far)
         return mesh
 
-    def _target(self, seen: int) -> int | None:
-        """Return how many triangles a piece with its margin gets, by its share of the points."""
-        target = self.settings.target_faces
-        if target is None:
-            return None
-        return max(4, round(target * seen / self.points.total()))
-
     def _joined(self, key: PieceKey, mesh: TriangleMesh) -> TriangleMesh:
         """Return the mesh of a piece, joined to those of its earlier neighbours."""
         for axis, far in _SIDES:
-            plane = self._plane(key, axis, far)
-            step = np.zeros(2, int)
-            step[axis] = 1 if far else -1
-            neighbour = (key[0] + int(step[0]), key[1] + int(step[1]))
+            plane, step = self._plane(key, axis, far), 2 * far - 1
+            neighbour = (key[0], key[1] + step) if axis else (key[0] + step, key[1])
             border = self.borders.pop((neighbour, plane), None)
             if border is not None:
                 mesh = close_seam(mesh, plane, border, _SEAM_M)
@@ -204,11 +195,9 @@ class _Mesher:
         return mesh
 
     def _bounds(self, key: PieceKey) -> Rectangle:
-        """Return the bounds of a piece."""
-        (x, y), edge_m = key, self.settings.tile_m
+        (x, y), edge_m, half_m = key, self.settings.tile_m, self.settings.tile_m / 2
         return Rectangle(
-            (x * edge_m - edge_m / 2, y * edge_m - edge_m / 2),
-            (x * edge_m + edge_m / 2, y * edge_m + edge_m / 2),
+            (x * edge_m - half_m, y * edge_m - half_m), (x * edge_m + half_m, y * edge_m + half_m)
         )
 
     def _plane(self, key: PieceKey, axis: int, far: int) -> Plane:

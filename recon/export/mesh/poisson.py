@@ -14,7 +14,7 @@ from recon.core.errors import MeshingError
 from recon.core.settings import Settings
 from recon.core.text import counted
 from recon.core.values import PointCloud, TriangleMesh
-from recon.core.values.arrays import Bool, Float32, Int32
+from recon.core.values.arrays import Bool, Float32
 from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
@@ -28,12 +28,8 @@ MIN_DEPTH = 4
 _FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of their median
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
-#: MeshLab's octree is this much wider than the cloud.
-OCTREE_SCALE = 1.1
+OCTREE_SCALE = 1.1  # MeshLab's octree is this much wider than the cloud
 Point = tuple[float, float, float]
-
-
-_SAMPLES_PER_NODE: Final = 1.5  # points that an octree cell should hold
 _NORMALS_NEIGHBOURS: Final = 20  # neighbours for normals where the cloud has none
 
 
@@ -119,12 +115,7 @@ def trimmed_surface(
     ``wrong`` says which vertices (V, 3) cannot be on a surface.
     """
     vertices, faces, density = screened_poisson(
-        cloud.xyz,
-        _required(cloud.normals),
-        depth=octree.depth,
-        scale=octree.scale,
-        samples_per_node=_SAMPLES_PER_NODE,
-        point_weight=settings.point_weight,
+        cloud.xyz, np.asarray(cloud.normals), octree.depth, octree.scale, settings.point_weight
     )
     supported = density >= np.quantile(density, settings.trim_density_quantile)
     if settings.max_distance_spacings is not None:
@@ -139,7 +130,9 @@ def trimmed_surface(
         vertices=vertices,
         faces=faces,
         normals=vertex_normals(vertices, faces),
-        rgb=None if cloud.rgb is None else cloud.rgb[_nearest_points(vertices, cloud.xyz)],
+        rgb=None
+        if cloud.rgb is None
+        else cloud.rgb[open3d_clouds.nearest(vertices, cloud.xyz)[0][:, 0]],
     )
 
 
@@ -147,11 +140,8 @@ def usable(cloud: PointCloud) -> PointCloud:
     """Return the finite points of a cloud, if they can span a surface."""
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     if finite.sum() < _MIN_POINTS:
-        raise MeshingError(
-            "too few points for a surface",
-            got=int(finite.sum()),
-            expected=f"at least {_MIN_POINTS} finite points",
-        )
+        expected = f"at least {_MIN_POINTS} finite points"
+        raise MeshingError("too few points for a surface", got=int(finite.sum()), expected=expected)
     cloud = cloud.select(finite)
     _refuse_outliers(cloud.xyz)
     centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
@@ -160,11 +150,9 @@ def usable(cloud: PointCloud) -> PointCloud:
     farthest = float(np.abs(cloud.xyz).max())
     if spread[1] <= 1e-5 * max(spread[2], farthest):
         distant = spread[1] > 1e-5 * spread[2] and spread[1] > 0
-        raise MeshingError(
-            "all points lie in one place or on one line",
-            got=f"{counted(len(cloud), 'point')}, up to {farthest:.3g} m from the origin",
-            hint="subtract an offset from all coordinates" if distant else None,
-        )
+        got = f"{counted(len(cloud), 'point')}, up to {farthest:.3g} m from the origin"
+        hint = "subtract an offset from all coordinates" if distant else None
+        raise MeshingError("all points lie in one place or on one line", got=got, hint=hint)
     return cloud
 
 
@@ -173,12 +161,9 @@ def _refuse_outliers(xyz: Float32) -> None:
     away_m = np.linalg.norm(xyz.astype(np.float64) - np.median(xyz, axis=0), axis=1)
     half_m, farthest_m = float(np.median(away_m)), float(away_m.max())
     if farthest_m > _FARTHEST * half_m > 0:
-        raise MeshingError(
-            "a point lies far from all others",
-            got=f"{farthest_m:.3g} m from the middle, of which half of the points are within "
-            f"{half_m:.3g} m",
-            hint="remove outliers from the cloud",
-        )
+        half = f"of which half of the points are within {half_m:.3g} m"
+        got, hint = f"{farthest_m:.3g} m from the middle, {half}", "remove outliers from the cloud"
+        raise MeshingError("a point lies far from all others", got=got, hint=hint)
 
 
 def oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
@@ -195,12 +180,6 @@ def oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
         away = np.einsum("ij,ij->i", normals, np.asarray(viewpoint_m) - cloud.xyz) < 0
         normals = np.where(away[:, None], -normals, normals)
     return replace(cloud, normals=normals)
-
-
-def _required(normals: Float32 | None) -> Float32:
-    if normals is None:
-        raise MeshingError("the cloud has no normals")
-    return normals
 
 
 def widest_cell(xyz: Float32, settings: MeshSettings) -> float:
@@ -231,8 +210,3 @@ def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
     # A lone point is far from its neighbours, and must not support a large patch of surface.
     local_m = np.minimum(local_m, 2 * np.median(local_m))
     return np.asarray(distance_m[:, 0] <= spacings * local_m[where])
-
-
-def _nearest_points(vertices: Float32, xyz: Float32) -> Int32:
-    """Return int32 (V,): the point nearest to each vertex."""
-    return open3d_clouds.nearest(vertices, xyz)[0][:, 0]

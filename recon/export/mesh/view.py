@@ -29,15 +29,15 @@ from recon.export.mesh.poisson import (
     widest_cell,
 )
 
+# A point is covered if the mesh is no farther from it than this share of its depth.
 COVERED_WITHIN: Final = 0.005
-"""A point is covered if the mesh is no farther from it than this share of its depth."""
 LEAST_COVERAGE: Final = 0.8  # share of the points of a pair that its mesh should cover
+# Pixels that a pixel of disparity counts for: what is trimmed as farther than two pixel spacings
+# from the points (2.8 pixels) is then a step of 1.4 pixels of disparity or more.
 _DISPARITY_STEP: Final = 2.0
-"""Pixels that a pixel of disparity counts for: what is trimmed as farther than two pixel spacings
-from the points (2.8 pixels) is then a step of 1.4 pixels of disparity or more."""
+# Cells that the surface may cross, about: Poisson takes 20 s for so many. Images of more than a
+# quarter of a megapixel get larger cells.
 _MOST_CELLS: Final = 60_000
-"""Cells that the surface may cross, about. The time of Poisson grows with them, 20 s for so many;
-images of more than a quarter of a megapixel get larger cells."""
 _COVERAGE_SAMPLES: Final = 100_000
 
 
