@@ -17,7 +17,7 @@ from recon.io.images.image import write_image
 from recon.sources.one_pair import PairInput, read_pair_input
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
-from tests.sources.test_frames import ALL
+from tests.sources.test_drives import ALL
 
 
 @pytest.fixture

@@ -20,10 +20,11 @@ EPOCH_S = 1_600_000_000
 FRAMES = 11
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
 
-Writer = Callable[[list[StereoPair], RectifiedCamera, Path], Path]
+Pairs = list[StereoPair]
+Writer = Callable[[Pairs, RectifiedCamera, Path], Path]
 
 
-def rendered(frames: int, **settings: Any) -> tuple[list[StereoPair], RectifiedCamera]:
+def rendered(frames: int, **settings: Any) -> tuple[Pairs, RectifiedCamera]:
     """Grey pairs of a street, which every layout can store without loss."""
     source = SyntheticSource(StreetScene(frames=frames, threads=1, **settings))
     grey = [
@@ -46,55 +47,66 @@ def projections(camera: RectifiedCamera) -> tuple[np.ndarray, np.ndarray]:
     return left, right
 
 
+def _rows(camera: RectifiedCamera) -> list[str]:
+    return [" ".join(f"{v:.17g}" for v in P.ravel()) for P in projections(camera)]
+
+
 def write_calib(folder: Path, camera: RectifiedCamera) -> Path:
-    rows = [" ".join(f"{v:.17g}" for v in P.ravel()) for P in projections(camera)]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "calib.txt"
-    path.write_text("".join(f"P{n}: {row}\n" for n, row in enumerate(rows)))
+    path.write_text("".join(f"P{n}: {row}\n" for n, row in enumerate(_rows(camera))))
     return path
 
 
-def write_kitti(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
+def stamp_ns(pair: StereoPair) -> int:
+    return EPOCH_S * 10**9 + round(pair.timestamp_s * 1e9)
+
+
+def write_images(
+    pairs: Pairs,
+    camera: RectifiedCamera | None,
+    folder: Path,
+    name: Callable[[int, StereoPair], str],
+) -> Path:
+    """Write both images of each pair, under a name by side (0 = left), and ``calib.txt``."""
     for pair in pairs:
-        write_image(folder / "image_0" / f"{pair.index:06d}.png", pair.left)
-        write_image(folder / "image_1" / f"{pair.index:06d}.png", pair.right)
-    write_calib(folder, camera)
+        for side, image in enumerate((pair.left, pair.right)):
+            write_image(folder / f"{name(side, pair)}.png", image)
+    if camera is not None:
+        write_calib(folder, camera)
+    return folder
+
+
+def write_kitti(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
+    write_images(pairs, camera, folder, lambda side, pair: f"image_{side}/{pair.index:06d}")
     (folder / "times.txt").write_text("".join(f"{p.timestamp_s:.6e}\n" for p in pairs))
     return folder
 
 
-def write_kitti_raw(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
-    drive = folder / "2011_09_26_drive_0001_sync"
-    size = f"{camera.width_px} {camera.height_px}"
-    lines = []
-    for number, P in enumerate(projections(camera)):
-        view = drive / f"image_0{number}"
-        for pair in pairs:
-            image = (pair.left, pair.right)[number]
-            write_image(view / "data" / f"{pair.index:010d}.png", image)
-        stamps = [f"2011-09-26 13:02:{25 + p.timestamp_s:012.9f}\n" for p in pairs]
-        (view / "timestamps.txt").write_text("".join(stamps))
-        row = " ".join(f"{v:.17g}" for v in P.ravel())
+def write_kitti_raw(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
+    drive, lines = folder / "2011_09_26_drive_0001_sync", []
+    write_images(pairs, None, drive, lambda side, pair: f"image_0{side}/data/{pair.index:010d}")
+    stamps = [f"2011-09-26 13:02:{25 + p.timestamp_s:012.9f}\n" for p in pairs]
+    for number, row in enumerate(_rows(camera)):
+        (drive / f"image_0{number}" / "timestamps.txt").write_text("".join(stamps))
         # The raw camera is another one: who takes its numbers gets nonsense.
         lines += [
             f"S_0{number}: 1392 512", f"K_0{number}: 900 0 690 0 900 250 0 0 1",
             f"D_0{number}: -0.3 0.1 0 0 0", f"R_0{number}: 1 0 0 0 1 0 0 0 1",
-            f"T_0{number}: {-0.5 * number} 0 0", f"S_rect_0{number}: {size}",
+            f"T_0{number}: {-0.5 * number} 0 0",
+            f"S_rect_0{number}: {camera.width_px} {camera.height_px}",
             f"R_rect_0{number}: 1 0 0 0 1 0 0 0 1", f"P_rect_0{number}: {row}",
         ]  # fmt: skip
-    (folder / "calib_cam_to_cam.txt").write_text(
-        "calib_time: 09-Jan-2012 13:57:47\n" + "\n".join(lines) + "\n"
-    )
+    text = "calib_time: 09-Jan-2012 13:57:47\n" + "\n".join(lines) + "\n"
+    (folder / "calib_cam_to_cam.txt").write_text(text)
     return drive
 
 
-def write_euroc(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
+def write_euroc(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
+    write_images(pairs, None, folder, lambda n, pair: f"mav0/cam{n}/data/{stamp_ns(pair)}")
+    rows = "".join(f"{stamp},{stamp}.png\n" for stamp in map(stamp_ns, pairs))
     for number, P in enumerate(projections(camera)):
         view = folder / "mav0" / f"cam{number}"
-        stamps = [EPOCH_S * 10**9 + round(p.timestamp_s * 1e9) for p in pairs]
-        for stamp, pair in zip(stamps, pairs, strict=True):
-            write_image(view / "data" / f"{stamp}.png", (pair.left, pair.right)[number])
-        rows = "".join(f"{stamp},{stamp}.png\n" for stamp in stamps)
         (view / "data.csv").write_text("#timestamp [ns],filename\n" + rows)
         # The body is turned against the cameras: x forward, z up.
         T_body_cam = np.eye(4)
@@ -114,37 +126,36 @@ def write_euroc(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) 
     return folder
 
 
-def write_tum(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
-    for number, side in enumerate(("left", "right")):
-        lines = ["# timestamp filename\n"]
-        for pair in pairs:
-            name = f"{side}/{EPOCH_S + pair.timestamp_s:.6f}.png"
-            write_image(folder / name, (pair.left, pair.right)[number])
-            lines.append(f"{EPOCH_S + pair.timestamp_s:.6f} {name}\n")
-        (folder / f"{side}.txt").write_text("".join(lines))
-    write_calib(folder, camera)
+def write_tum(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
+    sides = ("left", "right")
+
+    def stamp(pair: StereoPair) -> str:
+        return f"{EPOCH_S + pair.timestamp_s:.6f}"
+
+    write_images(pairs, camera, folder, lambda n, pair: f"{sides[n]}/{stamp(pair)}")
+    for side in sides:
+        lines = "".join(f"{stamp(pair)} {side}/{stamp(pair)}.png\n" for pair in pairs)
+        (folder / f"{side}.txt").write_text("# timestamp filename\n" + lines)
     return folder
 
 
-def write_folders(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
+def write_folders(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
     """Names without leading zeros: 10 comes after 9."""
-    for pair in pairs:
-        write_image(folder / "left" / f"left{pair.index}.png", pair.left)
-        write_image(folder / "right" / f"right{pair.index}.png", pair.right)
-    write_calib(folder, camera)
-    return folder
+    sides = ("left/left", "right/right")
+    return write_images(pairs, camera, folder, lambda n, pair: f"{sides[n]}{pair.index}")
 
 
-def write_stamped(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
-    """Names are timestamps, the right ones 2 ms late, and each side has one unpaired image."""
-    for pair in pairs:
-        stamp_us = round((EPOCH_S + pair.timestamp_s) * 1e6)
-        write_image(folder / "cam0" / f"{stamp_us}.png", pair.left)
-        write_image(folder / "cam1" / f"{stamp_us + 2000}.png", pair.right)
-    lonely = round((EPOCH_S + pairs[-1].timestamp_s) * 1e6)
-    write_image(folder / "cam0" / f"{lonely + 100_000}.png", pairs[0].left)
-    write_image(folder / "cam1" / f"{lonely + 150_000}.png", pairs[0].right)
-    write_calib(folder, camera)
+def write_stamped(
+    pairs: Pairs, camera: RectifiedCamera, folder: Path, late_us: int = 2000, lonely: bool = True
+) -> Path:
+    """Names are timestamps, the right ones are late, and each side has one unpaired image."""
+    write_images(
+        pairs, camera, folder, lambda n, pair: f"cam{n}/{stamp_ns(pair) // 1000 + n * late_us}"
+    )
+    if lonely:
+        last_us = stamp_ns(pairs[-1]) // 1000
+        write_image(folder / "cam0" / f"{last_us + 100_000}.png", pairs[0].left)
+        write_image(folder / "cam1" / f"{last_us + 150_000}.png", pairs[0].right)
     return folder
 
 
@@ -160,20 +171,19 @@ def write_video(path: Path, images: list[np.ndarray], fourcc: str = "FFV1") -> P
     return path
 
 
-def write_side_by_side(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
+def write_side_by_side(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
     write_calib(folder, camera)
     return write_video(folder / "both.mkv", [np.hstack([p.left, p.right]) for p in pairs])
 
 
-def write_two_videos(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
+def write_two_videos(
+    pairs: Pairs, camera: RectifiedCamera, folder: Path, end: str = ".avi", fourcc: str = "FFV1"
+) -> Path:
     write_calib(folder, camera)
-    write_video(folder / "left.avi", [p.left for p in pairs])
-    write_video(folder / "right.avi", [p.right for p in pairs])
+    write_video(folder / f"left{end}", [p.left for p in pairs], fourcc)
+    write_video(folder / f"right{end}", [p.right for p in pairs], fourcc)
     return folder
 
 
-def write_lossy_videos(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
-    write_calib(folder, camera)
-    write_video(folder / "left.mp4", [p.left for p in pairs], "mp4v")
-    write_video(folder / "right.mp4", [p.right for p in pairs], "mp4v")
-    return folder
+def write_lossy_videos(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
+    return write_two_videos(pairs, camera, folder, ".mp4", "mp4v")

@@ -1,12 +1,14 @@
-"""Which frames of a drive are pairs: of some, of late cameras, of drives that lost images.
+"""A drive is the same in every layout, and so is a part of it, a late one, and what is left of it.
 
 Times, truth and known poses stay those of the left images.
 """
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,27 +21,27 @@ from recon.core.values import RectifiedCamera, StereoPair, Trajectory
 from recon.io.images.image import write_image
 from recon.io.trajectory import FRAMES as FRAME_LIST
 from recon.io.trajectory import CapturedFrame
-from recon.map.drive.sequence import map_sequence
+from recon.map.drive.sequence import Workspace, map_sequence
 from recon.rig.audit.audit import audit_source
 from recon.rig.cameras import open_camera_source
 from recon.rig.capture import CaptureSettings
-from recon.sources.registry import open_source
+from recon.sources.registry import open_source, recognise_source
 from recon.sources.settings import SourceSettings
 from tests.sources import drives
-from tests.sources.drives import CAMERA, FRAMES
+from tests.sources.drives import CAMERA, FRAMES, Pairs, Writer
 
 pytest.importorskip("rosbags", reason="extra ros")
 from tests.sources.bags import bag
 
-Pairs = list[StereoPair]
+Drive = tuple[Pairs, RectifiedCamera]
 PART = SourceSettings(start=2, end=9, stride=3)
 CHOSEN = [2, 5, 8]
 
 
 def write_kitti(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
     """With a true path of a metre per frame."""
-    rows = [f"1 0 0 0 0 1 0 0 0 0 1 {pair.index}\n" for pair in pairs]
     drives.write_kitti(pairs, camera, folder)
+    rows = [f"1 0 0 0 0 1 0 0 0 0 1 {pair.index}\n" for pair in pairs]
     (folder / "poses.txt").write_text("".join(rows))
     return folder
 
@@ -51,12 +53,9 @@ def write_folders(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
 
 
 def write_one_folder(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
-    for pair in pairs:
-        write_image(folder / f"left{pair.index:02d}.png", pair.left)
-        write_image(folder / f"right{pair.index:02d}.png", pair.right)
     write_image(folder / "preview.png", pairs[0].left)
-    drives.write_calib(folder, camera)
-    return folder
+    sides = ("left", "right")
+    return drives.write_images(pairs, camera, folder, lambda n, p: f"{sides[n]}{p.index:02d}")
 
 
 def write_capture(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
@@ -71,16 +70,7 @@ def write_capture(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
     return folder
 
 
-def write_stamped(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
-    for pair in pairs:
-        for side, image in (("cam0", pair.left), ("cam1", pair.right)):
-            stamp_us = round((drives.EPOCH_S + pair.timestamp_s) * 1e6)
-            write_image(folder / side / f"{stamp_us}.png", image)
-    drives.write_calib(folder, camera)
-    return folder
-
-
-LAYOUTS: dict[str, drives.Writer] = {
+IN_IMAGES: dict[str, Writer] = {
     "kitti": write_kitti,
     "kitti-raw": drives.write_kitti_raw,
     "euroc": drives.write_euroc,
@@ -88,15 +78,122 @@ LAYOUTS: dict[str, drives.Writer] = {
     "folders": write_folders,
     "one folder": write_one_folder,
     "capture": write_capture,
-    "stamped": write_stamped,
+    "stamped": partial(drives.write_stamped, late_us=0, lonely=False),
 }
-ALL: dict[str, drives.Writer] = {
-    **LAYOUTS,
+ALL: dict[str, Writer] = {
+    **IN_IMAGES,
     "side by side": drives.write_side_by_side,
     "two videos": drives.write_two_videos,
     "ros 1": bag(kind="ros1"),
     "mcap": bag(kind="mcap"),
 }
+MORE: dict[str, Writer] = {
+    **ALL,
+    "folders without times": drives.write_folders,
+    "stamped late": drives.write_stamped,
+    "ros 2": bag(kind="ros2"),
+    "ros 2 compressed": bag(kind="ros2", compressed=True),
+}
+KINDS = {
+    **{name: name for name in ("kitti", "kitti-raw", "euroc", "tum")},
+    **dict.fromkeys(("side by side", "two videos"), "video"),
+    **dict.fromkeys(("ros 1", "mcap", "ros 2", "ros 2 compressed"), "bag"),
+}
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return drives.rendered(FRAMES, width_px=320, height_px=128, focal_px=180.0, smooth_edges=False)
+
+
+@pytest.fixture(scope="module")
+def written(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("drives")
+    return {name: write(*drive, folder / name) for name, write in MORE.items()}
+
+
+@pytest.mark.parametrize("layout", MORE)
+def test_each_layout_is_recognised_and_gives_every_pixel_and_time_from_any_pair_on(
+    written: dict[str, Path], drive: Drive, layout: str
+) -> None:
+    pairs, camera = drive
+    assert recognise_source(written[layout]) == KINDS.get(layout, "folders")
+    source = open_source(written[layout])
+    assert len(source) == len(pairs)
+    assert isinstance(source.calibration, RectifiedCamera)
+    assert source.calibration.baseline_m == pytest.approx(camera.baseline_m, rel=1e-12)
+    assert "\n" not in source.description
+    assert all(path.is_file() for path in source.files)
+    first_s = next(source.frames()).timestamp_s
+    for start in (0, 7, FRAMES - 1, FRAMES):
+        read = list(source.frames(start))
+        assert [pair.index for pair in read] == list(range(start, FRAMES))
+        for ours, truth in zip(read, pairs[start:], strict=True):
+            # Stamps of today have 0.2 µs in a double.
+            assert ours.timestamp_s - first_s == pytest.approx(truth.timestamp_s, abs=1e-6)
+            for seen, true in ((ours.left, truth.left), (ours.right, truth.right)):
+                # A video has three channels, of a grey image three equal ones.
+                channels = seen.reshape(*true.shape, -1)
+                np.testing.assert_array_equal(
+                    channels, np.broadcast_to(true[:, :, None], channels.shape)
+                )
+
+
+def trajectory(path: Path) -> np.ndarray:
+    config = load_config(overrides=["matching.matcher=opencv-bm", "fusion.voxel_m=0.5"])
+    mapped = map_sequence(open_source(path), config, workspace=Workspace(threads=1))
+    return mapped.trajectory.T_world_camera
+
+
+@pytest.mark.slow
+def test_every_layout_gives_the_same_trajectory(
+    written: dict[str, Path], drive: Drive, tmp_path: Path
+) -> None:
+    expected = trajectory(written["kitti"])
+    travelled_m = np.linalg.norm(expected[-1, :3, 3])
+    assert travelled_m > 8  # eleven frames a metre apart: it does follow the drive
+    for layout, path in written.items():
+        # Stamps of today have 0.2 µs in a double, and a motion goes on by its times: over eleven
+        # metres that is a tenth of a millimetre, and no pixel.
+        assert np.abs(trajectory(path) - expected).max() < 1e-4, layout
+    lossy = trajectory(drives.write_lossy_videos(*drive, tmp_path))
+    apart_m = np.linalg.norm(lossy[:, :3, 3] - expected[:, :3, 3], axis=1)
+    # MPEG-4 at OpenCV's default rate blurs what corners are made of.
+    assert 0 < apart_m.max() < 0.05 * travelled_m
+
+
+SHORT, LONG, WIDTH_PX, HEIGHT_PX = 50, 100, 320, 240
+
+
+@pytest.fixture(scope="module")
+def long() -> Drive:
+    """Shifted noise, which compresses badly and so fills a disk."""
+    rng = np.random.default_rng(0)
+    wide = rng.integers(0, 256, (HEIGHT_PX, WIDTH_PX + LONG + 8), dtype=np.uint8)
+    camera = RectifiedCamera(200.0, 159.5, 119.5, 159.5, 0.2, WIDTH_PX, HEIGHT_PX)
+    pairs = [
+        StereoPair(wide[:, k : k + WIDTH_PX], wide[:, k + 8 : k + 8 + WIDTH_PX], 0.1 * k, k)
+        for k in range(LONG)
+    ]
+    return pairs, camera
+
+
+@pytest.mark.parametrize("layout", ["kitti", "two videos", "ros 1", "ros 2", "mcap"])
+def test_a_longer_drive_takes_no_more_memory(long: Drive, tmp_path: Path, layout: str) -> None:
+    pairs, camera = long
+    peaks = []
+    for count in (SHORT, LONG):
+        path = MORE[layout](pairs[:count], camera, tmp_path / str(count))
+        tracemalloc.start()
+        try:
+            assert sum(1 for _ in open_source(path)) == count
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    # Times and names are known of every pair; a recording is read in chunks of a megabyte.
+    assert peaks[1] - peaks[0] < 2000 * (LONG - SHORT)
+    pair_bytes = 2 * WIDTH_PX * HEIGHT_PX
+    assert pair_bytes < peaks[1] < 0.5 * LONG * pair_bytes
 
 
 def images(folder: Path, side: int) -> list[Path]:
@@ -132,12 +229,7 @@ def test_every_layout_gives_a_part_of_itself(numbered: Pairs, tmp_path: Path, la
     assert part.figures() == {"frames_left_out": 0}
     if part.stamps_s is not None:
         assert part.stamps_s.tolist() == [pair.timestamp_s for pair in found]
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_skipped_images_are_not_read(numbered: Pairs, tmp_path: Path, layout: str) -> None:
-    path = LAYOUTS[layout](numbered, CAMERA, tmp_path)
-    for side in (0, 1):
+    for side in (0, 1):  # images that are skipped are not read
         for number, image in enumerate(images(tmp_path, side)):
             if number not in CHOSEN:
                 image.write_bytes(b"not an image")
@@ -158,26 +250,15 @@ def test_truth_starts_at_the_first_chosen_frame_and_need_cover_no_others(
         np.testing.assert_allclose(truth.timestamps_s, [0.2, 0.5, 0.8], atol=1e-9)
 
 
-@pytest.mark.parametrize("count", [FRAMES, 3])
+@pytest.mark.parametrize("numbers", [range(FRAMES), CHOSEN])
 def test_known_poses_are_those_of_the_chosen_frames(
-    noise: Pairs, tmp_path: Path, count: int
+    noise: Pairs, tmp_path: Path, numbers: list[int]
 ) -> None:
     folder = drives.write_folders(noise[:FRAMES], CAMERA, tmp_path)
-    numbers = range(FRAMES) if count == FRAMES else CHOSEN
     poses = [make_transform(np.eye(3), np.array([0.0, 0.0, float(k)])) for k in numbers]
-    known = Trajectory(np.stack(poses), np.arange(count, dtype=np.float64))
-    source = open_source(folder, settings=PART)
-    mapped = map_sequence(source, load_config(), known_poses=known)
+    known = Trajectory(np.stack(poses), np.arange(len(numbers), dtype=np.float64))
+    mapped = map_sequence(open_source(folder, settings=PART), load_config(), known_poses=known)
     assert mapped.trajectory.positions_m[:, 2].tolist() == [0, 3, 6]
-
-
-@pytest.mark.parametrize(("start", "end"), [(11, None), (4, 4), (5, 3)])
-def test_no_frame_at_all_is_an_error(
-    numbered: Pairs, tmp_path: Path, start: int, end: int | None
-) -> None:
-    folder = drives.write_folders(numbered, CAMERA, tmp_path)
-    with pytest.raises(ReconError, match=r"no frame is chosen .*frames from 0 to 10"):
-        open_source(folder, settings=SourceSettings(start=start, end=end))
 
 
 @pytest.mark.parametrize("shift", [-2, 1])
@@ -197,14 +278,15 @@ def test_every_layout_pairs_each_left_image_with_the_right_one_of_later(
     assert f"right images {shift:+d} frame" in source.description
     assert source.lines(FRAMES) == kept
     assert source.left_out == 0
-    part = SourceSettings(shift_frames=shift, start=1, stride=3)
-    assert [shown(p)[0] for p in open_source(path, settings=part)] == kept[1::3]
+    part = open_source(path, settings=SourceSettings(shift_frames=shift, start=1, stride=3))
+    assert [shown(pair)[0] for pair in part] == kept[1::3]
+    assert part.shift_of(-2) == shift - 6  # what the audit advises counts what is left out
 
 
 def test_of_cameras_with_different_rates_the_frames_of_the_slower_one_count(
     numbered: Pairs, tmp_path: Path
 ) -> None:
-    folder = write_stamped(numbered, CAMERA, tmp_path)
+    folder = IN_IMAGES["stamped"](numbered, CAMERA, tmp_path)
     for number, path in enumerate(images(folder, 1)):
         if number % 3:
             path.unlink()
@@ -212,14 +294,22 @@ def test_of_cameras_with_different_rates_the_frames_of_the_slower_one_count(
     assert [shown(pair) for pair in source] == [(0, 3), (3, 6), (6, 9)]
 
 
-@pytest.mark.parametrize("shift", [FRAMES, -FRAMES, 10**9])
-@pytest.mark.parametrize("layout", ["kitti", "euroc", "two videos", "mcap"])
-def test_a_shift_that_leaves_no_pair_is_refused(
-    numbered: Pairs, tmp_path: Path, layout: str, shift: int
+@pytest.mark.parametrize("layout", ["kitti", "two videos", "mcap"])
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        *(({"shift_frames": by}, rf"no pair is left .*shift_frames={by}, 11 frames")
+          for by in (FRAMES, -FRAMES, 10**9)),
+        *(({"start": start, "end": end}, r"no frame is chosen .*frames from 0 to 10")
+          for start, end in ((11, None), (4, 4), (5, 3))),
+    ],
+)  # fmt: skip
+def test_settings_that_leave_no_pair_are_refused(
+    numbered: Pairs, tmp_path: Path, layout: str, settings: dict[str, int | None], message: str
 ) -> None:
     path = ALL[layout](numbered, CAMERA, tmp_path)
-    with pytest.raises(ReconError, match=rf"no pair is left .*shift_frames={shift}, 11 frames"):
-        open_source(path, settings=SourceSettings(shift_frames=shift))
+    with pytest.raises(ReconError, match=message):
+        open_source(path, settings=SourceSettings(**settings))
 
 
 def test_cameras_take_no_shift() -> None:
@@ -231,11 +321,6 @@ def test_cameras_take_no_shift() -> None:
         pass
 
 
-@pytest.fixture(scope="module")
-def street() -> tuple[Pairs, RectifiedCamera]:
-    return drives.rendered(9, width_px=320, height_px=160, focal_px=190.0)
-
-
 def counted(pairs: Pairs) -> Pairs:
     """The pairs, counted from 0 at time 0."""
     return [replace(p, index=k, timestamp_s=0.1 * k) for k, p in enumerate(pairs)]
@@ -243,20 +328,20 @@ def counted(pairs: Pairs) -> Pairs:
 
 @pytest.mark.parametrize("frames", [-1, 1, 2])
 def test_the_audit_names_the_shift_with_which_a_late_drive_is_mapped_as_if_it_were_not(
-    street: tuple[Pairs, RectifiedCamera], tmp_path: Path, frames: int
+    drive: Drive, tmp_path: Path, frames: int
 ) -> None:
-    drive, camera = street
+    pairs, camera = drive
     late = [
-        replace(pair, right=drive[pair.index - frames].right)
-        for pair in drive
-        if 0 <= pair.index - frames < len(drive)
+        replace(pair, right=pairs[pair.index - frames].right)
+        for pair in pairs
+        if 0 <= pair.index - frames < len(pairs)
     ]
     folder = drives.write_kitti(counted(late), camera, tmp_path / "late")
     findings = audit_source(open_source(folder), load_config(), quick=True).findings
     (finding,) = (one for one in findings if one.code == "lag")
     assert f"--set source.shift_frames={frames} " in finding.text
     shifted = open_source(folder, settings=SourceSettings(shift_frames=frames))
-    known = [p for p in drive if abs(frames) <= p.index < len(drive) - abs(frames)]
+    known = [p for p in pairs if abs(frames) <= p.index < len(pairs) - abs(frames)]
     same = drives.write_kitti(counted(known), camera, tmp_path / "known")
     mapped, expected = (
         map_sequence(source, load_config()).trajectory.positions_m
@@ -266,19 +351,11 @@ def test_the_audit_names_the_shift_with_which_a_late_drive_is_mapped_as_if_it_we
     np.testing.assert_allclose(mapped, expected, atol=1e-6)
 
 
-def test_the_advice_counts_what_is_shifted_already_and_frames_that_are_left_out(
-    numbered: Pairs, tmp_path: Path
-) -> None:
-    folder = drives.write_kitti(numbered, CAMERA, tmp_path)
-    source = open_source(folder, settings=SourceSettings(shift_frames=1, stride=2))
-    assert source.shift_of(-2) == -3
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("layout", IN_IMAGES)
 def test_frames_without_a_partner_are_left_out_and_counted(
     numbered: Pairs, tmp_path: Path, layout: str
 ) -> None:
-    folder = LAYOUTS[layout](numbered, CAMERA, tmp_path)
+    folder = IN_IMAGES[layout](numbered, CAMERA, tmp_path)
     images(folder, 0)[7].unlink()
     images(folder, 1)[4].unlink()
     source = open_source(folder)
@@ -299,16 +376,11 @@ def test_frames_without_a_partner_are_left_out_and_counted(
     late = open_source(folder, settings=SourceSettings(shift_frames=1))
     assert [shown(pair) for pair in late] == [(k, k + 1) for k in (0, 1, 2, 4, 5, 6, 8, 9)]
     assert late.left_out == 2
-
-
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "stamped"])
-def test_most_images_missing_is_an_error(numbered: Pairs, tmp_path: Path, layout: str) -> None:
-    folder = LAYOUTS[layout](numbered, CAMERA, tmp_path)
-    # Stamped names may also be those of a slower camera.
     for path in images(folder, 1)[1:7]:
         path.unlink()
-    with pytest.raises(SourceError, match=r"most images have no partner|numbers of left and right"):
-        open_source(folder)
+    if layout != "stamped":  # whose names may also be those of a slower camera
+        with pytest.raises(SourceError, match=r"most images have no partner|numbers of left"):
+            open_source(folder)
 
 
 def extra_left(folder: Path) -> None:
@@ -324,7 +396,7 @@ def unpaired_row(folder: Path) -> None:
     ("write", "spoil"), [(write_kitti, extra_left), (drives.write_euroc, unpaired_row)]
 )
 def test_one_stray_entry_stops_nothing(
-    numbered: Pairs, tmp_path: Path, write: drives.Writer, spoil: Callable[[Path], None]
+    numbered: Pairs, tmp_path: Path, write: Writer, spoil: Callable[[Path], None]
 ) -> None:
     folder = write(numbered, CAMERA, tmp_path)
     spoil(folder)
