@@ -16,15 +16,14 @@ from recon.map.kernels.facets import LEAST
 from recon.map.kernels.raycast import MIN_DEPTH_M, Rays
 from tests.core.kernels.voxels_reference import Cell
 
+Array = NDArray[Any]
+Clamped = tuple[float, float, float]
+"""Sum, low, high: stands for ``x → min(max(x + sum, low), high)``."""
+
 
 def measure_points_reference(
-    xyz: NDArray[Any],
-    sigma: NDArray[Any],
-    confidence: NDArray[Any],
-    T: NDArray[Any],
-    max_range: float,
-    margin: float,
-) -> tuple[NDArray[Any], NDArray[Any]]:
+    xyz: Array, sigma: Array, confidence: Array, T: Array, max_range: float, margin: float
+) -> tuple[Array, Array]:
     """Ends of rays (N, 3) and values (N, 4), as `recon.map.kernels.raycast.measure_points` says."""
     scale = np.linalg.norm(T[0, :3])
     metres = np.linalg.norm(xyz, axis=1)
@@ -37,8 +36,8 @@ def measure_points_reference(
 
 
 def limit_points_reference(
-    xyz: NDArray[Any], sigma: NDArray[Any], max_range: float, beyond: float, margin: float
-) -> tuple[NDArray[Any], NDArray[Any]]:
+    xyz: Array, sigma: Array, max_range: float, beyond: float, margin: float
+) -> tuple[Array, Array]:
     """Points (N, 3) and deviations (N,), as `recon.map.kernels.raycast.limit_points` says."""
     length = np.linalg.norm(xyz, axis=1)
     shrink = np.where(length <= max_range, 1.0, beyond / np.maximum(length, 1e-30))
@@ -47,15 +46,8 @@ def limit_points_reference(
     return xyz * shrink[:, None], np.where(shrink == 1.0, sigma, left)
 
 
-def walk_reference(
-    origin: tuple[float, float, float], direction: tuple[float, float, float]
-) -> Iterator[tuple[Cell, float, float]]:
-    """The cells along a ray without end: cell, length at its entry, length at its exit.
-
-    Args:
-        origin: Where the ray starts, in cells.
-        direction: Unit vector.
-    """
+def walk(origin: list[float], direction: list[float]) -> Iterator[tuple[Cell, float, float]]:
+    """The cells along a ray without end: cell, length at its entry, length at its exit."""
     cell = [math.floor(o) for o in origin]
     step = [int(np.sign(d)) for d in direction]
     delta = [1.0 / abs(d) if d else math.inf for d in direction]
@@ -88,15 +80,14 @@ def cast_rays_reference(rays: Rays, spread: float) -> dict[Cell, float]:
 
 def _ray(rays: Rays, n: int, spread: float) -> Iterator[tuple[Cell, float]]:
     """What one ray says of each cell that it crosses."""
-    x, y, z = (rays.ends[n] - rays.origin).tolist()
-    length = math.sqrt(x * x + y * y + z * z)
+    way = rays.ends[n] - rays.origin
+    length = math.sqrt(sum(x * x for x in way.tolist()))
     if length == 0:
         return
     free, sigma, hit = float(rays.free[n]), float(rays.sigma[n]), float(rays.hit[n])
     near = length - spread * sigma if hit > 0 else math.inf
     stop = max(free, length + spread * sigma) if hit > 0 else free
-    ox, oy, oz = rays.origin.tolist()
-    for cell, enter, leave in walk_reference((ox, oy, oz), (x / length, y / length, z / length)):
+    for cell, enter, leave in walk(rays.origin.tolist(), (way / length).tolist()):
         if leave > near:
             yield cell, hit * (_below(leave, length, sigma) - _below(enter, length, sigma))
         elif leave <= free:
@@ -112,10 +103,6 @@ def _below(value: float, mean: float, sigma: float) -> float:
     return 0.5 * (1.0 + math.erf((value - mean) / (sigma * math.sqrt(2.0))))
 
 
-Clamped = tuple[float, float, float]
-"""Sum, low, high: stands for ``x → min(max(x + sum, low), high)``."""
-
-
 def apply_evidence_reference(
     log_odds: dict[Cell, float], evidence: dict[Cell, float], lowest: float, highest: float
 ) -> None:
@@ -124,37 +111,25 @@ def apply_evidence_reference(
         log_odds[cell] = min(max(log_odds.get(cell, 0.0) + change, lowest), highest)
 
 
-def move_reference(cells: dict[Cell, Clamped], T_new_old: NDArray[Any]) -> dict[Cell, Clamped]:
+def move_reference(cells: dict[Cell, Clamped], T_new_old: Array) -> dict[Cell, Clamped]:
     """Each new cell takes what the old cell at its centre has."""
     centres = np.array(list(cells), dtype=np.float64).reshape(-1, 3) + 0.5
     T_old_new = np.linalg.inv(T_new_old)
     moved: dict[Cell, Clamped] = {}
     for centre in centres @ T_new_old[:3, :3].T + T_new_old[:3, 3]:
-        home = np.floor(centre).astype(int)
-        for offset in np.ndindex(3, 3, 3):
-            i, j, k = (home + np.array(offset) - 1).tolist()
-            x, y, z = (T_old_new[:3, :3] @ [i + 0.5, j + 0.5, k + 0.5] + T_old_new[:3, 3]).tolist()
-            old = (math.floor(x), math.floor(y), math.floor(z))
-            if old in cells:
-                moved[i, j, k] = cells[old]
+        for offset in product((-1, 0, 1), repeat=3):
+            new = np.floor(centre).astype(int) + offset
+            i, j, k = np.floor(T_old_new[:3, :3] @ (new + 0.5) + T_old_new[:3, 3]).astype(int)
+            if (i, j, k) in cells:
+                moved[tuple(new.tolist())] = cells[i, j, k]
     return moved
 
 
-def crossed_cells_reference(
-    cells: list[Cell], points: dict[Cell, tuple[float, NDArray[Any]]]
-) -> list[bool]:
-    """Which cells are crossed, as `recon.map.kernels.facets.crossed_cells` defines it.
+def is_crossed(cell: Cell, points: dict[Cell, tuple[float, Array]]) -> bool:
+    """Whether a cell is crossed, as `recon.map.kernels.facets.crossed_cells` defines it.
 
-    Args:
-        cells: The cells asked about.
-        points: Of each cell that holds points, the sum of their weights and their mean, float64
-            (3,), as a place in space.
+    ``points`` are the sum of weights and the mean (3,) in space of each cell that holds any.
     """
-    return [_crossed(cell, points) for cell in cells]
-
-
-def _crossed(cell: Cell, points: dict[Cell, tuple[float, NDArray[Any]]]) -> bool:
-    """Whether the surface crosses one cell."""
     steps = product((-1, 0, 1), repeat=3)
     around = [points.get((cell[0] + i, cell[1] + j, cell[2] + k)) for i, j, k in steps]
     known = [point for point in around if point is not None]
