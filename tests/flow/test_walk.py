@@ -49,10 +49,9 @@ class Tracer:
                 self.files.add(path.relative_to(CODE.parent))
 
 
-@pytest.fixture(scope="module")
-def walked(street_film: Film, tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+def walked(street_film: Film, folder: Path) -> set[str]:
     """Files entered from the reading of one pair to the commit after it."""
-    folder, tracer = tmp_path_factory.mktemp("walk"), Tracer()
+    tracer = Tracer()
     write_kitti(street_film, folder / "drive")
     read, commit = ImageSource.frames, MapFile.commit
 
@@ -81,7 +80,6 @@ def walked(street_film: Film, tmp_path_factory: pytest.TempPathFactory) -> set[s
     return {path.as_posix() for path in tracer.files if is_walked(path)}
 
 
-@pytest.fixture(scope="module")
 def named() -> set[str]:
     """Files that the page names on the way."""
     page = (CODE.parent / "docs" / "architecture.md").read_text()
@@ -90,11 +88,9 @@ def named() -> set[str]:
     return set(re.findall(r"`(recon/[\w/]+\.py)`", steps))
 
 
-def test_the_page_names_the_files_that_a_pair_goes_through(
-    walked: set[str], named: set[str]
+def test_the_page_names_the_few_files_that_a_pair_goes_through(
+    street_film: Film, tmp_path: Path
 ) -> None:
-    assert named == walked
-
-
-def test_a_reader_follows_a_pair_through_few_files(walked: set[str]) -> None:
-    assert 15 < len(walked) <= MOST_FILES
+    files = walked(street_film, tmp_path)
+    assert named() == files
+    assert 15 < len(files) <= MOST_FILES

@@ -1,4 +1,4 @@
-"""What every command shares: configuration, report, summary and record of a run."""
+"""A run's folder appears complete, or not at all, with configuration, summary and record."""
 
 from __future__ import annotations
 
@@ -13,9 +13,13 @@ from typing import Any
 import pytest
 import yaml
 
+from recon.core.errors import FormatError, OutputError
 from recon.core.settings import Settings
+from recon.io.atomic import exchange
+from recon.run import directory
+from recon.run.directory import RunDirectory, refuse_links, state_folder
 from recon.run.progress import Silent
-from recon.run.run import Run, fingerprint, plain
+from recon.run.run import Run, WholeRun, fingerprint, plain
 
 
 class _Size(Settings):
@@ -30,20 +34,15 @@ class _Notes(Silent):
         self.stages.append(name)
 
 
-def _read(path: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
 def test_a_run_writes_configuration_summary_and_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    photo, peak_mb = tmp_path / "im0.png", itertools.count(100.0)
+    photo, out, peak_mb = tmp_path / "im0.png", tmp_path / "out", itertools.count(100.0)
     photo.write_bytes(b"pixels")
     monkeypatch.setattr("recon.run.run.peak_memory_mb", lambda: next(peak_mb))
     notes = _Notes()
     summary: dict[str, Any] = {"points": 3, "warnings": ["few points"]}
-    with Run("pair", tmp_path / "out", _Size(), threads=1, progress=notes) as run:
+    with Run("pair", out, _Size(), threads=1, progress=notes) as run:
         for _ in range(2):
             with run.stage("match"):
                 time.sleep(0.01)
@@ -51,17 +50,19 @@ def test_a_run_writes_configuration_summary_and_record(
             assert yaml.safe_load(run.path("config.yaml").read_text()) == {"voxel_m": 0.1}
             shown = dict(summary)
             run.path("report.html").write_text("<p>")
+        with pytest.raises(ValueError, match="JSON"):
+            run.write_json("figures.json", {"t_rel_percent": math.nan})
         run.finish(summary, source="im0", inputs=[photo], record={"mapped_by": "demo"})
 
     assert notes.stages == ["report"]
-    assert _read(tmp_path / "out" / "summary.json") == summary
-    assert summary["out"] == str(tmp_path / "out")
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert summary["out"] == str(out)
     cost = ("seconds", "stages", "peak_memory_mb")
     assert list(shown) == ["points", "warnings", *cost]
     assert shown == {**{key: summary[key] for key in cost}, "points": 3, "warnings": ["few points"]}
     assert list(shown["stages"]) == ["match"]
     assert 60 > shown["seconds"] >= shown["stages"]["match"] >= 0.02
-    record = _read(tmp_path / "out" / "run.json")
+    record = json.loads((out / "run.json").read_text())
     assert list(record["timings"]) == ["match", "report", "hash"]
     kept = ("command", "source", "inputs", "warnings", "mapped_by", "peak_memory_mb", "files")
     assert {name: record[name] for name in kept} == {
@@ -75,11 +76,18 @@ def test_a_run_writes_configuration_summary_and_record(
     }
 
 
-def test_a_run_without_configuration_writes_none(tmp_path: Path) -> None:
-    with Run("audit", tmp_path / "out") as run:
-        run.finish({}, source="drive", inputs=[])
-    written = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert written == ["run.json", "summary.json"]
+def test_a_run_in_the_default_folder_gets_a_link_and_writes_no_configuration_that_there_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        with Run("map") as run:
+            run.finish({}, source="drive", inputs=[])
+    runs = tmp_path / "outputs" / "map"
+    stamps = sorted(path for path in runs.iterdir() if not path.is_symlink())
+    assert len(stamps) == 2
+    assert (runs / "latest").resolve() == stamps[-1]
+    assert files_in(runs / "latest") == {"run.json", "summary.json"}
 
 
 def test_a_hash_of_inputs_knows_their_names_bytes_and_order(tmp_path: Path) -> None:
@@ -109,3 +117,130 @@ def test_plain_values_survive_json_and_nan_becomes_null() -> None:
     figures = _Figures(error=math.nan, bad={0.5: 1.25, 2.0: math.inf}, lengths=(50.0, 100.0))
     expected = {"error": None, "bad": {"0.5": 1.25, "2.0": None}, "lengths": [50.0, 100.0]}
     assert json.loads(json.dumps(plain(figures), allow_nan=False)) == expected
+
+
+def write_run(folder: Path, *names: str, whole: bool = False) -> None:
+    with WholeRun("merge", folder) if whole else RunDirectory(folder) as run:
+        for name in names:
+            run.path(name).write_text(name)
+        run.write_json("run.json", {"files": [*run.files(), "run.json"]})
+
+
+def fail_halfway(folder: Path, error: type[BaseException] = KeyError, begun: bool = False) -> None:
+    def fail() -> None:
+        with RunDirectory(folder) as run:
+            run.state("map.recon").write_text("so far")
+            run.begun = begun
+            run.path("map/cloud.ply").write_text("half")
+            assert ".partial" in {path.name for path in folder.iterdir()}
+            raise error
+
+    with pytest.raises(error):
+        fail()
+
+
+def files_in(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_failed_run_leaves_an_earlier_run_as_it_was_or_no_folder(tmp_path: Path) -> None:
+    fail_halfway(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+    write_run(tmp_path / "run", "map/cloud.ply")
+    fail_halfway(tmp_path / "run")
+    assert (tmp_path / "run" / "map" / "cloud.ply").read_text() == "map/cloud.ply"
+    assert files_in(tmp_path / "run") == {"map/cloud.ply", "run.json"}
+
+
+@pytest.mark.parametrize(
+    ("error", "begun", "stays"),
+    [(OSError, True, True), (OSError, False, False), (KeyError, True, False)],
+)
+def test_what_the_input_did_not_cause_leaves_what_a_run_resumes_from(
+    tmp_path: Path, error: type[BaseException], begun: bool, stays: bool
+) -> None:
+    fail_halfway(tmp_path / "run", error, begun)
+    assert (state_folder(tmp_path / "run") / "map.recon").is_file() == stays
+    if stays:
+        with RunDirectory(tmp_path / "run", resume=True) as run:
+            assert (run.begun, run.files()) == (True, [])
+            assert run.state("map.recon").read_text() == "so far"
+    assert not state_folder(tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("exchanges", "left"), [(False, "old"), (True, "new")])
+def test_a_run_that_is_interrupted_as_it_takes_the_place_of_another_leaves_one_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: bool, left: str
+) -> None:
+    def interrupted(new: Path, old: Path) -> None:
+        if exchanges:
+            exchange(new, old)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(directory, "exchange", interrupted)
+    write_run(tmp_path / "run", "old")
+    with pytest.raises(KeyboardInterrupt):
+        write_run(tmp_path / "run", "new", whole=True)
+    assert files_in(tmp_path) == {f"run/{left}", "run/run.json"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_an_address_is_not_taken_for_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resume: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    address = Path("s3://bucket/week")
+    for out in (address, address.resolve()):
+        with pytest.raises(OutputError, match="folder, not to an address"):
+            RunDirectory(out, resume=resume).__enter__()
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "s3:").mkdir()  # who has made it means it
+    write_run(address, "summary.json")
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(
+    tmp_path: Path, whole: bool
+) -> None:
+    write_run(tmp_path / "run", "mesh/mesh.ply")
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    (tmp_path / "precious").write_text("stay")
+    record = {"files": ["mesh/mesh.ply", "run.json", "../precious", str(tmp_path / "precious")]}
+    (tmp_path / "run" / "run.json").write_text(json.dumps(record))
+    killed = tmp_path / "run" / ".partial" / "map" / "octomap.ot"
+    killed.parent.mkdir(parents=True)
+    killed.write_text("half")
+    write_run(tmp_path / "run", "map/cloud.ply", whole=whole)
+    assert files_in(tmp_path / "run") == {"map/cloud.ply", "notes.txt", "run.json"}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["precious", "run"]
+
+
+@pytest.mark.parametrize(
+    ("inside", "said"),
+    [
+        ("", "are not of a run"),
+        ("thesis", "is a file"),
+        ("thesis/deeper", "cannot be written"),
+    ],
+)
+def test_a_folder_of_other_files_and_a_file_are_refused(
+    tmp_path: Path, inside: str, said: str
+) -> None:
+    (tmp_path / "thesis").write_text("years of work")
+    with pytest.raises(OutputError, match=said) as told, RunDirectory(tmp_path / inside):
+        pass
+    assert str(tmp_path / inside) in str(told.value)
+    assert "\n" not in str(told.value)
+    assert files_in(tmp_path) == {"thesis"}
+
+
+def test_links_below_a_folder_are_refused_and_the_folder_may_be_one(tmp_path: Path) -> None:
+    (tmp_path / "run" / "map").mkdir(parents=True)
+    (tmp_path / "latest").symlink_to("run")
+    refuse_links(tmp_path / "latest" / "map")
+    with pytest.raises(FormatError, match="latest"):
+        refuse_links(tmp_path / "latest" / "map", below=tmp_path)
+    (tmp_path / "run" / "map" / "cloud.ply").symlink_to("/etc/passwd")
+    with pytest.raises(FormatError, match=r"cloud\.ply"):
+        refuse_links(tmp_path / "run")

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-from recon.run.batch import job as process
 from recon.run.batch.job import Job
 
 #: What `recon` would do, without what it needs to start: `… map WHAT --out FOLDER …`.
@@ -62,13 +58,6 @@ elif what == "endless":
 def job(name: str, what: str = "good", **changes: Any) -> Job:
     values = {"folder": ".", "writes": True, **changes}
     return Job(name, "map", what, ("map", what), **values)
-
-
-@pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    script = tmp_path / "stand_in.py"
-    script.write_text(STAND_IN)
-    monkeypatch.setattr(process, "_PROGRAM", (sys.executable, str(script)))
 
 
 def tries(folder: Path, name: str) -> list[str]:

@@ -16,11 +16,9 @@ from recon.core.errors import ClusterError, FormatError, MissingDependencyError,
 from recon.run.batch.cluster import BatchOptions, Cluster, _outcome, join_cluster, local_cluster
 from recon.run.batch.job import Job, Outcome, log_file
 from recon.run.batch.results import work_off
-from tests.run.batch.jobs import job, stand_in, tries
+from tests.run.batch.jobs import job, tries
 
 distributed = pytest.importorskip("distributed")
-__all__ = ["stand_in"]
-usefixtures = pytest.mark.usefixtures("stand_in")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +39,7 @@ def run(cluster: Cluster, jobs: list[Job], folder: Path) -> dict[str, Outcome]:
     return dict(ended)
 
 
-@usefixtures
+@pytest.mark.usefixtures("stand_in")
 def test_what_breaks_goes_on_and_what_fails_is_named_and_the_rest_is_done(
     cluster: Cluster, tmp_path: Path
 ) -> None:
@@ -58,6 +56,8 @@ def test_what_breaks_goes_on_and_what_fails_is_named_and_the_rest_is_done(
     assert tries(tmp_path, "c") == ["begun", "resumed", "begun"]
     assert (ended["d"].state, ended["d"].tries) == ("failed", 1)
     assert ended["d"].error == "nowhere: folder does not exist"
+    ended = run(cluster, [job("a", retries=1)], tmp_path / "unseen")
+    assert (ended["a"].state, "unseen" in ended["a"].error) == ("broken", True)
 
 
 def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
@@ -118,13 +118,6 @@ def test_jobs_need_of_workers_what_all_of_these_declare() -> None:
     assert Client.asked == {"j0": {"threads": 2}, "j1": None, "j2": None}
 
 
-@usefixtures
-def test_a_worker_that_cannot_run_a_job_says_why(cluster: Cluster, tmp_path: Path) -> None:
-    ended = run(cluster, [job("a", retries=1)], tmp_path / "unseen")
-    assert ended["a"].state == "broken"
-    assert "unseen" in ended["a"].error
-
-
 def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path: Path) -> None:
     class Lost:
         status = "error"
@@ -146,7 +139,7 @@ def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path:
         run(Cluster(cluster._client, nobody), [job("a")], tmp_path)
 
 
-@usefixtures
+@pytest.mark.usefixtures("stand_in")
 def test_two_batches_with_jobs_of_the_same_name_share_a_scheduler(
     cluster: Cluster, tmp_path: Path
 ) -> None:
@@ -180,9 +173,6 @@ def test_workers_share_the_cores_of_this_machine(monkeypatch: pytest.MonkeyPatch
     assert BatchOptions(scheduler="tcp://x:1").threads_of(None) is None
 
 
-GREETINGS = (b"", b"SSH-2.0-OpenSSH_9.6\r\n", b"HTTP/1.1 400 Bad Request\r\n\r\n" + bytes(1000))
-
-
 def assert_not_reached(address: str | Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("recon.run.batch.cluster._REACH_S", 1.0)
@@ -192,8 +182,15 @@ def assert_not_reached(address: str | Path) -> None:
     assert caught.value.got
 
 
-@pytest.mark.parametrize("greeting", GREETINGS)
-@pytest.mark.parametrize("protocol", ["tcp://", "tls://", ""])
+@pytest.mark.parametrize(
+    ("protocol", "greeting"),
+    [
+        ("tcp://", b""),
+        ("tcp://", b"HTTP/1.1 400 Bad Request\r\n\r\n" + bytes(1000)),
+        ("tls://", b"SSH-2.0-OpenSSH_9.6\r\n"),
+        ("", b"SSH-2.0-OpenSSH_9.6\r\n"),
+    ],
+)
 def test_what_is_no_scheduler_is_one_line_and_not_waited_for(
     protocol: str, greeting: bytes
 ) -> None:
@@ -212,17 +209,13 @@ def test_what_is_no_scheduler_is_one_line_and_not_waited_for(
         connection.close()
 
 
-@pytest.mark.parametrize(
-    "address", ["tcp://127.0.0.1:9", "ucx://x:1", "nonsense", "tcp://", "tcp://127.0.0.1:x", ""]
-)
-def test_what_is_no_address_of_a_scheduler_is_one_line(address: str) -> None:
-    assert_not_reached(address)
-
-
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"address": 3}'])
-def test_a_file_that_names_no_scheduler_is_one_line(content: str, tmp_path: Path) -> None:
-    (tmp_path / "scheduler.json").write_text(content)
-    assert_not_reached(tmp_path / "scheduler.json")
+def test_what_names_no_scheduler_is_one_line(tmp_path: Path) -> None:
+    here = "tcp://127.0.0.1"
+    for address in (f"{here}:9", f"{here}:x", "tcp://", "ucx://x:1", "nonsense", ""):
+        assert_not_reached(address)
+    for content in ("", "[]", "{}", '{"address": 3}'):
+        (tmp_path / "scheduler.json").write_text(content)
+        assert_not_reached(tmp_path / "scheduler.json")
 
 
 def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -> None:

@@ -12,16 +12,14 @@ from pathlib import Path
 
 import pytest
 
-import recon
 from recon.core.errors import FormatError
 from recon.io.atomic import take_lock
 from recon.run.batch import job as process
 from recon.run.batch.job import Job, Outcome, is_done, last_outcome, log_file, run_job
 from recon.run.directory import lock_file
-from tests.run.batch.jobs import job, stand_in, tries
+from tests.run.batch.jobs import job, tries
 from tests.scenery.patience import LONG_S
 
-__all__ = ["stand_in"]
 usefixtures = pytest.mark.usefixtures("stand_in")
 
 
@@ -38,12 +36,9 @@ def test_a_job_writes_its_folder_and_a_log_and_is_not_run_again(tmp_path: Path) 
     assert '"succeeded"' in ended
     assert run_job(job("a"), tmp_path, "there") == outcome
     assert tries(tmp_path, "a") == ["begun"]
-
-
-@usefixtures
-def test_the_log_has_what_is_said_but_few_of_many_frames(tmp_path: Path) -> None:
-    run_job(job("a", "says much"), tmp_path)
-    log = log_of(tmp_path, "a")
+    # But few of many frames.
+    run_job(job("b", "says much"), tmp_path)
+    log = log_of(tmp_path, "b")
     assert "warning: the lens is dirty" in log
     assert 1 <= sum('"frame"' in line for line in log) < 10
 
@@ -60,19 +55,14 @@ def test_what_is_left_of_a_log_counts(tmp_path: Path) -> None:
     assert last_outcome(tmp_path, "a").state == "broken"
 
 
-@pytest.mark.parametrize(
-    "line", ['{"try": 3}', '{"try": {"state": "x"}}', '{"try": {"seconds": NaN}}']
-)
-def test_a_log_that_is_none_is_one_line(tmp_path: Path, line: str) -> None:
-    log_file(tmp_path, "a").parent.mkdir()
-    log_file(tmp_path, "a").write_text(line)
-    with pytest.raises(FormatError, match=r"a\.log"):
-        last_outcome(tmp_path, "a")
-
-
 @usefixtures
-def test_a_log_that_leads_elsewhere_is_not_followed(tmp_path: Path) -> None:
+def test_a_log_that_is_none_or_leads_elsewhere_is_one_line(tmp_path: Path) -> None:
     log_file(tmp_path, "a").parent.mkdir()
+    for line in ('{"try": 3}', '{"try": {"state": "x"}}', '{"try": {"seconds": NaN}}'):
+        log_file(tmp_path, "a").write_text(line)
+        with pytest.raises(FormatError, match=r"a\.log"):
+            last_outcome(tmp_path, "a")
+    log_file(tmp_path, "a").unlink()
     log_file(tmp_path, "a").symlink_to(tmp_path / "precious")
     with pytest.raises(FormatError, match="link"):
         run_job(job("a"), tmp_path)
@@ -81,30 +71,19 @@ def test_a_log_that_leads_elsewhere_is_not_followed(tmp_path: Path) -> None:
 
 @usefixtures
 @pytest.mark.parametrize(
-    ("what", "error"),
-    [("bad", "nowhere: folder does not exist"), ("boxed", "No such option: --x")],
+    ("what", "state", "error"),
+    [
+        ("bad", "failed", "nowhere: folder does not exist"),
+        ("boxed", "failed", "No such option: --x"),
+        ("killed once", "broken", "its process was killed by signal 9; out of memory?"),
+    ],
 )
-def test_bad_input_is_a_failure_with_the_line_of_the_command(
-    tmp_path: Path, what: str, error: str
+def test_a_failure_by_the_input_has_the_line_of_the_command_and_a_death_its_signal(
+    tmp_path: Path, what: str, state: str, error: str
 ) -> None:
     outcome = run_job(job("a", what), tmp_path)
-    assert (outcome.state, outcome.error) == ("failed", error)
-
-
-@usefixtures
-def test_a_killed_job_is_broken_and_says_by_what(tmp_path: Path) -> None:
-    killed = run_job(job("a", "killed once"), tmp_path)
-    error = "its process was killed by signal 9; out of memory?"
-    assert (killed.state, killed.error) == ("broken", error)
-    assert run_job(job("a", "killed once"), tmp_path).tries == 2
-
-
-def test_a_job_runs_the_program_of_its_worker(tmp_path: Path) -> None:
-    found = subprocess.run(
-        [sys.executable, "-c", "import recon; print(recon.__file__)"],
-        cwd=tmp_path, env=process._environment(), capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert Path(found.stdout.strip()).samefile(recon.__file__)
+    assert (outcome.state, outcome.error, outcome.tries) == (state, error, 1)
+    assert run_job(job("a", what), tmp_path).tries == 2
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Python before 3.11 looks there first")
@@ -124,6 +103,8 @@ def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path: Path) -> None:
     assert run_job(job("a", "damaged"), tmp_path).stale
     assert run_job(job("a", "damaged"), tmp_path).stale is False
     assert tries(tmp_path, "a") == ["begun", "resumed", "begun"]
+    outcome = run_job(job("b", folder=str(tmp_path / "elsewhere")), tmp_path)
+    assert (outcome.state, "elsewhere" in outcome.error) == ("broken", True)
 
 
 @usefixtures
@@ -166,12 +147,6 @@ def test_a_try_waits_for_an_earlier_one_that_still_runs(tmp_path: Path) -> None:
     assert run_job(job("a"), tmp_path).state == "succeeded"
     assert left_off == [True]
     release.join()
-
-
-@usefixtures
-def test_a_folder_that_this_worker_does_not_see_is_one_line(tmp_path: Path) -> None:
-    outcome = run_job(job("a", folder=str(tmp_path / "elsewhere")), tmp_path)
-    assert (outcome.state, "elsewhere" in outcome.error) == ("broken", True)
 
 
 def test_a_command_without_a_result_folder_gets_one(tmp_path: Path) -> None:

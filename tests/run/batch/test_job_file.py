@@ -45,10 +45,12 @@ def test_a_job_has_all_that_it_says(tmp_path: Path) -> None:
     assert (pair.source, pair.options, pair.timeout_s) == (["left.png", "right.png"], [], None)
 
 
-def test_yaml_says_the_same(tmp_path: Path) -> None:
+def test_yaml_says_the_same_and_its_recursion_is_one_line(tmp_path: Path) -> None:
     text = "job:\n- {name: monday, command: map, source: drives/monday, set: [a=1]}\n"
     (entry,) = read_jobs(write(tmp_path, text, "yaml")).job
     assert (entry.name, entry.source, entry.set) == ("monday", ["drives/monday"], ["a=1"])
+    with pytest.raises(ReconError, match=r"expand to too many|not a table"):
+        read_jobs(write(tmp_path, "job: &a\n- *a\n", "yaml"))
 
 
 def test_what_a_batch_says_stands_before_what_a_job_says(tmp_path: Path) -> None:
@@ -109,24 +111,18 @@ NAMES = ["../a", "/a", "a/b", "..", ".hidden", "", "a\\\\b", "a b", "é", "-a", 
         ("", "empty"),
         ("[[job]]\n[[job", "not a TOML"),
         ("jobs = 3", "'job'.*required"),
-        ("job = 3", "'job'.*got 3"),
         ("job = []", "'job'.*at least 1"),
-        ("job = [3]", r"'job\.0'.*got 3"),
         (one_job(sorce='"x"'), r"unknown setting 'job\.0\.sorce'; .*source"),
         (one_job(swept="{}"), r"unknown setting 'job\.0\.swept'"),
         (one_job(command=""), r"'job\.0\.command'.*required"),
-        (one_job(name=""), r"'job\.0\.name'.*required"),
         (one_job(source="3"), r"'job\.0\.source'.*got 3"),
-        (one_job(name="3"), "name'.*got 3"),
         (one_job(set='"a=1"'), "set'.*got 'a=1'"),
-        (one_job(options="[1]"), r"options\.0'.*got 1"),
         (one_job(threads="0"), "threads'.*got 0"),
         (one_job(threads="true"), "threads'.*got True"),
         (one_job(timeout_s='"1 h"'), "timeout_s'.*got '1 h'"),
         (one_job(timeout_s="nan"), "timeout_s'.*got nan"),
         (one_job(retries="-1"), "retries'.*got -1"),
         ("sweep = 3\n" + one_job(), "setting 'sweep"),
-        ("[sweep]\na = 3\n" + one_job(), "setting 'sweep"),
         ("[sweep]\na = []\n" + one_job(), "setting 'sweep"),
         ("[sweep]\na = [[1]]\n" + one_job(), "setting 'sweep"),
         ("[sweep]\na = [nan]\n" + one_job(), "setting 'sweep"),
@@ -151,8 +147,3 @@ def test_everything_else_is_one_line(tmp_path: Path, text: str, words: str) -> N
 def test_a_name_is_that_of_a_folder_below_the_batch_alone(names: list[str], words: str) -> None:
     with pytest.raises(SettingsError, match=words):
         check_names(names)
-
-
-def test_recursion_in_yaml_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ReconError, match=r"expand to too many|not a table"):
-        read_jobs(write(tmp_path, "job: &a\n- *a\n", "yaml"))
