@@ -38,9 +38,7 @@ from recon.stereo.match.sad import HalfSizeMatcher
 from recon.stereo.rectify.features import check_inspection, inspect_pair
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 
-_INSPECT_EVERY: Final = 50
-"""Frames from one inspection to the next: what it looks for, swapped cameras or rows that do not
-correspond, does not change from frame to frame."""
+_INSPECT_EVERY: Final = 50  # frames: swapped cameras and rows that are off do not change
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +57,14 @@ class ReconstructedFrame:
 
 
 class FrameReconstructor:
-    """Reconstructs pairs: rectify, inspect, match, remove edges, back-project, filter.
-
-    ``threads`` are those of the matcher (None = all cores); results do not depend on them.
-    """
+    """Reconstructs pairs: rectify, inspect, match, remove edges, back-project, filter."""
 
     def __init__(
         self,
         calibration: Rig,
         config: StereoSettings,
         *,
-        threads: int | None = None,
+        threads: int | None = None,  # of the matcher; results do not depend on them
         stopwatch: Stopwatch | None = None,
     ) -> None:
         self._config = config

@@ -13,11 +13,10 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64, Int32, freeze
 
 _AXIS_M: Final = 20.0  # typical distance of a map from its cameras
+# Short beside a path, whose tilt is to count, and longer than a straight one is wide.
 _UP_M: Final = np.array([0.0, 0.0, 3.0])
-"""Short beside a path, whose tilt is to count, and longer than a straight one is wide."""
 _IN_ONE_PLACE: Final = 1e-12
-_ENDS: Final = 24
-"""Points between which lines are tried: of 276 some have two good ends, if half of all are good."""
+_ENDS: Final = 24  # points between which lines are tried: of 276, some have two good ends
 _SIGMA_OF_MEDIAN: Final = 1.4826
 _SIGMAS: Final = 4.0  # hardly one of ten thousand normal errors is larger
 

@@ -74,10 +74,7 @@ def _temporary() -> Path:
 
 
 def cache_folder(parent: Path, package: Path = _PACKAGE) -> Path:
-    """Return the folder for the sources as they are; those of earlier states are removed.
-
-    The kernels are in the folders ``kernels`` of the package, and below.
-    """
+    """Return the folder for the sources in folders ``kernels`` as they are; others are removed."""
     digest = hashlib.sha256()
     for path in sorted(path for path in package.rglob("*.py") if "kernels" in path.parts):
         digest.update(path.read_bytes())

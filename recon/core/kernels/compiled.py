@@ -29,11 +29,7 @@ _CACHE: Final = str(cache_folder(cache_parent()))
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of one kernel, which one process at a time writes.
-
-    Two that add machine code at once would choose the same file, and a later run would call code
-    for the wrong types.
-    """
+    """numba's cache of one kernel, which one process at a time writes: two would mix up code."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         found = super().load_overload(sig, target_context)

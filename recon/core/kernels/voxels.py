@@ -5,7 +5,7 @@ probing, capacity a power of two, at most half full) that gives a row. Rows are 
 which voxels were first seen, so the result does not depend on the hash. Tables and arrays grow
 by doubling.
 
-The reference implementations in plain Python are in `tests/core/kernels/voxels_reference.py`.
+The reference implementation in plain Python is in `tests/core/kernels/test_kernels.py`.
 """
 
 from __future__ import annotations
@@ -18,44 +18,43 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Bool, Float32, Int32, Int64, kernel
 
 KEY_BITS: Final = 21
-KEY_LIMIT: Final = 1 << (KEY_BITS - 1)
-"""Cell indices lie in ``[-KEY_LIMIT, KEY_LIMIT)``: 100 km to each side at 0.1 m."""
+KEY_LIMIT: Final = 1 << (KEY_BITS - 1)  # cell indices are at least minus this, and less
 EMPTY: Final = -1
 _MASK: Final = (1 << KEY_BITS) - 1
 _MIN_CAPACITY: Final = 1 << 10
 
-Store = TypeVar("Store", bound=tuple[NDArray[Any], ...])
-"""A named tuple of a hash, packed cells, what is stored under each, and the rows in use."""
+Arrays = tuple[NDArray[Any], ...]
+# A named tuple of a hash, packed cells, what is stored under each, and the rows in use.
+Store = TypeVar("Store", bound=Arrays)
 
 
 class VoxelSums(NamedTuple):
     """Sums per voxel, one row each."""
 
-    table: NDArray[np.int64]  # int64 (C, 2), hash from packed cell to row (`make_table`)
-    keys: NDArray[np.int64]  # int64 (R,), packed cells
-    # float32 (R, 4 + C): sum of weights; weighted sums of the offset from the voxel's centre (x, y,
-    # z, metres) and of the C values of each point
-    sums: NDArray[np.float32]
-    # float32 (R,), sum over frames of the largest weight in each frame
-    information: NDArray[np.float32]
-    best: NDArray[np.float32]  # float32 (R,), the largest weight in frame ``last``
-    frames: NDArray[np.int32]  # int32 (R,), number of frames that saw the voxel
-    last: NDArray[np.int32]  # int32 (R,), the frame that saw it last; -1 = none
-    used: NDArray[np.int64]  # int64 (1,), number of rows in use
+    table: Int64  # (C, 2), hash from packed cell to row (`make_table`)
+    keys: Int64  # (R,), packed cells
+    #: (R, 4 + C): sum of weights; weighted sums of the offset from the voxel's centre (x, y, z,
+    #: metres) and of the C values of each point.
+    sums: Float32
+    information: Float32  # (R,), sum over frames of the largest weight in each frame
+    best: Float32  # (R,), the largest weight in frame ``last``
+    frames: Int32  # (R,), number of frames that saw the voxel
+    last: Int32  # (R,), the frame that saw it last; -1 = none
+    used: Int64  # (1,), number of rows in use
 
 
 class VoxelPoints(NamedTuple):
     """The points of one frame."""
 
     xyz: NDArray[np.floating]  # (N, 3), finite, with cells inside ``KEY_LIMIT``
-    weights: NDArray[np.float32]  # float32 (N,); points with a weight of 0 or less are left out
-    values: NDArray[np.float32]  # float32 (N, C), numbers to average, such as colours
+    weights: Float32  # (N,); points with a weight of 0 or less are left out
+    values: Float32  # (N, C), numbers to average, such as colours
 
 
-def make_table(rows: int) -> NDArray[np.int64]:
+def make_table(rows: int) -> Int64:
     """Return an empty hash for ``rows`` entries: int64 (C, 2), packed cell (or `EMPTY`) and row."""
     capacity = _MIN_CAPACITY
     while capacity < 2 * rows:
@@ -95,13 +94,13 @@ def reserve(store: Store, rows: int, make: Callable[[int], Store]) -> Store:
     return larger
 
 
-def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
+def unpack_keys(keys: Int64) -> Int32:
     """Return int32 (N, 3) cell indices of packed cells (N,)."""
     parts = [(keys >> shift) & _MASK for shift in (2 * KEY_BITS, KEY_BITS, 0)]
     return np.asarray(np.stack(parts, axis=1) - KEY_LIMIT, dtype=np.int32)
 
 
-def pack_keys(cells: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+def pack_keys(cells: NDArray[np.integer[Any]]) -> Int64:
     """Return int64 (N,) packed cells of cell indices (N, 3)."""
     i, j, k = cells.astype(np.int64).T + KEY_LIMIT
     return np.asarray((i << (2 * KEY_BITS)) | (j << KEY_BITS) | k)
@@ -130,7 +129,7 @@ def _place(key: int, mask: int) -> int:
 
 
 @kernel
-def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
+def find_or_add(table: Int64, key: int, next_row: int) -> int:
     """Return the row of a packed cell, or enter it with ``next_row``; there is an unused place."""
     mask = len(table) - 1
     place = _place(key, mask)
@@ -144,7 +143,7 @@ def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
 
 
 @kernel
-def find(table: NDArray[np.int64], key: int) -> int:
+def find(table: Int64, key: int) -> int:
     """Return the row of a packed cell, or `EMPTY` where it is not in the hash."""
     mask = len(table) - 1
     place = _place(key, mask)
@@ -156,9 +155,7 @@ def find(table: NDArray[np.int64], key: int) -> int:
 
 
 @kernel
-def find_or_append(
-    table: NDArray[np.int64], keys: NDArray[np.int64], used: NDArray[np.int64], key: int
-) -> int:
+def find_or_append(table: Int64, keys: Int64, used: Int64, key: int) -> int:
     """Return the row of a packed cell; where it is new it gets the next row, which must exist."""
     row: int = find_or_add(table, key, used[0])
     if row == used[0]:
@@ -168,7 +165,7 @@ def find_or_append(
 
 
 @kernel
-def enter_keys(table: NDArray[np.int64], keys: NDArray[np.int64]) -> None:
+def enter_keys(table: Int64, keys: Int64) -> None:
     """Enter the cells of rows 0 … N - 1 into an empty hash."""
     for row in range(len(keys)):
         find_or_add(table, keys[row], row)
@@ -190,13 +187,7 @@ def add_points(voxels: VoxelSums, points: VoxelPoints, edge: float, frame: int) 
 
 
 @kernel
-def _add_points(
-    voxels: tuple[NDArray[Any], ...],
-    points: tuple[NDArray[Any], ...],
-    edge: float,
-    frame: int,
-    start: int,
-) -> int:
+def _add_points(voxels: Arrays, points: Arrays, edge: float, frame: int, start: int) -> int:
     """Add points from ``start`` on; return the first that finds no memory left."""
     table, keys, sums, information, best, frames, last, used = voxels
     xyz, weights, values = points
@@ -233,11 +224,7 @@ def _add_points(
 
 
 def add_rows(
-    voxels: VoxelSums,
-    keys: NDArray[np.int64],
-    sums: NDArray[np.float32],
-    information: NDArray[np.float32],
-    frames: NDArray[np.int32],
+    voxels: VoxelSums, keys: Int64, sums: Float32, information: Float32, frames: Int32
 ) -> VoxelSums:
     """Add what other frames (not those of ``voxels``) summed up: packed cells (N,), each once."""
     voxels = reserve_sums(voxels, int(voxels.used[0]) + len(keys))
@@ -247,11 +234,7 @@ def add_rows(
 
 @kernel
 def _add_rows(
-    voxels: tuple[NDArray[Any], ...],
-    new_keys: NDArray[np.int64],
-    new_sums: NDArray[np.float32],
-    new_information: NDArray[np.float32],
-    new_frames: NDArray[np.int32],
+    voxels: Arrays, new_keys: Int64, new_sums: Float32, new_information: Float32, new_frames: Int32
 ) -> None:
     table, keys, sums, information, _, frames, _, used = voxels
     for n in range(len(new_keys)):
@@ -273,9 +256,7 @@ def distinct_keys(keys: NDArray[Key]) -> NDArray[Key]:
     return ordered[first]
 
 
-def find_keys(
-    wanted: NDArray[np.int64], keys: NDArray[np.int64]
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def find_keys(wanted: Int64, keys: Int64) -> tuple[NDArray[np.intp], Bool]:
     """Return where in sorted keys the wanted ones (N,) are, and which of them are there."""
     if not len(keys):
         return np.zeros(len(wanted), np.intp), np.zeros(len(wanted), np.bool_)
@@ -283,6 +264,6 @@ def find_keys(
     return place, np.asarray(keys[place] == wanted)
 
 
-def are_among(keys: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
+def are_among(keys: Int64, others: Int64) -> Bool:
     """Return bool (N,), which keys are among others, in whatever order."""
     return find_keys(keys, np.sort(others))[1]

@@ -14,9 +14,9 @@ from recon.core.values.arrays import Float64, freeze
 
 LensModel = Literal["pinhole", "fisheye"]
 
+#: Of a principal point from the image centre, in image sizes, by which a calibration may still be
+#: of these images: at half the calibrated size it is 0.5.
 LARGEST_CENTRE_OFFSET: Final = 0.25
-"""Offset of a principal point from the image centre, relative to the image size, above which the
-calibration is hardly of these images: at half the calibrated size it is 0.5."""
 _FOCAL_SIZES: Final = (0.01, 1000.0)  # focal lengths in image sizes: to see 179 and 0.06 degrees
 _MOST_SIZES: Final = 100.0  # of a principal point from the centre, in image sizes: no crop has it
 _LARGEST_PX: Final = 1_000_000
@@ -131,15 +131,8 @@ class RectifiedCamera:
         cls, left: Float64, right: Float64, baseline_m: float, width_px: int, height_px: int
     ) -> RectifiedCamera:
         """Return the camera of the pinhole matrices, (3, 3) or (3, 4), of both views."""
-        return cls(
-            focal_px=float(left[0, 0]),
-            cx_px=float(left[0, 2]),
-            cy_px=float(left[1, 2]),
-            cx_right_px=float(right[0, 2]),
-            baseline_m=float(baseline_m),
-            width_px=width_px,
-            height_px=height_px,
-        )
+        f, cx, cy, cx_right = map(float, (left[0, 0], left[0, 2], left[1, 2], right[0, 2]))
+        return cls(f, cx, cy, cx_right, float(baseline_m), width_px, height_px)
 
     @property
     def doffs_px(self) -> float:
@@ -214,8 +207,8 @@ def _check_baseline(baseline_m: float) -> None:
         raise CalibrationError("baseline is implausible", got=f"{baseline_m:g} m")
 
 
+# Calibration of a pair of cameras: of rectified images, or of raw ones.
 Rig = RectifiedCamera | StereoCalibration
-"""Calibration of a pair of cameras: of rectified images, or of raw ones."""
 
 
 def check_size(

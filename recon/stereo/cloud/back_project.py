@@ -82,7 +82,6 @@ def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> p
         nearest=settings.min_range_m,
         farthest=_or_infinity(settings.max_range_m),
         relative_sigma=_or_infinity(settings.max_relative_sigma),
-        confidence=0.0,
         stride=settings.stride,
         radius=_NORMALS_RADIUS_PX if normals else 0,
     )
@@ -133,11 +132,8 @@ def _support(values: Float32) -> UInt8:
     return np.asarray(count[r : r + height, r : r + width] + np.uint8(1))
 
 
-_STATISTICAL_SIGMAS: Final = 2.0
-"""Limit of the statistical filter, in standard deviations of the mean distance."""
-
-_RADIUS_NEIGHBOURS: Final = 2
-"""Neighbours that a point needs within the radius: fewer are an island."""
+_STATISTICAL_SIGMAS: Final = 2.0  # of the mean distance: limit of the statistical filter
+_RADIUS_NEIGHBOURS: Final = 2  # that a point needs within the radius: fewer are an island
 
 
 class FilterSettings(Settings):
@@ -153,8 +149,8 @@ class FilterSettings(Settings):
     drops larger islands."""
 
 
+# For the cloud of one pair, whose scale is unknown: no filter with a length in metres.
 ANY_SCALE: Final = FilterSettings(statistical_neighbours=20)
-"""For the cloud of one pair, whose scale is unknown: no filter with a length in metres."""
 
 
 def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:

@@ -36,10 +36,7 @@ def voxel_downsample(
 
 
 def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bool:
-    """Return bool (N,), points whose mean distance to their neighbours is not unusually large.
-
-    ``sigmas`` is the limit, in standard deviations above the mean over the cloud.
-    """
+    """Return bool (N,): the mean distance to neighbours is within ``sigmas`` of that of all."""
     if len(xyz) <= neighbours:
         return np.ones(len(xyz), dtype=bool)
     with _quiet():

@@ -29,9 +29,7 @@ from recon.stereo.kernels.simd.vectors import (
 )
 from recon.stereo.kernels.tiles import GROUP, Offer
 
-_CACHE_BYTES: Final = 1024 * 1024
-"""Size of the ring of half windows: what a core's own (L2) cache commonly holds."""
-
+_CACHE_BYTES: Final = 1024 * 1024  # of the ring of half windows: what L2 caches commonly hold
 _CHUNK: Final = 16  # candidates whose columns are summed at a time: their sums stay in the L1 cache
 BLOCK: Final = 1024  # most columns of a block
 
@@ -93,15 +91,7 @@ def empty_views(search: Search, block: int, height: int, width: int) -> Views:
 
 @kernel
 def lay_out(left: UInt8, right: UInt8, search: Search, first: int, views: Views) -> None:
-    """Copy some rows of both images to where the search reads them.
-
-    Args:
-        left: uint8 (N, W), the rows.
-        right: uint8 (N, W).
-        search: What will be searched.
-        first: Number of the first of them in the image.
-        views: Written: the rows.
-    """
+    """Copy rows (N, W) of both images, from row ``first`` on, to where the search reads them."""
     places = views.right.shape[1] - views.left.shape[1] + 1
     right_at = search.radius + search.minimum - abs(search.slant) + places - 1
     for n in range(len(left)):
@@ -172,16 +162,10 @@ def next_half(
 def offer_candidates(
     views: Views, search: Search, now: Offer, soon: Offer, y: int, x0: int, scratch: Scratch
 ) -> None:
-    """From row ``y`` on offer some candidates, and sum these and those offered soon.
+    """From row ``y`` on offer the candidates of groups ``now``, in a block from column ``x0`` on.
 
-    Args:
-        views: The images.
-        search: What is searched.
-        now: bool (G,), the groups of candidates that are offered in row ``y``.
-        soon: bool (G,), those offered when the half below row ``y`` will be an upper one.
-        y: The row whose half window comes next.
-        x0: First column of the block.
-        scratch: Changed.
+    Sum these and those of the groups ``soon``, bool (G,): what is offered when the half below row
+    ``y`` will be an upper one.
     """
     _list_runs(now, now, search.ndisp, 0, scratch.offers)
     _list_runs(now, soon, search.ndisp, 2 * abs(search.slant), scratch.runs)

@@ -11,8 +11,7 @@ import numpy as np
 
 from recon.core.kernels.compiled import UInt8, UInt16, kernel
 
-NO_COST: Final = 65535
-"""Stands for the cost of a candidate that does not exist; real costs stay below it."""
+NO_COST: Final = 65535  # of a candidate that does not exist; real costs stay below it
 
 
 class Minima(NamedTuple):
@@ -53,10 +52,7 @@ def write_right_winners(ndisp: int, minimum: int, y: int, minima: Minima) -> Non
 
 @kernel
 def continue_row(row: UInt8, at: int, longer: UInt8) -> None:
-    """Copy a row into a longer one, from place ``at`` on; beyond it the nearest value goes on.
-
-    ``at`` may lie outside.
-    """
+    """Copy a row into a longer one, from place ``at`` on, also outside; its ends go on beyond."""
     start = min(max(at, 0), longer.size)
     end = min(max(at + row.size, 0), longer.size)
     longer[:start] = row[0]

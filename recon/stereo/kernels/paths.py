@@ -44,11 +44,8 @@ DOWN, UP, WARM_UP = range(3)
 """What `advance` does with the means over the paths: write them (the sweep down), average them with
 those of the sweep down (the sweep up), or nothing (rows in which paths only start)."""
 
-STRAIGHT, FROM_LEFT, FROM_RIGHT = range(3)
-"""The paths of a sweep: vertical, and diagonal from either side."""
-
-TOGETHER: Final = 16
-"""Candidates done for some columns before the next columns: what they share stays in registers."""
+STRAIGHT, FROM_LEFT, FROM_RIGHT = range(3)  # the paths of a sweep: vertical, and diagonal
+TOGETHER: Final = 16  # candidates done for some columns: what they share stays in registers
 
 
 class Paths(NamedTuple):

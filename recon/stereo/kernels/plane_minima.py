@@ -14,9 +14,7 @@ from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.path_costs import aligned, padded
 from recon.stereo.kernels.simd.vectors import LANES, load_row, smaller, splat, store_row, where_less
 
-NONE: Final = 255
-"""Stands for the cost of a candidate that does not exist; real costs stay below it."""
-
+NONE: Final = 255  # cost of a candidate that does not exist; real costs stay below it
 MARGIN: Final = LANES  # columns on each side of a row of costs, where no candidate exists
 BLOCK: Final = 256  # candidates that a byte can number
 PARTS: Final = 8  # units of `Minima.costs` per unit of these costs

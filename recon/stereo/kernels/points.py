@@ -14,9 +14,7 @@ import numpy as np
 
 from recon.core.kernels.compiled import Bool, Float32, UInt8, kernel
 
-MIN_SPREAD: Final = 1e-6
-"""Known pixels of a window that spread by less lie on a line, and determine no plane."""
-
+MIN_SPREAD: Final = 1e-6  # known pixels that spread by less lie on a line: they have no plane
 _COLUMN_SUMS: Final = 5
 _WINDOW_SUMS: Final = 9
 
@@ -32,7 +30,6 @@ class PointRules(NamedTuple):
     nearest: float  # least depth
     farthest: float  # largest depth; may be infinite
     relative_sigma: float  # largest error of a depth, divided by it; may be infinite
-    confidence: float  # least confidence
     stride: int  # every n-th row and column is used
     radius: int  # half width of the window that gives a normal; 0 = no normals
 
@@ -76,7 +73,7 @@ def make_points(maps: Maps, rules: PointRules) -> Points:
 @kernel(error_model="numpy")
 def _make_points(maps: tuple[Any, ...], rules: tuple[Any, ...], points: tuple[Any, ...]) -> int:
     values, confidence, sigma, colours, usable = maps
-    focal, cx, cy, fb, doffs, nearest, farthest, relative_sigma, least, stride, radius = rules
+    focal, cx, cy, fb, doffs, nearest, farthest, relative_sigma, stride, radius = rules
     xyz, normals, sigma_m, sure, rgb = points
     height, width = values.shape
     known, masked = _with_frame(values, radius)
@@ -92,7 +89,7 @@ def _make_points(maps: tuple[Any, ...], rules: tuple[Any, ...], points: tuple[An
         for u in range(0, width, stride):
             shifted = np.float64(values[v, u]) + doffs
             # A comparison with NaN is False.
-            if not shifted > 0.0 or not confidence[v, u] >= least:
+            if not shifted > 0.0:
                 continue
             if masks and not usable[v, u]:
                 continue

@@ -9,15 +9,11 @@ import numpy as np
 from recon.core.kernels.compiled import Bool, Float32, Int32, UInt8, UInt16, kernel
 from recon.stereo.kernels.minima import NO_COST, Minima
 
+# The codes of `recon.core.values.Reason`; a test holds them equal.
 VALID, LOW_TEXTURE, AMBIGUOUS, LEFT_RIGHT, OCCLUDED, OUT_OF_RANGE, BORDER = range(7)
-"""The codes of `recon.core.values.Reason`; a test holds them equal."""
-
 SIGMA_LARGEST_PX: Final = 2.0  # standard deviation at a flat minimum; none is larger
-WRONG_PX: Final = 1.0
-"""Error from which a disparity counts as wrong; the least error of a wrong one."""
-
-ODDS: Final = 2.2
-"""Odds of being right at margin 1 and a standard deviation of 1 px (see `refine_minima`)."""
+WRONG_PX: Final = 1.0  # error from which a disparity counts as wrong; the least of a wrong one
+ODDS: Final = 2.2  # of being right at margin 1 and a standard deviation of 1 px
 
 
 class Rules(NamedTuple):

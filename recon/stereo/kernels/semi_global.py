@@ -47,8 +47,7 @@ from recon.stereo.kernels.plane_minima import MARGIN, NONE, Band, Best, choose_r
 from recon.stereo.kernels.simd.vectors import LANES
 
 ROWS: Final = 32  # rows of a block: many, compared with the overlap below it that is swept in vain
-SCRATCH_BYTES: Final = 4 << 20
-"""Most memory of what passes from one sweep to the other, so that it stays in the cache."""
+SCRATCH_BYTES: Final = 4 << 20  # at most, for what passes between sweeps and stays in the cache
 
 
 class Scratch(NamedTuple):

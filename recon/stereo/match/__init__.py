@@ -1,14 +1,7 @@
-"""From a rectified pair to a disparity for each pixel.
+"""From a rectified pair to a disparity for each pixel: the matchers by name in `registry.py`.
 
-- `protocol.py`: what every matcher gives, and matchers that are not ours; `registry.py`: by name;
-- `search.py`: the range that is searched, what is done with what was found, gradients, and memory
-  that is kept from pair to pair;
-
-`sad.py` compares gradients in windows; it also finds a range where none is known, and rough
-disparities at half size. The cost is in `kernels/half_windows.py`, the best
-candidate in `kernels/sad.py`, and `kernels/tiles.py` says which are tried. `sgm.py` adds census
-and paths: the cost is in `kernels/path_costs.py`, the paths are in `kernels/semi_global.py`. Of
-both, `kernels/refine.py` checks what was found, and says why a pixel has no disparity.
-
-Other matchers: `opencv.py` and `onnx.py`.
+`protocol.py` has what every matcher gives, `search.py` what matchers over a range share. `sad.py`
+also finds a range where none is known, and rough disparities at half size; its costs are in
+`kernels/half_windows.py`, those of `sgm.py` in `kernels/path_costs.py`. Of both,
+`kernels/refine.py` checks what was found, and says why a pixel has no disparity.
 """

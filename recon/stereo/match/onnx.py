@@ -18,10 +18,7 @@ from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.match.protocol import unrated_disparity
 
 _WHITE: Final = 255.0
-
-_MULTIPLE_PX: Final = 32
-"""Where the size is free, images are widened to multiples of this: what networks with five halvings
-of the size need."""
+_MULTIPLE_PX: Final = 32  # of free sizes, as networks with five halvings of the size need
 
 
 class OnnxSettings(Settings):

@@ -21,22 +21,15 @@ from recon.stereo.match.search import LEFT_RIGHT_PX, OddInt, SearchSettings
 _STEPS: Final = 16  # OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities
 _LIMIT_PX: Final = 2**15 // _STEPS - 1  # 16ths of a pixel are counted in 16 bits
 _SGBM_MODE: Final = cv2.STEREO_SGBM_MODE_HH  # eight paths over the whole image, its most accurate
-_BM_PREFILTER_CAP: Final = 31
-_BM_TEXTURE_THRESHOLD: Final = 10
-"""Least sum of prefiltered values in the window; OpenCV's default, as the cap."""
-
+_BM_PREFILTER_CAP: Final = 31  # OpenCV's default, as the threshold
+_BM_TEXTURE_THRESHOLD: Final = 10  # least sum of prefiltered values in the window
 _SGBM_PREFILTER_CAP: Final = 63
 _P1, _P2 = 8, 32  # P1 and P2 per pixel of the block, as OpenCV's documentation suggests
-_UNIQUENESS_PERCENT: Final = 5
-"""By how much the second best cost must exceed the best; OpenCV suggests 5 to 15."""
-
+_UNIQUENESS_PERCENT: Final = 5  # of the second best cost over the best; OpenCV suggests 5 to 15
 _SPECKLE_PX: Final = 50  # regions of at most so many pixels are removed, as of our matchers
 _SPECKLE_STEP_PX: Final = 1
-
-
-_BM_BLOCK_PX: Final = 9
-_SGBM_BLOCK_PX: Final = 3
-"""Windows where the settings name none: a single one of SGBM smooths by its paths instead."""
+_BM_BLOCK_PX: Final = 9  # where the settings name none, as below
+_SGBM_BLOCK_PX: Final = 3  # a single window of SGBM smooths by its paths instead
 
 
 class OpencvSettings(SearchSettings):
@@ -51,10 +44,7 @@ class OpencvSettings(SearchSettings):
 
 
 class OpencvMatcher:
-    """A matcher of OpenCV, ``cv2.StereoBM`` or ``cv2.StereoSGBM``; a `Matcher`.
-
-    It has no number of threads: OpenCV has one for the whole process, which the commands set.
-    """
+    """A matcher of OpenCV, ``cv2.StereoBM`` or ``cv2.StereoSGBM``; the process sets its threads."""
 
     def __init__(self, settings: OpencvSettings, *, semi_global: bool) -> None:
         self._settings = settings
@@ -104,10 +94,7 @@ def _sides(s: OpencvSettings, block_px: int, ndisp: int) -> tuple[int, int, int,
 def _match(
     pair: RectifiedPair, engine: Any, s: OpencvSettings, sides: tuple[int, int, int, int]
 ) -> Disparity:
-    """Let OpenCV match; pixels without a value are AMBIGUOUS.
-
-    OpenCV does not report which of its checks (texture, uniqueness, left against right) failed.
-    """
+    """Let OpenCV match; it does not report which check rejects a pixel: those are AMBIGUOUS."""
     try:
         wide = (
             cv2.copyMakeBorder(v, *sides, cv2.BORDER_REPLICATE) for v in (pair.left, pair.right)
@@ -130,8 +117,7 @@ def _match(
 
 
 def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
-    ndisp = settings.ndisp_for(camera)
-    ndisp = _STEPS * -(-ndisp // _STEPS)
+    ndisp = _STEPS * -(-settings.ndisp_for(camera) // _STEPS)
     first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
     if first <= -_LIMIT_PX or last >= _LIMIT_PX:
         raise MatchingError(

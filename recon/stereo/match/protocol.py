@@ -19,11 +19,7 @@ class Matcher(Protocol):
     """Finds the disparity of each pixel of the left view."""
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            MatchingError: The settings do not fit the pair.
-        """
+        """Match one rectified pair; settings that do not fit it are a `MatchingError`."""
         ...
 
 
@@ -52,10 +48,7 @@ GROUP: Final = "recon.matchers"  # the entry point group in which a package regi
 
 
 class CheckedMatcher:
-    """Checks what a matcher that is not ours returns; a `Matcher`.
-
-    Pixels for which rectification found no image have no match, whatever the matcher says.
-    """
+    """Checks what a matcher that is not ours returns, without matches where there is no image."""
 
     def __init__(self, matcher: Matcher, name: str) -> None:
         self._matcher = matcher

@@ -10,16 +10,10 @@ from pydantic import InstanceOf, field_serializer
 from recon.core.errors import SettingsError
 from recon.core.settings import Settings
 from recon.core.values import RectifiedPair
+from recon.stereo.match import protocol
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
-from recon.stereo.match.protocol import (
-    CheckedMatcher,
-    Matcher,
-    check_object,
-    load_registered,
-    name_of,
-    registered_names,
-)
+from recon.stereo.match.protocol import Matcher, name_of
 from recon.stereo.match.sad import AutoRangeMatcher, SadMatcher, SadSettings, estimate_ndisp
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.match.sgm import SgmMatcher, SgmSettings
@@ -60,8 +54,8 @@ def make_matcher(
     settings = settings or MatchingSettings()
     if not isinstance(matcher, str) or matcher not in MATCHERS:
         check_matcher(matcher)
-        made = load_registered(matcher) if isinstance(matcher, str) else matcher
-        return AutoRangeMatcher(CheckedMatcher(made, name_of(matcher)))
+        made = protocol.load_registered(matcher) if isinstance(matcher, str) else matcher
+        return AutoRangeMatcher(protocol.CheckedMatcher(made, name_of(matcher)))
     own = getattr(settings, field_of(matcher))
     made = MATCHERS[matcher](own, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.
@@ -73,8 +67,8 @@ def make_matcher(
 def check_matcher(matcher: str | Matcher) -> None:
     """Check that a matcher exists, without making it."""
     if not isinstance(matcher, str):
-        check_object(matcher)
-    elif matcher not in MATCHERS and matcher not in (others := registered_names()):
+        protocol.check_object(matcher)
+    elif matcher not in MATCHERS and matcher not in (others := protocol.registered_names()):
         choices = ", ".join(sorted({*MATCHERS, *others}))
         raise SettingsError("unknown matcher", got=repr(matcher), expected=f"one of: {choices}")
 
@@ -96,10 +90,7 @@ def searched(settings: MatchingSettings) -> SearchSettings:
 def searched_ndisp(
     matcher: str | Matcher, settings: MatchingSettings, pair: RectifiedPair
 ) -> int | None:
-    """Return how many disparities a matcher searches in a pair, before it rounds them.
-
-    None of a matcher that searches no range, or is not ours.
-    """
+    """Return how many disparities a matcher searches before rounding; None: no range, not ours."""
     own = settings_of(matcher, settings)
     if not isinstance(own, SearchSettings):
         return None

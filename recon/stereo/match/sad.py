@@ -25,61 +25,36 @@ from recon.stereo.kernels.half_windows import (
     widest_block,
 )
 from recon.stereo.kernels.minima import empty_minima
-from recon.stereo.kernels.refine import (
-    REFINED_BYTES,
-    Refined,
-    Rules,
-    refine_minima,
-    refined_in,
-)
+from recon.stereo.kernels.refine import REFINED_BYTES, Refined, Rules, refine_minima, refined_in
 from recon.stereo.kernels.sad import sad_minima
 from recon.stereo.kernels.tiles import Support, Tiles, make_tiles, offer_supported
+from recon.stereo.match import search as common
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.search import (
-    MeasuredSettings,
-    OddInt,
-    ResultPool,
-    ScratchPool,
-    SearchSettings,
-    UniquenessPercent,
-    clipped_gradients,
-    finish,
-    in_strips,
-    no_texture,
-    rules_of,
-    texture,
-    usual_ndisp,
-)
 
-_MIN_TEXTURE: Final = 0.1
-"""Least mean horizontal gradient in the window, grey levels per pixel."""
+_MIN_TEXTURE: Final = 0.1  # least mean horizontal gradient in the window, grey levels per pixel
+# Largest cost of one pixel; limits what an outlier or an edge can do. Times the pixels of both
+# halves of the widest window it is below 65535, as the kernel wants.
 _COST_CAP: Final = 20
-"""Largest cost of one pixel; limits what an outlier or an edge can do. Times the pixels of both
-halves of the widest window it is below 65535, as the kernel wants."""
-
+# Disparity per row of a second window, which competes with the upright one at each pixel; 0 = none.
+# On level ground it is baseline / camera height. Its upper and its lower half are moved against
+# each other by whole disparities, so that any slant near this one is the same.
 WINDOW_SLANT: Final = 1 / 3
-"""Disparity per row of a second window, which competes with the upright one at each pixel; 0 =
-none. On level ground it is baseline / camera height. Its upper and its lower half are moved against
-each other by whole disparities, so that any slant near this one is the same."""
-RADIUS_PX: Final = 3
-"""Half the window at half size: smaller than at full size, or thin things are lost."""
-
+RADIUS_PX: Final = 3  # half the window at half size: with that of full size thin things are lost
 UNIQUENESS_PERCENT: Final = 5
-
 LEAST_NDISP: Final = 32  # with fewer candidates a search at half size takes longer than it saves
 TILE_HEIGHT_PX: Final = 16
 _TILE_COLUMNS: Final = 160  # columns of a tile together with those that its windows reach over
+# How much support at half size offers candidates to a tile.
 SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0.03, least=4)
-"""How much support at half size offers candidates to a tile."""
 
 
-class SadSettings(MeasuredSettings):
+class SadSettings(common.MeasuredSettings):
     """Settings of the SAD matcher."""
 
-    window_px: OddInt = Field(11, ge=1, le=55)
+    window_px: common.OddInt = Field(11, ge=1, le=55)
     """Edge of the square window; odd. Smaller keeps thin things and sharp edges, larger is denser
     where texture is weak."""
-    uniqueness_percent: UniquenessPercent = 2
+    uniqueness_percent: common.UniquenessPercent = 2
 
 
 class SadMatcher:
@@ -104,10 +79,10 @@ class SadMatcher:
         search, rules = self._plan(pair.camera)
         s = self._settings
         with ThreadPoolExecutor(self._threads) as pool:
-            enough = partial(texture, pair, s.window_px)
+            enough = partial(common.texture, pair, s.window_px)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
-            return finish(refined, pool, self._threads, average=self._average)
+            return common.finish(refined, pool, self._threads, average=self._average)
 
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
         if search.ndisp < LEAST_NDISP:
@@ -116,7 +91,7 @@ class SadMatcher:
         views = halve(pair.left), halve(pair.right)
         shape = views[0].shape
         valid = None if pair.valid is None else pair.valid[::2, ::2]
-        asked = partial(no_texture, shape[1], valid)
+        asked = partial(common.no_texture, shape[1], valid)
         whole, rules = undivided(halved, shape), half_rules(halved)
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)
@@ -125,7 +100,7 @@ class SadMatcher:
         def offer(rows: range) -> None:
             offer_supported(values, minimum, ndisp, SUPPORT, rows.start, rows.stop, tiles)
 
-        in_strips(pool, self._threads, offer, len(tiles.offered))
+        common.in_strips(pool, self._threads, offer, len(tiles.offered))
         return tiles
 
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
@@ -135,7 +110,7 @@ class SadMatcher:
         # The middles of the two halves lie half a radius above and below the pixel.
         slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
-        return search, rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
+        return search, common.rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
 
 
 class _StripSearch:
@@ -143,10 +118,10 @@ class _StripSearch:
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
-        self._scratch = ScratchPool(empty_scratch, threads)
-        self._views = ScratchPool(empty_views, 1)
-        self._minima = ScratchPool(empty_minima, 1)
-        self._results = ResultPool(2)
+        self._scratch = common.ScratchPool(empty_scratch, threads)
+        self._views = common.ScratchPool(empty_views, 1)
+        self._minima = common.ScratchPool(empty_minima, 1)
+        self._results = common.ResultPool(2)
 
     def find(
         self,
@@ -163,7 +138,7 @@ class _StripSearch:
         refined = refined_in(results, height, width)
 
         def prepare(strip: range) -> None:
-            left, right = (clipped_gradients(image, strip) for image in images)
+            left, right = (common.clipped_gradients(image, strip) for image in images)
             lay_out(left, right, search, strip.start, views)
 
         def search_strip(strip: range) -> None:
@@ -175,8 +150,8 @@ class _StripSearch:
             self._views.borrow(search, tiles.width, height, width) as views,
             self._minima.borrow(height, width) as minima,
         ):
-            in_strips(pool, self._threads, prepare, height)
-            in_strips(pool, self._threads, search_strip, height)
+            common.in_strips(pool, self._threads, prepare, height)
+            common.in_strips(pool, self._threads, search_strip, height)
         return refined
 
 
@@ -200,7 +175,7 @@ def half_search(search: Search) -> Search:
 def half_rules(search: Search) -> Rules:
     """Return what makes a match of a search at half size reliable."""
     asked = SadSettings(min_disparity_px=search.minimum, uniqueness_percent=UNIQUENESS_PERCENT)
-    return rules_of(asked, search.ndisp, (2 * RADIUS_PX + 1) ** 2)._replace(fit=False)
+    return common.rules_of(asked, search.ndisp, (2 * RADIUS_PX + 1) ** 2)._replace(fit=False)
 
 
 def undivided(search: Search, shape: tuple[int, int]) -> Tiles:
@@ -215,23 +190,15 @@ def divided(search: Search, shape: tuple[int, int]) -> Tiles:
     return make_tiles(shape, (height, width), search.ndisp)
 
 
-_COARSE_WIDTH_PX: Final = 200
-"""Approximate width of the small pair; images are reduced by whole factors."""
-
+_COARSE_WIDTH_PX: Final = 200  # of the small pair, about; images are reduced by whole factors
 _STEP: Final = 16
-_SHARE: Final = 99.5
-"""Percentile of the trusted disparities that the range must include before its margin."""
-
+_SHARE: Final = 99.5  # percentile of the trusted disparities in the range, before its margin
 _LEAST_MATCHES: Final = 100
 _CONFIDENCE: Final = 0.8
 
 
 class AutoRangeMatcher:
-    """Chooses the range of another matcher for each pair; a `Matcher`.
-
-    The range is a function of the pair alone, never of the frames before it, so that a resumed run
-    gives the same result.
-    """
+    """Chooses the range of another matcher by the pair alone: resumed runs give the same result."""
 
     def __init__(self, matcher: Matcher, minimum_px: int = 0) -> None:
         self._matcher = matcher
@@ -254,10 +221,12 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     """
     height, width = pair.left.shape
     factor = max(1, width // _COARSE_WIDTH_PX)
-    usual = usual_ndisp(width)
+    usual = common.usual_ndisp(width)
     if width // factor < 6 or height < factor:
         return usual
-    trusted = _trusted_disparities(_smaller(pair, factor))
+    settings = SadSettings(window_px=7, uniqueness_percent=10)
+    found = SadMatcher(settings, threads=1, average=False).match(_smaller(pair, factor))
+    trusted = found.values[found.valid & (found.confidence >= _CONFIDENCE)]
     if trusted.size < _LEAST_MATCHES:
         return usual
     nearest_px = factor * (1.1 * float(np.percentile(trusted, _SHARE)) + 1.0)
@@ -266,21 +235,11 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
 
 
 def _smaller(pair: RectifiedPair, factor: int) -> RectifiedPair:
-    width, height = pair.left.shape[1] // factor, pair.left.shape[0] // factor
+    width, height = size = pair.left.shape[1] // factor, pair.left.shape[0] // factor
     camera = replace(pair.camera.resized(width, height), ndisp=width // 2)
-    left, right = (_shrunk(image, factor, (width, height)) for image in (pair.left, pair.right))
-    return RectifiedPair(left, right, camera)
-
-
-def _shrunk(image: UInt8, factor: int, size: tuple[int, int]) -> UInt8:
-    whole = np.ascontiguousarray(image[: size[1] * factor, : size[0] * factor])
-    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    settings = SadSettings(window_px=7, uniqueness_percent=10)
-    found = SadMatcher(settings, threads=1, average=False).match(small)
-    return found.values[found.valid & (found.confidence >= _CONFIDENCE)]
+    wholes = (image[: height * factor, : width * factor] for image in (pair.left, pair.right))
+    left, right = (cv2.resize(whole, size, interpolation=cv2.INTER_AREA) for whole in wholes)
+    return RectifiedPair(np.asarray(left, np.uint8), np.asarray(right, np.uint8), camera)
 
 
 Number = TypeVar("Number", np.float32, np.uint8)
@@ -295,7 +254,7 @@ class HalfSizeMatcher:
     a quarter of a pixel or more. ``searched`` is the range at full size.
     """
 
-    def __init__(self, searched: SearchSettings, threads: int | None = None) -> None:
+    def __init__(self, searched: common.SearchSettings, threads: int | None = None) -> None:
         half = SadSettings(
             window_px=_WINDOW_PX,
             min_disparity_px=searched.min_disparity_px // 2,

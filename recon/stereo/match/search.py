@@ -21,20 +21,14 @@ from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.stereo.kernels.finish import average_opposite, find_speckles
 from recon.stereo.kernels.refine import ODDS, Refined, Rules, reject
 
-LEFT_RIGHT_PX: Final = 1
-"""Largest difference between the disparities of the left and the right view."""
-
-_SIGMA_FLOOR_PX: Final = 0.1
-"""Smallest standard deviation that a disparity is given: noise is not all that makes it wrong."""
-
+LEFT_RIGHT_PX: Final = 1  # largest difference of disparities of the left and the right view
+_SIGMA_FLOOR_PX: Final = 0.1  # of a disparity at least: noise is not all that makes it wrong
 _SPECKLE_SIZE_PX: Final = 50  # regions of fewer pixels are removed
 _SPECKLE_STEP_PX: Final = 1.0  # largest step of disparity between neighbours of one region
+# Each disparity becomes the mean of the pairs of opposite neighbours, in a square of this width,
+# that lie on its surface.
 _AVERAGE_PX: Final = 7
-"""Each disparity becomes the mean of the pairs of opposite neighbours, in a square of this width,
-that lie on its surface."""
-
-_SAME_SURFACE_PX: Final = 1.0
-"""Neighbours that differ by more are not averaged: between them may be a step of depth."""
+_SAME_SURFACE_PX: Final = 1.0  # between neighbours that differ by more may be a step of depth
 
 
 def _odd(value: int) -> int:
@@ -43,8 +37,7 @@ def _odd(value: int) -> int:
     return value
 
 
-OddInt = Annotated[int, AfterValidator(_odd)]
-"""The width of something that has a pixel in its middle."""
+OddInt = Annotated[int, AfterValidator(_odd)]  # a width with a pixel in its middle
 
 UniquenessPercent = Annotated[
     int,
@@ -114,17 +107,8 @@ def rules_of(
     )
 
 
-def finish(
-    refined: Refined,
-    pool: Executor,
-    threads: int,
-    *,
-    average: bool = True,
-) -> Disparity:
-    """Return the disparity of what was refined: no small regions (reason SPECKLE), averaged.
-
-    ``refined`` is overwritten: a copy of each array would cost more than the search for speckles.
-    """
+def finish(refined: Refined, pool: Executor, threads: int, *, average: bool = True) -> Disparity:
+    """Return the disparity without small regions, averaged; ``refined`` is overwritten."""
     small = find_speckles(refined.values, _SPECKLE_STEP_PX, _SPECKLE_SIZE_PX)
     # A plain number: to look up what an enumeration is takes numba 0.2 ms.
     reject(small, int(Reason.SPECKLE), refined)
@@ -144,10 +128,7 @@ def _averaged(values: Float32, pool: Executor, threads: int) -> Float32:
 
 
 def in_strips(pool: Executor, threads: int, work: Callable[[range], None], rows: int) -> None:
-    """Work on all rows, in one strip per thread.
-
-    The last strip is left to the thread that calls: to hand work over takes time.
-    """
+    """Work on all rows, in one strip per thread; the calling thread takes the last one itself."""
     edges = np.linspace(0, rows, min(threads, rows) + 1).astype(int).tolist()
     *strips, last = itertools.starmap(range, itertools.pairwise(edges))
     handed_over = [pool.submit(work, strip) for strip in strips]
@@ -213,9 +194,7 @@ class _Lent:
         self._free.append(self._block)
 
 
-_GRADIENT_CAP: Final = 31
-"""Gradients (Sobel units) are clipped to plus or minus this before windows compare them."""
-
+_GRADIENT_CAP: Final = 31  # plus or minus; Sobel units that windows compare at most
 _GAIN_OF_SOBEL: Final = 8.0  # a 3×3 Sobel filter answers a slope of one grey level per pixel with 8
 
 

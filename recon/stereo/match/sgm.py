@@ -29,45 +29,26 @@ from recon.stereo.kernels.semi_global import (
     scratch_bytes,
     semi_global_minima,
 )
-from recon.stereo.match.search import (
-    MeasuredSettings,
-    OddInt,
-    ResultPool,
-    ScratchPool,
-    finish,
-    no_texture,
-    rules_of,
-)
+from recon.stereo.match import search as common
 
 _LEVELS: Final = 250  # largest path cost before rounding, which needs the rest of a byte
-_ODDS: Final = 2.4
-"""`Rules.odds` of this matcher, fitted on MiddEval3; 2003, 2005 and 2006 were held out."""
-
+_ODDS: Final = 2.4  # `Rules.odds`, fitted on MiddEval3; 2003, 2005 and 2006 were held out
 _STRIP_ROWS: Final = 192
-
-_SIDE_OVERLAP: Final = 16
-"""Columns that neighbouring bands share: horizontal and diagonal paths start there."""
-
-
+_SIDE_OVERLAP: Final = 16  # columns shared by bands: horizontal and diagonal paths start there
 _COST_CAP: Final = 14  # largest difference of gradients that counts at one pixel
+# Of one pixel: of its gradient and of all bits of the census.
 _LARGEST_COST: Final = _COST_CAP + (2 * CENSUS_RADIUS + 1) ** 2 - 1
-"""Largest cost of one pixel: of its gradient and of all bits of the census."""
-
+# Where the image changes by more along a path, large steps are cheaper: surfaces end there.
 _EDGE_GREY_LEVELS: Final = 12
-"""Where the image changes by more along a path, large steps are cheaper: surfaces end there."""
-
 _EDGE_P2_SHARE: Final = 0.25  # share of P2 that is left there
-_OVERLAP_ROWS: Final = 4
-"""Rows that each strip of an image shares with its neighbours, for vertical paths to start in."""
-
-_MEMORY_BYTES: Final = 1536 << 20
-"""Strips are worked on at once as long as they need less than this together."""
+_OVERLAP_ROWS: Final = 4  # rows that strips share, for vertical paths to start in
+_MEMORY_BYTES: Final = 1536 << 20  # what strips that are worked on at once need together, at most
 
 
-class SgmSettings(MeasuredSettings):
+class SgmSettings(common.MeasuredSettings):
     """Settings of the semi-global matcher."""
 
-    window_px: OddInt = Field(5, ge=1, le=31)
+    window_px: common.OddInt = Field(5, ge=1, le=31)
     """Edge of the square window; odd. Larger suppresses noise and widens edges."""
     p1: float = Field(16.0, gt=0.0, le=255.0)
     """Penalty of a step of one disparity along a path, as a mean cost of one pixel. Smaller where
@@ -101,10 +82,10 @@ class SgmMatcher:
     def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
-        self._scratch = ScratchPool(empty_scratch, self._threads)
-        self._planes = ScratchPool(empty_planes, 1)
-        self._minima = ScratchPool(empty_minima, 1)
-        self._results = ResultPool(2)
+        self._scratch = common.ScratchPool(empty_scratch, self._threads)
+        self._planes = common.ScratchPool(empty_planes, 1)
+        self._minima = common.ScratchPool(empty_minima, 1)
+        self._results = common.ResultPool(2)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair."""
@@ -113,7 +94,7 @@ class SgmMatcher:
         window, size = _window(s), pair.left.shape
         paths = _paths(s, ndisp, window.levels)
         # A cost is about so many times the mean cost of a pixel.
-        rules = rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=_ODDS)
+        rules = common.rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=_ODDS)
         results = self._results.lend(REFINED_BYTES * pair.left.size)
         refined = refined_in(results, *size)
 
@@ -123,7 +104,7 @@ class SgmMatcher:
         def search(strip: range) -> None:
             with self._scratch.borrow(pair.camera.width_px, paths) as scratch:
                 semi_global_minima(views, window, paths, strip, scratch, minima)
-            enough = no_texture(pair.camera.width_px, pair.valid, strip)
+            enough = common.no_texture(pair.camera.width_px, pair.valid, strip)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
         strips, at_once = self._strips(pair.camera, paths)
@@ -135,7 +116,7 @@ class SgmMatcher:
             views = Views(pair.left, *planes)
             list(pool.map(prepare, strips))
             list(pool.map(search, strips))
-            return finish(refined, pool, at_once)
+            return common.finish(refined, pool, at_once)
 
     def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
         height = camera.height_px

@@ -20,15 +20,11 @@ from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8, freeze
 
-_RATIO: Final = 0.8
-"""Lowe's ratio test: the best distance must be below this share of the second best."""
-
+_RATIO: Final = 0.8  # Lowe's test: the best distance is below this share of the second best
 _EXACT_RATIO: Final = 0.75
 _CONTRAST: Final = 0.02  # half of OpenCV's default: weak features are still located accurately
 _BLOCK: Final = 1024  # descriptors compared with all others at once
-_ROUGH_PX: Final = 3.0
-"""Features of coarse pyramid levels are a few pixels off; larger shifts are wrong matches."""
-
+_ROUGH_PX: Final = 3.0  # that features of coarse levels may be off; farther are wrong matches
 _ROWS_APART: Final = 12.0  # row error that the initial homographies may leave
 MOST_FEATURES: Final = 8000  # maximum number of features per image, where a caller does not say
 
@@ -94,8 +90,7 @@ def match_features(
 def match_exactly(left: UInt8, right: UInt8, count: int = MOST_FEATURES) -> PairFeatures:
     """Return mutual best matches of SIFT features that pass a stricter ratio test.
 
-    Slower than `match_features`, but subpixel accurate and robust to rotation, scale and slant
-    between the images.
+    Slower than `match_features`, but subpixel accurate and robust to rotation, scale and slant.
     """
     sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=_CONTRAST)
     (left_uv, left_d), (right_uv, right_d) = (_describe(sift, side) for side in (left, right))
@@ -194,18 +189,12 @@ def _mutual_best(left: Float32, right: Float32) -> Int32:
     return np.stack([np.flatnonzero(chosen).astype(np.int32), best[chosen]], axis=1)
 
 
-_NEAR_PX: Final = 1.0
-"""Features with a smaller disparity are too far away to show whether the cameras are swapped."""
-
-_OUTLIER_PX: Final = 3.0
-"""A feature whose row error differs from that of the others by more than this is a wrong match."""
-
-
+_NEAR_PX: Final = 1.0  # of smaller disparities: too far away to show that cameras are swapped
+_OUTLIER_PX: Final = 3.0  # between the row error of a wrong match and that of the others
 _FEATURES: Final = 1000  # maximum number of features per image
 _MIN_FEATURES: Final = 40  # with fewer matched features there is no verdict
 _WARN_ROW_PX: Final = 1.0  # median row error that gives a warning, in pixels
-_SWAPPED_SHARE: Final = 0.8
-"""Share of near features with negative disparity from which the cameras count as swapped."""
+_SWAPPED_SHARE: Final = 0.8  # of near features with negative disparity: swapped cameras
 
 
 @dataclass(frozen=True)

@@ -85,10 +85,7 @@ def rays_of(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
 
 
 def sees_all(camera: CameraIntrinsics) -> bool:
-    """Return whether the lens model can be inverted along the whole border of the image.
-
-    Distortion polynomials are fitted where points were seen; farther out they may fold back.
-    """
+    """Return whether the lens model, which may fold back, can be inverted along the border."""
     return bool(np.isfinite(rays_of(camera, np.concatenate(border_of(camera)))).all())
 
 

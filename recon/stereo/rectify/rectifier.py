@@ -65,15 +65,11 @@ class RemapTables:
 
 
 class Rectifier:
-    """Rectifies the pairs of one rig; images of a rectified camera are only checked and made grey.
-
-    Attributes:
-        camera: Geometry of the rectified views.
-        valid: bool (H, W), where the rectified left view has a source; None = everywhere.
-    """
+    """Rectifies the pairs of a rig; those of a rectified camera are only checked and made grey."""
 
     def __init__(self, calibration: Rig, settings: RectificationSettings | None = None) -> None:
         self.settings = settings or RectificationSettings()
+        #: bool (H, W), where the rectified left view has a source; None = everywhere.
         self.valid: Bool | None = None
         self._views: tuple[RemapTables, RemapTables] | None = None
         if isinstance(calibration, RectifiedCamera):
@@ -136,10 +132,7 @@ class RectifyingTurns:
 
 
 def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) -> RectifyingTurns:
-    """Compute the rectifying rotations of a rig, and the rectified camera.
-
-    Ref: Bouguet's method, as in OpenCV's ``stereoRectify``.
-    """
+    """Compute the rectifying rotations of a rig and the rectified camera, by Bouguet's method."""
     _check_rig(calibration)
     left, right = calibration.left, calibration.right
     size = (left.width_px, left.height_px)

@@ -17,28 +17,8 @@ from numba import types
 from numba.core import cgutils, typing
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-from recon.stereo.kernels.simd.vectors import (
-    LANES,
-    absolute_difference,
-    broadcast_smallest,
-    differing_bits,
-    larger,
-    load,
-    load_row,
-    mean,
-    narrow,
-    put_after,
-    put_before,
-    ramp,
-    smaller,
-    splat,
-    store,
-    store_row,
-    transpose,
-    where_equal,
-    where_less,
-    widen,
-)
+from recon.stereo.kernels.simd import vectors
+from recon.stereo.kernels.simd.vectors import LANES
 
 
 class _Vector(types.Type):  # type: ignore[misc]
@@ -115,11 +95,11 @@ _binary(operator.add, lambda builder, a, b: builder.add(a, b))
 _binary(operator.sub, lambda builder, a, b: builder.sub(a, b))
 _binary(operator.mul, lambda builder, a, b: builder.mul(a, b))
 _binary(operator.rshift, lambda builder, a, b: builder.lshr(a, b))
-_binary(mean, _write_mean)
-_binary(differing_bits, _write_differing)
-_binary(smaller, _intrinsic("umin"))
-_binary(larger, _intrinsic("umax"))
-_binary(absolute_difference, _write_difference)
+_binary(vectors.mean, _write_mean)
+_binary(vectors.differing_bits, _write_differing)
+_binary(vectors.smaller, _intrinsic("umin"))
+_binary(vectors.larger, _intrinsic("umax"))
+_binary(vectors.absolute_difference, _write_difference)
 
 
 def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
@@ -171,10 +151,10 @@ def _store_at(address: Callable[..., Any]) -> Callable[..., Any]:
     return emit
 
 
-_compiled_as(load, lambda array, at: _Vector(array.dtype))(_load_from(_address))
-_compiled_as(store, lambda array, at, lanes: types.none)(_store_at(_address))
-_compiled_as(load_row, _type_in_row)(_load_from(_address_in_row))
-_compiled_as(store_row, _store_type)(_store_at(_address_in_row))
+_compiled_as(vectors.load, lambda array, at: _Vector(array.dtype))(_load_from(_address))
+_compiled_as(vectors.store, lambda array, at, lanes: types.none)(_store_at(_address))
+_compiled_as(vectors.load_row, _type_in_row)(_load_from(_address_in_row))
+_compiled_as(vectors.store_row, _store_type)(_store_at(_address_in_row))
 
 
 def _vector_of(value: types.Integer) -> _Vector:
@@ -182,12 +162,12 @@ def _vector_of(value: types.Integer) -> _Vector:
     return _Vector(value)
 
 
-@_compiled_as(splat, _vector_of)
+@_compiled_as(vectors.splat, _vector_of)
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return _write_splat(builder, arguments[0], LANES)
 
 
-@_compiled_as(ramp, lambda first: _Vector(types.uint16))
+@_compiled_as(vectors.ramp, lambda first: _Vector(types.uint16))
 def _ramp(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     start = _write_splat(builder, arguments[0], LANES)
     return builder.add(start, ir.Constant(_llvm_type(16), list(range(LANES))))
@@ -201,21 +181,21 @@ def _select_where(sign: str) -> Callable[..., Any]:
     return emit
 
 
-_compiled_as(where_equal, lambda a, b, then, otherwise: then)(_select_where("=="))
-_compiled_as(where_less, lambda a, b, then, otherwise: then)(_select_where("<"))
+_compiled_as(vectors.where_equal, lambda a, b, then, otherwise: then)(_select_where("=="))
+_compiled_as(vectors.where_less, lambda a, b, then, otherwise: then)(_select_where("<"))
 
 
-@_compiled_as(widen, lambda lanes, array: _Vector(array.dtype))
+@_compiled_as(vectors.widen, lambda lanes, array: _Vector(array.dtype))
 def _widen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.zext(arguments[0], _llvm_type(signature.return_type.element.bitwidth))
 
 
-@_compiled_as(narrow, lambda lanes: _Vector(types.uint8))
+@_compiled_as(vectors.narrow, lambda lanes: _Vector(types.uint8))
 def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.trunc(arguments[0], _llvm_type(8))
 
 
-@_compiled_as(broadcast_smallest, lambda lanes: lanes)
+@_compiled_as(vectors.broadcast_smallest, lambda lanes: lanes)
 def _broadcast_smallest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     # A butterfly of exchanges between ever nearer lanes, which stays in registers.
     found, turn = arguments[0], LANES // 2
@@ -232,13 +212,13 @@ def _shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
 
 
 _binary(
-    put_before,
+    vectors.put_before,
     lambda builder, lanes, before: _shuffle(
         builder, before, lanes, list(range(LANES - 1, 2 * LANES - 1))
     ),
 )
 _binary(
-    put_after,
+    vectors.put_after,
     lambda builder, lanes, after: _shuffle(builder, lanes, after, list(range(1, LANES + 1))),
 )
 
@@ -249,7 +229,7 @@ def _transpose_type(rows: Any, n: Any, at: Any, out: Any, m: Any, to: Any) -> An
     return types.none if fits else None
 
 
-@_compiled_as(transpose, _transpose_type)
+@_compiled_as(vectors.transpose, _transpose_type)
 def _transpose(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     def address(row: int, part: slice) -> Any:
         """Return where a row of a block begins, given by array, first row and first column."""

@@ -10,9 +10,8 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+# Values of a vector. In 16 bits they fill 512 bits; of smaller registers the compiler uses several.
 LANES: Final = 32
-"""Values of a vector. In 16 bits they fill a register of 512 bits; where registers are smaller, the
-compiler uses several."""
 
 Vector: TypeAlias = NDArray[Any]  # uint8 or uint16 (LANES,)
 
