@@ -1,12 +1,133 @@
+"""Numbers in text are ASCII decimals; errors and settings are one clear line; bounds are kept."""
+
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 from pydantic import Field, ValidationError, field_validator
 
-from recon.core.errors import SettingsError
+from recon.cli.options import parse_numbers as parse_option
+from recon.commands.config import ReconConfig, load_config
+from recon.core.errors import MissingDependencyError, ReconError, SettingsError, require
 from recon.core.settings import Settings
+from recon.core.text import counted, is_count, parse_integer, parse_number, unit_of, with_unit
+from recon.evaluation.trajectory import TrajectoryRules
+from recon.io.cameras.opencv_yaml import read_file_storage
+from recon.io.fields import parse_yaml
+from recon.io.files import read_table
+from recon.io.models.ply import read_ply
+from recon.io.trajectory import read_frames
+from recon.rig.capture import RecordingSettings
+from recon.run.threads import parse_size_mb
+from recon.sources.times import read_dates, read_stamped_names
+from recon.street.settings import StreetScene
+from tests.scenery.bounds import Number, numbers_of
+
+FOREIGN = ["1_0", "١٢", "1_0.5", "\uff11\uff12"]
+PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+READERS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "table": (lambda path: read_table(path, (2,)), "1 {}\n"),
+    "frames": (read_frames, "left.png,right.png,0.5,{}\n"),
+    "stamps": (read_stamped_names, "{} image.png\n"),
+    "dates": (read_dates, "2011-09-26 13:02:{}.964\n"),
+    "cloud": (read_ply, PLY + "property float z\nend_header\n1 2 {}\n"),
+}
+
+
+@pytest.mark.parametrize("number", ["1", "-1.5", "+.5", "1e-05", "7."])
+def test_decimal_numbers_are_what_python_reads(number: str) -> None:
+    assert parse_number(number) == float(number)
+
+
+@pytest.mark.parametrize("text", FOREIGN)
+def test_other_notations_are_no_numbers(text: str) -> None:
+    assert not is_count(text)
+    for parse in (parse_number, parse_integer):
+        with pytest.raises(ValueError, match=r"not a decimal number|invalid literal"):
+            parse(text)
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_readers_take_decimals_alone(tmp_path: Path, reader: str) -> None:
+    read, content = READERS[reader]
+    (tmp_path / "file").write_text(content.format("10"), encoding="utf-8")
+    read(tmp_path / "file")
+    for text in FOREIGN:
+        (tmp_path / "file").write_text(content.format(text), encoding="utf-8")
+        with pytest.raises(ReconError):
+            read(tmp_path / "file")
+
+
+@pytest.mark.parametrize("text", [*FOREIGN, "0x10", "1:30"])
+def test_numbers_of_old_yaml_are_text(tmp_path: Path, text: str) -> None:
+    assert parse_yaml(f"value: {text}", "x.yaml") == {"value": text}
+    (tmp_path / "rig.yml").write_text(f"%YAML:1.0\n---\nfx: {text}\n", encoding="utf-8")
+    assert read_file_storage(tmp_path / "rig.yml") == {"fx": text}
+
+
+def test_yaml_has_decimals_and_what_is_not_finite() -> None:
+    text = "[10, 010, -2, 0.5, 1.5e+3, -.inf, true]"
+    assert parse_yaml(text, "x.yaml") == [10, 10, -2, 0.5, 1500.0, -float("inf"), True]
+
+
+@pytest.mark.parametrize("text", FOREIGN)
+def test_settings_and_options_refuse_other_notations(text: str) -> None:
+    for setting in (f"fusion.voxel_m={text}", f"audit.baseline_m=[0.1, {text}]"):
+        with pytest.raises(ReconError, match="number"):
+            load_config(None, [setting])
+    with pytest.raises(ReconError, match="--antenna"):
+        parse_option(f"1,{text},3", "--antenna")
+    with pytest.raises(ReconError):
+        parse_size_mb(f"{text}M")
+
+
+def test_things_are_counted_with_their_plural() -> None:
+    numbers = (0, 1, 2, -1, 1200)
+    found = ["0 frames", "1 frame", "2 frames", "-1 frame", "1200 frames"]
+    assert [counted(number, "frame") for number in numbers] == found
+    assert counted(1, "frame", form="+d") == "+1 frame"
+    assert counted(1200, "point", form=",") == "1,200 points"
+    assert [counted(n, "match", "matches") for n in (1, 2)] == ["1 match", "2 matches"]
+
+
+UNITS = {
+    "path_length_m": "m", "trajectory.r_rel_deg_per_100m": "°/100 m", "speed_m_per_s": "m/s",
+    "trajectory.t_rel_percent at 100 m": "%", "peak_memory_mb": "MB", "fps": "frames/s",
+    "seconds": "s", "seconds.match": "s", "seconds_per_frame.p95": "s",
+    "live.latency_ms.p50": "ms", "disparity.bad.0.5": "%", "disparity.quantiles_px.50": "px",
+    "depth_error_cm.10.calibration": "cm", "precision at 0.2 m": "", "frames": "",
+    "frames_not_trusted": "", "map.f_score": "", "m": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_a_figure_has_the_unit_that_its_name_tells(name: str) -> None:
+    assert unit_of(name) == UNITS[name]
+    assert with_unit("3", name) == f"3 {UNITS[name]}".strip()
+
+
+@pytest.mark.parametrize(
+    ("parts", "line"),
+    [
+        ({}, "wrong"),
+        ({"got": 0}, "wrong (got 0)"),
+        ({"got": "a\n  b\t c"}, "wrong (got a b c)"),
+        ({"where": "f", "expected": "3", "hint": "crop it"}, "f: wrong (expected 3); crop it"),
+        ({"where": Path("a/b"), "got": 2, "expected": 3}, "a/b: wrong (got 2, expected 3)"),
+    ],
+)
+def test_the_line_of_an_error_has_the_known_parts(parts: dict[str, object], line: str) -> None:
+    assert str(ReconError("wrong", **parts)) == line  # type: ignore[arg-type]
+
+
+def test_an_optional_package_is_imported_and_a_missing_one_gets_the_pip_line() -> None:
+    assert require("json", extra="ros").dumps([1]) == "[1]"
+    words = r"'no_such_thing'.*pip install 'recon\[ros\]'"
+    with pytest.raises(MissingDependencyError, match=words):
+        require("no_such_thing", extra="ros")
 
 
 class Inner(Settings):
@@ -25,12 +146,6 @@ class Outer(Settings):
     name: str = Field(default="a", description="Name.")
 
 
-def test_settings_come_from_plain_values_and_give_them_back() -> None:
-    settings = Outer.parse({"inner": {"window_px": 5}})
-    assert settings == Outer(inner=Inner(window_px=5))
-    assert Outer.parse(settings.model_dump()) == settings
-
-
 def test_the_word_none_leaves_open_what_can_be_left_open() -> None:
     class Open(Settings):
         limit_m: float | None = Field(default=1.0, description="Limit.")
@@ -45,15 +160,10 @@ def test_a_part_of_a_group_keeps_the_other_defaults_of_that_group() -> None:
     class Filtered(Settings):
         outer: Outer = Outer(inner=Inner(window_px=5), name="b")
 
-    assert Filtered.parse({"outer": {"name": "c"}}).outer == Outer(
-        inner=Inner(window_px=5), name="c"
-    )
+    found = Filtered.parse({"outer": {"name": "c"}})
+    assert found.outer == Outer(inner=Inner(window_px=5), name="c")
     assert Filtered.parse({"outer": {"inner": {}}}).outer.inner.window_px == 5
-
-
-def test_settings_cannot_be_changed() -> None:
-    with pytest.raises(ValidationError, match="frozen"):
-        Outer().name = "b"
+    assert Filtered.parse(found.model_dump()) == found
 
 
 @pytest.mark.parametrize(
@@ -73,9 +183,65 @@ def test_a_bad_setting_is_named_with_its_path(values: dict[str, object], message
         Outer.parse(values, where="config.yaml")
 
 
-def test_a_default_outside_its_bounds_is_refused() -> None:
+def test_settings_cannot_be_changed_and_defaults_keep_their_bounds() -> None:
     class Wrong(Settings):
         window_px: int = Field(default=0, ge=1, description="Window.")
 
+    with pytest.raises(ValidationError, match="frozen"):
+        Outer().name = "b"
     with pytest.raises(ValidationError):
         Wrong()
+
+
+#: What settings of before are fixed at.
+FIXED: dict[str, Any] = {
+    "matching.sad.speckle_size_px": 50, "matching.sad.min_texture": 0.1,
+    "matching.sad.half_size_first": True, "matching.sgm.speckle_size_px": 50,
+    "cloud.min_confidence": 0.0, "occupancy.rays_per_voxel": 2, "occupancy.thin_surfaces": True,
+    "grid.free_height_m": 0.8, "grid.occupied_probability": 0.55, "grid.free_probability": 0.35,
+    "audit.frames": 300, "calibration.bootstrap": 500, "paper.patch_px": 11,
+    "calibration.depths_m": [2.0, 5.0, 10.0, 20.0], "street.turn_deg_per_100m": 20.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_a_constant_of_now_is_read_from_files_of_before_with_its_value_alone(name: str) -> None:
+    assert load_config(None, [{name: FIXED[name]}]) == ReconConfig()
+    group, _, last = name.rpartition(".")
+    with pytest.raises(SettingsError, match=f"{group}.*{last} is fixed in this version"):
+        load_config(None, [{name: 7}])
+
+
+def test_a_setting_that_a_group_has_again_is_not_fixed() -> None:
+    class Old(Settings):
+        fixed = {"size": 1}  # noqa: RUF012
+
+    class New(Old):
+        size: int = 2
+
+    assert New.parse({"size": 3}) == New(size=3)
+
+
+@pytest.mark.parametrize("settings", [ReconConfig, TrajectoryRules, RecordingSettings, StreetScene])
+def test_every_number_has_two_bounds(settings: type[Settings]) -> None:
+    open_ended = [one.name for one in numbers_of(settings) if None in (one.low, one.high)]
+    assert open_ended == []
+
+
+def _given(number: Number, value: object) -> list[str]:
+    text = f"[{', '.join([str(value)] * number.count)}]" if number.count else f"{value}"
+    return [f"{number.name}={text}"]
+
+
+@pytest.mark.parametrize("number", [*numbers_of(ReconConfig)], ids=lambda number: number.name)
+def test_a_number_beyond_its_bounds_is_refused_in_one_line(number: Number) -> None:
+    assert number.low is not None
+    assert number.high is not None
+    step = 1 if number.whole else 1e-9 * max(1.0, abs(number.low), abs(number.high))
+    ends = zip((number.low, number.high), number.outside, strict=True)
+    far = ("1e300", "-1e300", ".inf", "-.inf", ".nan", "1" + "0" * 30, "-1" + "0" * 30)
+    near = (number.low - step, number.high + step, *(end for end, outside in ends if outside))
+    for value in (*far, *near):
+        with pytest.raises(SettingsError, match=number.name) as raised:
+            load_config(None, _given(number, value))
+        assert "\n" not in str(raised.value)

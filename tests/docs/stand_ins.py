@@ -37,7 +37,7 @@ from tests.scenery.middlebury import write_scene
 from tests.scenery.planes import slanted_pair
 from tests.sources import drives
 from tests.sources.bags import Recording, write_bag
-from tests.stereo.match.plugins import install_plugin
+from tests.stereo.match.test_foreign_matchers import install_plugin
 
 SCENES = ("ArtL", "Jadeplant", "Pipes", "Teddy")
 CAMERA = """  camera_model: pinhole

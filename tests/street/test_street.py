@@ -1,19 +1,291 @@
-"""The street depends only on its settings, and so do the poses of the rig."""
+"""A street depends on its settings alone; its images and truth agree with analytic geometry."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from recon.core.errors import SettingsError
 from recon.core.geometry import se3
-from recon.street.materials import ROAD_HALF_M
-from recon.street.path import LANE_M, camera_poses, centre_line
+from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.se3 import check_rigid
+from recon.core.values import OCCUPIED, PointCloud
+from recon.street.materials import ROAD_HALF_M, both, stripe, stripes, tile_joints, tile_tone
+from recon.street.path import LANE_M, R_STREET_LEVEL, camera_poses, centre_line
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
-from recon.street.street import build_street
+from recon.street.shapes import (
+    Material,
+    Paint,
+    boxes,
+    bumpy_ball,
+    cylinder,
+    disc,
+    extrusion,
+    frustum,
+    icosphere,
+    merge,
+    move,
+    quads,
+)
+from recon.street.street import StreetWorld, build_street, rig
+from recon.street.truth import true_occupancy, true_surface
+
+SMALL = StreetScene(seed=3, frames=4, width_px=320, height_px=120, focal_px=180.0, noise_dn=0.0)
+
+
+@pytest.fixture(scope="module")
+def street() -> StreetCamera:
+    return StreetCamera(build_street(SMALL))
+
+
+@pytest.fixture(scope="module")
+def box_world() -> StreetWorld:
+    """A level road, a wall 20 m ahead, a box of 2 × 2 × 1.8 m whose front is 8 m ahead."""
+    size = {"width_px": 200, "height_px": 100, "focal_px": 100.0, "baseline_m": 0.5}
+    settings = StreetScene(frames=1, noise_dn=0.0, **size)
+    grey = Paint(Material.PLAIN, (0.5, 0.5, 0.5), 1)
+    soup = merge([
+        quads([-5, -50, 0], [100, 0, 0], [0, 100, 0], grey),
+        quads([20, -50, 0], [0, 100, 0], [0, 0, 30], grey),
+        boxes([8, -1, 0.01], [10, 1, 1.8], grey),
+    ])  # fmt: skip
+    pose = se3.make_transform(R_STREET_LEVEL, np.array([0.0, 0.0, 1.5]))
+    return StreetWorld(settings, soup, rig(settings), pose[None], np.array([0.0, 0.0, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def frame(street: StreetCamera):
+    return street.render(1)
+
+
+def _points(depth_m: np.ndarray, camera) -> np.ndarray:
+    """float64 (H·W, 3), camera axes; NaN = sky."""
+    v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
+    return unproject(u.ravel(), v.ravel(), depth_m.ravel().astype(np.float64), camera)
+
+
+def _depths_at(street: StreetCamera, index: int, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which points a frame shows, in its axes, and the depth that it sees there."""
+    camera, view = street.world.camera, street.views(index)[0]
+    u, v, _ = project(xyz, camera)
+    inside = (u > 0) & (u < camera.width_px - 1) & (v > 0) & (v < camera.height_px - 1)
+    pixels = np.stack([u[inside], v[inside]], axis=1)
+    return inside, street.stage.depth(view.origin, view.directions(pixels))
+
+
+def test_images_are_well_exposed_and_depth_is_that_of_the_road_the_sky_and_the_disparity(
+    frame, street
+):
+    for image in (frame.pair.left, frame.pair.right):
+        assert image.shape == (120, 320, 3)
+        assert 70 < image.mean() < 180
+        assert image.std() > 35
+        assert (image == 255).mean() < 0.1
+    xyz = _points(frame.depth_m, street.world.camera)
+    height = xyz @ frame.ground_plane[:3] + frame.ground_plane[3]
+    height = height[np.isfinite(height)]
+    assert (np.abs(height) < 1e-4).mean() > 0.15
+    assert (np.abs(height - 0.12) < 1e-4).mean() > 0.01  # the pavement
+    # Nothing is below the road; float32 depths of 30 m are good to 2e-6 m.
+    assert height.min() > -1e-4
+    camera, sky = street.world.camera, np.isnan(frame.depth_m)
+    product = (frame.truth.values * frame.depth_m)[~sky]
+    assert np.allclose(product, camera.focal_px * camera.baseline_m)
+    assert 0.02 < sky.mean() < 0.5
+    assert np.array_equal(sky, np.isnan(frame.truth.values))
+    assert not frame.truth.nonocc[sky].any()
+    # It is blue or white but where an edge blends with a roof, and above the road.
+    red, _, blue = frame.pair.left[sky].astype(int).T
+    assert (blue >= red).mean() > 0.95
+    assert not sky[80:].any()
+
+
+def test_depth_and_occlusion_of_the_box_world_are_those_on_paper(box_world: StreetWorld):
+    depth = StreetCamera(box_world).depth(0)
+    v, u = np.mgrid[0:100, 0:200]
+    # Camera 1.5 m above the road, f = 100 px, principal point (99.5, 49.5).
+    road = np.where(v > 49.5, 100.0 * 1.5 / np.where(v > 49.5, v - 49.5, 1), np.inf)
+    expected = np.minimum(road, 20.0)
+    x, y = (u - 99.5) * 8 / 100, (v - 49.5) * 8 / 100
+    front = (np.abs(x) < 1.0) & (y > -0.3) & (y < 1.49)
+    top = (v == 49) | (v == 48)
+    expected[front] = 8.0
+    certain = ~top & (np.abs(np.abs(x) - 1.0) > 0.2)
+    # Corners are stored in single precision: 1e-6 m at these distances.
+    np.testing.assert_allclose(depth[certain], expected[certain], rtol=3e-6)
+    truth = StreetCamera(box_world).disparity_truth(0)
+    # Row 48, 0.12 m above the cameras' height, looks over the road at box (8 m) and wall (20 m).
+    row, d = truth.nonocc[48], truth.values[48]
+    box = np.flatnonzero(d > 6.0)
+    assert np.allclose(d[box], 100 * 0.5 / 8.0)
+    assert np.allclose(np.delete(d, box), 100 * 0.5 / 20.0)
+    # The box's left edge is at x = -1 m: column 99.5 - 12.5 = 87 in the left view, 80.75 in the
+    # right one, where the wall appears 2.5 px further right than in the left view: 83.25.
+    hidden = np.flatnonzero(~row[box[0] - 10 : box[0]]) + box[0] - 10
+    assert box[0] == 87
+    assert hidden.tolist() == [84, 85, 86]
+    # Columns whose point lies left of the right image (beyond half a pixel): u < 2.
+    assert row[:4].tolist() == [False, False, True, True]
+    assert row[box].all()
+
+
+def test_the_right_view_warped_by_the_truth_is_the_left_view(frame):
+    d, keep = frame.truth.values, frame.truth.nonocc.copy()
+    v, u = np.mgrid[0:120, 0:320].astype(np.float32)
+    x = (u - np.nan_to_num(d)).astype(np.float32)
+    fetched = cv2.remap(frame.pair.right.astype(np.float32), x, v, cv2.INTER_LANCZOS4)
+    error = np.abs(fetched - frame.pair.left).mean(axis=2)[keep & (x > 3) & (x < 316)]
+    # Most surfaces are smooth at this size; the tail are edges that both views blend differently.
+    assert np.median(error) < 1.5
+    assert np.percentile(error, 90) < 10.0
+    # One pixel off is clearly worse: the truth is where the images agree.
+    shifted = cv2.remap(frame.pair.right.astype(np.float32), x + 1, v, cv2.INTER_LANCZOS4)
+    worse = np.abs(shifted - frame.pair.left).mean(axis=2)[keep & (x > 3) & (x < 316)]
+    assert worse.mean() > 2.0 * error.mean()
+
+
+def test_points_of_one_frame_are_found_by_the_next(street):
+    camera, here, there = street.world.camera, 0, 2
+    poses = street.world.trajectory.T_world_camera
+    xyz = _points(street.depth(here), camera)
+    moved = se3.apply(se3.invert(poses[there]) @ poses[here], xyz[np.isfinite(xyz[:, 2])])
+    inside, found = _depths_at(street, there, moved)
+    # A ray to a point ends there or before it; poses and depths are good to float32.
+    assert (found <= moved[inside, 2] * (1 + 1e-4) + 1e-3).mean() > 0.999
+    assert np.isclose(found, moved[inside, 2], rtol=1e-5, atol=1e-4).mean() > 0.85
+
+
+def test_threads_change_no_bit_and_a_longer_drive_goes_down_the_same_street(street):
+    again = StreetCamera(build_street(SMALL.model_copy(update={"threads": 1})))
+    one, other = street.render(2), again.render(2)
+    assert np.array_equal(one.pair.left, other.pair.left)
+    assert np.array_equal(one.pair.right, other.pair.right)
+    assert np.array_equal(one.truth.values, other.truth.values, equal_nan=True)
+    assert np.array_equal(one.truth.nonocc, other.truth.nonocc)
+    longer = StreetCamera(build_street(SMALL.model_copy(update={"frames": 12})))
+    here, there = street.depth(3), longer.depth(3)
+    near = np.nan_to_num(here, nan=np.inf) < 60.0
+    assert near.mean() > 0.5
+    # On the edge between two triangles either may be hit: the same to rounding.
+    np.testing.assert_allclose(here[near], there[near], rtol=1e-6)
+    for index in (-1, 4):
+        with pytest.raises(SettingsError, match="no such frame"):
+            street.depth(index)
+
+
+def test_noise_and_gain_change_images_but_not_truth(street):
+    update = {"noise_dn": 3.0, "right_gain": 0.8, "right_offset_dn": 5.0}
+    noisy = StreetCamera(
+        dataclasses.replace(street.world, settings=SMALL.model_copy(update=update))
+    )
+    clean, frame = street.render(0), noisy.render(0)
+    mid = (clean.pair.left > 30) & (clean.pair.left < 225)
+    difference = frame.pair.left.astype(float) - clean.pair.left
+    assert 2.8 < difference[mid].std() < 3.2
+    bright = (clean.pair.right > 60) & (clean.pair.right < 225)
+    expected = 0.8 * clean.pair.right[bright].astype(float) + 5.0
+    assert np.abs((frame.pair.right[bright] - expected).mean()) < 0.2
+    assert np.array_equal(frame.truth.values, clean.truth.values, equal_nan=True)
+    assert np.array_equal(noisy.pair(0).left, frame.pair.left)
+    other = noisy.pair(1).left.astype(float) - street.pair(1).left
+    assert abs(np.corrcoef(difference[mid], other[mid])[0, 1]) < 0.05
+
+
+@pytest.fixture(scope="module")
+def surface(street) -> PointCloud:
+    return true_surface(street, range_m=25.0, voxel_m=0.1)
+
+
+def test_surface_points_lie_on_what_the_camera_sees(street, surface):
+    assert surface.frame == "world"
+    # World is the first camera, so points in its view are hit by rays through their projections.
+    inside, found = _depths_at(street, 0, surface.xyz.astype(np.float64))
+    z = surface.xyz[inside, 2]
+    # float32 coordinates of 25 m are good to 1e-6 m; grazing rays magnify that.
+    assert np.isclose(found, z, rtol=1e-4, atol=1e-3).mean() > 0.8
+    assert (found > z * 1.0001 + 1e-3).mean() < 0.01
+
+
+def test_the_surface_is_thin_above_the_road_and_within_its_range(street, surface):
+    cells = np.floor(surface.xyz / np.float32(0.1)).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(surface)
+    assert len(surface) > 10_000
+    xyz, plane = surface.xyz.astype(np.float64), street.world.ground_plane(0)
+    height = xyz @ plane[:3] + plane[3]
+    assert (np.abs(height) < 1e-3).mean() > 0.1
+    assert height.min() > -1e-3
+    last = street.world.trajectory.T_world_camera[-1]
+    assert ((xyz - last[:3, 3]) @ last[:3, 2]).max() < 25.5
+
+
+def test_the_ground_plan_of_a_box_is_that_on_paper(box_world):
+    camera = StreetCamera(box_world)
+    truth = true_occupancy(camera, resolution_m=0.25, band_m=(0.3, 2.0), range_m=30.0)
+    grid = truth.grid
+    rows, columns = np.indices(grid.cells.shape)
+    x = grid.origin_m[0] + (columns + 0.5) * 0.25
+    y = grid.origin_m[1] + (rows + 0.5) * 0.25
+    # The map's origin is the camera, its axes here those of the street.
+    certain = (np.abs(np.abs(y) - 1.0) > 0.25) & (np.abs(x - 8) > 0.25) & (np.abs(x - 10) > 0.25)
+    certain &= np.abs(x - 20.0) > 0.25
+    box = (x > 8) & (x < 10) & (np.abs(y) < 1)
+    assert np.array_equal((grid.cells == OCCUPIED)[certain], box[certain])
+    # The front of the box and the road before it are seen, what is behind it is not.
+    assert truth.seen[(np.abs(x - 8.1) < 0.1) & (np.abs(y) < 0.9)].all()
+    # Up to 5.5 m rows of pixels meet the road less than a cell apart: Z² / (f·h) = 0.2 m.
+    assert truth.seen[(x > 3) & (x < 5.5) & (np.abs(y) < 0.9)].all()
+    assert not truth.seen[(x > 10.5) & (x < 14) & (np.abs(y) < 0.5)].any()
+
+
+def test_the_grid_turns_with_the_map_axes_and_has_what_is_in_the_band(box_world):
+    camera = StreetCamera(box_world)
+    turn = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
+    plain = true_occupancy(camera, range_m=15.0)
+    turned = true_occupancy(camera, range_m=15.0, T_map_world=turn @ box_world.T_map_world)
+    above = true_occupancy(camera, range_m=15.0, band_m=(1.9, 2.5))
+    one, two, none = ((t.grid.cells == OCCUPIED).sum() for t in (plain, turned, above))
+    # A quarter turn maps cells to cells, but for rounding at their borders.
+    assert abs(int(one) - int(two)) <= 0.2 * one
+    assert turned.grid.cells.shape[0] == pytest.approx(plain.grid.cells.shape[1], abs=2)
+    assert none == 0
+
+
+def test_seen_obstacles_of_the_street_are_where_surface_points_are(street, surface):
+    truth = true_occupancy(street, range_m=60.0)
+    world = street.world
+    xyz = surface.xyz.astype(np.float64)
+    height = se3.apply(se3.invert(world.T_world_street), xyz)[:, 2]
+    tall = se3.apply(world.T_map_world, xyz[(height > 0.35) & (height < 1.95)])
+    cells = np.floor((tall[:, :2] - truth.grid.origin_m) / 0.2).astype(int)
+    # Every visible point in the band is in an obstacle's cell, up to 5 cm between the level cuts.
+    hit = truth.grid.cells[cells[:, 1], cells[:, 0]] == OCCUPIED
+    assert hit.mean() > 0.97
+    assert 0.02 < (truth.grid.cells == OCCUPIED).mean() < 0.4
+
+
+def test_frames_count_how_often_a_cell_was_seen(street):
+    T = street.world.T_map_world
+    truth = true_occupancy(street, range_m=15.0, least_frames=3)
+    assert 0 <= truth.frames.min() < truth.frames.max() == len(street)
+    once = true_occupancy(street, range_m=15.0, least_frames=1)
+    assert 0 < truth.seen.sum() < once.seen.sum()
+    # What is only seen from beyond the range is true, and counts for no frame.
+    centres = (truth.keys + 0.5) * 0.2
+    cameras = (T @ street.world.trajectory.T_world_camera)[:, :3, 3]
+    nearest = np.linalg.norm(centres[:, None] - cameras, axis=2).min(axis=1)
+    # Half the diagonal of a cell more or less.
+    assert nearest[truth.frames > 0].max() < 15.0 + 0.18
+    assert (truth.frames == 0).any()
+    assert len(np.unique(truth.keys, axis=0)) == len(truth.keys)
+    assert nearest.max() < 17.0 + 0.18
+
 
 RAILS = {"path": "straight", "sway": 0.0, "yaw_deg": 0.0, "pitch_deg": 0.0, "roll_deg": 0.0}
 
@@ -23,50 +295,38 @@ def _poses(**settings) -> np.ndarray:
     return camera_poses(chosen, centre_line(chosen, 200.0))
 
 
-def test_the_first_pose_of_the_trajectory_is_the_identity(street):
+def test_on_rails_the_camera_moves_straight_ahead(street):
     trajectory = street.world.trajectory
     assert np.array_equal(trajectory.T_world_camera[0], np.eye(4))
     assert np.allclose(np.diff(trajectory.timestamps_s), 0.1)
-
-
-def test_on_rails_the_camera_moves_straight_ahead():
     poses = _poses(frames=5, speed_m_per_frame=0.8, **RAILS)
     T_world_camera = se3.invert(poses[0]) @ poses
     assert np.allclose(T_world_camera[:, :3, :3], np.eye(3))
     assert np.allclose(T_world_camera[:, :3, 3], np.outer(np.arange(5) * 0.8, [0, 0, 1]))
 
 
-def test_the_mounting_turns_the_view_by_its_angles():
-    poses = _poses(frames=1, **{**RAILS, "yaw_deg": 10.0})
-    assert np.allclose(poses[0, :3, 2], [np.cos(np.radians(10)), -np.sin(np.radians(10)), 0])
-    poses = _poses(frames=1, **{**RAILS, "pitch_deg": 10.0})
-    assert np.allclose(poses[0, :3, 2], [np.cos(np.radians(10)), 0, -np.sin(np.radians(10))])
+@pytest.mark.parametrize(("angle", "axis"), [("yaw_deg", 1), ("pitch_deg", 2)])
+def test_the_mounting_turns_the_view_by_its_angles(angle: str, axis: int):
+    ahead = _poses(frames=1, **{**RAILS, angle: 10.0})[0, :3, 2]
+    expected = np.cos(np.radians(10)) * np.eye(3)[0] - np.sin(np.radians(10)) * np.eye(3)[axis]
+    assert np.allclose(ahead, expected)
 
 
-def test_a_curved_street_turns_by_its_rate():
+def test_a_curved_street_turns_by_its_rate_and_steps_have_the_length_of_the_speed():
     poses = _poses(frames=101, turn_deg_per_100m=30.0, sway=0.0, yaw_deg=0.0)
     turned = np.degrees(se3.angle_rad(se3.invert(poses[0]) @ poses[-1]))
     # The winding adds at most 0.35 · 18 m of the rate: 1.9° at both ends.
     assert 26.0 < turned < 34.0
     assert poses[-1, 1, 3] > 5.0  # positive = to the left
-
-
-def test_poses_are_rigid_and_their_steps_have_the_length_of_the_speed():
     poses = _poses(frames=60, speed_m_per_frame=1.0)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     # The lane lies 1.55 m inside or outside of the centre line, whose curve is above 180 m.
     assert np.allclose(steps, 1.0, atol=0.02)
-    rotation = poses[:, :3, :3]
-    assert np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-12)
-    assert np.allclose(np.linalg.det(rotation), 1.0)
+    for T in poses:
+        check_rigid("pose", T)
 
 
-def test_another_seed_builds_another_street(street):
-    other = build_street(StreetScene(seed=4, frames=4))
-    assert len(other.soup) != len(street.world.soup)
-
-
-def test_map_axes_are_level_and_look_along_the_first_view(street):
+def test_map_axes_look_along_the_first_view_and_nothing_stands_in_the_lane(street):
     world = street.world
     T_map_street = world.T_map_world @ world.T_world_street
     assert np.allclose(T_map_street[2, :3], [0, 0, 1])
@@ -74,20 +334,12 @@ def test_map_axes_are_level_and_look_along_the_first_view(street):
     assert forward[0] > 0.99
     assert forward[1] == pytest.approx(0.0, abs=1e-12)
     assert np.allclose(world.T_map_world[:3, 3], 0.0)
-
-
-def test_nothing_stands_in_the_lane_of_the_camera(street):
     world = street.world
+    assert len(build_street(StreetScene(seed=4, frames=4)).soup) != len(world.soup)
     centres = world.soup.vertices.mean(axis=1)
     for pose in world.T_street_camera:
         near = np.linalg.norm(centres[:, :2] - pose[:2, 3], axis=1) < 0.9
         assert (centres[near, 2] < 0.05).all()
-
-
-@pytest.mark.parametrize("wrong", [{"frames": 0}, {"baseline_m": 0.0}, {"colour": 1}])
-def test_wrong_settings_are_refused(wrong):
-    with pytest.raises(SettingsError):
-        StreetScene.parse(wrong)
 
 
 TINY = {"width_px": 96, "height_px": 40, "focal_px": 54.0, "smooth_edges": False}
@@ -105,26 +357,13 @@ def block() -> StreetCamera:
     return StreetCamera(build_street(settings))
 
 
-@pytest.fixture(scope="module")
-def repeated() -> StreetCamera:
-    settings = StreetScene(
-        path="straight", repeat_m=40.0, frames=41, speed_m_per_frame=4.0, **TINY, **ON_RAILS
-    )
-    return StreetCamera(build_street(settings))
-
-
-def test_the_line_around_a_block_closes():
+def test_the_line_around_a_block_closes_and_the_second_lap_runs_where_the_first_did(block):
     road = centre_line(StreetScene(path="block", block_m=BLOCK_M), 0.0)
-
     assert road.loop_m == pytest.approx(LAP_M)
     # Steps of 0.25 m replace each corner's arc by chords, all four alike.
     assert road.xy_m[-1] == pytest.approx(road.xy_m[0], abs=1e-9)
     assert road.heading_rad[-1] == pytest.approx(2 * math.pi)
-
-
-def test_the_second_lap_runs_where_the_first_did(block):
     poses = block.world.T_street_camera
-
     assert poses[100:] == pytest.approx(poses[:11], abs=1e-9)
     # The car keeps to the outer lane, so a lap of the car is longer than one of the line.
     expected_m = LAP_M - 2 * math.pi * LANE_M
@@ -133,29 +372,23 @@ def test_the_second_lap_runs_where_the_first_did(block):
     assert not np.array_equal(block.pair(3).left, block.pair(53).left)
 
 
-def test_nothing_stands_on_the_road_around_a_block(block):
+def test_nothing_stands_on_the_road_around_a_block_nor_inside_its_corners(block):
     road = centre_line(block.world.settings, 0.0)
     corners = block.world.soup.vertices.reshape(-1, 3)
     standing = corners[(corners[:, 2] > 0.3) & (corners[:, 2] < 2.5), :2]
-
     gap = np.linalg.norm(standing[:, None] - road.xy_m[None, ::8], axis=2).min(axis=1)
     # Parked cars fill the outer 2 m of each side of the road.
     assert gap.min() > ROAD_HALF_M - 2.3
+    middle = road.loop_m - CORNER_M * math.pi / 4  # of the last corner
+    inner = road.points(np.array([middle]), np.array([9.0]))[0]
+    walls = corners[corners[:, 2] > 5.0, :2]
+    assert np.linalg.norm(walls - inner, axis=1).min() > 2.0
 
 
-def test_the_inside_of_a_corner_has_no_house(block):
-    road = centre_line(block.world.settings, 0.0)
-    at = road.loop_m - CORNER_M * math.pi / 4  # the middle of the last corner
-    inner = road.points(np.array([at]), np.array([9.0]))[0]
-    corners = block.world.soup.vertices.reshape(-1, 3)
-
-    walls = corners[(corners[:, 2] > 5.0)]
-    assert np.linalg.norm(walls[:, :2] - inner, axis=1).min() > 2.0
-
-
-def test_a_repeated_street_looks_and_is_the_same_each_period(repeated):
+def test_a_repeated_street_looks_and_is_the_same_each_period():
+    period = {"path": "straight", "repeat_m": 40.0, "frames": 41, "speed_m_per_frame": 4.0}
+    repeated = StreetCamera(build_street(StreetScene(**period, **TINY, **ON_RAILS)))
     here, later, elsewhere = (repeated.pair(k).left.astype(float) for k in (2, 12, 5))
-
     # Only the grain of the surfaces is of the place, and the end of the street comes nearer.
     assert np.abs(later - here).mean() < 0.3 * np.abs(elsewhere - here).mean()
     here, later = repeated.depth(2), repeated.depth(12)
@@ -165,8 +398,113 @@ def test_a_repeated_street_looks_and_is_the_same_each_period(repeated):
 
 
 @pytest.mark.parametrize(
-    "values", [{"path": "block", "block_m": (100.0, 40.0)}, {"path": "curve", "repeat_m": 40.0}]
+    ("values", "words"),
+    [
+        ({"frames": 0}, "frames"),
+        ({"baseline_m": 0.0}, "baseline_m"),
+        ({"colour": 1}, "colour"),
+        ({"path": "block", "block_m": (100.0, 40.0)}, "block_m"),
+        ({"path": "curve", "repeat_m": 40.0}, "repeat_m"),
+    ],
 )
-def test_an_impossible_street_is_refused(values):
-    with pytest.raises(SettingsError, match=r"block_m|repeat_m"):
+def test_an_impossible_street_is_refused(values, words: str):
+    with pytest.raises(SettingsError, match=words):
         StreetScene.parse(values)
+
+
+PAINT = Paint(Material.BRICK, (0.2, 0.4, 0.6), 5)
+
+
+def _area(soup) -> float:
+    v = soup.vertices
+    return 0.5 * np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]), axis=1).sum()
+
+
+def _open_edges(vertices: np.ndarray) -> int:
+    """Edges that belong to an odd number of triangles."""
+    keys = {}
+    for triangle in np.round(vertices, 9):
+        for k in range(3):
+            edge = frozenset([tuple(triangle[k] + 0.0), tuple(triangle[(k + 1) % 3] + 0.0)])
+            keys[edge] = keys.get(edge, 0) + 1
+    return sum(count % 2 for count in keys.values())
+
+
+def test_a_quad_has_its_area_and_metric_surface_coordinates():
+    soup = quads([1, 2, 3], [2, 0, 0], [0, 0, 3], PAINT, (10.0, 20.0))
+    assert _area(soup) == pytest.approx(6.0)
+    assert soup.uv.reshape(-1, 2).min(axis=0).tolist() == [10.0, 20.0]
+    assert soup.uv.reshape(-1, 2).max(axis=0).tolist() == [12.0, 23.0]
+
+
+@pytest.mark.parametrize(
+    ("soup", "area", "closed"),
+    [
+        (boxes([0, 0, 0], [1, 2, 3], PAINT), 22.0, True),
+        (cylinder((0.5, 0.5), 2.0, PAINT, 64), 2.0 * np.pi, False),
+        (disc(2.0, PAINT, 100), 4.0 * np.pi, False),
+        (extrusion([(0, 0), (2, 0), (2, 1), (0, 1)], 1.5, PAINT), 13.0, True),
+        (frustum([0, 0, 0], [1, 2, 3], (0, 0, 0), PAINT), 18.0, False),
+    ],
+    ids=["box", "cylinder", "disc", "extrusion", "frustum"],
+)
+def test_shapes_have_their_area_and_are_closed(soup, area: float, closed: bool):
+    assert _area(soup) == pytest.approx(area, rel=2e-3)
+    assert (_open_edges(soup.vertices) == 0) == closed
+    assert np.allclose(np.linalg.norm(soup.normals, axis=2), 1.0)
+
+
+@pytest.mark.parametrize("splits", [0, 1, 3])
+def test_an_icosphere_is_closed_and_round(splits):
+    triangles = icosphere(splits)
+    assert len(triangles) == 20 * 4**splits
+    assert np.allclose(np.linalg.norm(triangles, axis=2), 1.0)
+    assert _open_edges(triangles) == 0
+
+
+def test_a_bumpy_ball_is_closed_and_near_its_radius():
+    ball = bumpy_ball([2.0, 2.0, 2.0], PAINT, bump=0.2, wavelength=0.4)
+    radius = np.linalg.norm(ball.vertices, axis=2)
+    assert _open_edges(ball.vertices) == 0
+    # Bumps reach 1.5 times the share that was asked for: one octave and half of another.
+    assert 2.0 * (1 - 0.3) <= radius.min() < 2.0 < radius.max() <= 2.0 * (1 + 0.3)
+    assert ((ball.normals * ball.vertices).sum(axis=2) > 0).all()
+
+
+def test_moving_keeps_paint_and_turns_normals():
+    T = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.array([5.0, 0, 0]))
+    soup = merge([boxes([0, 0, 0], [1, 1, 1], PAINT), disc(1.0, PAINT)])
+    moved = move(soup, T)
+    assert np.array_equal(moved.uv, soup.uv)
+    assert _area(moved) == pytest.approx(_area(soup))
+    back = move(moved, se3.invert(T))
+    assert np.allclose(back.vertices, soup.vertices)
+    assert np.allclose(back.normals, soup.normals)
+
+
+@given(st.floats(-20, 20), st.floats(0.2, 5), st.floats(0.05, 0.95), st.floats(0.01, 9))
+def test_stripes_are_the_mean_over_the_footprint(x, period, share, w):
+    fine = x + w * ((np.arange(4000) + 0.5) / 4000 - 0.5)
+    expected = ((fine % period) < share * period).mean()
+    got = stripes(np.array([x]), period, share * period, np.array([w]))[0]
+    # 4000 samples place each stripe's edge to w/4000; there are at most 2·(9 / 0.2 + 1) edges.
+    assert got == pytest.approx(expected, abs=0.03)
+
+
+def test_stripes_and_joints_cover_their_share_of_an_area():
+    x = np.array([-0.1, 0.1, 0.4, 0.6])
+    assert np.allclose(stripe(x, 0.0, 0.5, np.zeros(4)), [0, 1, 1, 0])
+    assert stripe(np.array([0.5]), 0.0, 0.5, np.array([0.2]))[0] == pytest.approx(0.5)
+    uv = np.random.default_rng(0).uniform(0, 100, (50, 2))
+    got = tile_joints(uv, (0.5, 0.25), 0.05, np.full((50, 2), 40.0))
+    # 10 % of the columns, 20 % of the rows, the crossings once.
+    assert np.allclose(got, both(np.array(0.1), np.array(0.2)), atol=0.01)
+
+
+def test_a_tile_has_one_tone_its_neighbour_another_and_tones_fade_over_many_tiles():
+    uv = np.array([[0.1, 0.1], [0.4, 0.3], [0.6, 0.1]])
+    tone = tile_tone(uv, (0.5, 0.5), np.zeros((3, 2)), np.zeros(3, int))
+    assert tone[0] == tone[1] != tone[2]
+    uv = np.random.default_rng(0).uniform(0, 100, (500, 2))
+    tone = tile_tone(uv, (0.1, 0.1), np.full((500, 2), 2.0), np.zeros(500, int))
+    assert np.abs(tone).max() < 0.01

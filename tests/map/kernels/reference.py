@@ -14,7 +14,8 @@ from recon.core.kernels.voxels import unpack_keys
 from recon.map.kernels.clamped import ClampedBlocks, observed_rows
 from recon.map.kernels.facets import LEAST
 from recon.map.kernels.raycast import MIN_DEPTH_M, Rays
-from tests.core.kernels.voxels_reference import Cell
+
+Cell = tuple[int, int, int]
 
 Array = NDArray[Any]
 Clamped = tuple[float, float, float]

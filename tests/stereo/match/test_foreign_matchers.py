@@ -1,9 +1,10 @@
-"""Matchers that are not ours: objects, and plug-ins that packages register."""
+"""Matchers that are not ours: OpenCV's, objects, and plug-ins that packages register."""
 
 from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -12,10 +13,25 @@ import pytest
 
 import recon
 from recon.core.errors import MatchingError, SettingsError
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.io.middlebury import stand_in_camera
+from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
-from tests.stereo.match.plugins import install_plugin
+
+
+def install_plugin(
+    site: Path, package: str, modules: Mapping[str, str], matchers: Mapping[str, str]
+) -> None:
+    """Write modules and metadata of a package that registers matchers into a folder of packages."""
+    for name, source in modules.items():
+        (site / name).write_text(source)
+    info = site / f"{package.replace('-', '_')}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    points = "".join(f"{name} = {value}\n" for name, value in matchers.items())
+    (info / "entry_points.txt").write_text(f"[recon.matchers]\n{points}")
+
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -43,46 +59,26 @@ def image(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8)
 
 
-def altered(**fields: np.ndarray) -> Disparity:
+def altered(**fields: float | np.ndarray) -> Disparity:
     made = Disparity.from_values(np.full(SHAPE, 5.0))
     arrays = {name: getattr(made, name) for name in ("values", "confidence", "sigma_px", "reason")}
-    return Disparity(**{**arrays, **fields})
+    for name, given in fields.items():
+        arrays[name] = np.broadcast_to(given, SHAPE).astype(arrays[name].dtype)
+    return Disparity(**arrays)
 
 
-def full(number: float, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
-    return np.full(shape, number, np.float32)
-
-
-def test_an_object_is_taken_where_a_name_is() -> None:
-    mine = Flat()
+def test_an_object_is_taken_where_a_name_is_and_recorded_by_its_name(tmp_path: Path) -> None:
+    mine, out = Flat(), tmp_path / "run"
     config = recon.load_config(overrides=["cloud.remove_flying_edges=false"]).with_matcher(mine)
+    given = recon.PairInput(recon.StereoPair(image(0), image(1)), CAMERA)
     for found in (
         recon.match(image(), image(), matcher=mine),
         recon.reconstruct(image(), image(), CAMERA, matcher=mine).disparity,
         recon.reconstruct(image(), image(), CAMERA, config).disparity,
+        recon.run_disparity(given, config, out=out).disparity,
     ):
         assert np.nanmedian(found.values) == 5
-    assert MatchingSettings(matcher=mine).matcher is mine
-    assert config.model_dump(mode="json")["matching"]["matcher"] == "Flat"
-
-
-def test_a_run_is_made_with_an_object_and_records_its_name(tmp_path: Path) -> None:
-    config = recon.load_config().with_matcher(Flat())
-    given = recon.PairInput(recon.StereoPair(image(0), image(1)), CAMERA)
-    out = tmp_path / "run"
-    run = recon.run_disparity(given, config, out=out)
-    assert np.nanmedian(run.disparity.values) == 5
     assert "matcher: Flat" in (out / "config.yaml").read_text()
-
-
-@pytest.mark.slow
-def test_a_drive_is_mapped_with_an_object() -> None:
-    small = ["frames=3", "width_px=256", "height_px=96", "focal_px=150"]
-    config = recon.load_config(overrides=[f"street.{setting}" for setting in small])
-    mine = Flat()
-    mapped = recon.map_sequence(recon.SyntheticSource(config.street), config.with_matcher(mine))
-    assert len(mapped.trajectory) == 3
-    assert mine.ndisp is not None
 
 
 @pytest.mark.parametrize(
@@ -91,14 +87,11 @@ def test_a_drive_is_mapped_with_an_object() -> None:
         (np.ones(SHAPE), "returns no Disparity.*ndarray float64.*from_values"),
         (7, "returns no Disparity.*int"),
         (Disparity.from_values(np.ones((3, 4))), r"size of the images.*\(3, 4\).*\(20, 60\)"),
-        (altered(confidence=full(1.5)), "confidence is out of range.*1.5"),
-        (altered(confidence=full(np.nan)), "confidence is out of range.*NaN"),
-        (altered(sigma_px=full(np.nan)), "standard deviation is out of range.*NaN"),
-        (altered(sigma_px=full(0)), "standard deviation is out of range.*0 to 0"),
-        (
-            altered(values=full(np.inf), reason=np.full(SHAPE, 2, np.uint8)),
-            "infinite.*expected NaN",
-        ),
+        (altered(confidence=1.5), "confidence is out of range.*1.5"),
+        (altered(confidence=np.nan), "confidence is out of range.*NaN"),
+        (altered(sigma_px=np.nan), "standard deviation is out of range.*NaN"),
+        (altered(sigma_px=0), "standard deviation is out of range.*0 to 0"),
+        (altered(values=np.inf, reason=np.full(SHAPE, 2, np.uint8)), "infinite.*expected NaN"),
     ],
 )
 def test_what_is_no_disparity_of_the_pair_is_refused(found: object, words: str) -> None:
@@ -107,17 +100,16 @@ def test_what_is_no_disparity_of_the_pair_is_refused(found: object, words: str) 
 
 
 def test_an_error_inside_is_reported_with_its_matcher_and_kept_as_the_cause() -> None:
-    class Broken:
+    class Broken(Flat):
         name = "mine"
 
         def match(self, pair: RectifiedPair) -> Disparity:
             raise ZeroDivisionError("by zero")
 
-    with pytest.raises(
-        MatchingError, match=r"'mine': the matcher fails.*ZeroDivisionError"
-    ) as told:
+    words = r"'mine': the matcher fails.*ZeroDivisionError"
+    with pytest.raises(MatchingError, match=words) as raised:
         recon.match(image(), image(), matcher=Broken())
-    assert isinstance(told.value.__cause__, ZeroDivisionError)
+    assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
 
 def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named() -> None:
@@ -129,15 +121,19 @@ def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named() -> No
     assert mine.ndisp >= 1
 
 
-@pytest.mark.parametrize(("given", "word"), [(Flat, r"class.*Flat\(\)"), (7, "not a matcher.*int")])
-def test_what_is_no_matcher_is_refused(given: object, word: str) -> None:
+@pytest.mark.parametrize(
+    ("given", "settings", "word"),
+    [
+        (Flat, {}, r"class.*Flat\(\)"),
+        (7, {}, "not a matcher.*int"),
+        (Flat(), {"ndisp": 16}, r"only recon's own matchers take settings.*ndisp"),
+    ],
+)
+def test_what_is_no_matcher_or_takes_no_settings_is_refused(
+    given: object, settings: dict[str, int], word: str
+) -> None:
     with pytest.raises(SettingsError, match=word):
-        recon.match(image(), image(), matcher=given)  # type: ignore[arg-type]
-
-
-def test_settings_belong_to_our_matchers() -> None:
-    with pytest.raises(SettingsError, match=r"only recon's own matchers take settings.*ndisp"):
-        recon.match(image(), image(), matcher=Flat(), ndisp=16)
+        recon.match(image(), image(), matcher=given, **settings)  # type: ignore[arg-type]
 
 
 FLAT = """
@@ -158,15 +154,12 @@ def fails():
 
 @pytest.fixture
 def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = {
-        "flat": "flat_matcher:Flat",
-        "sad": "flat_matcher:Flat",
-        "missing": "flat_matcher:Nowhere",
-        "gone": "not_there:Flat",
-        "nothing": "flat_matcher:nothing",
-        "fails": "flat_matcher:fails",
-    }
-    install_plugin(tmp_path, "flat-matcher", {"flat_matcher.py": FLAT}, names)
+    places = {"flat": "Flat", "sad": "Flat", "missing": "Nowhere"}
+    names = {name: f"flat_matcher:{place}" for name, place in places.items()}
+    names |= {name: f"flat_matcher:{name}" for name in ("nothing", "fails")}
+    install_plugin(
+        tmp_path, "flat-matcher", {"flat_matcher.py": FLAT}, {**names, "gone": "not_there:Flat"}
+    )
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
@@ -190,10 +183,10 @@ def test_a_registered_matcher_has_a_name_but_not_one_of_ours() -> None:
     ],
 )
 def test_a_broken_plugin_is_named_in_one_line(name: str, words: str) -> None:
-    with pytest.raises(SettingsError, match=words) as told:
+    with pytest.raises(SettingsError, match=words) as raised:
         recon.match(image(), image(), matcher=name)
-    assert f"matcher {name!r}" in str(told.value)
-    assert "of package flat-matcher" in str(told.value)
+    assert f"matcher {name!r}" in str(raised.value)
+    assert "of package flat-matcher" in str(raised.value)
 
 
 @pytest.mark.usefixtures("plugin")
@@ -208,20 +201,15 @@ def test_a_matcher_whose_range_is_estimated_is_a_matcher(name: str) -> None:
     assert isinstance(make_matcher(name, MatchingSettings(), threads=1), Matcher)
 
 
-PAGE = Path(__file__).parents[3] / "docs" / "walk-research.md"
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
-
-
-def test_the_example_finds_a_shift_when_it_is_installed(
+def test_the_example_of_the_page_finds_a_shift_when_it_is_installed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (source,) = [block for block in blocks("python") if "class BlockMatcher" in block]
-    (project,) = [tomllib.loads(block) for block in blocks("toml")]
-    points = project["project"]["entry-points"]["recon.matchers"]
-    install_plugin(tmp_path, project["project"]["name"], {"block_matcher.py": source}, points)
+    page = (Path(__file__).parents[3] / "docs" / "walk-research.md").read_text()
+    blocks = re.findall(r"^```(\w+)\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    (source,) = [text for _, text in blocks if "class BlockMatcher" in text]
+    (project,) = [tomllib.loads(text)["project"] for kind, text in blocks if kind == "toml"]
+    points = project["entry-points"]["recon.matchers"]
+    install_plugin(tmp_path, project["name"], {"block_matcher.py": source}, points)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "block_matcher", raising=False)
 
@@ -229,10 +217,80 @@ def test_the_example_finds_a_shift_when_it_is_installed(
     world = cv2.GaussianBlur(noise, (3, 3), 0)
     found = recon.match(world[:, :120], world[:, 6:126], matcher="block")
     # Beyond the left rim, where the shift is visible, it is found everywhere but beside the rims.
-    inner = found.values[5:-5, 12:-5]
-    assert np.mean(inner == 6) > 0.99
+    assert np.mean(found.values[5:-5, 12:-5] == 6) > 0.99
 
 
-def test_the_page_says_what_the_arrays_give() -> None:
-    truth = np.full((20, 30), 7.0)
-    assert recon.evaluate_disparity(truth + 0.75, truth).bad == {0.5: 100, 1: 0, 2: 0, 4: 0}
+NAMES = ("opencv-bm", "opencv-sgbm")
+BOTH = pytest.mark.parametrize("name", NAMES)
+
+
+def shifted_pair(shift_px: int, shape: tuple[int, int] = (60, 160)) -> RectifiedPair:
+    """Noise, seen by the right camera ``shift_px`` further left."""
+    height, width = shape
+    world = np.random.default_rng(3).integers(0, 256, (height, width + 64), dtype=np.uint8)
+    world = cv2.GaussianBlur(world, (3, 3), 0)
+    left, right = world[:, 32 : 32 + width], world[:, 32 + shift_px : 32 + shift_px + width]
+    return RectifiedPair(left, right, stand_in_camera(width, height, 32))
+
+
+def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: object) -> Disparity:
+    matcher = OpencvMatcher(OpencvSettings(pad=pad, **settings), semi_global=name == NAMES[1])
+    return matcher.match(pair)
+
+
+@BOTH
+@pytest.mark.parametrize("shift_px", [-6, 0, 7, 20])
+def test_a_shift_is_found_wherever_the_right_image_reaches(name: str, shift_px: int) -> None:
+    first = -16 if shift_px < 0 else 0
+    found = match(name, shifted_pair(shift_px), min_disparity_px=first).values
+    # A 16th is OpenCV's step; ten of them allow for the bias of its sub-pixel fit.
+    inner = found[5:-5, max(0, shift_px) + 5 : min(0, shift_px) - 5]
+    assert np.nanmax(np.abs(inner - shift_px)) < 10 / 16
+    assert np.isfinite(inner).mean() > 0.95
+
+
+@BOTH
+def test_without_padding_a_strip_as_wide_as_the_range_is_unknown(name: str) -> None:
+    assert not OpencvSettings().pad  # the baseline is OpenCV as it comes
+    assert np.isnan(match(name, shifted_pair(7), pad=False).values[:, :31]).all()
+
+
+@BOTH
+def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_error(
+    name: str,
+) -> None:
+    left, right = np.random.default_rng(5).integers(0, 256, (2, 60, 160), dtype=np.uint8)
+    disparity = match(name, RectifiedPair(left, right, stand_in_camera(160, 60, 32)))
+    assert np.isnan(disparity.values).mean() > 0.5
+    assert Reason.AMBIGUOUS in disparity.reason
+    assert not (disparity.values < 0).any()
+    for height, width in ((1, 1), (1, 40), (40, 1), (3, 3)):
+        tiny = left[:height, :width]
+        pair = RectifiedPair(tiny, tiny, stand_in_camera(width, height))
+        assert match(name, pair).values.shape == (height, width)
+
+
+@BOTH
+def test_nothing_is_matched_beside_the_right_image_or_without_an_image(name: str) -> None:
+    pair, valid = shifted_pair(20), np.ones((60, 160), dtype=bool)
+    valid[:10] = False
+    found = match(name, RectifiedPair(pair.left, pair.right, pair.camera, valid=valid))
+    there = np.arange(160) - found.values
+    assert np.nanmin(there) >= -0.5
+    assert np.nanmax(there) <= 159.5
+    assert (found.reason[:10] == Reason.BORDER).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "settings", "words"),
+    [
+        ("opencv-bm", (6, 20), {"block_px": 21}, "20x6"),
+        ("opencv-sgbm", (60, 160), {"min_disparity_px": -4096}, "exceed the range of OpenCV"),
+        ("opencv-sgbm", (60, 160), {"ndisp": 4096}, "exceed the range of OpenCV"),
+    ],
+)
+def test_what_opencv_refuses_or_cannot_count_is_an_error_of_ours(
+    name: str, shape: tuple[int, int], settings: dict[str, int], words: str
+) -> None:
+    with pytest.raises(MatchingError, match=words):
+        match(name, shifted_pair(0, shape), pad=False, **settings)

@@ -39,9 +39,8 @@ def write_network(
 @pytest.fixture
 def difference(tmp_path: Path) -> Path:
     """Gives ``left - right``: a "disparity" that a test can predict."""
-    return write_network(
-        tmp_path / "net.onnx", ["left", "right"], [(["left", "right"], "d", "Sub")]
-    )
+    sides = ["left", "right"]
+    return write_network(tmp_path / "net.onnx", sides, [(sides, "d", "Sub")])
 
 
 def pair_of(left: int, right: int, shape: tuple[int, int] = (40, 60)) -> RectifiedPair:
@@ -61,20 +60,11 @@ def test_the_network_decides_the_disparity(difference: Path) -> None:
     # Left of column 20 the match lies beside the right image.
     assert (disparity.reason[:, :19] == Reason.BORDER).all()
     assert disparity.valid[:, 21:].all()
-
-
-def test_mean_and_scale_are_what_the_settings_say(difference: Path) -> None:
-    settings = {"mean": (0.2,), "std": (0.5 / 255,), "output_scale": -1.0}
-    disparity = match(difference, pair_of(10, 15), **settings)
-    assert np.nanmedian(disparity.values) == pytest.approx(10, abs=1e-3)
-
-
-def test_a_network_of_another_size_gives_disparities_in_pixels_of_the_image(
-    difference: Path,
-) -> None:
-    fixed = {"std": (1 / 255,), "width_px": 30, "height_px": 20}
+    scaled = match(difference, pair_of(10, 15), mean=(0.2,), std=(0.5 / 255,), output_scale=-1.0)
+    assert np.nanmedian(scaled.values) == pytest.approx(10, abs=1e-3)
     # 8 pixels of an image half as wide are 16 of the image.
-    assert np.nanmedian(match(difference, pair_of(18, 10), **fixed).values) == pytest.approx(16)
+    half = match(difference, pair_of(18, 10), std=(1 / 255,), width_px=30, height_px=20)
+    assert np.nanmedian(half.values) == pytest.approx(16)
 
 
 def write_mean(path: Path, inputs: list[str], shape: tuple[int | None, ...]) -> Path:
@@ -87,69 +77,50 @@ def write_mean(path: Path, inputs: list[str], shape: tuple[int | None, ...]) -> 
     return path
 
 
-def test_one_stacked_input_is_fed_where_the_network_has_one(tmp_path: Path) -> None:
+def test_inputs_channels_and_size_are_those_that_the_network_declares(tmp_path: Path) -> None:
     path = write_mean(tmp_path / "one.onnx", ["both"], (1, None, None, None))
-    disparity = match(path, pair_of(4, 8), std=(1 / 255,))
-    assert np.nanmedian(disparity.values) == pytest.approx(6, abs=1e-3)
-
-
-def test_the_size_and_the_channels_that_a_network_declares_are_kept(tmp_path: Path) -> None:
+    stacked = match(path, pair_of(4, 8), std=(1 / 255,))
+    assert np.nanmedian(stacked.values) == pytest.approx(6, abs=1e-3)
     path = write_mean(tmp_path / "fixed.onnx", ["left", "right"], (1, 3, 20, 30))
-    disparity = match(path, pair_of(18, 10), mean=(0.1, 0.1, 0.1), std=(1 / 255,))
-    # 8 pixels of an image half as wide are 16 of the image.
-    assert np.nanmedian(disparity.values) == pytest.approx(16)
+    fixed = match(path, pair_of(18, 10), mean=(0.1, 0.1, 0.1), std=(1 / 255,))
+    assert np.nanmedian(fixed.values) == pytest.approx(16)
 
 
 def test_what_is_not_finite_is_no_match(tmp_path: Path) -> None:
-    path = write_network(tmp_path / "log.onnx", ["left", "right"], [
-        (["left", "right"], "x", "Sub"), (["x"], "d", "Log"),
-    ])  # fmt: skip
-    disparity = match(path, pair_of(10, 30))
-    assert (disparity.reason == Reason.AMBIGUOUS).all()
+    nodes = [(["left", "right"], "x", "Sub"), (["x"], "d", "Log")]
+    path = write_network(tmp_path / "log.onnx", ["left", "right"], nodes)
+    assert (match(path, pair_of(10, 30)).reason == Reason.AMBIGUOUS).all()
 
 
-def test_a_network_that_gives_no_map_or_takes_other_inputs_is_refused(
-    difference: Path, tmp_path: Path
-) -> None:
-    colours = write_network(
-        tmp_path / "colours.onnx",
-        ["left", "right"],
-        [(["left", "right"], "d", "Sub")],
-        (1, 3, None, None),
-    )
-    with pytest.raises(MatchingError, match="not a disparity map"):
-        match(colours, pair_of(1, 2))
-    three = write_network(tmp_path / "three.onnx", ["a", "b", "c"], [(["a", "b", "c"], "d", "Sum")])
-    with pytest.raises(MatchingError, match="number of inputs"):
-        match(three, pair_of(1, 2))
-    with pytest.raises(MatchingError, match="no such output"):
-        match(difference, pair_of(1, 2), output=3)
+def test_no_map_and_other_inputs_of_a_network_are_refused(difference: Path, tmp_path: Path) -> None:
+    sides, letters = ["left", "right"], ["a", "b", "c"]
+    shape = (1, 3, None, None)
+    colours = write_network(tmp_path / "colours.onnx", sides, [(sides, "d", "Sub")], shape)
+    three = write_network(tmp_path / "three.onnx", letters, [(letters, "d", "Sum")])
+    for path, settings, words in (
+        (colours, {}, "not a disparity map"),
+        (three, {}, "number of inputs"),
+        (difference, {"output": 3}, "no such output"),
+    ):
+        with pytest.raises(MatchingError, match=words):
+            match(path, pair_of(1, 2), **settings)
     with pytest.raises(SettingsError, match="more numbers than the network has channels"):
         match(difference, pair_of(1, 2), mean=(0.1, 0.2, 0.3))
 
 
-def test_a_file_that_is_no_network_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_no_network_and_settings_that_disagree_are_refused(tmp_path: Path) -> None:
     (tmp_path / "bad.onnx").write_bytes(b"no network")
-    with pytest.raises(FormatError, match=r"bad\.onnx"):
-        match(tmp_path / "bad.onnx", pair_of(1, 2))
-    with pytest.raises(FormatError, match="does not exist"):
-        match(tmp_path / "none.onnx", pair_of(1, 2))
-
-
-def test_without_a_network_the_setting_is_named() -> None:
+    for name, words in (("bad.onnx", r"bad\.onnx"), ("none.onnx", "does not exist")):
+        with pytest.raises(FormatError, match=words):
+            match(tmp_path / name, pair_of(1, 2))
+    for values in ({"width_px": 8}, {"mean": (0.1, 0.2)}, {"std": (0.0,)}):
+        with pytest.raises(SettingsError):
+            OnnxSettings.parse(values)
     with pytest.raises(SettingsError, match=r"matching\.onnx\.model"):
         OnnxMatcher(OnnxSettings()).match(pair_of(1, 2))
 
 
-def test_settings_that_contradict_each_other_are_refused() -> None:
-    for values in ({"width_px": 8}, {"mean": (0.1, 0.2)}, {"std": (0.0,)}):
-        with pytest.raises(SettingsError):
-            OnnxSettings.parse(values)
-
-
-def test_without_the_extra_the_pip_line_is_reported(
-    difference: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_extra_pip_is_named(difference: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(name: str) -> None:
         raise ModuleNotFoundError(name)
 

@@ -1,35 +1,87 @@
-"""What our matchers promise, on images whose disparity is known exactly."""
+"""What our matchers promise: on images of known disparity, for any pair's range, on real pairs."""
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
+from pathlib import Path
 from unittest.mock import patch
 
 import cv2
 import numpy as np
 import pytest
 
+from recon.commands.evaluate_middlebury import run_middlebury
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float32, Float64, UInt8
+from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.stereo.kernels.refine import Rules
 from recon.stereo.match import sad, search
-from recon.stereo.match.registry import MatchingSettings, make_matcher
-from recon.stereo.match.sad import SadMatcher, SadSettings
-from recon.stereo.match.sgm import SgmMatcher, SgmSettings
-from tests.stereo.match.images import (
-    HEIGHT,
-    WIDTH,
-    inner,
-    make_pair,
-    noise,
-    square_before_wall,
-    warped_pair,
+from recon.stereo.match.registry import (
+    MATCHERS,
+    MatchingSettings,
+    make_matcher,
+    searched,
+    settings_of,
 )
+from recon.stereo.match.sad import (
+    AutoRangeMatcher,
+    HalfSizeMatcher,
+    SadMatcher,
+    SadSettings,
+    estimate_ndisp,
+)
+from recon.stereo.match.search import ResultPool, clipped_gradients, texture, usual_ndisp
+from recon.stereo.match.sgm import SgmMatcher, SgmSettings
+from recon.stereo.rectify.rectifier import to_grey
+
+HEIGHT, WIDTH = 60, 120
+
+
+def make_pair(left: UInt8, right: UInt8, valid: np.ndarray | None = None) -> RectifiedPair:
+    return RectifiedPair(left, right, stand_in_camera(*left.shape[::-1]), valid=valid)
+
+
+def noise(height: int = HEIGHT, width: int = WIDTH, seed: int = 0) -> UInt8:
+    grey = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=np.uint8)
+
+
+def smooth_texture(x: Float64, y: Float64) -> UInt8:
+    """A texture that is known between pixels: waves of several directions and lengths."""
+    waves = np.random.default_rng(1).uniform(-1.2, 1.2, (24, 2))
+    phases = np.random.default_rng(2).uniform(0, 2 * np.pi, 24)
+    total = sum(np.sin(a * x + b * y + p) for (a, b), p in zip(waves, phases, strict=True))
+    return np.asarray(np.clip(128 + 18 * total, 0, 255).round(), dtype=np.uint8)
+
+
+def warped_pair(disparity: Float64) -> RectifiedPair:
+    """Left view of a surface whose disparity is given on the grid of the *right* view."""
+    y, x = np.mgrid[: disparity.shape[0], : disparity.shape[1]].astype(np.float64)
+    return make_pair(smooth_texture(x, y), smooth_texture(x + disparity, y))
+
+
+def square_before_wall() -> tuple[RectifiedPair, np.ndarray]:
+    """A square (disparity 20) before a wall (disparity 4), and the mask of its half shadow."""
+    wall, square = noise(80, 160, seed=3), noise(40, 50, seed=4)
+    left, right = wall[:, :144].copy(), wall[:, 4:148].copy()
+    left[20:60, 70:120] = square
+    right[20:60, 50:100] = square
+    # The square hides wall columns 50 to 99 of the right view, 54 to 103 of the left one.
+    hidden = np.zeros(left.shape, bool)
+    hidden[20:60, 54:70] = True
+    return make_pair(left, right), hidden
+
+
+def inner(array: np.ndarray, left: int = 40, margin: int = 8) -> np.ndarray:
+    """The part of a map that both images show, off the border."""
+    return array[margin:-margin, left:-margin]
+
 
 Match = Callable[..., Disparity]
 SAD, SGM = SadSettings(ndisp=32), SgmSettings(ndisp=32)
@@ -57,18 +109,15 @@ def shifted_noise(shift: int) -> RectifiedPair:
     return make_pair(scene[:, 8 : 8 + WIDTH], scene[:, 8 + shift : 8 + shift + WIDTH])
 
 
-def test_whole_shift_is_found_exactly(match: Match) -> None:
-    values = inner(match(shifted_noise(8)).values)
-    assert (np.rint(values) == 8).all()
-    # The fit moves a perfect match by up to half the difference of two neighbouring costs.
-    assert np.median(np.abs(values - 8)) < 0.05
-
-
 @pytest.mark.parametrize("shift", [-6, -1, 0, 8])
-def test_whole_shift_of_either_sign_has_no_error_without_a_fit(match: Match, shift: int) -> None:
+def test_whole_shifts_of_either_sign_are_moved_only_by_the_fit(match: Match, shift: int) -> None:
+    pair, searched = shifted_noise(shift), {"min_disparity_px": -10, "ndisp": 20}
+    fitted = inner(match(pair, **searched).values, margin=20)
+    assert (np.rint(fitted) == shift).all()
+    # By up to half the difference of two neighbouring costs.
+    assert np.median(np.abs(fitted - shift)) < 0.05
     with patch.object(search, "Rules", partial(Rules, fit=False)):
-        values = match(shifted_noise(shift), min_disparity_px=-10, ndisp=20).values
-    assert (inner(values, margin=20) == shift).all()
+        assert (inner(match(pair, **searched).values, margin=20) == shift).all()
 
 
 @pytest.mark.parametrize("shift", [5.25, 7.5, 10.8])
@@ -108,11 +157,14 @@ def test_half_occluded_wall_is_occluded_and_not_given_a_value(match: Match) -> N
     assert np.nanmedian(found.values[25:55, 10:45]) == pytest.approx(4, abs=0.1)
 
 
-def test_pixels_without_an_image_are_border(match: Match) -> None:
-    scene = noise()
-    valid = np.ones(scene.shape, bool)
+def test_pixels_without_an_image_are_border_and_have_no_rough_disparity(match: Match) -> None:
+    valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, 50:60] = False
-    assert (match(make_pair(scene, scene, valid)).reason[:, 50:60] == Reason.BORDER).all()
+    pair = replace(warped_pair(np.full((HEIGHT, WIDTH), 8.0)), valid=valid)
+    assert (match(pair).reason[:, 50:60] == Reason.BORDER).all()
+    rough = HalfSizeMatcher(SAD).match(pair).valid
+    assert not rough[:, 50:60].any()
+    assert rough[:, 60:].any()
 
 
 @pytest.mark.parametrize("threads", [2, 3, 7])
@@ -126,7 +178,7 @@ def test_number_of_threads_does_not_change_the_result(match: Match, threads: int
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (2, 3), (40, 60)])
 @pytest.mark.parametrize("level", [0, 7, 255])
-def test_images_without_content_have_no_disparity(
+def test_blank_images_have_no_disparity(
     name: str, match: Match, shape: tuple[int, int], level: int
 ) -> None:
     grey = np.full(shape, level, np.uint8)
@@ -137,9 +189,7 @@ def test_images_without_content_have_no_disparity(
     assert name == "sgm" or (found.reason == Reason.LOW_TEXTURE).all()
 
 
-def test_range_far_wider_than_the_image_is_searched_and_one_outside_is_an_error(
-    match: Match,
-) -> None:
+def test_a_range_wider_than_the_image_is_searched_and_one_outside_refused(match: Match) -> None:
     pair = shifted_noise(8)
     found = match(pair, min_disparity_px=-300, ndisp=600)
     assert (np.abs(inner(found.values) - 8) < 0.5).mean() > 0.99
@@ -161,30 +211,20 @@ def test_slanted_window_sees_the_ground_more_completely_and_better() -> None:
     assert np.nanmedian(errors[1]) < 0.6 * np.nanmedian(errors[0])
 
 
-def test_left_border_columns_are_searched_as_far_as_the_right_image_reaches() -> None:
+def test_repeated_patterns_ends_of_the_range_and_what_lies_beyond_are_not_trusted() -> None:
+    stripes = np.tile(np.repeat(np.array([40, 200], np.uint8), 4), (40, 20))
+    assert not inner(SadMatcher(SAD).match(make_pair(stripes, stripes)).valid).any()
+    found = SadMatcher(SadSettings(ndisp=8)).match(shifted_noise(7))
+    assert (inner(found.reason) == Reason.OUT_OF_RANGE).mean() > 0.99
     found = SadMatcher(SadSettings(ndisp=64)).match(shifted_noise(3))
     # Far left of column 63, where a matcher that wants all 64 disparities gives nothing.
     assert np.isfinite(found.values[:, 6:63]).mean() > 0.97
     assert np.nanmax(np.abs(found.values[:, 6:63] - 3)) < 0.5
-
-
-def test_repeated_pattern_is_ambiguous() -> None:
-    stripes = np.tile(np.repeat(np.array([40, 200], np.uint8), 4), (40, 20))
-    found = SadMatcher(SAD).match(make_pair(stripes, stripes))
-    assert not inner(found.valid).any()
-
-
-def test_shift_beyond_the_range_is_mostly_refused_and_never_trusted() -> None:
     settings = SadSettings(ndisp=12, uniqueness_percent=15)
     wrong, right = (SadMatcher(s).match(shifted_noise(20)) for s in (settings, SAD))
     # Chance alone lets windows of noise resemble each other in both views.
     assert inner(wrong.valid).mean() < 0.2
     assert np.max(inner(wrong.confidence)) < np.median(inner(right.confidence))
-
-
-def test_minimum_at_an_end_of_the_range_is_out_of_range() -> None:
-    found = SadMatcher(SadSettings(ndisp=8)).match(shifted_noise(7))
-    assert (inner(found.reason) == Reason.OUT_OF_RANGE).mean() > 0.99
 
 
 @pytest.mark.parametrize("grey_noise", [2.0, 6.0])
@@ -201,13 +241,6 @@ def test_sigma_covers_the_errors_of_noisy_images(grey_noise: float) -> None:
     # within a fifth of one.
     assert (errors < 2).mean() > 0.9
     assert (errors < 0.2).mean() < 0.8
-
-
-def test_costs_of_the_widest_window_fit_the_kernel() -> None:
-    widest = 55
-    with pytest.raises(SettingsError):
-        SadSettings.parse({"window_px": widest + 2})
-    assert widest * (widest + 1) * sad._COST_CAP < 65535
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -232,31 +265,34 @@ def test_slanted_ground_of_weak_texture_is_dense_and_right(seed: int) -> None:
     assert (error[known] > 1).mean() < 0.08
 
 
-def test_what_is_flat_is_filled_in_from_what_is_not() -> None:
+def test_what_is_flat_is_filled_in_and_brightness_of_one_camera_matters_little() -> None:
     scene = noise(width=WIDTH + 9)
     scene[24:36, 60:90] = 128
     found = SgmMatcher(SGM).match(make_pair(scene[:, :WIDTH], scene[:, 9:]))
     assert (np.abs(found.values[24:36, 60:81] - 9) < 1).mean() > 0.95
-
-
-def test_brightness_and_contrast_of_one_camera_matter_little() -> None:
     pair = shifted_noise(9)
     dimmed = (pair.right * 0.7 + 20).astype(np.uint8)
     values = SgmMatcher(SGM).match(make_pair(pair.left, dimmed)).values
     assert (np.abs(inner(values) - 9) < 0.5).mean() > 0.97
 
 
-def test_penalties_that_do_not_fit_or_have_their_old_names_are_refused() -> None:
+@pytest.mark.parametrize(
+    ("settings", "wrong", "words"),
+    [
+        (SadSettings, {"window_px": 10}, "odd"),
+        (SgmSettings, {"window_px": 10}, "odd"),
+        (SadSettings, {"window_px": 57}, "less than or equal to 55"),
+        (SgmSettings, {"p1": 70.0}, "exceed"),
+        (SgmSettings, {"small_penalty": 1.0}, "now called p1"),
+    ],
+)
+def test_windows_and_penalties_that_do_not_fit_are_refused(
+    settings: type[SadSettings | SgmSettings], wrong: dict[str, float], words: str
+) -> None:
     assert SgmSettings(p1=50.0).p2 == 50.0
-    for wrong, words in (({"p1": 70.0}, "exceed"), ({"small_penalty": 1.0}, "now called p1")):
-        with pytest.raises(SettingsError, match=words):
-            SgmSettings.parse(wrong)
-
-
-@pytest.mark.parametrize("settings", [SadSettings, SgmSettings])
-def test_even_windows_are_refused(settings: type[SadSettings | SgmSettings]) -> None:
-    with pytest.raises(SettingsError, match="odd"):
-        settings.parse({"window_px": 10})
+    assert 55 * (55 + 1) * sad._COST_CAP < 65535  # costs of the widest window fit the kernel
+    with pytest.raises(SettingsError, match=words):
+        settings.parse(wrong)
 
 
 @pytest.mark.slow
@@ -274,3 +310,165 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 100e3 < int(done.stdout) < 2.5e6  # kilobytes
+
+
+@pytest.mark.parametrize("edges", [(0, 11, 23), (0, 1, 2, 22, 23), range(24)])
+@pytest.mark.parametrize("window_px", [1, 11, 61])
+def test_gradients_and_texture_are_those_of_strips(edges: tuple[int, ...], window_px: int) -> None:
+    rng = np.random.default_rng(5)
+    image = rng.integers(0, 256, (23, 17), dtype=np.uint8)
+    pair = make_pair(image, image, rng.random(image.shape) < 0.9)
+    for of_rows in (partial(clipped_gradients, image), partial(texture, pair, window_px)):
+        parts = [of_rows(range(*rows)) for rows in itertools.pairwise(edges)]
+        np.testing.assert_array_equal(np.vstack(parts), of_rows(range(23)))
+    # Of a ramp it is the slope, but at the border, where a continued image is half as steep.
+    ramp = np.tile(np.arange(0, 51, 3, dtype=np.uint8), (23, 1))
+    found = texture(make_pair(ramp, ramp), 5, range(4, 9))[:, 3:-3]
+    np.testing.assert_allclose(found, 3.0, rtol=1e-6)
+
+
+def test_memory_is_lent_again_once_no_view_of_it_is_referenced() -> None:
+    pool = ResultPool(2)
+    block = pool.lend(4096)
+    address = block.ctypes.data
+    del block
+    assert pool.lend(4096).ctypes.data == address
+    assert pool.lend(100).shape == (100,)
+    pool = ResultPool(2)
+    view = pool.lend(4096)[:4000].view(np.float32).reshape(10, 100)[2:]
+    view[:] = 7
+    pool.lend(4096)[:] = 0
+    pool.lend(4096)[:] = 0
+    assert (view == 7).all()
+
+
+def plane(disparity_px: int) -> RectifiedPair:
+    rng = np.random.default_rng(disparity_px)
+    scene = rng.integers(0, 256, (160, 480 + disparity_px), dtype=np.uint8)
+    # Wide enough a texture to be left when the image is made smaller.
+    scene = cv2.normalize(cv2.GaussianBlur(scene, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
+    return make_pair(scene[:, :480], scene[:, disparity_px:])
+
+
+@pytest.mark.parametrize("disparity_px", [3, 40, 75, 120, 170])
+def test_range_of_a_plane_holds_it_without_waste(disparity_px: int) -> None:
+    pair = plane(disparity_px)
+    ndisp = estimate_ndisp(pair)
+    assert disparity_px < ndisp - 1
+    # A tenth, a small pixel and a step of 16 above it, or the usual range.
+    assert ndisp <= max(usual_ndisp(480), 1.1 * disparity_px + 24)
+    assert ndisp % 16 == 0
+    assert estimate_ndisp(pair, minimum_px=-32) >= ndisp + 32 * (disparity_px > 40)
+
+
+@pytest.mark.parametrize(
+    ("shape", "ndisp"),
+    [((1, 1), 16), ((1, 640), 64), ((900, 1), 16), ((3, 5), 16), ((90, 160), 16), ((9, 1242), 128)],
+)
+def test_blank_images_get_a_range_of_a_tenth_of_the_width(
+    shape: tuple[int, int], ndisp: int
+) -> None:
+    grey = np.full(shape, 77, np.uint8)
+    assert estimate_ndisp(make_pair(grey, grey)) == usual_ndisp(shape[1]) == ndisp
+
+
+@pytest.mark.parametrize("name", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
+def test_near_plane_is_found_only_with_the_automatic_range(name: str) -> None:
+    settings, pair = MatchingSettings.parse({"opencv": {"pad": True}}), plane(100)
+    known = replace(pair, camera=replace(pair.camera, ndisp=32))
+    auto, usual = make_matcher(name, settings, 1), MATCHERS[name](settings_of(name, settings), 1)
+    found = [auto.match(pair), usual.match(pair), auto.match(known)]
+    near = [(np.abs(each.values[:, 108:] - 100) < 0.5).mean() > 0.1 for each in found]
+    assert near == [True, False, False]
+    assert (np.abs(found[0].values[:, 108:] - 100) < 0.5).mean() > 0.9
+
+
+def test_range_of_settings_is_kept() -> None:
+    narrow = MatchingSettings(sad=SadSettings(ndisp=16))
+    assert not isinstance(make_matcher("sad", narrow), AutoRangeMatcher)
+    assert searched(narrow) is narrow.sad
+    assert searched(MatchingSettings(matcher="sgm")) == SgmSettings()
+    assert searched(MatchingSettings(matcher="onnx")) == SadSettings()
+
+
+@pytest.mark.real
+def test_range_holds_the_truth_of_real_pairs(recon_data: Path) -> None:
+    folder = recon_data / "middlebury"
+    parts = ("MiddEval3/trainingQ", "2005", "2006")
+    scenes = [scene for part in parts for scene in (folder / part).iterdir()]
+    assert scenes
+    for scene in map(read_middlebury_scene, scenes):
+        left, right = to_grey(scene.pair.left), to_grey(scene.pair.right)
+        ndisp = estimate_ndisp(make_pair(left, right))
+        assert scene.truth is not None
+        truth = scene.truth.values[np.isfinite(scene.truth.values)]
+        assert (truth < ndisp - 1).mean() > 0.99, scene.name
+        # Wider than needed by a third and two steps, or the usual range.
+        assert ndisp <= max(usual_ndisp(left.shape[1]), 4 / 3 * truth.max() + 32), scene.name
+
+
+@pytest.mark.parametrize("shift", [5.25, 7.5, 10.8])
+@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (HEIGHT + 1, WIDTH + 1)])
+def test_rough_disparities_are_right_to_a_fraction(shift: float, size: tuple[int, int]) -> None:
+    found = HalfSizeMatcher(SAD, threads=1).match(warped_pair(np.full(size, shift)))
+    values = inner(found.values)
+    assert found.values.shape == size
+    assert np.nanmedian(np.abs(values - shift)) < 0.3
+    assert np.isfinite(values).mean() > 0.9
+    assert np.nanmin(found.sigma_px) >= 0.2  # twice that of half size
+
+
+def test_the_rough_range_is_that_of_the_full_size_or_of_the_calibration() -> None:
+    pair = warped_pair(np.full((HEIGHT, WIDTH), 20.0))
+    known = replace(pair, camera=replace(pair.camera, ndisp=32))
+    for settings, given in ((SAD, pair), (SadSettings(), known)):
+        values = inner(HalfSizeMatcher(settings).match(given).values)
+        assert np.isfinite(values).mean() > 0.8
+        assert np.nanmedian(np.abs(values - 20.0)) < 0.3
+    for settings in (SadSettings(ndisp=12), SadSettings(min_disparity_px=-8, ndisp=16)):
+        values = inner(HalfSizeMatcher(settings).match(pair).values)
+        assert not (np.abs(values - 20.0) < 2).any()
+
+
+def match_scene(folder: Path) -> tuple[Disparity, Float32]:
+    scene = read_middlebury_scene(folder)
+    left, right = to_grey(scene.pair.left), to_grey(scene.pair.right)
+    assert scene.truth is not None
+    truth = np.where(scene.truth.nonocc, scene.truth.values, np.float32(np.nan))
+    return SadMatcher(SadSettings()).match(RectifiedPair(left, right, scene.camera)), truth
+
+
+@pytest.mark.real
+def test_disparities_of_real_pairs_are_right_as_sigma_and_confidence_say(recon_data: Path) -> None:
+    folder = recon_data / "middlebury" / "MiddEval3" / "trainingQ"
+    scenes = [match_scene(folder / name) for name in ("ArtL", "Motorcycle", "Piano", "Teddy")]
+    both = [found.valid & np.isfinite(truth) for found, truth in scenes]
+    parts = [(found.values - truth, found.sigma_px, found.confidence) for found, truth in scenes]
+    error, sigma, confidence = (
+        np.concatenate([part[n][known] for part, known in zip(parts, both, strict=True)])
+        for n in range(3)
+    )
+    assert error.size / sum(int(np.isfinite(truth).sum()) for _, truth in scenes) > 0.75
+    # Measured: 8 % (all eight scenes, weighted); no local matcher gets below 2 %.
+    assert 0.02 < (np.abs(error) > 1).mean() < 0.12
+    assert np.median(np.abs(error)) < 0.2
+    ratio = np.abs(error / sigma)
+    # A normal distribution has 68 % and 95 %; errors of stereo have heavier tails.
+    assert 0.63 < (ratio < 1).mean() < 0.8
+    assert 0.86 < (ratio < 2).mean() < 0.97
+    ends, right = (0.6, 0.7, 0.8, 0.9), np.abs(error) < 1
+    share = [right[(confidence >= a) & (confidence < a + 0.1)].mean() for a in ends]
+    assert share == sorted(share)
+    assert share[-1] > 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_sgm_makes_fewer_and_smaller_errors_than_opencv(recon_data: Path, tmp_path: Path) -> None:
+    folder, names = recon_data / "middlebury" / "MiddEval3" / "trainingQ", ("sgm", "opencv-sgbm")
+    figures = run_middlebury(folder, matchers=names, out=tmp_path / "run")["matchers"]
+    ours, other = (figures[name]["weighted"]["nonocc"]["dense"] for name in names)
+    # Measured: 0.80, 0.67, 0.53; nothing that is not learned gets far below half.
+    assert 0.5 < ours["bad"]["1"] / other["bad"]["1"] <= 0.87
+    assert 0.5 < ours["bad"]["2"] / other["bad"]["2"] <= 0.88
+    assert 0.4 < ours["avgerr"] / other["avgerr"] <= 0.82

@@ -1,20 +1,23 @@
-"""Rooms seen by lenses of 120, 160 and 195 degrees: rectified views, depth, maps."""
+"""Furnished rooms, seen by lenses of 60 to 230 degrees: rectified views, depth, maps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from recon.commands.config import load_config
 from recon.core.errors import CalibrationError, FormatError
+from recon.core.geometry.projection import disparity_from_depth
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
-from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import write_kalibr
 from recon.io.images.image import write_image
 from recon.map.drive.sequence import map_sequence
@@ -24,14 +27,153 @@ from recon.stereo.frame import FrameReconstructor
 from recon.stereo.rectify.rectifier import (
     RectificationSettings,
     Rectifier,
+    RectifyingTurns,
     _check_focal,
     plan_turns,
 )
-from tests.stereo.rectify import rooms
+from recon.street.render import Stage, View, make_stage, stereo_views, take_image
+from recon.street.shapes import (
+    Material,
+    Paint,
+    boxes,
+    merge,
+    quads,
+)
 
 # The polynomial of a lens of TUM VI.
 LENS = (0.01017, -0.01082, 0.00594, -0.00166)
 NONE = (0.0, 0.0, 0.0, 0.0)
+# Camera axes (x right, y down, z forward) in room axes (x forward, y left, z up).
+R_ROOM_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+
+def fisheye_rig(
+    field_deg: float,
+    size: tuple[int, int],
+    coefficients: tuple[float, ...] = NONE,
+    centre: tuple[float, float] = (1.5, -2.0),
+) -> StereoCalibration:
+    """A rig that sees ``field_deg`` across its width, 10 cm apart, the right camera pitched 2.7°.
+
+    The coefficients are of the left lens, the right one is a little off; ``centre`` is that of the
+    principal points from the image centre.
+    """
+    width, height = size
+    focal = width / 2 / np.radians(field_deg / 2)
+
+    def camera(scale: float, shift: float) -> CameraIntrinsics:
+        x, y = (width - 1) / 2 + centre[0] + shift, (height - 1) / 2 + centre[1] - shift
+        K = np.array([[focal * scale, 0, x], [0, focal * scale, y], [0, 0, 1]])
+        return CameraIntrinsics(K, np.array(coefficients) * scale, width, height, "fisheye")
+
+    T = make_transform(exp_so3(np.radians([2.7, 0.4, -0.3])), np.array([-0.101, 0.0019, 0.0012]))
+    return StereoCalibration(camera(1.0, 0.0), camera(0.996, -1.2), T)
+
+
+@dataclass(frozen=True, eq=False)
+class LensView(View):
+    """A raw camera in a room; its rays may point backwards."""
+
+    camera: CameraIntrinsics | None = None
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit rays (N, 3) in room axes, by inverting the polynomial with Newton's method."""
+        assert self.camera is not None
+        K = self.camera.matrix
+        ahead = np.polynomial.Polynomial(
+            [0.0, 1.0, *np.ravel([(0.0, k) for k in self.camera.distortion])]
+        )
+        plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
+        radius = np.linalg.norm(plane, axis=1)
+        angle = radius.copy()
+        for _ in range(50):
+            angle -= (ahead(angle) - radius) / ahead.deriv()(angle)
+        sideways = plane * (np.sin(angle) / np.maximum(radius, 1e-12))[:, None]
+        rays = np.column_stack([sideways, np.cos(angle)])
+        return np.asarray(rays @ self.T_scene_camera[:3, :3].T)
+
+
+def view_of(camera: CameraIntrinsics, T_room_camera: np.ndarray) -> LensView:
+    (fx, _, cx), (_, _, cy), _ = camera.matrix.tolist()
+    return LensView(T_room_camera, fx, (cx, cy), camera.width_px, camera.height_px, camera)
+
+
+@cache
+def room() -> Stage:
+    """A room of 8 by 6 by 3 m around the origin at eye level, furnished and open to the sky."""
+    rng = np.random.default_rng(1)
+    low, high = np.array([-2.5, -3.0, -1.4]), np.array([5.5, 3.0, 1.6])
+    x, y, z = np.diag(high - low)
+    walls = [(low, x, z), (low, y, z), (low + y, x, z), (low + x, y, z), (low, x, y)]
+    soups = [
+        quads(p, u, v, Paint(Material.POSTER, tuple(rng.uniform(0.3, 0.9, 3)), 10 + n))
+        for n, (p, u, v) in enumerate(walls)
+    ]
+    for n in range(9):
+        corner = rng.uniform((0.8, -2.8, -1.4), (4.5, 2.0, -1.4))
+        if abs(corner[1]) < 0.9:
+            corner[1] += 1.8 * np.sign(corner[1])
+        paint = Paint(Material.POSTER, tuple(rng.uniform(0.2, 0.9, 3)), 40 + n)
+        soups.append(boxes(corner, corner + rng.uniform(0.4, 1.2, 3), paint))
+    return make_stage(merge(soups), np.array([0.2, 0.3, 0.93]), 1, threads=2)
+
+
+def pose(frame: int) -> np.ndarray:
+    """``T_room_left``: ahead with a slight turn, swinging sideways."""
+    turn = exp_so3(np.array([0.0, 0.004 * frame, 0.0]))
+    place = np.array([-1.0 + 0.05 * frame, 0.1 * np.sin(0.25 * frame), 0.0])
+    return make_transform(R_ROOM_FORWARD @ turn, place)
+
+
+def photograph(rig: StereoCalibration, T_room_left: np.ndarray) -> list[np.ndarray]:
+    """Left and right raw image in [0, 1], float64 (H, W), with noise of half a grey level."""
+    images = []
+    T_room_right = T_room_left @ invert(rig.T_right_left)
+    for side, (camera, T) in enumerate(((rig.left, T_room_left), (rig.right, T_room_right))):
+        light = take_image(room(), view_of(camera, T), smooth_edges=True).mean(axis=2)
+        noise = np.random.default_rng([1, side]).standard_normal(light.shape)
+        # Into corners beyond 100 degrees a lens lets no light through.
+        v, u = np.indices(light.shape)
+        K = camera.matrix
+        radius = np.hypot((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
+        images.append(np.clip(light + noise / 510, 0, 1) * (radius < np.radians(100)))
+    return images
+
+
+def true_depth(turns: RectifyingTurns, T_room_left: np.ndarray) -> np.ndarray:
+    """float64 (H, W), depth of the rectified left view in metres; NaN = sky."""
+    T = T_room_left @ make_transform(turns.R_left.T, np.zeros(3))
+    view = stereo_views(turns.camera, T)[0]
+    depth = room().depth(view.origin, view.directions(view.pixels()))
+    return depth.reshape(view.height_px, view.width_px)
+
+
+def write_euroc_room(
+    folder: Path, rig: StereoCalibration, frames: int, levels: Callable[[np.ndarray], np.ndarray]
+) -> Path:
+    """A drive in EuRoC's layout, ``sensor.yaml`` as TUM VI has it; ``levels`` makes pixels."""
+    for n in range(frames):
+        stamp = 1_520_530_308_199_447_626 + n * 50_000_000
+        for side, image in enumerate(photograph(rig, pose(n))):
+            view = folder / "mav0" / f"cam{side}"
+            write_image(view / "data" / f"{stamp}.png", levels(image))
+            with (view / "data.csv").open("a") as lines:
+                lines.write(f"{stamp},{stamp}.png\n")
+    cameras = ((rig.left, np.eye(4)), (rig.right, invert(rig.T_right_left)))
+    for side, (camera, T_body_camera) in enumerate(cameras):
+        (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+        content = {
+            "sensor_type": "camera",
+            "T_BS": {"cols": 4, "rows": 4, "data": T_body_camera.ravel().tolist()},
+            "resolution": [camera.width_px, camera.height_px],
+            "camera_model": "pinhole",
+            "intrinsics": [fx, fy, cx, cy],
+            "distortion_model": "equidistant",
+            "distortion_coefficients": camera.distortion.tolist(),
+        }
+        path = folder / "mav0" / f"cam{side}" / "sensor.yaml"
+        path.write_text("#Camera\n" + yaml.safe_dump(content))
+    return folder
 
 
 def tum_vi() -> StereoCalibration:
@@ -48,21 +190,13 @@ def tum_vi() -> StereoCalibration:
     )
 
 
-def test_views_of_a_lens_beyond_a_half_space_keep_the_resolution_of_its_centre() -> None:
-    rectifier = Rectifier(tum_vi())
-    assert rectifier.camera.focal_px == pytest.approx(380.81)
-    assert rectifier.camera.field_of_view_deg == pytest.approx(106.7, abs=0.1)
-    assert rectifier.valid is not None
-    assert rectifier.valid.all()
-
-
 @pytest.mark.parametrize("lens", [NONE, LENS])
 @pytest.mark.parametrize("size", [(640, 480), (512, 512)])
 @pytest.mark.parametrize("field_deg", [60, 120, 160, 195, 230])
 def test_the_field_of_view_is_bounded_however_wide_the_lens(
     field_deg: float, size: tuple[int, int], lens: tuple[float, ...]
 ) -> None:
-    rig = rooms.fisheye_rig(field_deg, size, lens, centre=(6.0, -9.0))
+    rig = fisheye_rig(field_deg, size, lens, centre=(6.0, -9.0))
     rectifier = Rectifier(rig)
     # Of a lens of 60 degrees the views show nearly all; 120 degrees is the bound.
     assert 53 < rectifier.camera.field_of_view_deg < 120.5
@@ -70,33 +204,21 @@ def test_the_field_of_view_is_bounded_however_wide_the_lens(
     assert rectifier.valid.mean() > 0.999
 
 
-@pytest.mark.parametrize("field_deg", [70.0, 100.0, 140.0])
-def test_the_field_of_view_can_be_set(field_deg: float) -> None:
-    settings = RectificationSettings(field_of_view_deg=field_deg)
-    assert Rectifier(tum_vi(), settings).camera.field_of_view_deg == pytest.approx(field_deg)
+def test_views_of_a_lens_beyond_a_half_space_keep_the_resolution_of_its_centre() -> None:
+    rectifier = Rectifier(tum_vi())
+    assert rectifier.camera.focal_px == pytest.approx(380.81)
+    assert rectifier.camera.field_of_view_deg == pytest.approx(106.7, abs=0.1)
+    assert rectifier.valid is not None
+    assert rectifier.valid.all()
+    for field_deg in (70.0, 140.0):
+        set_to = Rectifier(tum_vi(), RectificationSettings(field_of_view_deg=field_deg))
+        assert set_to.camera.field_of_view_deg == pytest.approx(field_deg)
 
 
 def test_a_focal_length_out_of_all_proportion_is_never_used() -> None:
     view = RectifiedCamera(1.02e6, 511.5, 511.5, 511.5, 0.1, 1024, 1024)
     with pytest.raises(CalibrationError, match=r"out of all proportion \(got 1.02e\+06 px"):
         _check_focal(view, tum_vi().left)
-
-
-WRITERS = {
-    "camchain.yaml": write_kalibr,
-    "fisheye.yml": write_opencv_calibration,
-    "rig.yaml": write_recon_calibration,
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_every_format_of_a_fisheye_gives_the_same_views(tmp_path: Path, name: str) -> None:
-    write: Callable[[Path, StereoCalibration], None] = WRITERS[name]
-    write(tmp_path / name, tum_vi())
-    camera = Rectifier(read_calibration(tmp_path / name, 1024, 1024)).camera
-    want = Rectifier(tum_vi()).camera
-    assert camera.focal_px == pytest.approx(want.focal_px, abs=1e-6)
-    assert camera.baseline_m == pytest.approx(want.baseline_m, abs=1e-9)
 
 
 def test_an_opencv_file_that_may_be_of_a_fisheye_must_say_so(tmp_path: Path) -> None:
@@ -106,10 +228,6 @@ def test_an_opencv_file_that_may_be_of_a_fisheye_must_say_so(tmp_path: Path) -> 
     (tmp_path / "rig.yml").write_text(text.replace("distortion_model: fisheye\n", ""))
     with pytest.raises(FormatError, match=r"which lens model .*'distortion_model: fisheye'"):
         read_calibration(tmp_path / "rig.yml", 1024, 1024)
-
-
-def eight_bits(image: np.ndarray) -> np.ndarray:
-    return np.rint(255 * image).astype(np.uint8)
 
 
 def sixteen_bits(image: np.ndarray) -> np.ndarray:
@@ -123,18 +241,16 @@ def sixteen_bits(image: np.ndarray) -> np.ndarray:
 def test_depth_of_a_room_is_right(
     tmp_path: Path, field_deg: float, size: tuple[int, int], lens: tuple[float, ...]
 ) -> None:
-    rig, T_room_left = rooms.fisheye_rig(field_deg, size, lens), rooms.poses(1)[0]
+    rig = fisheye_rig(field_deg, size, lens)
     paths = [tmp_path / "left.png", tmp_path / "right.png"]
-    for path, image in zip(paths, rooms.photograph(rig, T_room_left), strict=True):
+    for path, image in zip(paths, photograph(rig, pose(0)), strict=True):
         write_image(path, sixteen_bits(image))
     write_kalibr(tmp_path / "camchain.yaml", rig)
-    given = read_pair_input(paths[0], paths[1], tmp_path / "camchain.yaml")
-    config = load_config()
+    given, config = read_pair_input(*paths, tmp_path / "camchain.yaml"), load_config()
     _, disparity = FrameReconstructor(given.calibration, config).match(given.pair)
     turns = plan_turns(rig, config.rectification)
-    depth = rooms.true_depth(turns, T_room_left)
-    true_px = turns.camera.focal_px * turns.camera.baseline_m / depth
-    known = np.isfinite(depth)
+    true_px = disparity_from_depth(true_depth(turns, pose(0)), turns.camera)
+    known = np.isfinite(true_px)
     error = np.abs(disparity.values - true_px)[known & disparity.valid]
     assert disparity.valid[known].mean() > 0.8
     # Noise of half a grey level and resampling: about 0.1 px on such texture.
@@ -145,14 +261,14 @@ def test_depth_of_a_room_is_right(
 @pytest.mark.slow
 @pytest.mark.parametrize("field_deg", [120, 195])
 def test_a_drive_through_a_room_has_the_right_path(tmp_path: Path, field_deg: float) -> None:
-    rig = rooms.fisheye_rig(field_deg, (320, 320), LENS)
+    rig = fisheye_rig(field_deg, (320, 320), LENS)
     frames = 8
-    drive = rooms.write_euroc_room(tmp_path, rig, frames, sixteen_bits)
+    drive = write_euroc_room(tmp_path, rig, frames, sixteen_bits)
     mapped = map_sequence(open_source(drive), load_config())
     assert all(record.ok for record in mapped.health)
     # The world is the rectified left camera of the first frame.
     T_raw_rectified = make_transform(plan_turns(rig, RectificationSettings()).R_left.T, np.zeros(3))
-    true = [T @ T_raw_rectified for T in rooms.poses(frames)]
+    true = [T @ T_raw_rectified for T in map(pose, range(frames))]
     for found, T in zip(mapped.trajectory.T_world_camera, true, strict=True):
         off = invert(invert(true[0]) @ T) @ found
         # One pixel at 2 m is 1 to 2 cm; averaged over hundreds of features.
@@ -161,21 +277,18 @@ def test_a_drive_through_a_room_has_the_right_path(tmp_path: Path, field_deg: fl
     assert len(mapped.cloud) > 1000
 
 
-def test_sixteen_bit_images_of_a_drive_share_one_white(tmp_path: Path) -> None:
+def test_sixteen_bit_images_of_a_drive_or_a_pair_share_one_white(tmp_path: Path) -> None:
     """A camera of 12 bits; the first frame is dark, the right image darker."""
-    rig = rooms.fisheye_rig(160, (32, 24))
+    rig = fisheye_rig(160, (32, 24))
     brightest = iter([500, 400, 2100, 1500, 4000, 3000])
 
     def twelve_bits(image: np.ndarray) -> np.ndarray:
         ramp = np.linspace(0, next(brightest), image.size).reshape(image.shape)
         return np.rint(ramp).astype(np.uint16)
 
-    drive = rooms.write_euroc_room(tmp_path, rig, 3, twelve_bits)
+    drive = write_euroc_room(tmp_path, rig, 3, twelve_bits)
     seen = [(int(pair.left.max()), int(pair.right.max())) for pair in open_source(drive)]
     assert seen == [(31, 25), (131, 93), (249, 187)]
-
-
-def test_both_images_of_one_pair_share_one_white(tmp_path: Path) -> None:
     paths = [tmp_path / "left.png", tmp_path / "right.png"]
     for path, brightest in zip(paths, (900, 1000), strict=True):
         levels = np.linspace(0, brightest, 24 * 32).reshape(24, 32)

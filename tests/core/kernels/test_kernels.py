@@ -1,0 +1,306 @@
+"""Machine code is never older than its sources; the voxel hash agrees with a dictionary."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import recon
+from recon.core.kernels import voxels
+from recon.core.kernels.cache import cache_folder, cache_parent, when_compiling
+from recon.core.kernels.compiled import kernel
+from recon.core.kernels.voxels import are_among, distinct_keys, find_keys
+from tests.scenery.patience import LONG_S
+
+compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> Path:
+    folder = tmp_path / "sources" / "room" / "kernels"
+    (folder / "simd").mkdir(parents=True)
+    for name in ("outer.py", "inner.py", "simd/vectors.py"):
+        (folder / name).write_text("LANES = 32\n")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["inner.py", "simd/vectors.py"])
+def test_a_change_in_a_source_gives_another_folder(
+    tmp_path: Path, sources: Path, name: str
+) -> None:
+    before = cache_folder(tmp_path, sources.parents[1])
+    assert cache_folder(tmp_path, sources.parents[1]) == before
+    (sources / name).write_text("LANES = 16\n")
+    assert cache_folder(tmp_path, sources.parents[1]) != before
+
+
+def test_folders_of_earlier_sources_are_removed(tmp_path: Path, sources: Path) -> None:
+    current = cache_folder(tmp_path, sources.parents[1])
+    current.mkdir()
+    earlier, other = tmp_path / "kernels-0123", tmp_path / "notes"
+    for folder in (earlier, other):
+        folder.mkdir()
+        (folder / "file").write_text("")
+    cache_folder(tmp_path, sources.parents[1])
+    assert earlier.is_dir()  # nothing is tidied while the current one is in use
+    current.rmdir()
+    cache_folder(tmp_path, sources.parents[1])
+    assert not earlier.exists()
+    assert other.is_dir()
+
+
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The folder of a user who may write nothing but what lies in it."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(os, "access", lambda path, _: tmp_path in (path, *path.parents))
+    return tmp_path
+
+
+def test_the_cache_is_the_users_where_the_installation_cannot_be_written(
+    monkeypatch: pytest.MonkeyPatch, foreign: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(foreign / "caches"))
+    assert cache_parent() == foreign / "caches" / "recon"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(foreign / "numba"))
+    assert cache_parent() == foreign / "numba"
+
+
+@pytest.mark.parametrize("home", ["/", "~"])
+def test_a_user_without_a_home_gets_a_temporary_folder_that_nobody_else_can_write(
+    monkeypatch: pytest.MonkeyPatch, foreign: Path, home: str
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", home)
+    monkeypatch.setattr(tempfile, "tempdir", str(foreign))
+    kept = cache_parent()
+    assert kept.parent == foreign
+    assert kept.stat().st_mode & 0o077 == 0
+    assert cache_parent() == kept  # the next process finds it again
+    kept.chmod(0o777)
+    assert cache_parent() not in (kept, Path())
+    assert cache_parent().stat().st_mode & 0o077 == 0
+
+
+RACE = """
+import sys, time
+from pathlib import Path
+from numba.core.caching import IndexDataCacheFile
+from race_kernel import double
+
+meeting, (mine, other, value) = Path(sys.argv[1]), sys.argv[2:]
+
+def wait(name, seconds=3):
+    until = time.monotonic() + seconds
+    while not (meeting / name).exists() and time.monotonic() < until:
+        time.sleep(0.01)
+
+load, save = IndexDataCacheFile._load_index, IndexDataCacheFile._save_data
+save_index = IndexDataCacheFile._save_index
+
+def load_and_meet(self):
+    index = load(self)
+    if compiling:
+        (meeting / f"{mine} has read").touch()
+        wait(f"{other} has read")
+    return index
+
+def save_index_in_turn(self, overloads):
+    if mine == "second":
+        wait("first has an index")
+    save_index(self, overloads)
+    (meeting / f"{mine} has an index").touch()
+
+def save_in_turn(self, name, data):
+    if mine == "first":
+        wait("second has written")
+    save(self, name, data)
+    (meeting / f"{mine} has written").touch()
+
+compiling = []
+IndexDataCacheFile._load_index, IndexDataCacheFile._save_data = load_and_meet, save_in_turn
+IndexDataCacheFile._save_index = save_index_in_turn
+from recon.core.kernels.cache import when_compiling
+(meeting / f"{mine} is ready").touch()
+wait(f"{other} is ready", 60)
+with when_compiling(compiling.append):
+    assert double(eval(value)) == 2 * eval(value)
+"""
+
+
+@compiled
+@pytest.mark.slow
+def test_processes_that_compile_different_types_do_not_mix_up_code(tmp_path: Path) -> None:
+    """The second writes the index last and the first the code: what numba alone would mix up."""
+    (tmp_path / "race_kernel.py").write_text(
+        "from recon.core.kernels.compiled import kernel\n\n"
+        "@kernel\ndef double(x):\n    return 2 * x\n"
+    )
+    (tmp_path / "race.py").write_text(RACE)
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(recon.__file__).parents[1])]),
+    }
+    both = [
+        subprocess.Popen(
+            [sys.executable, str(tmp_path / "race.py"), str(tmp_path), *arguments], env=environment
+        )
+        for arguments in (("first", "second", "3"), ("second", "first", "2.5"))
+    ]
+    assert [process.wait(LONG_S) for process in both] == [0, 0]
+    check = "from race_kernel import double; print(double(3), double(2.5))"
+    found = subprocess.run(
+        [sys.executable, "-c", check], env=environment, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.split() == ["6", "5.0"]
+
+
+@compiled
+def test_what_is_compiled_is_announced_unless_it_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Path(voxels.pack_key.stats.cache_path).parent == cache_folder(cache_parent())
+    # Other users of numba keep their cache.
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "elsewhere")
+
+    def treble(value: int) -> int:
+        return 3 * value
+
+    announced: list[str] = []
+    function = kernel(treble)
+    assert numba.config.CACHE_DIR == "elsewhere"
+    with when_compiling(announced.append):
+        assert function(np.int32(1)) == 3
+        assert function(np.int32(2)) == 6
+        first = tuple(announced)
+        assert kernel(treble)(np.int32(3)) == 9
+    kernel(treble)(np.complex64(1))
+    assert first in (("treble",), ())  # cached by an earlier run of this test
+    assert tuple(announced) == first
+
+
+def sum_points_reference(
+    frames: list[tuple[np.ndarray, ...]], edge: float
+) -> dict[tuple[int, ...], dict[str, Any]]:
+    """Sum frames of points (xyz, weights, values) up per voxel, in the order first seen."""
+    found: dict[tuple[int, ...], dict[str, Any]] = {}
+    for xyz, weights, values in frames:
+        best: dict[tuple[int, ...], float] = {}
+        for point, w, value in zip(xyz.astype(np.float64), weights, values, strict=True):
+            if not w > 0:
+                continue
+            cell = tuple(np.floor(point / edge).astype(int).tolist())
+            empty = {"sums": np.zeros(4 + len(value)), "information": 0.0, "frames": 0}
+            voxel = found.setdefault(cell, empty)
+            offset = point - (np.array(cell) + 0.5) * edge
+            voxel["sums"] += w * np.concatenate([[1.0], offset, value])
+            best[cell] = max(best.get(cell, 0.0), float(w))
+        for cell, weight in best.items():
+            found[cell]["information"] += weight
+            found[cell]["frames"] += 1
+    return found
+
+
+# float32 sums of n ≤ 240 terms err by n · 2^-24 of the sum of their sizes: 1.4e-5 of the sum where
+# all have one sign (values, weights; information takes two operations a term). Offsets from the
+# middle of a cell (half of it, times weights up to 5) cancel: 240 · 2^-24 · (240 · 5 / 2) = 8.6e-3.
+SUM_ROUNDING = {"rtol": 3e-5, "atol": 1e-2}
+CELLS = st.integers(-voxels.KEY_LIMIT, voxels.KEY_LIMIT - 1)
+ANY = st.integers(-(2**62), 2**62) | st.integers(0, 9)
+KEYS = hnp.arrays(np.int64, st.integers(0, 30), elements=ANY)
+
+
+def _random_frame(rng: np.random.Generator, number: int) -> tuple[np.ndarray, ...]:
+    xyz = rng.uniform(-3, 3, (number, 3)).astype(np.float32)
+    weights = np.where(rng.random(number) < 0.1, 0, rng.uniform(0.1, 5, number))
+    values = rng.uniform(-1, 255, (number, 2))
+    return xyz, weights.astype(np.float32), values.astype(np.float32)
+
+
+def _sum(frames: list[tuple[np.ndarray, ...]], edge: float) -> voxels.VoxelSums:
+    sums = voxels.make_sums(1, 2)
+    for number, frame in enumerate(frames):
+        points = voxels.VoxelPoints(*frame)
+        sums = voxels.add_points(sums, points, edge, number)
+    return sums
+
+
+@given(st.lists(st.tuples(*[CELLS] * 3), min_size=1, max_size=20))
+def test_unpacking_inverts_packing(cells: list[tuple[int, int, int]]) -> None:
+    keys = voxels.pack_keys(np.array(cells))
+    assert (keys >= 0).all()
+    assert keys.tolist() == [voxels.pack_key(*cell) for cell in cells]
+    assert voxels.unpack_keys(keys).tolist() == [list(cell) for cell in cells]
+
+
+def test_growing_keeps_every_row_and_a_row_is_found_where_it_was_entered() -> None:
+    keys = voxels.pack_keys(np.stack(np.unravel_index(np.arange(8000), (20, 20, 20)), axis=1))
+    sums = voxels.make_sums(len(keys), 0)
+    assert voxels.reserve_sums(sums, len(keys)) is sums
+    sums.keys[:] = keys
+    sums.used[0] = len(keys)
+    sums = voxels.reserve_sums(sums, len(keys) + 1)
+    assert len(sums.table) >= 2 * len(sums.keys) >= 4 * len(keys)
+    rows = [voxels.find_or_add(sums.table, key, -7) for key in keys.tolist()]
+    assert rows == list(range(len(keys)))
+    table = voxels.make_table(10)
+    keys = voxels.pack_keys(np.array([[1, 2, 3], [-4, 0, 9]]))
+    voxels.enter_keys(table, keys)
+    assert [voxels.find(table, key) for key in keys.tolist()] == [0, 1]
+    assert voxels.find(table, voxels.pack_key(1, 2, 4)) == voxels.EMPTY
+
+
+def test_neighbouring_cells_spread_over_the_table() -> None:
+    # A street is a sheet of neighbouring cells: probing stays short if they do not cluster.
+    cells = np.stack(np.unravel_index(np.arange(90_000), (300, 300, 1)), axis=1)
+    table = voxels.make_table(len(cells))
+    voxels.enter_keys(table, voxels.pack_keys(cells))
+    empty = np.flatnonzero(table[:, 0] == voxels.EMPTY)
+    # At half load a random hash gives a longest run of some tens; clusters give thousands.
+    assert np.diff(empty).max() < 200
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    sizes=st.lists(st.integers(0, 60), min_size=1, max_size=4),
+    edge=st.sampled_from([0.1, 0.5, 1.0, 7.0]),
+)
+def test_sums_of_frames_and_parts_equal_the_reference(
+    seed: int, sizes: list[int], edge: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    frames = [_random_frame(rng, size) for size in sizes]
+    expected = sum_points_reference(frames, edge)
+    total = voxels.make_sums(1, 2)
+    for part in (_sum([frame], edge) for frame in frames):
+        n = int(part.used[0])
+        total = voxels.add_rows(
+            total, part.keys[:n], part.sums[:n], part.information[:n], part.frames[:n]
+        )
+    for sums in (total, _sum(frames, edge)):
+        cells = [tuple(cell) for cell in voxels.unpack_keys(sums.keys[: sums.used[0]]).tolist()]
+        assert cells == list(expected)
+        for row, cell in enumerate(cells):
+            np.testing.assert_allclose(sums.sums[row], expected[cell]["sums"], **SUM_ROUNDING)
+            assert sums.information[row] == pytest.approx(expected[cell]["information"], rel=3e-5)
+            assert sums.frames[row] == expected[cell]["frames"]
+
+
+@given(KEYS, KEYS)
+def test_keys_are_found_and_distinct_ones_sorted(wanted: np.ndarray, keys: np.ndarray) -> None:
+    place, known = find_keys(wanted, np.sort(keys))
+    np.testing.assert_array_equal(known, np.isin(wanted, keys))
+    np.testing.assert_array_equal(np.sort(keys)[place[known]], wanted[known])
+    np.testing.assert_array_equal(are_among(wanted, keys), known)
+    np.testing.assert_array_equal(distinct_keys(keys), np.unique(keys))
