@@ -89,11 +89,11 @@ class MappedCloud:
 
 def read_mapped_cloud(run: Path) -> MappedCloud:
     """Read the map of a run, by its folder, or a PLY file: map axes if it is inside a run's."""
-    folder = run if run.is_dir() else run.parent.parent
-    if not run.is_dir() and (run.parent.name != "map" or not (folder / RECORD).is_file()):
+    folder, file = (run, run / CLOUD) if run.is_dir() else (run.parent.parent, run)
+    if file is run and (run.parent.name != "map" or not (folder / RECORD).is_file()):
         return MappedCloud(read_ply(run))
     map_ = map_of_run(folder)
-    return MappedCloud(read_ply(run / CLOUD if run.is_dir() else run), *map_)
+    return MappedCloud(read_ply(file), *map_)
 
 
 def place_cloud(
@@ -109,10 +109,10 @@ def place_cloud(
         raise SettingsError(what, where="--reference-frame", got="map", expected="camera")
     T_map_world, T = mapped.T_map_world, np.eye(4)
     how: dict[str, Any] = {"alignment": "none"}
+    if T_map_world is None and align_to is not None:
+        what = "a cloud without a run has no path to align"
+        raise EvaluationError(what, hint="give the folder of a run")
     if T_map_world is None:
-        if align_to is not None:
-            what = "a cloud without a run has no path to align"
-            raise EvaluationError(what, hint="give the folder of a run")
         return mapped, how
     if frame == "map":
         return replace(mapped, path=_moved(mapped.path, T_map_world)), how
@@ -213,7 +213,6 @@ def doubt_axes(
 
 
 def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
-    """Return the rigid motion that brings the run's path closest to ground truth."""
     path, truth = mapped.path, read_trajectory(poses)
     if path is None:
         raise EvaluationError("the run has no path to align", hint="give one that has its map")

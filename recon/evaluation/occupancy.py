@@ -61,11 +61,9 @@ def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) 
         got = ", ".join(f"{size:g} m" for size in sorted(sizes))
         raise EvaluationError("map and truth have different resolutions", got=got)
     if not (truth.frames >= truth.least_frames).any() or not truth.seen.any():
-        raise EvaluationError(
-            "no surface was seen in enough frames to compare",
-            expected=f"surfaces seen in {counted(truth.least_frames, 'frame')}",
-            hint="use a drive with more frames",
-        )
+        what = "no surface was seen in enough frames to compare"
+        expected = f"surfaces seen in {counted(truth.least_frames, 'frame')}"
+        raise EvaluationError(what, expected=expected, hint="use a drive with more frames")
 
 
 def _looked_at(keys: Int32, truth: OccupancyTruth) -> Bool:

@@ -38,9 +38,7 @@ from recon.stereo.rectify.rectifier import Rectifier, to_grey
 
 # Scene of each experiment, identified by Table 1: docs/paper.md.
 EXPERIMENTS: Final[Mapping[int, str]] = {2: "ArtL", 3: "Jadeplant", 4: "Pipes"}
-CORRECTED: Final = "corrected"
-ABSOLUTE: Final = "absolute"
-AS_PRINTED: Final = "as_printed"
+CORRECTED, ABSOLUTE, AS_PRINTED = "corrected", "absolute", "as_printed"
 TITLES: Final[Mapping[str, str]] = {
     CORRECTED: "corrected",
     ABSOLUTE: "as printed, but absolute differences",
@@ -49,8 +47,7 @@ TITLES: Final[Mapping[str, str]] = {
 BAD_PX: Final = 1.0  # disparity error above which a pixel counts as wrong
 _SCENES: Final = Path("middlebury", "MiddEval3", "trainingQ")
 _WHERE: Final = "name the folder MiddEval3/trainingQ of the Middlebury benchmark"
-# A value rounded to whole pixels is off by up to half a pixel, each amount as likely.
-_SIGMA_PX: Final = 1 / math.sqrt(12)
+_SIGMA_PX: Final = 1 / math.sqrt(12)  # of what is rounded to whole pixels
 # Keeps every point of the printed method, regardless of range and uncertainty.
 _EVERY_POINT: Final = CloudSettings(min_range_m=0.0, max_range_m=None, max_relative_sigma=None)
 _PATCH_PX: Final = 11  # of the printed method; the paper does not give it
@@ -159,14 +156,12 @@ def _patch_sums(compared: Int32, n: int) -> NDArray[Any]:
 
 def read_experiments(folder: Path | None = None) -> list[Experiment]:
     """Read the three scenes; None = those of MiddEval3 in the folder that ``RECON_DATA`` names."""
-    if folder is None:
-        if not os.environ.get("RECON_DATA"):
-            what = "no folder of scenes is given, and RECON_DATA is not set"
-            expected = f"a folder with {', '.join(EXPERIMENTS.values())}"
-            raise SourceError(what, expected=expected, hint=_WHERE)
-        folder = Path(os.environ["RECON_DATA"]) / _SCENES
-    missing = [scene for scene in EXPERIMENTS.values() if not (folder / scene).is_dir()]
-    if missing:
+    if folder is None and not os.environ.get("RECON_DATA"):
+        what = "no folder of scenes is given, and RECON_DATA is not set"
+        expected = f"a folder with {', '.join(EXPERIMENTS.values())}"
+        raise SourceError(what, expected=expected, hint=_WHERE)
+    folder = folder or Path(os.environ["RECON_DATA"]) / _SCENES
+    if missing := [scene for scene in EXPERIMENTS.values() if not (folder / scene).is_dir()]:
         got = f"no folder {', '.join(missing)}"
         raise SourceError("scenes of the paper are missing", where=folder, got=got, hint=_WHERE)
     return [_read_experiment(number, folder / scene) for number, scene in EXPERIMENTS.items()]
@@ -273,7 +268,6 @@ def compare_depth(
 
 
 def _printed_pair(experiment: Experiment) -> RectifiedPair:
-    """Return the images converted to grey by Eq. 6."""
     pair, rectifier = experiment.pair, Rectifier(experiment.camera)
     left, right = (to_grey(image, "paper") for image in rectifier.warp(pair))
     return replace(rectifier.rectify(pair), left=left, right=right)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from os import PathLike
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -109,11 +109,9 @@ def _path(name: str, given: object) -> Trajectory:
         return read_trajectory(found)
     if isinstance(found, Trajectory):
         return found
-    raise EvaluationError(
-        f"the {name} is no trajectory",
-        got=f"{type(given).__name__} without a path" if found is None else type(given).__name__,
-        expected="a Trajectory, a KITTI or TUM file, or the truth of a source",
-    )
+    got = type(given).__name__ + (" without a path" if found is None else "")
+    expected = "a Trajectory, a KITTI or TUM file, or the truth of a source"
+    raise EvaluationError(f"the {name} is no trajectory", got=got, expected=expected)
 
 
 def compare_paths(
@@ -192,12 +190,10 @@ def _rms(values: Float64) -> float:
 
 def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> None:
     if len(estimate) != len(truth):
-        raise EvaluationError(
-            "estimated and true trajectory differ in length",
-            got=counted(len(estimate), "pose"),
-            expected=counted(len(truth), "pose"),
-            hint="without timestamps (TUM, or --times) both must have one pose per frame",
-        )
+        got, expected = counted(len(estimate), "pose"), counted(len(truth), "pose")
+        what = "estimated and true trajectory differ in length"
+        hint = "without timestamps (TUM, or --times) both must have one pose per frame"
+        raise EvaluationError(what, got=got, expected=expected, hint=hint)
     least = rules.rpe_frames + 1
     if len(truth) < least:
         got, expected = counted(len(truth), "pose"), f"{least} or more"
@@ -209,11 +205,10 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
     drift_m = min(drift_at_end(estimate), drift_at_end(truth))
     fit = fit_to_path(estimate.positions_m, truth.positions_m, drift_m)
     if fit.other_unit and rules.alignment != "sim3":
-        raise EvaluationError(
-            "the true path is the estimated one in another unit",
-            got=f"{fit.scale:.4g} times as large, {fit.scaled_m:.3g} m apart if that is undone",
-            hint="both are in metres; sim3 compares an estimate whose scale is unknown",
-        )
+        what = "the true path is the estimated one in another unit"
+        got = f"{fit.scale:.4g} times as large, {fit.scaled_m:.3g} m apart if that is undone"
+        hint = "both are in metres; sim3 compares an estimate whose scale is unknown"
+        raise EvaluationError(what, got=got, hint=hint)
 
 
 def without_roll(estimate: Trajectory, truth: Trajectory, axis: Float64) -> Trajectory:
@@ -240,8 +235,7 @@ SHORT_LENGTHS_M: Final = (50.0, 100.0)  # for a drive with no room for two of KI
 KITTI_STEP_FRAMES: Final = 10  # the benchmark starts a segment at every tenth frame (one second)
 
 
-@dataclass(frozen=True, eq=False)
-class Segments:
+class Segments(NamedTuple):
     """Segments of the true path."""
 
     first: Int32  # (N,), frames
@@ -260,11 +254,9 @@ def choose_segments(
     lengths = lengths_m or KITTI_LENGTHS_M
     segments = segments_of(distances_m, lengths, step_frames or KITTI_STEP_FRAMES)
     if lengths_m is not None and not len(segments.first):
-        raise EvaluationError(
-            "true path has no room for a segment of the requested lengths",
-            got=f"a path of {distances_m[-1]:.1f} m",
-            expected=f"more than {min(lengths_m):g} m",
-        )
+        what = "true path has no room for a segment of the requested lengths"
+        got, expected = f"a path of {distances_m[-1]:.1f} m", f"more than {min(lengths_m):g} m"
+        raise EvaluationError(what, got=got, expected=expected)
     if lengths_m is not None or len(np.unique(segments.length_m)) >= 2:
         return segments
     segments = segments_of(distances_m, SHORT_LENGTHS_M, step_frames or 1)
@@ -296,13 +288,11 @@ def associate(
     mutual = (back[there] == np.arange(len(estimate))) & (apart_s <= tolerance_s)
     if not mutual.any():
         times = (estimate.timestamps_s, truth.timestamps_s)
-        spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in times]
-        raise EvaluationError(
-            "no poses of the two trajectories match in time",
-            got=f"times {' and '.join(spans)}",
-            expected=f"times within {tolerance_s:g} s of each other",
-            hint="raise --tolerance, or make sure that both use the same clock",
-        )
+        got = "times " + " and ".join(f"{t[0]:.3f} to {t[-1]:.3f} s" for t in times)
+        expected = f"times within {tolerance_s:g} s of each other"
+        what = "no poses of the two trajectories match in time"
+        hint = "raise --tolerance, or make sure that both use the same clock"
+        raise EvaluationError(what, got=got, expected=expected, hint=hint)
     return estimate.select(mutual), truth.select(there[mutual])
 
 

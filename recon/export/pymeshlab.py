@@ -2,8 +2,7 @@
 
 MeshLab's Poisson may abort the process, exhaust its memory, print, or leave it in a deleted
 working directory. A child process for each surface shields the caller from this; it costs about
-half a second. Arrays are exchanged as files in a temporary folder. The module stands beside the
-folder ``mesh`` because importing that folder would load Open3D into every child.
+half a second. Importing the folder ``mesh`` would load Open3D into every child.
 """
 
 from __future__ import annotations

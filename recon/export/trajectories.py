@@ -67,9 +67,8 @@ def export_localized(
     drive: LocalizedDrive, camera_height_m: float | None, run: RunDirectory
 ) -> None:
     """Write ``trajectory_tum.txt``, ``trajectory_map_base_tum.txt`` and ``states.csv``."""
-    path, T_map_world = drive.trajectory, drive.T_map_world
-    write_tum(run.path("trajectory_tum.txt"), path)
-    based = _of_base(path, T_map_world, camera_height_m)
+    write_tum(run.path("trajectory_tum.txt"), drive.trajectory)
+    based = _of_base(drive.trajectory, drive.T_map_world, camera_height_m)
     write_tum(run.path("trajectory_map_base_tum.txt"), based)
     lines = [",".join(HEADER), *map(_line, drive.frames)]
     write_text(run.path("states.csv"), "\n".join(lines) + "\n")

@@ -133,10 +133,8 @@ def _known(figures: Mapping[str, Any], text: str) -> str:
 
 
 def _by_motion(found: Mapping[str, Any]) -> str:
-    disparity, focal, lens = (
-        f"{found[name]['value']:+.2f} ± {1.96 * found[name]['sigma']:.2f}"
-        for name in ("disparity_px", "focal_percent", "lens_px")
-    )
+    each = (found[name] for name in ("disparity_px", "focal_percent", "lens_px"))
+    disparity, focal, lens = (f"{x['value']:+.2f} ± {1.96 * x['sigma']:.2f}" for x in each)
     depths = ", ".join(f"{off:+.1f} % at {z} m" for z, off in found["depth_percent"].items())
     return (
         f"disparities lack {disparity} px (depth {depths}), at the sides another {lens} px by the "
@@ -146,10 +144,8 @@ def _by_motion(found: Mapping[str, Any]) -> str:
 
 def _mended(mended: Mapping[str, Any]) -> str:
     turn = ", ".join(f"{mended[f'{x}_deg']:+.3f} deg {x}" for x in ("pitch", "yaw", "roll"))
-    text = (
-        f"{mended['calibration']}: right camera rotated by {turn}, its focal length changed by "
-        f"{mended['focal_percent']:+.2f} %"
-    )
+    text = f"{mended['calibration']}: right camera rotated by {turn}, its focal length changed by "
+    text += f"{mended['focal_percent']:+.2f} %"
     if mended["lenses_px"] is None:
         return text
     left, right = mended["lenses_px"]

@@ -112,16 +112,16 @@ def depth_error_figure(result: CalibrationRun) -> bytes:
     matching = [100 * each.matching_m for each in errors]
     calibration = [100 * each.calibration_m for each in known]
     reach = [100 * max(abs(each.low_m), abs(each.high_m)) for each in known]
+    depths_m, label = [each.depth_m for each in errors], f"matching to {MATCH_SIGMA_PX:g} px"
     figure, axes = style.subplots(style.HALF_IN, 3.4)
-    label = f"matching to {MATCH_SIGMA_PX:g} px"
-    axes.plot([each.depth_m for each in errors], matching, "o-", color=style.FAINT, label=label)
+    axes.plot(depths_m, matching, "o-", color=style.FAINT, label=label)
     axes.plot(known_m, calibration, "o-", color=style.ESTIMATE, label="calibration, over the image")
     label = f"{100 * CONFIDENCE:.0f} % interval, middle of the image"
     look = {"color": style.ESTIMATE, "alpha": 0.15, "linewidth": 0}
     axes.fill_between(known_m, 1e-3, reach, label=label, **look)
     axes.set(xscale="log", yscale="log", xlabel="depth, m", ylabel="depth error, cm")
     axes.set_ylim(bottom=max(min([*matching, *calibration]) / 3, 1e-3))
-    axes.set_xticks([each.depth_m for each in errors], [f"{each.depth_m:g}" for each in errors])
+    axes.set_xticks(depths_m, [f"{depth_m:g}" for depth_m in depths_m])
     axes.minorticks_off()
     axes.legend(fontsize=8)
     return style.to_png(figure)

@@ -83,8 +83,8 @@ def loops_figure(
 @style.styled
 def top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> bytes:
     """Draw lines in a plane with equal axes, with the start and end of one path."""
-    figure = Figure((style.WIDE_IN, _height_in(np.concatenate([points for points, _ in lines]))))
-    axes = figure.subplots()
+    height_in = _height_in(np.concatenate([points for points, _ in lines]))
+    figure, axes = style.subplots(style.WIDE_IN, height_in)
     for points, look in lines:
         axes.plot(*points.T, **look)
     _mark_ends(axes, path)
@@ -100,9 +100,9 @@ def drift_figure(
 ) -> bytes:
     """Draw the drift of position and rotation, with both paths starting at the identity."""
     if len(estimate) != len(truth):
-        figure = Figure((style.WIDE_IN, 4.6))
+        figure, axes = style.subplots(style.WIDE_IN, 4.6)
         poses = f"{counted(len(estimate), 'pose')}, but {counted(len(truth), 'true one')}"
-        style.write_note(figure.subplots(), f"{poses}: not compared")
+        style.write_note(axes, f"{poses}: not compared")
         return style.to_png(figure)
     drift = invert(truth.T_world_camera) @ estimate.T_world_camera
     position_m, rotation_deg = np.linalg.norm(drift[:, :3, 3], axis=1), np.degrees(angle_rad(drift))
@@ -135,19 +135,18 @@ def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
     path = np.concatenate([np.zeros((0, 2)), *paths.values()])
     corners = np.concatenate([[near, far], path - _PATH_MARGIN_M, path + _PATH_MARGIN_M])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    figure = Figure((style.WIDE_IN, _height_in(corners)))
-    axes = figure.subplots()
+    figure, axes = style.subplots(style.WIDE_IN, _height_in(corners))
     axes.set_facecolor(style.unit_colour(style.GRID_UNKNOWN))
     axes.imshow(style.colour_grid(grid), extent=(near[0], far[0], near[1], far[1]))
     lines = [axes.plot(*way.T, linewidth=1.6, label=name)[0] for name, way in paths.items()]
     for way in paths.values():
         _mark_ends(axes, way)
     axes.grid(visible=False)
-    limits = {"xlim": (low[0], high[0]), "ylim": (low[1], high[1])}
-    axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1], **limits)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1])
     _draw_scale_bar(axes, low, high - low)
     colours = (style.GRID_FREE, style.GRID_OCCUPIED, style.GRID_UNKNOWN)
-    keys = [*map(style.colour_key, ("free", "occupied", "unknown"), colours)]
+    keys = map(style.colour_key, ("free", "occupied", "unknown"), colours)
     named = lines if len(lines) > 1 else []
     figure.legend(handles=[*keys, *named], loc="outside lower center", ncols=3)
     return style.to_png(figure)
@@ -222,8 +221,8 @@ def nice_length(target: float) -> float:
 def _draw_scale_bar(axes: Axes, low: NDArray[Any], size_m: NDArray[Any]) -> None:
     length = nice_length(float(size_m[0]) / 6)
     left, bottom = low + size_m * (0.03, 0.06)
-    ends = [left, left + length]
-    axes.plot(ends, [bottom, bottom], color=style.INK, linewidth=4, solid_capstyle="butt")
+    look: dict[str, Any] = {"color": style.INK, "linewidth": 4, "solid_capstyle": "butt"}
+    axes.plot([left, left + length], [bottom, bottom], **look)
     middle = (left + length / 2, bottom)
     axes.annotate(f"{length:g} m", middle, (0, 5), textcoords="offset points", ha="center")
 

@@ -19,7 +19,6 @@ from recon.io.models.ply import write_ply
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
 from recon.map.store.map_file import MapFile
-from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
 from recon.report import drive_figures as figures
 from recon.report import style
@@ -50,6 +49,7 @@ def map_content(
     path, health, T_map_world = session.trajectory, session.health, session.T_map_world
     drift = expected_drift(path, health, session.camera)
     radius_share = 0.0 if drift is None else drift.radius_share
+    pairs = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
     true_path = {} if truth is None else {"true path": truth}
     return {
         **_map_content(made, {"path": path}, true_path, T_map_world),
@@ -58,7 +58,9 @@ def map_content(
         "metrics": errors.path,
         "figures": {
             "path": figures.path_figure(path, truth, T_map_world, health, radius_share),
-            "loops": _loops(session),
+            "loops": figures.loops_figure(session.odometry, path, pairs, T_map_world)
+            if pairs
+            else None,
             "drift": None if truth is None else figures.drift_figure(path, truth, health),
             "health": figures.health_figure(health) if health else None,
         },
@@ -86,13 +88,6 @@ def _map_content(
         "resolution_m": made.grid.resolution_m,
         "view": plot_scene(Scene(np.eye(4), made.cloud, made.mesh, [*ways.items()])),
     }
-
-
-def _loops(session: Session) -> bytes | None:
-    pairs = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
-    if not pairs:
-        return None
-    return figures.loops_figure(session.odometry, session.trajectory, pairs, session.T_map_world)
 
 
 def write_map_errors(comparison: MapComparison, run: RunDirectory) -> None:

@@ -61,10 +61,8 @@ def pair_content(result: PairRun) -> Json:
 
 
 ERROR_LIMIT_PX = 4.0  # error of the last colour: the largest threshold of Middlebury's table
-# Height of the strip below an image: axis label and ticks, colour bar, and depths above it.
-_BELOW_IN = 1.0
-_BAR_BOTTOM_IN = 0.5
-_BAR_IN = 0.16
+_BELOW_IN = 1.0  # strip below an image: axis label and ticks, colour bar, and depths above it
+_BAR_BOTTOM_IN, _BAR_IN = 0.5, 0.16
 _WIDE_ASPECT = 2.0
 _LABEL_ROOM = 0.1  # fraction of the length of a scale: "0.45 m" below a narrow image
 _FARTHEST_MARK_M = 1000.0
@@ -96,10 +94,10 @@ def pair_figure(pair: RectifiedPair) -> bytes:
     height, width = pair.left.shape
     rows, columns = (2, 1) if is_wide(pair.left.shape) else (1, 2)
     height_in = (style.WIDE_IN / columns * height / width + 0.3) * rows
-    figure, (left_axes, right_axes) = style.subplots(style.WIDE_IN, height_in, rows, columns)
-    style.show_image(left_axes, pair.colours, "Left, rectified")
+    figure, both = style.subplots(style.WIDE_IN, height_in, rows, columns)
     right = pair.right if pair.right_rgb is None else pair.right_rgb
-    style.show_image(right_axes, right, "Right, rectified")
+    for axes, side, image in zip(both, ("Left", "Right"), (pair.colours, right), strict=True):
+        style.show_image(axes, image, f"{side}, rectified")
     return style.to_png(figure)
 
 
@@ -213,5 +211,5 @@ def _mark_depths(bar: Axes, limits: tuple[float, float], camera: RectifiedCamera
     depths, upper = depth_marks(near, far, place, limits), bar.twiny()
     upper.set_xlim(*limits)
     upper.spines[:].set_visible(False)
-    upper.set_xticks([place(depth) for depth in depths], [f"{depth:g} m" for depth in depths])
+    upper.set_xticks([*map(place, depths)], [f"{depth:g} m" for depth in depths])
     upper.tick_params(length=2, pad=1)

@@ -223,8 +223,7 @@ def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int,
     towards = np.cos(above_rad) * level + [0.0, 0.0, np.sin(above_rad)]
     across = np.array([-level[1], level[0], 0.0])
     axes = np.stack([across, np.cross(towards, across)])
-    look_at, place = np.zeros(3), np.zeros((1, 2))
-    away = 0.0
+    look_at, place, away = np.zeros(3), np.zeros((1, 2)), 0.0
     for _ in range(_CENTRED):
         flat, near = (points - look_at) @ axes.T, (points - look_at) @ towards
         # A point at distance z before the eye is in view up to z times the tangent of half of it.

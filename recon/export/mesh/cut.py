@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +64,7 @@ def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64
         mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12)
         normals = np.concatenate([normals, mixed.astype(np.float32)])
     if rgb is not None:
-        mixed = np.rint(between(rgb, edges, share))
-        rgb = np.concatenate([rgb, mixed.astype(np.uint8)])
+        rgb = np.concatenate([rgb, np.rint(between(rgb, edges, share)).astype(np.uint8)])
     return TriangleMesh(np.concatenate([mesh.vertices, new]), mesh.faces, normals, rgb)
 
 
@@ -96,24 +95,19 @@ def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) ->
 def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
     """Return the faces with the vertices that they use; degenerate faces of a cut are dropped."""
     a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    used, faces = renumbered(faces)
+    used, faces = renumbered(faces[(a != b) & (b != c) & (c != a)])
     normals = None if mesh.normals is None else mesh.normals[used]
     rgb = None if mesh.rgb is None else mesh.rgb[used]
     return TriangleMesh(mesh.vertices[used], faces, normals, rgb)
 
 
-@dataclass(frozen=True, eq=False)
-class OnEdges:
-    """Projections of points onto line segments: the segments, and positions on them, from 0 to 1.
+class OnEdges(NamedTuple):
+    """Projections of points onto line segments."""
 
-    ``feet`` are the projected points, float64 (N, 3), at ``distance_m`` from the points.
-    """
-
-    edge: Places
-    share: Float64
-    feet: Float64
-    distance_m: Float64
+    edge: Places  # the segments
+    share: Float64  # places on them, from 0 to 1
+    feet: Float64  # (N, 3), the projected points
+    distance_m: Float64  # of these from the points
 
 
 def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:

@@ -32,13 +32,10 @@ from recon.run.machine import available_cores
 from recon.run.threads import side_by_side
 
 WHOLE: Final = "mesh/mesh.ply"
-LAYER: Final = "mesh/cloud.ply"
-"""The points of the MeshLab project, where the run has no other cloud."""
-SAMPLE_FACES: Final = 2_000_000
-"""Largest number of triangles of a mesh that is loaded whole for images."""
+LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where the run has no other cloud
+SAMPLE_FACES: Final = 2_000_000  # most triangles of a mesh that is loaded whole for images
 _MOST_AT_ONCE: Final = 4
-_SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""The four sides of a piece: (axis, 1 for the far side)."""
+_SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))  # of a piece: axis, 1 for the far side
 _SEAM_M: Final = 0.15  # widest gap that is closed where two pieces meet
 _BULGE_M: Final = 2.0  # how far a surface may go beyond the points that it is made of
 PieceKey = tuple[int, int]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -96,8 +96,7 @@ def reconstruct_mesh(
     return trimmed_surface(cloud, settings, Octree(depth), wrong)
 
 
-@dataclass(frozen=True)
-class Octree:
+class Octree(NamedTuple):
     """The grid of a surface: 2^depth cells, ``scale`` times the longest side of the cloud."""
 
     depth: int

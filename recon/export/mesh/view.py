@@ -1,15 +1,12 @@
-"""The surface of one stereo pair, as finely resolved as the pair was measured.
+"""The surface of one stereo pair, computed in image coordinates: column, row and disparity.
 
-The points of a pair are a pixel apart, which is millimetres close by and decimetres far away. An
-octree of equal cells in metres is too coarse for the one or too fine for the other, and a single
-wrong match far away makes all its cells larger. So the surface is computed in image coordinates:
-column, row and disparity.
+In metres, an octree of equal cells is too coarse close by or too fine far away.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -54,8 +51,7 @@ def reconstruct_view(
     """
     cloud = usable(cloud.select(cloud.xyz[:, 2] > 0))
     cloud = oriented(cloud, viewpoint_m=(0.0, 0.0, 0.0))
-    space = _ImageSpace(camera.focal_px, camera.baseline_m)
-    seen = space.of_cloud(cloud)
+    seen = _in_image(cloud, camera)
     low, high = seen.xyz.min(axis=0), seen.xyz.max(axis=0)
 
     def outside(vertices: Float32) -> Bool:
@@ -64,7 +60,7 @@ def reconstruct_view(
         return np.asarray(beside | (vertices[:, 2] > high[2] / 2))
 
     mesh = trimmed_surface(seen, settings, _octree(seen.xyz, settings), outside)
-    vertices = space.metres(mesh.vertices)
+    vertices = _in_metres(mesh.vertices, camera)
     return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
 
 
@@ -87,41 +83,30 @@ def check_coverage(coverage: float) -> tuple[str, ...]:
     return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
 
 
-@dataclass(frozen=True)
-class _ImageSpace:
-    """Column, row and negative disparity from the principal point and infinity, in pixels.
+def _in_image(cloud: PointCloud, camera: RectifiedCamera) -> PointCloud:
+    """Return a cloud in camera axes and its normals by column, row and negative disparity.
 
-    The mapping is projective, so planes stay planes, and it preserves orientation.
+    From the principal point and infinity, in pixels. The mapping is projective, so planes stay
+    planes, and it preserves orientation.
     """
+    f, fb = camera.focal_px, _DISPARITY_STEP * camera.focal_px * camera.baseline_m
+    x, y, z = cloud.xyz.T.astype(np.float64)
+    xyz = np.stack([f * x / z, f * y / z, -fb / z], axis=1)
+    # A normal is transformed by the transposed Jacobian of the way back to metres; its columns
+    # are the motions of the point per pixel of each image coordinate.
+    along = np.asarray(cloud.normals, np.float64)
+    depthwards = np.einsum("ij,ij->i", along, cloud.xyz) / fb
+    pulled = np.stack([along[:, 0] / f, along[:, 1] / f, depthwards], axis=1)
+    pulled /= np.linalg.norm(pulled, axis=1, keepdims=True)
+    return replace(cloud, xyz=xyz.astype(np.float32), normals=pulled.astype(np.float32))
 
-    focal_px: float
-    baseline_m: float
 
-    @property
-    def _range(self) -> float:
-        """Third coordinate times depth, negated."""
-        return _DISPARITY_STEP * self.focal_px * self.baseline_m
-
-    def of_cloud(self, cloud: PointCloud) -> PointCloud:
-        """Return a cloud in camera axes and its normals, in image coordinates."""
-        x, y, z = cloud.xyz.T.astype(np.float64)
-        xyz = np.stack([self.focal_px * x / z, self.focal_px * y / z, -self._range / z], axis=1)
-        if cloud.normals is None:
-            return replace(cloud, xyz=xyz.astype(np.float32))
-        # A normal is transformed by the transposed Jacobian of the way back to metres; its columns
-        # are the motions of the point per pixel of each image coordinate.
-        along = cloud.normals.astype(np.float64)
-        depthwards = np.einsum("ij,ij->i", along, cloud.xyz) / self._range
-        pulled = np.stack([along[:, 0] / self.focal_px, along[:, 1] / self.focal_px, depthwards], 1)
-        pulled /= np.linalg.norm(pulled, axis=1, keepdims=True)
-        return replace(cloud, xyz=xyz.astype(np.float32), normals=pulled.astype(np.float32))
-
-    def metres(self, vertices: Float32) -> Float32:
-        """Return float32 (V, 3): camera axes from image coordinates."""
-        column, row, disparity = vertices.T.astype(np.float64)
-        z = -self._range / disparity
-        xyz = np.stack([column * z / self.focal_px, row * z / self.focal_px, z], axis=1)
-        return np.asarray(xyz, dtype=np.float32)
+def _in_metres(vertices: Float32, camera: RectifiedCamera) -> Float32:
+    """Return float32 (V, 3): camera axes from image coordinates."""
+    column, row, disparity = vertices.T.astype(np.float64)
+    z = -(_DISPARITY_STEP * camera.focal_px * camera.baseline_m) / disparity
+    xyz = np.stack([column * z / camera.focal_px, row * z / camera.focal_px, z], axis=1)
+    return np.asarray(xyz, dtype=np.float32)
 
 
 def _octree(xyz: Float32, settings: MeshSettings) -> Octree:
