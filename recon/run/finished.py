@@ -21,10 +21,10 @@ GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
 CLOUD: Final = "map/cloud.ply"
 PAIR_CLOUD: Final = "clouds/cloud.ply"
+# Record keys of a run made from another run: the command that mapped the drive; of one without a
+# map of its own, what was doubted there.
 MAPPED_BY: Final = "mapped_by"
-"""Record key of a run made from another run: the command that mapped the drive."""
 DOUBTS: Final = "doubts"
-"""Record key of a run made from another run, without a map of its own: what was doubted there."""
 
 
 def command_of_map(folder: Path) -> str:

@@ -15,22 +15,18 @@ class Step(Protocol):
     @property
     def seconds(self) -> float:
         """Time since the previous item was done."""
-        ...
 
     @property
     def ok(self) -> bool:
         """Whether its result is to be trusted."""
-        ...
 
     @property
     def event(self) -> Mapping[str, Any]:
         """Its figures for programs, ready for JSON; ``event`` names the kind of item."""
-        ...
 
     @property
     def state(self) -> str:
         """Its result in a few words, for people; plain text."""
-        ...
 
 
 @runtime_checkable

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from functools import cached_property
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 import yaml
 
 from recon.commands.config import load_config, run_settings
-from recon.commands.demo import demo_source
 from recon.commands.export import run_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
@@ -21,15 +19,12 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.trajectory import read_tum
 from recon.map.map import Map
-from recon.map.store.map_file import MAP_FILE
-from recon.map.store.records import Store
 from recon.sources.kitti import open_kitti
 from recon.sources.source import StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from recon.street.shapes import Material, Paint, boxes, merge
 from recon.street.street import StreetWorld, rig
-from tests.flow.conftest import SMALL_STREET
 from tests.flow.runs import summary_of
 
 FOOTPRINT_M = 0.3
@@ -115,34 +110,6 @@ def test_a_robot_starts_in_free_space_where_the_camera_stands_on_the_road(small_
     np.testing.assert_allclose(base.T_world_camera[0, :3, :3], np.eye(3), atol=1e-9)
     assert base.positions_m[0, 2] == pytest.approx(-summary["camera_height_m"])
     assert base.positions_m[-1, 0] > 10
-
-
-def test_frames_that_are_not_trusted_free_nothing(small_demo: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(small_demo, tmp_path / "copy")
-    with Store.open(copy / MAP_FILE) as store:
-        frames = store.get("frames", (0, 0))
-        ok = frames["health"]["ok"]
-        assert ok[0]
-        health = frames["health"] | {"ok": [False, False, *ok[2:]]}
-        store.put("frames", (0, 0), frames | {"health": health})
-        store.commit()
-    run_occupancy(copy, out=tmp_path / "out")
-    assert (ServedMap(tmp_path / "out").at(np.zeros((1, 2))) == UNKNOWN).all()
-
-
-@pytest.mark.slow
-def test_the_map_can_have_its_origin_on_the_ground(tmp_path: Path) -> None:
-    street = [f"street.{key}={value}" for key, value in SMALL_STREET.items()]
-    config, out = load_config(None, [*street, "axes.origin=ground"]), tmp_path / "run"
-    options = MapOptions(audit=False, command="demo", out=out, mesh=False)
-    run = run_map(demo_source(config), config, options)
-    base = read_tum(out / "trajectory_map_base_tum.txt")
-    # One frame's ground plane against the ground of the whole drive: some centimetres apart.
-    assert abs(base.positions_m[0, 2]) < 0.1
-    assert np.array(run.summary["T_map_world"])[2, 3] == pytest.approx(1.65, abs=0.1)
-    assert run.errors.occupancy is not None
-    assert run.errors.occupancy.voxels.precision > 0.8
-    _check_start(out)
 
 
 FRAMES = 20

@@ -8,9 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from recon.cli import app
 from recon.core.geometry.se3 import apply
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.board import parse_board
@@ -18,6 +16,7 @@ from recon.io.images.image import write_image
 from recon.io.models.ply import read_ply
 from recon.stereo.rectify.lens import rays_of
 from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
+from tests.hostile.refusals import run
 from tests.scenery.boards import Lens, board_rig, place_boards, render_views
 
 BOARD = "chess:9x6:25mm"
@@ -48,12 +47,8 @@ def photograph(camera: CameraIntrinsics, T_left_camera: np.ndarray) -> np.ndarra
 def take_images(folder: Path, rig: StereoCalibration) -> None:
     board = parse_board(BOARD)
     pairs = render_views(rig, board, place_boards(rig, board, 12, seed=4))
-    pairs.append(
-        (
-            photograph(rig.left, np.eye(4)),
-            photograph(rig.right, np.linalg.inv(rig.T_right_left)),
-        )
-    )
+    poses = (np.eye(4), np.linalg.inv(rig.T_right_left))
+    pairs.append((photograph(rig.left, poses[0]), photograph(rig.right, poses[1])))
     for number, pair in enumerate(pairs):
         for side, image in zip(("left", "right"), pair, strict=True):
             name = "room" if number == 12 else f"board{number:02d}"
@@ -61,9 +56,9 @@ def take_images(folder: Path, rig: StereoCalibration) -> None:
 
 
 def recon(*arguments: str | Path) -> dict[str, object]:
-    done = CliRunner().invoke(app, [*map(str, arguments), "--json"])
-    assert done.exit_code == 0, done.stderr
-    return dict(json.loads(done.stdout))
+    done = run(*arguments, "--json")
+    assert done.code == 0, done.err
+    return dict(json.loads(done.out))
 
 
 @pytest.mark.slow

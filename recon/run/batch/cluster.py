@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 from uuid import uuid4
@@ -26,7 +26,7 @@ _AT_ONCE: Final = 10_000
 _KEY: Final = "recon-job"
 """Dask keeps a list of the kinds of tasks, told by their keys, and looks through it at every step:
 jobs are all of one kind."""
-_LOCAL: Final = {
+_LOCAL: Final[dict[str, Any]] = {
     # A worker is not given a second job to wait behind its first.
     "distributed.scheduler.worker-saturation": 1.0,
     # Workers that die are started again, however long that takes.
@@ -38,9 +38,7 @@ _LOCAL: Final = {
 _NO_SCHEDULER: Final = (
     ValueError, TypeError, KeyError, RuntimeError, ImportError, MemoryError,
 )  # fmt: skip
-_Try = tuple[Job, int]
-Work = Callable[[Job, str], Outcome]
-"""Runs a job in the folder of its batch."""
+Work = Callable[[Job, str], Outcome]  # runs a job in the folder of its batch
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,8 @@ class Cluster:
         One that broke (its workers died, it was killed or late) is tried again, up to its retries.
         """
         dask, waiting = require("distributed", extra=EXTRA), iter(jobs)
-        ended, tries = dask.as_completed(with_results=True, raise_errors=False), dict[str, _Try]()
+        ended = dask.as_completed(with_results=True, raise_errors=False)
+        tries: dict[str, tuple[Job, int]] = {}
 
         def give(some: Iterable[Job], number: int = 0, workers: Sequence[str] = ()) -> None:
             for job, future in self._submit(list(some), str(folder), workers):
@@ -136,19 +135,18 @@ class Cluster:
     ) -> Iterator[tuple[Job, Any]]:
         """Give jobs to Dask, all with the same needs in one message."""
         declared = self._declared() if any(job.needs for job in jobs) else ()
-
-        def needs_of(job: Job) -> list[tuple[str, float]]:
-            return sorted(job.needs.items())
-
-        for needs, group in groupby(sorted(jobs, key=needs_of), needs_of):
-            alike = list(group)
+        groups: dict[tuple[tuple[str, float], ...], list[Job]] = {}
+        for job in jobs:
+            needs = tuple((name, job.needs[name]) for name in declared if name in job.needs)
+            groups.setdefault(needs, []).append(job)
+        for needs, alike in groups.items():
             futures = self._client.map(
                 self._work,
                 alike,
                 folder=folder,
                 key=_KEY,
                 pure=False,
-                resources={name: least for name, least in needs if name in declared} or None,
+                resources=dict(needs) or None,
                 workers=workers or None,
                 allow_other_workers=bool(workers),  # where these die, too
             )
@@ -165,9 +163,7 @@ class Cluster:
 @contextmanager
 def local_cluster(workers: int) -> Iterator[Cluster]:
     """Start workers on this machine, each of which runs one job at a time."""
-    distributed = require("distributed", extra=EXTRA)
-    _be_quiet()
-    require("dask", extra=EXTRA).config.set(_LOCAL)
+    distributed = _quiet_dask(_LOCAL)
     try:
         local = distributed.LocalCluster(
             n_workers=workers,
@@ -187,8 +183,7 @@ def local_cluster(workers: int) -> Iterator[Cluster]:
 @contextmanager
 def join_cluster(address: str) -> Iterator[Cluster]:
     """Use the workers of a scheduler, by its address or the file that it writes this to."""
-    distributed = require("distributed", extra=EXTRA)
-    _be_quiet()
+    distributed = _quiet_dask({})
     try:
         file = Path(address)
         where = json.loads(file.read_text())["address"] if file.is_file() else address
@@ -255,10 +250,12 @@ def _reaching() -> Iterator[None]:
         raise ClusterError("the scheduler is gone", got=error) from error
 
 
-def _be_quiet() -> None:
-    """Keep the messages of Dask from standard error: what matters of them we say."""
+def _quiet_dask(settings: dict[str, Any]) -> Any:
+    """Return Dask, whose messages do not reach standard error: what matters of them we say."""
+    distributed = require("distributed", extra=EXTRA)
     # Dask gives each part of it a level of its own.
     parts = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
     for name in (*parts, "distributed", "tornado", "bokeh", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    require("dask", extra=EXTRA).config.set({"logging.distributed": "critical"})
+    require("dask", extra=EXTRA).config.set({"logging.distributed": "critical", **settings})
+    return distributed

@@ -143,12 +143,14 @@ def run_job(
     with path.open("ab", buffering=0) as log:
         log.write(tried.line() + f"{shlex.join(['recon', *line])}\n".encode(errors="replace"))
         code, error = _run(job, line, out, log, stopped)
-        full = code != 0 and any(map(_is_full, (folder, Path(tempfile.gettempdir()))))
-        state = _state(job, out, code, full=full)
+        free = (shutil.disk_usage(place).free for place in (folder, tempfile.gettempdir()))
+        full = code != 0 and min(free) < _LEAST_FREE_BYTES
+        done = code == 0 and is_done(out)
+        by_input = code in _INPUT and not job.resumes(out) and not full
         ended = replace(
             tried,
-            state=state,
-            error="" if state == "succeeded" else error,
+            state="succeeded" if done else "failed" if by_input else "broken",
+            error="" if done else error,
             seconds=round(time.monotonic() - begun, 3),
             full=full,
             stale=resume and code > 0 and not full,
@@ -163,16 +165,6 @@ def _wait_for_others(out: Path, stopped: Callable[[], bool]) -> None:
     late = time.monotonic() + _OTHERS_S
     while is_locked(lock_file(out)) and time.monotonic() < late and not stopped():
         time.sleep(_LOOK_S)
-
-
-def _state(job: Job, out: Path, code: int, *, full: bool) -> State:
-    if code == 0 and is_done(out):
-        return "succeeded"
-    return "failed" if code in _INPUT and not job.resumes(out) and not full else "broken"
-
-
-def _is_full(folder: Path) -> bool:
-    return shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
 
 
 def _run(

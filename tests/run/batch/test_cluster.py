@@ -39,7 +39,6 @@ def run(cluster: Cluster, jobs: list[Job], folder: Path) -> dict[str, Outcome]:
     return dict(ended)
 
 
-@pytest.mark.usefixtures("stand_in")
 def test_what_breaks_goes_on_and_what_fails_is_named_and_the_rest_is_done(
     cluster: Cluster, tmp_path: Path
 ) -> None:
@@ -139,7 +138,6 @@ def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path:
         run(Cluster(cluster._client, nobody), [job("a")], tmp_path)
 
 
-@pytest.mark.usefixtures("stand_in")
 def test_two_batches_with_jobs_of_the_same_name_share_a_scheduler(
     cluster: Cluster, tmp_path: Path
 ) -> None:

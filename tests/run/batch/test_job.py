@@ -20,10 +20,9 @@ from recon.run.directory import lock_file
 from tests.run.batch.jobs import job, tries
 from tests.scenery.patience import LONG_S
 
-usefixtures = pytest.mark.usefixtures("stand_in")
+PROGRAM = process._PROGRAM
 
 
-@usefixtures
 def test_a_job_writes_its_folder_and_a_log_and_is_not_run_again(tmp_path: Path) -> None:
     outcome = run_job(job("a"), tmp_path, "here")
     assert (outcome.state, outcome.error) == ("succeeded", "")
@@ -43,7 +42,6 @@ def test_a_job_writes_its_folder_and_a_log_and_is_not_run_again(tmp_path: Path) 
     assert 1 <= sum('"frame"' in line for line in log) < 10
 
 
-@usefixtures
 def test_what_is_left_of_a_log_counts(tmp_path: Path) -> None:
     """Of a worker that died, which is as if the try had no end."""
     log_file(tmp_path, "a").parent.mkdir()
@@ -55,7 +53,6 @@ def test_what_is_left_of_a_log_counts(tmp_path: Path) -> None:
     assert last_outcome(tmp_path, "a").state == "broken"
 
 
-@usefixtures
 def test_a_log_that_is_none_or_leads_elsewhere_is_one_line(tmp_path: Path) -> None:
     log_file(tmp_path, "a").parent.mkdir()
     for line in ('{"try": 3}', '{"try": {"state": "x"}}', '{"try": {"seconds": NaN}}'):
@@ -69,7 +66,6 @@ def test_a_log_that_is_none_or_leads_elsewhere_is_one_line(tmp_path: Path) -> No
     assert not (tmp_path / "precious").exists()
 
 
-@usefixtures
 @pytest.mark.parametrize(
     ("what", "state", "error"),
     [
@@ -87,7 +83,10 @@ def test_a_failure_by_the_input_has_the_line_of_the_command_and_a_death_its_sign
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Python before 3.11 looks there first")
-def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(tmp_path: Path) -> None:
+def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "_PROGRAM", PROGRAM)
     (tmp_path / "recon").mkdir()
     for hidden in ("recon/__init__.py", "json.py"):
         (tmp_path / hidden).write_text("raise SystemExit('error: something else')")
@@ -95,7 +94,6 @@ def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(tmp_path: Path
     assert run_job(command, tmp_path).error.startswith("left.png: file does not exist")
 
 
-@usefixtures
 def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path: Path) -> None:
     outcome = run_job(job("a", "damaged"), tmp_path)
     assert (outcome.state, outcome.error, outcome.stale) == ("broken", "damaged", False)
@@ -107,7 +105,6 @@ def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path: Path) -> None:
     assert (outcome.state, "elsewhere" in outcome.error) == ("broken", True)
 
 
-@usefixtures
 def test_what_is_resumed_where_the_disk_is_full_goes_on_elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,7 +116,6 @@ def test_what_is_resumed_where_the_disk_is_full_goes_on_elsewhere(
     assert tries(tmp_path, "a") == ["begun", "resumed"]
 
 
-@usefixtures
 @pytest.mark.parametrize(
     ("timeout_s", "error"), [(1.0, "took more than 1 s"), (None, "was stopped")]
 )
@@ -133,7 +129,6 @@ def test_a_job_that_is_late_or_that_nobody_waits_for_is_killed(
     assert ended(int(begun.read_text()))
 
 
-@usefixtures
 def test_a_try_waits_for_an_earlier_one_that_still_runs(tmp_path: Path) -> None:
     lock = take_lock(lock_file(tmp_path / "a"), "", where=tmp_path, hint="")
     left_off = []
@@ -149,8 +144,10 @@ def test_a_try_waits_for_an_earlier_one_that_still_runs(tmp_path: Path) -> None:
     release.join()
 
 
-def test_a_command_without_a_result_folder_gets_one(tmp_path: Path) -> None:
-    """With the real program."""
+def test_a_command_without_a_result_folder_gets_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "_PROGRAM", PROGRAM)
     words = ("datasets", "list", "euroc", "--json")
     outcome = run_job(Job("a", "datasets list", "euroc", words, writes=False, folder="."), tmp_path)
     assert outcome.state == "succeeded", outcome.error
