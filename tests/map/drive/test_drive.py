@@ -137,7 +137,7 @@ def test_what_goes_wrong_is_raised_where_frames_are_added() -> None:
         raise MappingError("no")
 
     behind = MapBehind(Live(), fail)
-    with pytest.raises(MappingError, match="no"):  # in one or the other, as the thread is fast
+    with pytest.raises(MappingError, match="no"):  # noqa: PT012 - in one or the other
         behind.add(_waiting(0))
         behind.wait()
     with pytest.raises(MappingError, match="no"):
