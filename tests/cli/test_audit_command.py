@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +16,6 @@ from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from tests.rig.audit import faults
 from tests.sources import drives
-
-pytest.importorskip("rosbags", reason="extra ros")
-from tests.sources.bags import TOPICS, Recording, recorder, write_bag
 
 Drive = tuple[list[StereoPair], RectifiedCamera]
 FRAMES = 6
@@ -45,25 +41,17 @@ def spoiled(drive: Drive, **turn_deg: float) -> Drive:
     return list(faults.turned(source, **turn_deg)), camera
 
 
-def test_a_good_drive_is_announced_measured_and_found_good(good: Path) -> None:
-    done = recon("audit", good, "--verbose")
+def test_a_good_drive_is_announced_measured_and_found_good(good: Path, tmp_path: Path) -> None:
+    done = recon("audit", good, "--source", "kitti", "--verbose", "--out", tmp_path / "audited")
     assert done.exit_code == 0
     assert '"description": "KITTI odometry drive' in done.stderr
-    assert done.stdout.rstrip().endswith("verdict: good")
+    assert "verdict: good" in done.stdout
     for subject in ("frames", "rows", "brightness", "sharpness", "depth error", "54 cm"):
         assert subject in done.stdout
     assert "not known" not in done.stdout
-
-
-def test_a_report_shows_pairs_rows_and_frames(good: Path, tmp_path: Path) -> None:
-    done = recon("audit", good, "--out", tmp_path / "audited")
-    assert done.exit_code == 0
-    assert "verdict: good" in done.stdout
     page = (tmp_path / "audited" / "report.html").read_text()
     for words in ("Verdict: good", "Row errors", "Disparity", "Exposure, focus and rows"):
         assert words in page
-    assert "<link" not in page
-    assert "http-equiv" in page  # the policy that blocks whatever is not in the file
     summary = json.loads((tmp_path / "audited" / "summary.json").read_text())
     assert summary["verdict"] == "good"
 
@@ -77,8 +65,7 @@ def test_a_report_is_made_of_a_camera_that_shows_nothing(drive: Drive, tmp_path:
     assert "shows nothing" in (tmp_path / "audited" / "report.html").read_text()
 
 
-def test_the_kind_can_be_overridden(good: Path) -> None:
-    assert recon("audit", good, "--source", "kitti").exit_code == 0
+def test_a_layout_that_is_named_and_not_there_is_refused(good: Path) -> None:
     done = recon("audit", good, "--source", "euroc")
     assert done.exit_code == 1
     assert "cam0: folder of a camera is missing" in done.stderr
@@ -140,74 +127,3 @@ def test_images_of_another_size_are_refused_in_one_line(drive: Drive, tmp_path: 
     assert "images have another size than the calibration" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert done.stdout == ""
-
-
-def cut_off(path: Path) -> Path:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    return path
-
-
-def truncated_bag(drive: Drive, folder: Path) -> list[str | Path]:
-    return [cut_off(write_bag(*drive, folder, Recording("ros1")))]
-
-
-def missing_topic(drive: Drive, folder: Path) -> list[str | Path]:
-    bag = write_bag(*drive, folder, Recording("mcap"))
-    return [bag, "--left", "/front/image", "--right", TOPICS[1]]
-
-
-def stamps_out_of_order(drive: Drive, folder: Path) -> list[str | Path]:
-    with recorder(folder, Recording("ros2")) as bag:
-        for recorded, pair in enumerate([drive[0][1], drive[0][0], *drive[0][2:]]):
-            stamp = round(pair.timestamp_s * 1e9) + 10**18
-            for topic, image in zip(TOPICS, (pair.left, pair.right), strict=True):
-                bag.write(topic, recorded * 10**8, bag.image(stamp, image))
-    return [folder / "drive"]
-
-
-def unreadable_video(drive: Drive, folder: Path) -> list[str | Path]:
-    drives.write_lossy_videos(*drive, folder)
-    cut_off(folder / "left.mp4")
-    return [folder]
-
-
-def empty_folder(drive: Drive, folder: Path) -> list[str | Path]:
-    del drive
-    folder.mkdir(exist_ok=True)
-    return [folder]
-
-
-def mostly_without_partner(drive: Drive, folder: Path) -> list[str | Path]:
-    drives.write_folders(*drive, folder)
-    for number in range(1, 5):
-        (folder / "right" / f"right{number}.png").unlink()
-    return [folder]
-
-
-@pytest.mark.parametrize("command", ["audit", "map"])
-@pytest.mark.parametrize(
-    ("spoil", "told"),
-    [
-        (truncated_bag, "reindex"),
-        (missing_topic, "/front/image"),
-        (stamps_out_of_order, "out of order"),
-        (unreadable_video, "left.mp4"),
-        (empty_folder, "folder is empty"),
-        (mostly_without_partner, "6 left and 2 right"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_1(
-    drive: Drive,
-    tmp_path: Path,
-    spoil: Callable[[Drive, Path], list[str | Path]],
-    told: str,
-    command: str,
-) -> None:
-    place = ["--out", tmp_path / "out"] if command == "map" else []
-    done = recon(command, *spoil(drive, tmp_path / "in"), *place)
-    assert done.exit_code == 1
-    assert done.stdout == ""
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
-    assert told in done.stderr
-    assert not (tmp_path / "out").exists()

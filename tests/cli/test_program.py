@@ -34,22 +34,17 @@ def line(folder: Path = ROOT, /, **changes: Any) -> list[str]:
     return job.command_line(Path("out"))
 
 
-def test_a_command_line_has_what_the_job_says() -> None:
+def test_a_command_line_has_what_the_job_says_and_limits_are_needs_of_a_worker() -> None:
     changes = {"options": ["--no-mesh"], "set": ["matching.sad.window_px=9"]}
-    assert line(**changes, threads=2, memory="4G") == [
+    limits = {"threads": 2, "memory": "4G", "timeout_s": 5.0, "retries": 0}
+    (job,) = plan({**DRIVE, **changes, **limits})
+    assert job.command_line(Path("out")) == [
         "map", "drive", "--set", "matching.sad.window_px=9", "--threads", "2", "--memory-limit",
         "4G", "--no-mesh", "--json", "--verbose", "--out", "out",
     ]  # fmt: skip
-
-
-def test_limits_are_needs_of_a_worker() -> None:
-    (job,) = plan({**DRIVE, "threads": 2, "memory": "2G", "timeout_s": 5.0, "retries": 0})
     assert (job.timeout_s, job.retries) == (5.0, 0)
-    assert job.needs == {"threads": 2.0, "memory": 2e9}
-
-
-def test_an_option_that_a_command_does_not_have_is_left_out_of_the_limits() -> None:
-    sources = ["a.txt", "b.txt"]
+    assert job.needs == {"threads": 2.0, "memory": 4e9}
+    sources = ["a.txt", "b.txt"]  # of a command that has no such limits
     words = line(command="evaluate trajectory", source=sources, threads=1, memory="2G")
     assert words == ["evaluate", "trajectory", *sources, "--json", "--out", "out"]
 
@@ -60,15 +55,6 @@ SOURCES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_whole_command_line_of_a_job_is_one_of_the_program(command: str) -> None:
-    options = ["--map", "run"] if command == "localize" else []
-    words = line(command=command, source=["x"] * SOURCES.get(command, 1), options=options)
-    name = command.split()
-    assert words[: len(name)] == name
-    _command(command).make_context("recon", words[len(name) :])
-
-
 INPUTS = {
     "--poses", "--calib", "--config", "--map", "--georeference", "--truth", "--align-to", "--mask",
     "--confidence", "--results", "--times",
@@ -77,10 +63,17 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_no_option_that_names_an_output_is_one_of_a_job(command: str) -> None:
-    options = [one for one in _command(command).params if one.opts[0].startswith("--")]
-    kinds = {one.opts[0]: getattr(one, "type_descriptor", None) or one.type for one in options}
-    paths = {name for name, kind in kinds.items() if "path" in str(kind).lower()}
+def test_the_command_line_of_a_job_is_one_of_the_program_and_names_no_other_output(
+    command: str,
+) -> None:
+    options = ["--map", "run"] if command == "localize" else []
+    words = line(command=command, source=["x"] * SOURCES.get(command, 1), options=options)
+    name = command.split()
+    assert words[: len(name)] == name
+    _command(command).make_context("recon", words[len(name) :])
+    named = [one for one in _command(command).params if one.opts[0].startswith("--")]
+    kinds = {one.opts[0]: getattr(one, "type_descriptor", None) or one.type for one in named}
+    paths = {option for option, kind in kinds.items() if "path" in str(kind).lower()}
     assert "--config" in paths or "--out" in paths or command.startswith("evaluate")
     assert paths - INPUTS <= _NOT_OPTIONS
 
@@ -93,22 +86,16 @@ def test_the_folder_of_a_scene_is_a_pair_with_calibration_and_truth(tmp_path: Pa
         "pair", f"{tmp_path}/im0.png", f"{tmp_path}/im1.png", "--calib", f"{tmp_path}/calib.txt",
         "--truth", f"{tmp_path}/disp0GT.pfm",
     ]  # fmt: skip
-
-
-def test_a_scene_that_is_not_there_is_left_to_its_job(tmp_path: Path) -> None:
-    words = line(tmp_path, command="pair", source=["nowhere"])
+    words = line(tmp_path, command="pair", source=["nowhere"])  # its job says that it is not there
     assert words[:3] == ["pair", f"{tmp_path}/nowhere/im0.png", f"{tmp_path}/nowhere/im1.png"]
 
 
-def test_a_run_that_was_begun_is_resumed_with_its_limits(tmp_path: Path) -> None:
+def test_what_was_begun_is_resumed_with_its_limits(tmp_path: Path) -> None:
     (job,) = plan({**DRIVE, "threads": 3, "memory": "2G"})
     assert job.command_line(tmp_path, resume=True) == [
         "map", "--resume", str(tmp_path), "--threads", "3", "--memory-limit", "2G", "--json",
         "--verbose",
     ]  # fmt: skip
-
-
-def test_a_piece_that_was_begun_is_told_again_what_it_is_of(tmp_path: Path) -> None:
     job = piece_job(tmp_path / "pieces.json", 3, Piece(80, 140, 20), 2)
     words = ["piece", str(tmp_path / "pieces.json"), "3", "--threads", "2", "--json", "--verbose"]
     assert job.command_line(tmp_path / "3") == [*words, "--out", str(tmp_path / "3")]
@@ -144,70 +131,47 @@ def test_a_wrong_value_of_a_sweep_is_refused() -> None:
         plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"command": "mapp"}, "job a: unknown command .*got mapp"),
-        ({"command": "batch"}, "unknown command"),
-        ({"command": "rm -rf /"}, "unknown command"),
-        ({"command": "map drive2"}, "unknown command"),
-        ({"command": ""}, "unknown command"),
-        ({"source": []}, "job a: job has no source"),
-        ({"name": "../a"}, "not a name of a folder"),
-        ({"set": ["matching.window_px=9"]}, "job a: .*matching.sad.window_px"),
-        ({"options": ["--no-such"]}, "job a: No such option.*no-such"),
-        ({"options": ["another"]}, "unexpected extra argument"),
-        ({"source": ["a", "b"]}, "unexpected extra argument"),
-        ({"command": "evaluate trajectory"}, "Missing argument"),
-        ({"memory": "much"}, "cannot read this size"),
-        (
-            {
-                "command": "evaluate disparity",
-                "source": ["a", "b"],
-                "set": ["matching.sad.window_px=9"],
-            },
-            "job a: command has no settings .*evaluate disparity",
-        ),
-    ],
-)
+TWO = {"command": "evaluate disparity", "source": ["a", "b"]}
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"command": "batch"}, "job a: unknown command .*got batch"),
+    ({"command": "map drive2"}, "unknown command"),
+    ({"command": ""}, "unknown command"),
+    ({"source": []}, "job a: job has no source"),
+    ({"source": ["x", "--mend=/abs"]}, "source is an option"),
+    ({"name": "../a"}, "not a name of a folder"),
+    ({"set": ["matching.window_px=9"]}, "job a: .*matching.sad.window_px"),
+    ({"options": ["--no-such"]}, "job a: No such option.*no-such"),
+    ({"options": ["another"]}, "unexpected extra argument"),
+    ({"command": "evaluate trajectory"}, "Missing argument"),
+    ({"memory": "much"}, "cannot read this size"),
+    ({**TWO, "set": ["matching.sad.window_px=9"]}, "job a: command has no settings"),
+    *(
+        ({"options": options.split()}, "job a: a job cannot have this option")
+        for options in (
+            "--", "--help", "-q", "-o/abs", "-vo/abs", "--out=/abs", "--resume x", "--into run",
+            "--into run --remove 0", "--json",
+        )
+    ),
+    *(
+        ({"command": command, "options": [option]}, "a job cannot have this option")
+        for command, option in (
+            ("audit", "--mend=/abs.yaml"), ("evaluate occupancy", "--picture=/abs.png"),
+            ("evaluate middlebury", "--latex"),
+        )
+    ),
+    *(
+        ({"options": options.split()}, "job a: a setting among the options")
+        for options in ("--set a=b", "--set=a=b", "-sa=b", "-s a=b")
+    ),
+]  # fmt: skip
+"""Jobs that are none, write elsewhere than into their folder, or have settings among options."""
+
+
+@pytest.mark.parametrize(("changes", "words"), REFUSED)
 def test_jobs_that_are_none_are_one_line(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(SettingsError, match=words) as told:
         line(**changes)
     assert "\n" not in str(told.value)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--"], ["--help"], ["-q"], ["-o/abs"], ["-vo/abs"], ["--out", "/abs"], ["--out=/abs"],
-        ["--resume", "x"], ["--into", "run"], ["--into", "run", "--remove", "0"], ["--json"],
-    ],
-)  # fmt: skip
-def test_a_job_writes_into_its_own_folder_alone(options: list[str]) -> None:
-    with pytest.raises(SettingsError, match="job a: a job cannot have this option"):
-        line(options=options)
-
-
-@pytest.mark.parametrize(
-    ("command", "options"),
-    [
-        ("audit", ["--mend", "/abs.yaml"]),
-        ("audit", ["--mend=/abs.yaml"]),
-        ("evaluate occupancy", ["--picture=/abs.png"]),
-        ("evaluate middlebury", ["--latex"]),
-    ],
-)
-def test_no_other_file_is_written_by_a_job(command: str, options: list[str]) -> None:
-    with pytest.raises(SettingsError, match="a job cannot have this option"):
-        line(command=command, options=options)
-    with pytest.raises(SettingsError, match="source is an option"):
-        line(command=command, source=["x", *options])
-
-
-@pytest.mark.parametrize("options", [["--set", "a=b"], ["--set=a=b"], ["-sa=b"], ["-s", "a=b"]])
-def test_settings_among_the_options_are_refused(options: list[str]) -> None:
-    with pytest.raises(SettingsError, match="job a: a setting among the options"):
-        line(options=options)
 
 
 def test_no_help_loses_words_in_brackets_to_the_markup() -> None:

@@ -1,3 +1,5 @@
+"""What is shown of a run: a bar on a terminal, JSON lines for programs, a line per source."""
+
 from __future__ import annotations
 
 import io
@@ -17,7 +19,7 @@ from recon.map.localize.sequence import LocalizedFrame
 from recon.odometry.protocol import OdometryHealth
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult
-from recon.run.progress import SILENT, Progress, Silent, Step
+from recon.run.progress import Progress, Silent, Step
 from recon.sources.datasets import _Megabyte
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
@@ -48,27 +50,15 @@ def lines(stream: io.StringIO) -> list[dict[str, Any]]:
     return [json.loads(line) for line in stream.getvalue().splitlines()]
 
 
-def test_each_viewer_takes_the_progress_of_a_run() -> None:
-    viewers = (SILENT, JsonLines(io.StringIO()), ProgressBar(Console(file=io.StringIO())))
-    assert all(isinstance(viewer, Progress) for viewer in viewers)
-
-
-def test_every_event_is_one_json_line() -> None:
+def test_every_event_is_one_json_line_with_null_for_nan() -> None:
     stream = io.StringIO()
     run(JsonLines(stream))
-    events = [line["event"] for line in lines(stream)]
-    assert events == ["start", "frame", "frame", "frame", "finish", "stage"]
-
-
-def test_json_lines_tell_the_frame_and_have_null_for_nan() -> None:
-    stream = io.StringIO()
     JsonLines(stream).on_step(frame(1, ok=False, valid_share=float("nan")))
-    (told,) = lines(stream)
-    assert told["index"] == 1
-    assert told["measured"] is False
-    assert told["valid_share"] is None
-    assert told["position_m"] == [0.0, 0.0, 0.0]
-    assert told["notes"] == ["a [bold] note"]
+    *events, last = lines(stream)
+    names = [event["event"] for event in events]
+    assert names == ["start", "frame", "frame", "frame", "finish", "stage"]
+    assert (last["index"], last["measured"], last["valid_share"]) == (1, False, None)
+    assert (last["position_m"], last["notes"]) == ([0.0, 0.0, 0.0], ["a [bold] note"])
 
 
 def test_bar_shows_frames_rate_and_lost_poses() -> None:
@@ -105,21 +95,13 @@ def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose(
     assert err
 
 
-def run_scenes(viewer: Progress) -> None:
-    viewer.on_start("trainingQ [1]", 2, "scenes")
-    viewer.on_step(SceneDone("Piano", {"sad": {"seconds": 0.25}}, 0.5))
-    viewer.on_step(SceneDone("Pipes", None, 0.5))
-    viewer.on_finish()
-
-
 def test_lines_of_scenes_have_the_seconds_of_each_matcher() -> None:
     stream = io.StringIO()
-    run_scenes(JsonLines(stream))
-    events = lines(stream)
-    assert [event["event"] for event in events] == ["start", "scene", "scene", "finish"]
-    assert events[0]["scenes"] == 2
-    assert events[1] == {"event": "scene", "name": "Piano", "seconds": {"sad": 0.25}}
-    assert events[2]["seconds"] == {}
+    JsonLines(stream).on_step(SceneDone("Piano", {"sad": {"seconds": 0.25}}, 0.5))
+    JsonLines(stream).on_step(SceneDone("Pipes", None, 0.5))
+    first, second = lines(stream)
+    assert first == {"event": "scene", "name": "Piano", "seconds": {"sad": 0.25}}
+    assert second["seconds"] == {}
 
 
 def located(state: State) -> LocalizedFrame:
@@ -179,34 +161,18 @@ def test_frames_that_are_searched_are_not_called_untrusted() -> None:
 SOURCE = SyntheticSource(StreetSettings(frames=3, width_px=64, height_px=32, focal_px=36.0))
 
 
-@pytest.mark.parametrize("stream", [Terminal(), io.StringIO()])
-def test_nothing_is_said_where_quiet(stream: io.StringIO) -> None:
-    announce(SOURCE, quiet=True, stream=stream)
-    warn(["too dark"], quiet=True, stream=stream)
-    assert stream.getvalue() == ""
+def said(stream: io.StringIO, **how: bool) -> list[str]:
+    announce(SOURCE, stream=stream, **how)
+    warn(["zu dunkel für alles", "too late"], stream=stream, **how)
+    return stream.getvalue().splitlines()
 
 
-def test_a_terminal_gets_text() -> None:
-    stream = Terminal()
-    announce(SOURCE, stream=stream)
-    warn(["too dark", "too late"], stream=stream)
-    first, *rest = stream.getvalue().splitlines()
+def test_a_source_is_a_line_on_a_terminal_and_json_elsewhere_if_verbose() -> None:
+    first, *rest = said(Terminal())
     assert first == f"{SOURCE.name}: {SOURCE.description}, 3 pairs"
-    assert rest == ["warning: too dark", "warning: too late"]
-
-
-def test_anything_else_gets_one_json_object_a_line_if_verbose() -> None:
-    stream = io.StringIO()
-    announce(SOURCE, verbose=True, stream=stream)
-    warn(["zu dunkel für alles"], verbose=True, stream=stream)
-    source, warning = (json.loads(line) for line in stream.getvalue().splitlines())
+    assert rest == ["warning: zu dunkel für alles", "warning: too late"]
+    source, warning, _ = map(json.loads, said(io.StringIO(), verbose=True))
     assert (source["event"], source["frames"]) == ("source", 3)
     assert source["description"] == SOURCE.description
     assert warning == {"event": "warning", "text": "zu dunkel für alles"}
-
-
-def test_anything_else_gets_nothing_unless_verbose() -> None:
-    stream = io.StringIO()
-    announce(SOURCE, stream=stream)
-    warn(["too dark"], stream=stream)
-    assert stream.getvalue() == ""
+    assert said(io.StringIO()) == said(Terminal(), quiet=True) == []
