@@ -1,7 +1,8 @@
-"""Settings come from defaults, file and overrides, in that order; unknown ones are errors."""
+"""What a run is asked for: settings from defaults, file and overrides; and what resuming keeps."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,12 @@ import yaml
 
 import recon
 from recon.commands.config import GROUPS, PAIR_DEFAULTS, ReconConfig, load_config
-from recon.core.errors import FormatError, SettingsError
+from recon.commands.map_options import MapOptions
+from recon.core.errors import FormatError, OutputError, SettingsError
 from recon.io.fields import write_yaml
-from recon.run.run import Run
+from recon.map.map import Map
+from recon.map.store.session import SessionInfo
+from recon.run.directory import STARTED, state_folder
 
 
 @pytest.mark.parametrize(
@@ -50,25 +54,14 @@ def test_the_groups_of_every_command_are_settings(command: str) -> None:
     assert {*GROUPS[command]} <= {*ReconConfig.model_fields}
 
 
-def test_overrides_win_over_the_file_and_the_file_over_defaults(tmp_path: Path) -> None:
+def test_what_comes_later_wins_and_only_for_its_key(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("mesh: {max_depth: 8}\nmatching: {sad: {window_px: 7}}\n")
-    config = load_config(tmp_path / "c.yaml", ["matching.sad.window_px=9"], PAIR_DEFAULTS)
+    changes = ["matching.sad.window_px=9", "fusion.min_count=2", "fusion.min_count=5"]
+    config = load_config(f"{tmp_path}/c.yaml", [*changes, "fusion.voxel_m=0.2"], PAIR_DEFAULTS)
     assert config.matching.sad.window_px == 9
+    assert (config.fusion.min_count, config.fusion.voxel_m) == (5, 0.2)
     assert config.mesh.max_depth == 8
     assert config.cloud.max_range_m is None
-
-
-def test_the_last_override_of_a_key_wins() -> None:
-    config = load_config(overrides=["fusion.min_count=2", "fusion.min_count=5"])
-    assert config.fusion.min_count == 5
-
-
-def test_overrides_of_two_keys_of_one_stage_both_count() -> None:
-    config = load_config(overrides=["fusion.min_count=2", "fusion.voxel_m=0.2"])
-    assert (config.fusion.min_count, config.fusion.voxel_m) == (2, 0.2)
-
-
-def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("")
     assert load_config(tmp_path / "c.yaml") == ReconConfig()
 
@@ -89,6 +82,9 @@ def test_a_wrong_file_is_refused_by_name(tmp_path: Path, text: str, message: str
         load_config(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+    path.unlink()
+    with pytest.raises(SettingsError, match=r"c\.yaml: file does not exist"):
+        load_config(path)
 
 
 def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path: Path) -> None:
@@ -96,11 +92,6 @@ def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"^setting 'matching\.sad\.window_px': ") as refused:
         load_config(tmp_path / "good.yaml", ["matching.sad.window_px=8"])
     assert "good.yaml" not in str(refused.value)
-
-
-def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"none\.yaml: file does not exist"):
-        load_config(tmp_path / "none.yaml")
 
 
 @pytest.mark.parametrize("text", ["fusion.voxel_m", "=3", "fusion.voxel_m=[1"])
@@ -117,17 +108,6 @@ def test_a_map_is_made_and_opened_by_its_name(tmp_path: Path) -> None:
             assert map_.sessions == []
 
 
-def test_settings_are_read_by_the_name_of_their_file(tmp_path: Path) -> None:
-    (tmp_path / "robot.yaml").write_text("grid: {max_height_m: 3}")
-    assert recon.load_config(f"{tmp_path}/robot.yaml").grid.max_height_m == 3
-
-
-def test_a_run_writes_to_a_folder_by_its_name(tmp_path: Path) -> None:
-    with Run("pair", f"{tmp_path}/out") as run:
-        run.path("a.txt").write_text("a")
-    assert (tmp_path / "out/a.txt").is_file()
-
-
 def test_a_folder_that_is_no_run_is_named_whatever_the_type(tmp_path: Path) -> None:
     for make in (recon.run_export, recon.run_occupancy):
         for folder in (tmp_path, str(tmp_path)):
@@ -136,3 +116,85 @@ def test_a_folder_that_is_no_run_is_named_whatever_the_type(tmp_path: Path) -> N
     source = recon.SyntheticSource()
     with pytest.raises(FormatError, match=r"folder has no map \(expected a map/map\.recon"):
         recon.run_localize(source, str(tmp_path), options=recon.MapOptions(out=f"{tmp_path}/out"))
+
+
+Begin = Callable[..., Path]
+RAN = load_config(None, ["fusion.voxel_m=0.2", "memory.limit_mb=900"])
+
+
+@pytest.fixture
+def begin(tmp_path: Path) -> Begin:
+    """Begin a run: its folder, with an unfinished map that keeps what it was asked for."""
+
+    def begun(config: dict[str, Any] | None = None, **asked: Any) -> Path:
+        options = MapOptions(source=tmp_path / "drive", kind="kitti", **asked)
+        identity = {"config": RAN.model_dump(mode="json") if config is None else config}
+        start = {"identity": identity, "arguments": options.arguments}
+        path = state_folder(tmp_path / "run") / STARTED
+        path.parent.mkdir(parents=True)
+        with Map.create(path) as map_:
+            map_.begin(SessionInfo("drive", "a drive", 3, {}, {}, start))
+            map_.commit()
+        return tmp_path / "run"
+
+    return begun
+
+
+def test_what_is_left_open_is_as_the_run_was_asked_for(begin: Begin, tmp_path: Path) -> None:
+    (tmp_path / "prior.txt").touch()
+    run = begin(poses_file=tmp_path / "p.txt", prior_from=str(tmp_path / "prior.txt"), mesh=False)
+    options, settings = MapOptions(threads=2).resumed(run, None, [])
+    assert settings == RAN
+    assert (options.resume, options.out, options.threads) == (True, run, 2)
+    assert (options.source, options.kind) == (str(tmp_path / "drive"), "kitti")
+    assert (options.poses_file, options.mesh) == (str(tmp_path / "p.txt"), False)
+    assert options.prior_from == str(tmp_path / "prior.txt")
+    other, _ = MapOptions(source="moved", kind="tum", prior_from="/odom").resumed(run, None, [])
+    assert (other.source, other.kind, other.prior_from) == ("moved", "tum", "/odom")
+
+
+def test_settings_must_be_those_of_the_run_but_for_the_memory(begin: Begin) -> None:
+    run = begin()
+    for same in ([], ["fusion.voxel_m=0.2"], [{"fusion.voxel_m": 0.2}]):
+        assert MapOptions().resumed(run, None, same)[1] == RAN
+    _, settings = MapOptions().resumed(run, None, [{"memory.limit_mb": 700}])
+    assert settings.memory.limit_mb == 700
+    assert settings.fusion.voxel_m == 0.2
+    with pytest.raises(SettingsError, match=r"other settings.*voxel_m = 0.1, expected 0.2"):
+        MapOptions().resumed(run, None, ["fusion.voxel_m=0.1"])
+    with pytest.raises(SettingsError, match="started with a mesh"):
+        MapOptions(mesh=False).resumed(run, None, [])
+
+
+def test_a_run_of_an_earlier_version_has_settings_that_are_fixed_now(begin: Begin) -> None:
+    run = begin({"grid": {"free_height_m": 0.8, "max_height_m": 3.0}, "audit": {"frames": 300}})
+    _, settings = MapOptions().resumed(run, None, [])
+    assert settings == load_config(None, ["grid.max_height_m=3"])
+
+
+@pytest.mark.parametrize("config", [{"grid": {"free_height_m": 0.5}}, {"no": 1}])
+def test_settings_that_there_are_not_are_refused_by_the_name_of_the_run(
+    begin: Begin, config: dict[str, Any]
+) -> None:
+    run = begin(config)
+    with pytest.raises(SettingsError, match=str(run)):
+        MapOptions().resumed(run, None, [])
+
+
+def test_where_nothing_can_be_resumed_it_is_said_why(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"no unfinished run.*start it without --resume"):
+        MapOptions().resumed(tmp_path, None, [])
+    (tmp_path / "run.json").touch()
+    with pytest.raises(OutputError, match="it is finished"):
+        MapOptions().resumed(tmp_path, None, [])
+    path = state_folder(tmp_path) / STARTED
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"no map")
+    with pytest.raises(FormatError, match="cannot be read"):
+        MapOptions().resumed(tmp_path, None, [])
+
+
+def test_without_a_source_there_is_nothing_to_open_and_nothing_to_keep() -> None:
+    assert MapOptions().arguments == {}
+    with pytest.raises(SettingsError, match="name SOURCE"):
+        MapOptions().open(ReconConfig())

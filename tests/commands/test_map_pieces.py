@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from recon.commands.config import ReconConfig, load_config
+from recon.commands.config import load_config
 from recon.commands.map_pieces import LEAD, Piece, cut_drive
 from recon.map.drive.drive import Workspace, session_info
 from recon.map.drive.drive_odometry import odometry_of
@@ -16,7 +16,7 @@ from recon.map.map import Map
 from recon.map.sessions.copying import join_parts
 from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
-from tests.scenery.film import Film, film
+from tests.scenery.film import film
 
 STREET = StreetScene(
     frames=26, width_px=256, height_px=96, focal_px=150.0, seed=5, smooth_edges=False
@@ -36,23 +36,12 @@ def test_pieces_have_every_frame_once_behind_their_leads(frames: int, workers: i
 
 
 @pytest.fixture(scope="module")
-def source() -> Film:
-    return film(STREET)
+def mapped() -> tuple[MappedSequence, MappedSequence]:
+    """The drive mapped whole, and in pieces that are joined."""
+    source = film(STREET)
+    config = load_config(None, ["submaps.length_m=4", "submaps.tile_m=12.8"])
 
-
-@pytest.fixture(scope="module")
-def config() -> ReconConfig:
-    return load_config(None, ["submaps.length_m=4", "submaps.tile_m=12.8"])
-
-
-@pytest.fixture(scope="module")
-def whole(source: Film, config: ReconConfig) -> MappedSequence:
-    return map_sequence(source, config, workspace=Workspace(threads=1))
-
-
-@pytest.fixture(scope="module")
-def joined(source: Film, config: ReconConfig) -> MappedSequence:
-    def mapped() -> Iterator[tuple[Map, int]]:
+    def parts() -> Iterator[tuple[Map, int]]:
         for piece in PIECES:
             part = Workspace(threads=1)
             map_sequence(SourcePart(source, *piece), config, workspace=part)
@@ -60,15 +49,17 @@ def joined(source: Film, config: ReconConfig) -> MappedSequence:
 
     work = Workspace(threads=1)
     session = work.map.begin(session_info(source, config))
-    join_parts(work.map, mapped(), config)
+    join_parts(work.map, parts(), config)
     odometry = odometry_of(config, source, None, None, None).state()
     session.set_state({"mapper": {"odometry": odometry, "builder": None}, "seconds": 1.0})
-    return map_sequence(source, config, workspace=work)
+    whole = map_sequence(source, config, workspace=Workspace(threads=1))
+    return whole, map_sequence(source, config, workspace=work)
 
 
 def test_the_path_has_every_frame_once_and_is_that_of_one_run(
-    whole: MappedSequence, joined: MappedSequence
+    mapped: tuple[MappedSequence, MappedSequence],
 ) -> None:
+    whole, joined = mapped
     np.testing.assert_array_equal(joined.trajectory.timestamps_s, whole.trajectory.timestamps_s)
     assert joined.session.submaps.frames == len(joined.health) == STREET.frames
     # The first piece is the drive itself; behind it only the odometry has begun elsewhere.
@@ -77,15 +68,13 @@ def test_the_path_has_every_frame_once_and_is_that_of_one_run(
     apart_m = np.linalg.norm(joined.path_m - whole.path_m, axis=1)
     assert 0 < apart_m.max() < 0.01 * whole.trajectory.path_length_m
     np.testing.assert_array_equal(joined.T_map_world, whole.T_map_world)
+    assert joined.loops.keyframes >= STREET.frames // 2
 
 
-def test_the_map_is_about_that_of_one_run(whole: MappedSequence, joined: MappedSequence) -> None:
+def test_the_map_is_about_that_of_one_run(mapped: tuple[MappedSequence, MappedSequence]) -> None:
+    whole, joined = mapped
     # Voxels that are turned into others share some of these: fewer points for the same surface.
     assert 0.8 < len(joined.cloud) / len(whole.cloud) < 1.05
     assert len(joined.voxels) == pytest.approx(len(whole.voxels), rel=0.05)
     assert joined.camera == whole.camera
     assert joined.sample.pair.timestamp_s == whole.sample.pair.timestamp_s
-
-
-def test_keyframes_lie_on_the_path_of_the_drive(joined: MappedSequence) -> None:
-    assert joined.loops.keyframes >= STREET.frames // 2

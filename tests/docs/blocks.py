@@ -20,18 +20,11 @@ _ENDS_OF_COMMANDS = {"&&", "||", ";", "|", "&"}
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block.
+    """A fenced block."""
 
-    Attributes:
-        page: Path of the page, from the root of the project.
-        line: Line of its opening fence, from 1.
-        language: What follows the fence.
-        text: What is in it.
-    """
-
-    page: str
-    line: int
-    language: str
+    page: str  # path of the page, from the root of the project
+    line: int  # line of its opening fence, from 1
+    language: str  # what follows the fence
     text: str
 
     def __str__(self) -> str:

@@ -7,7 +7,6 @@ and the function that writes it.
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,13 +18,13 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import invert, make_transform
-from recon.core.values import PointCloud
+from recon.core.values import PointCloud, Trajectory
 from recon.core.values.board import parse_board
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
 from recon.io.models.ply import write_ply
-from recon.io.trajectory import write_tum
+from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.docs.blocks import ROOT
@@ -60,6 +59,13 @@ def drive(folder: Path) -> None:
     write_kitti(street(), folder)
 
 
+def true_path() -> Trajectory:
+    truth = street().truth
+    assert truth is not None
+    assert truth.trajectory is not None
+    return truth.trajectory
+
+
 def lidar(path: Path) -> None:
     """The true surface of the street."""
     truth = street().truth
@@ -69,10 +75,7 @@ def lidar(path: Path) -> None:
 
 
 def poses(path: Path) -> None:
-    folder = path.parent / ".drive"
-    write_kitti(street(), folder, grey=False)
-    shutil.copyfile(folder / "poses.txt", path)
-    shutil.rmtree(folder)
+    write_kitti_poses(path, true_path())
 
 
 def drive_with_truth(folder: Path) -> None:
@@ -109,13 +112,9 @@ def bag(path: Path) -> None:
 
 def body_path(frames: int) -> np.ndarray:
     """T_odom_base of the street's camera in body axes (x forward, y left, z up)."""
-    truth = street().truth
-    assert truth is not None
-    assert truth.trajectory is not None
     T_base_camera = np.eye(4)
     T_base_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    poses = truth.trajectory.T_world_camera[:frames]
-    return T_base_camera @ poses @ invert(T_base_camera)
+    return T_base_camera @ true_path().T_world_camera[:frames] @ invert(T_base_camera)
 
 
 def recording(folder: Path) -> None:
@@ -130,11 +129,8 @@ def recording(folder: Path) -> None:
 
 def path_of_truth(path: Path) -> None:
     """On the clock of the bag."""
-    truth = street().truth
-    assert truth is not None
-    assert truth.trajectory is not None
-    path_s = truth.trajectory.timestamps_s + drives.EPOCH_S
-    write_tum(path, replace(truth.trajectory, timestamps_s=path_s))
+    times_s = true_path().timestamps_s + drives.EPOCH_S
+    write_tum(path, replace(true_path(), timestamps_s=times_s))
 
 
 def survey(path: Path) -> None:
@@ -232,17 +228,11 @@ def job_file(path: Path) -> None:
 
 @dataclass(frozen=True)
 class StandIn:
-    """A file or folder that a page needs.
+    """A file or folder that a page needs."""
 
-    Attributes:
-        mention: What is in the text of a page that needs it.
-        write: Writes it.
-        path: Where, from the folder in which blocks run, or ``~`` for the home folder; None = as
-            mentioned.
-    """
-
-    mention: str
+    mention: str  # what is in the text of a page that needs it
     write: Callable[[Path], None]
+    #: Where, from the folder in which blocks run or from ``~``; None = as mentioned.
     path: str | None = None
 
     def place(self, folder: Path, home: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +46,8 @@ def test_the_file_of_each_lens_model_is_what_recon_writes(tmp_path: Path, model:
 
 
 def test_without_lens_distortion_the_coefficients_may_be_left_out(tmp_path: Path) -> None:
-    lines = [
-        "  distortion: {}" if line.startswith("  distortion:") else line
-        for line in FILES[1].splitlines()
-    ]
-    (tmp_path / "rig.yaml").write_text("\n".join(lines))
+    text = re.sub(r"^  distortion:.*$", "  distortion: {}", FILES[1], flags=re.MULTILINE)
+    (tmp_path / "rig.yaml").write_text(text)
     rig = read_calibration(tmp_path / "rig.yaml", 1280, 720)
     assert isinstance(rig, StereoCalibration)
     np.testing.assert_array_equal(rig.left.distortion, [])

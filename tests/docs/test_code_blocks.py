@@ -30,7 +30,7 @@ NOT_RUN = {
     r"recon datasets (fetch|verify)": "needs a network; tests/commands/test_datasets.py has one",
     r"python benchmarks/": "measures on a machine that does nothing else",
     r"dask |for host in |sbatch |kubectl |recon (batch|map) .* --scheduler": "needs a cluster",
-    r"recon capture 0 2": "needs two cameras; tests/commands/test_capture.py records from videos",
+    r"recon capture 0 2": "needs two cameras; tests/commands/test_cameras.py records from videos",
     r"recon live (0|/dev/)": "needs cameras; tests/flow/test_live.py plays videos as such",
 }
 """Beginnings of shell lines that are checked but not run, and why."""

@@ -7,6 +7,7 @@ import json
 import re
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,13 @@ def results(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("results")
 
 
+def measure(results: ModuleType, *names: str) -> Any:
+    """Measure some tables; the exit code."""
+    with pytest.raises(SystemExit) as end:
+        results.main(["--only", *names])
+    return end.value.code
+
+
 @pytest.fixture
 def elsewhere(results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A page and the file of results in a folder of their own."""
@@ -46,23 +54,14 @@ def test_the_tables_of_the_pages_are_those_that_were_measured(results: ModuleTyp
     assert results.outdated() == []
 
 
-def test_every_place_for_a_table_names_one_and_every_table_has_a_place(results: ModuleType) -> None:
-    places = [
-        place[2] for page in results.PAGES for place in results.PLACE.finditer(page.read_text())
-    ]
-    begun = [
-        name
-        for page in results.PAGES
-        for name in re.findall("<!-- table: (.*) -->", page.read_text())
-    ]
-
-    assert sorted(places) == sorted(begun) == sorted(results.TABLES)
-
-
-def test_no_page_of_results_has_a_table_of_figures_that_was_typed(results: ModuleType) -> None:
+def test_every_table_has_one_place_and_no_figures_are_typed_elsewhere(results: ModuleType) -> None:
     """Figures stand behind the first column: `| 12.3 % |`."""
-    for page in results.PAGES:
-        typed = results.PLACE.sub("", page.read_text())
+    pages = [page.read_text() for page in results.PAGES]
+    places = [place[2] for text in pages for place in results.PLACE.finditer(text)]
+    begun = [name for text in pages for name in re.findall("<!-- table: (.*) -->", text)]
+    assert sorted(places) == sorted(begun) == sorted(results.TABLES)
+    for text in pages:
+        typed = results.PLACE.sub("", text)
         assert re.findall(r"^\|[^|\n]*\|.*?\d[.\d]* (?:%|m|ms|MB)\b.*$", typed, re.MULTILINE) == []
 
 
@@ -79,11 +78,8 @@ def test_what_was_measured_says_of_which_commit_and_machine_it_is(results: Modul
 def test_a_table_says_of_which_commit_and_machine_it_is(
     results: ModuleType, elsewhere: Path
 ) -> None:
-    with pytest.raises(SystemExit) as end:
-        results.main(["--only", "movers"])
-
+    assert measure(results, "movers") == 0
     origin = "commit 0123abc, 2026-01-02, a processor, 2 cores, load 3.5 at the start"
-    assert end.value.code == 0
     assert elsewhere.read_text().splitlines() == [
         "before",
         "<!-- table: movers -->",
@@ -103,9 +99,7 @@ def test_a_table_says_of_which_commit_and_machine_it_is(
 def test_what_is_not_measured_again_stays(results: ModuleType, elsewhere: Path) -> None:
     earlier = {"movers": {**RECORD, "commit": "fedcba9"}}
     results.FILE.write_text(json.dumps(earlier))
-    with pytest.raises(SystemExit):
-        results.main(["--only", "occupancy"])
-
+    measure(results, "occupancy")
     assert json.loads(results.FILE.read_text()) == {**earlier, "occupancy": RECORD}
 
 
@@ -116,10 +110,7 @@ def test_a_table_without_its_data_is_skipped_and_says_why(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.delenv("RECON_DATA", raising=False)
-    with pytest.raises(SystemExit) as end:
-        results.main(["--only", "kitti-d", "middlebury"])
-
-    assert end.value.code == 0
+    assert measure(results, "kitti-d", "middlebury") == 0
     assert capsys.readouterr().out.splitlines() == [
         "kitti-drift: skipped, RECON_DATA is not set",
         "middlebury: skipped, RECON_DATA is not set",
@@ -135,8 +126,5 @@ def test_a_table_that_fails_keeps_what_it_has(
 
     results.FILE.write_text(json.dumps({"movers": RECORD}))
     monkeypatch.setattr(results, "measured", fail)
-    with pytest.raises(SystemExit) as end:
-        results.main(["--only", "movers"])
-
-    assert end.value.code == 1
+    assert measure(results, "movers") == 1
     assert results.read() == {"movers": RECORD}

@@ -26,7 +26,7 @@ from recon.sources import live
 from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings
 from recon.sources.source import DerivedSource, StereoSource
-from tests.commands.test_capture import FakeCamera
+from tests.commands.test_cameras import FakeCamera
 from tests.flow.runs import summary_of
 from tests.hostile.refusals import assert_refused, run
 from tests.scenery.film import Film

@@ -1,4 +1,4 @@
-"""Pairs without a calibration file: what their camera is taken from is said."""
+"""Pairs from Python and from files: any matcher, any calibration, or none."""
 
 from __future__ import annotations
 
@@ -9,15 +9,92 @@ import cv2
 import numpy as np
 import pytest
 
+import recon
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.pair import run_pair
-from recon.core.errors import CalibrationError, ReconError
+from recon.core.errors import CalibrationError, FormatError, ReconError, SettingsError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.images.image import write_image
 from recon.sources.one_pair import PairInput, read_pair_input
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from tests.sources.test_drives import ALL
+
+Noise = tuple[np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def noise() -> Noise:
+    """Noise, six pixels further left in the right image."""
+    world = np.random.default_rng(8).integers(0, 256, (50, 130), dtype=np.uint8)
+    world = cv2.GaussianBlur(world, (3, 3), 0)
+    return world[:, :120], world[:, 6:126]
+
+
+@pytest.mark.parametrize("matcher", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
+def test_every_matcher_finds_the_shift(noise: Noise, matcher: str) -> None:
+    disparity = recon.match(*noise, matcher=matcher, ndisp=16)
+    # All fit parts of a pixel; a quarter is more than the bias of any of them.
+    assert np.nanmedian(disparity.values) == pytest.approx(6, abs=0.25)
+    # OpenCV as it comes leaves out the range at the left and half a window at each other side.
+    assert disparity.valid[4:-4, 20:-4].mean() > 0.8
+
+
+def test_settings_are_those_of_the_matcher_that_is_named(
+    noise: Noise,
+) -> None:
+    assert recon.match(*noise, matcher="opencv-bm", block_px=15).values.shape == (50, 120)
+    with pytest.raises(SettingsError, match="block_px"):
+        recon.match(*noise, block_px=15)
+    with pytest.raises(SettingsError, match="unknown matcher"):
+        recon.match(*noise, matcher="nonsense")
+
+
+CALIBRATIONS = {
+    "kitti": "P0: 100 0 60 0 0 100 25 0 0 0 1 0\nP1: 100 0 60 -50 0 100 25 0 0 0 1 0\n",
+    "middlebury": "cam0=[100 0 60; 0 100 25; 0 0 1]\ncam1=[100 0 60; 0 100 25; 0 0 1]\n"
+    "doffs=0\nbaseline=500\nwidth=120\nheight=50\nndisp=16\n",
+    "opencv": "%YAML:1.0\n---\n"
+    + "".join(
+        f"M{n}: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [ 100., 0., 60., 0., 100., 25., 0., 0., 1. ]\n"
+        for n in (1, 2)
+    )
+    + "R: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+    "   data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]\n"
+    "T: !!opencv-matrix\n   rows: 3\n   cols: 1\n   dt: d\n   data: [ -0.5, 0., 0. ]\n",
+    "kalibr": "".join(
+        f"cam{n}:\n{apart}  camera_model: pinhole\n  intrinsics: [100, 100, 60, 25]\n"
+        "  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n  resolution: [120, 50]\n"
+        for n, apart in (
+            (0, ""),
+            (1, "  T_cn_cnm1: [[1, 0, 0, -0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"),
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", CALIBRATIONS)
+def test_a_calibration_file_of_any_format_gives_metres(
+    noise: Noise, tmp_path: Path, kind: str
+) -> None:
+    path = tmp_path / "calib.txt"
+    path.write_text(CALIBRATIONS[kind])
+    frame = recon.reconstruct(*noise, path)
+    # f·b / d = 100 · 0.5 / 6; a quarter of a pixel off, as above, is 4 % of the disparity.
+    assert np.median(frame.cloud.xyz[:, 2]) == pytest.approx(100 * 0.5 / 6, rel=0.05)
+
+
+@pytest.mark.parametrize("kind", CALIBRATIONS)
+def test_a_calibration_without_a_size_says_how_to_give_it(tmp_path: Path, kind: str) -> None:
+    path, size = tmp_path / "calib.txt", (120, 50)
+    path.write_text(CALIBRATIONS[kind])
+    if kind in ("middlebury", "kalibr"):
+        size = ()
+    else:
+        with pytest.raises(FormatError, match="pass width_px and height_px"):
+            recon.read_calibration(path)
+    assert recon.read_calibration(path, *size).baseline_m == pytest.approx(0.5)
 
 
 @pytest.fixture
@@ -35,16 +112,15 @@ def read(images: tuple[Path, Path], known: SourceSettings) -> PairInput:
     return read_pair_input(*images, None, known=known)
 
 
-def test_focal_length_and_baseline_give_metres(images: tuple[Path, Path]) -> None:
+def test_focal_length_and_baseline_give_metres_and_a_principal_point_is_that_of_both_views(
+    images: tuple[Path, Path],
+) -> None:
     given = read(images, SourceSettings(focal_px=300, baseline_m=0.2))
     camera = given.calibration
     assert isinstance(camera, RectifiedCamera)
     assert (camera.focal_px, camera.baseline_m) == (300, 0.2)
     assert (camera.cx_px, camera.cy_px, camera.doffs_px) == (119.5, 59.5, 0)
     assert (given.notes, given.up_to_scale) == ((), False)
-
-
-def test_a_given_principal_point_is_that_of_both_views(images: tuple[Path, Path]) -> None:
     known = SourceSettings(focal_px=300, baseline_m=0.2, cx_px=100, cy_px=50)
     camera = read(images, known).calibration
     assert isinstance(camera, RectifiedCamera)
@@ -62,14 +138,18 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
     assert [text for text in run.warnings if "in baselines, not in metres" in text]
 
 
-def test_an_unknown_focal_length_is_refused(images: tuple[Path, Path]) -> None:
-    with pytest.raises(CalibrationError, match=r"left\.png: focal length is unknown.*--focal PX"):
-        read(images, SourceSettings(baseline_m=0.2))
-
-
-def test_a_focal_length_in_millimetres_is_refused(images: tuple[Path, Path]) -> None:
-    with pytest.raises(CalibrationError, match=r"--focal: .*4\.5 px.*see 17\d deg.*in pixels"):
-        read(images, SourceSettings(focal_px=4.5, baseline_m=0.2))
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ({}, r"left\.png: focal length is unknown.*--focal PX"),
+        ({"focal_px": 4.5}, r"--focal: .*4\.5 px.*see 17\d deg.*in pixels"),
+    ],
+)
+def test_an_unknown_focal_length_or_one_in_millimetres_is_refused(
+    images: tuple[Path, Path], known: dict[str, float], message: str
+) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        read(images, SourceSettings(baseline_m=0.2, **known))
 
 
 def test_a_drive_takes_the_same_numbers_and_a_file_is_not_needed(images: tuple[Path, Path]) -> None:
