@@ -43,24 +43,16 @@ def calibrate(
         Literal["radtan", "rational", "fisheye"] | None,
         opt.setting(
             "calibration.model",
-            "Lens model: radtan, rational (wide angle) or fisheye (150 degrees or more).",
-            default="radtan",
+            "radtan (usual), rational (wide angle), fisheye (150 degrees or more).",
         ),
     ] = None,
     distance: Annotated[
         float | None,
-        opt.setting(
-            "calibration.working_m",
-            "Distance in metres for which the verdict is made.",
-            default="where matching errs by 2 %",
-        ),
+        opt.setting("calibration.working_m", "Distance in metres for which the verdict is made."),
     ] = None,
     report: Annotated[
         Path | None,
-        opt.option(
-            "Folder for the report, figures and pictures.",
-            default="outputs/calibrate/<UTC time stamp>",
-        ),
+        opt.option("Folder for report and figures.", default="outputs/calibrate/<UTC time stamp>"),
     ] = None,
     *,
     shared: opt.Shared,
@@ -101,10 +93,7 @@ def calibrate(
 
 
 def board(
-    pattern: Annotated[
-        str | None,
-        typer.Argument(metavar="BOARD", help=_BOARD),
-    ] = None,
+    pattern: Annotated[str | None, typer.Argument(metavar="BOARD", help=_BOARD)] = None,
     same: Annotated[
         str | None, opt.option("The board as an option, as in recon calibrate.", "--board")
     ] = None,
@@ -114,7 +103,7 @@ def board(
     paper: Annotated[
         str | None,
         opt.option(
-            "a4, a3, a2, a1, a0, letter, legal, tabloid, or a size such as 600x400mm.",
+            "a4 to a0, letter, legal, tabloid, or e.g. 600x400mm.",
             default="smallest A size that fits",
         ),
     ] = None,

@@ -39,8 +39,7 @@ StartInMap = Annotated[
     str | None,
     setting(
         _first_frame,
-        "Where the drive begins in map axes, if known: metres, and degrees from x to y. "
-        "A single number is the first frame to use.",
+        "Where the drive begins in map axes: metres, degrees from x to y; or its first frame.",
         "--start",
         default="anywhere in the map, frame 0",
         metavar="X,Y,YAW|FRAME",
@@ -55,29 +54,18 @@ class RectifiedOptions:
     focal: Annotated[
         float | None,
         setting(
-            "source.focal_px",
-            "Focal length of images that are rectified already, without --calib.",
-            default="that of the calibration",
-            metavar="PX",
+            "source.focal_px", "Focal length of rectified images, without --calib.", metavar="PX"
         ),
     ] = None
     baseline: Annotated[
         float | None,
-        setting(
-            "source.baseline_m",
-            "Distance between their cameras in metres.",
-            default="that of the calibration",
-            metavar="M",
-        ),
+        setting("source.baseline_m", "Distance between their cameras in metres.", metavar="M"),
     ] = None
     cx: Annotated[
-        float | None,
-        setting(
-            "source.cx_px", "Column of their principal points.", default="middle", metavar="PX"
-        ),
+        float | None, setting("source.cx_px", "Column of their principal points.", default="middle")
     ] = None
     cy: Annotated[
-        float | None, setting("source.cy_px", "Row of it.", default="middle", metavar="PX")
+        float | None, setting("source.cy_px", "Row of their principal points.", default="middle")
     ] = None
 
 
@@ -88,16 +76,13 @@ class SourceOptions(RectifiedOptions):
     kind: Annotated[
         str | None,
         opt.option(
-            "Kind of source: kitti, kitti-raw, euroc, tum, folders, video, bag or middlebury.",
+            "Kind, else detected: kitti, kitti-raw, euroc, tum, folders, video, bag, middlebury.",
             "--source",
-            default="detected from its files",
         ),
     ] = None
     calib: Annotated[
         Path | None,
-        setting(
-            "source.calibration", "Calibration file.", default="the one that comes with the source"
-        ),
+        setting("source.calibration", "Calibration file.", default="that of the source"),
     ] = None
     left: Annotated[
         str | None, setting("source.left", "Left image folder or topic.", default="found by name")
@@ -105,17 +90,13 @@ class SourceOptions(RectifiedOptions):
     right: Annotated[
         str | None,
         setting(
-            "source.right",
-            "Right image folder or topic, or the right video where SOURCE is the left one.",
-            default="found by name",
+            "source.right", "Right image folder or topic, or right video.", default="found by name"
         ),
     ] = None
     tolerance: Annotated[
         float | None,
         setting(
-            "source.tolerance_s",
-            "Largest difference between the time stamps of a pair, in seconds.",
-            default="0.01",
+            "source.tolerance_s", "Largest time difference of a pair, in seconds.", default="0.01"
         ),
     ] = None
     end: Annotated[
@@ -134,10 +115,7 @@ class DriveOptions(SourceOptions):
     memory_limit: Annotated[
         str | None,
         setting(
-            _memory_limit,
-            "Memory limit of the process, e.g. 2G or 1500M. A run that exceeds it stops and "
-            "can be resumed.",
-            default="none",
+            _memory_limit, "Memory limit, e.g. 2G. A run that exceeds it stops, and can be resumed."
         ),
     ] = None
 

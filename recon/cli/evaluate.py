@@ -19,10 +19,9 @@ _NONE = "none"
 Matchers = Annotated[
     str | None,
     opt.option(
-        "Matchers, separated by commas: sad, sgm, opencv-bm, opencv-sgbm, onnx, or those of "
-        "installed plug-ins; none for --results alone.",
+        "Matchers, with commas, as for recon pair; none for --results alone.",
         "--matcher",
-        default="matching.matcher, sad unless changed",
+        default="sad",
     ),
 ]
 
@@ -31,18 +30,12 @@ Matchers = Annotated[
 @opt.takes_groups
 def middlebury(
     folder: Annotated[
-        Path,
-        typer.Argument(
-            help="A Middlebury scene, or a folder with scenes of any year at any depth."
-        ),
+        Path, typer.Argument(help="A Middlebury scene, or a folder with scenes at any depth.")
     ],
     matcher: Matchers = None,
     results: Annotated[
         list[Path] | None,
-        opt.option(
-            "Folder with results of another program: SCENE.pfm or SCENE/disp0*.pfm, for a "
-            "column of its own. May be repeated."
-        ),
+        opt.option("Results of another program: SCENE.pfm or SCENE/disp0*.pfm. May be repeated."),
     ] = None,
     truth: Annotated[
         Path | None,
@@ -122,9 +115,7 @@ def disparity(
     mask: Annotated[Path | None, opt.option("Image that is 255 at the pixels to compare.")] = None,
     scale: Annotated[
         float,
-        opt.option(
-            "Scale of the reported errors: 4 reports a quarter-size map at full size.", min=1e-3
-        ),
+        opt.option("Scale of the errors: 4 reports a quarter-size map at full size.", min=1e-3),
     ] = 1.0,
     confidence: Annotated[
         Path | None, opt.option("Confidence of the map (PFM), to be evaluated too.")
@@ -171,8 +162,7 @@ def trajectory(
     lengths: Annotated[
         str | None,
         opt.option(
-            "Lengths of the segments in metres, e.g. 50,100.",
-            default="100 to 800, or shorter on short drives",
+            "Lengths of the segments in metres.", default="100,200 … 800, shorter on short drives"
         ),
     ] = None,
     step: Annotated[
@@ -262,23 +252,14 @@ def map_(
     reference: Annotated[Path, typer.Argument(help="Reference point cloud (PLY).")],
     reference_frame: Annotated[
         Literal["camera", "map"] | None,
-        opt.option(
-            "Frame of REFERENCE: the first left camera, or the map.",
-            default="camera, or the one in which --align icp finds more",
-        ),
+        opt.option("Axes of REFERENCE.", default="camera, or where --align icp finds more"),
     ] = None,
     threshold: Annotated[
-        str,
-        opt.option(
-            "Distance in metres up to which a point counts as correct; several with commas."
-        ),
+        str, opt.option("Distance in metres up to which a point is correct; several with commas.")
     ] = "0.2",
     align_to: Annotated[
         Path | None,
-        opt.option(
-            "Ground-truth poses (KITTI or TUM): align the path of the run, and the map with "
-            "it, to these first."
-        ),
+        opt.option("True poses (KITTI or TUM), to which path and map are aligned first."),
     ] = None,
     align: Annotated[
         Literal["none", "icp"], opt.option("Align the cloud to the reference with ICP.")
@@ -323,12 +304,7 @@ def paper(
         ),
     ] = None,
     as_printed: Annotated[
-        bool,
-        opt.setting(
-            "paper.as_printed",
-            "Also run the method as printed, and compare the two.",
-            "--as-printed",
-        ),
+        bool, opt.setting("paper.as_printed", "Also run the method as printed.", "--as-printed")
     ] = False,
     out: opt.Out = None,
     *,

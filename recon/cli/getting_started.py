@@ -169,9 +169,7 @@ def fetch(
     address: Annotated[
         str | None,
         opt.option(
-            "A mirror: a folder on a server that has the archives by their names.",
-            default="the owners' server",
-            metavar="URL",
+            "A mirror: a folder on a server that has the archives by their names.", metavar="URL"
         ),
     ] = None,
     json: opt.Json = False,

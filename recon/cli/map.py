@@ -35,8 +35,7 @@ def map_(
         Literal["visual", "kiss", "fused"] | None,
         opt.setting(
             "odometry.method",
-            "visual: features followed from frame to frame; kiss: kiss-icp on the points that "
-            "stereo measures well, to compare with; fused: earlier name of visual.",
+            "visual (also named fused): features; kiss: kiss-icp on points, to compare with.",
             default="visual",
         ),
     ] = None,
@@ -46,8 +45,8 @@ def map_(
     prior: Annotated[
         str | None,
         opt.option(
-            "Trajectory from wheel odometry, an IMU or GNSS that guides the odometry: a TUM "
-            "file on the clock of the images, or a topic of the bag, such as /odom.",
+            "Trajectory of wheels, an IMU or GNSS that guides the odometry: a TUM file on the "
+            "clock of the images, or a topic of the bag, such as /odom.",
             metavar="FILE|TOPIC",
         ),
     ] = None,
@@ -57,10 +56,7 @@ def map_(
     ] = None,
     into: Annotated[
         Path | None,
-        opt.option(
-            "Add the drive to the map of this finished run, which is replaced when all is "
-            "done; settings are those of the run."
-        ),
+        opt.option("Add the drive to the map of this finished run, with the settings of the run."),
     ] = None,
     remove: Annotated[
         int | None,
@@ -178,11 +174,7 @@ def merge(
     out: opt.Out = None,
     georeference: Annotated[
         Path | None,
-        opt.option(
-            "Measured positions, which the paths are bent to run through: rows of time, "
-            "easting, northing and height (s, m), on the clock of the images.",
-            default="none",
-        ),
+        opt.option("Measured positions, which the paths are bent to run through." + opt.POSITIONS),
     ] = None,
     antenna: opt.Antenna = None,
     mesh: opt.Mesh = True,

@@ -62,9 +62,8 @@ Matcher = Annotated[
     str | None,
     setting(
         "matching.matcher",
-        "Matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one of an installed plug-in.",
-        "--matcher",
-        default="matching.matcher, sad unless changed",
+        "sad, sgm, opencv-bm, opencv-sgbm, onnx, or that of a plug-in.",
+        default="sad",
     ),
 ]
 Json = Annotated[bool, option("Print the summary as JSON and nothing else.", "--json")]
@@ -74,52 +73,36 @@ Quiet = Annotated[
 Verbose = Annotated[
     bool,
     option(
-        "Also print the time spent in each stage; where standard error is no terminal, "
-        "print progress there as JSON lines.",
+        "Also print the time of each stage; without a terminal, progress as JSON lines.",
         "--verbose",
         "-v",
     ),
 ]
 Formats = Annotated[
     list[str] | None,
-    option(
-        "Format of the mesh: ply, obj, stl or glb. May be repeated; PLY is always written.",
-        "--format",
-        "-f",
-        default="ply",
-    ),
+    option("Format of the mesh besides PLY: obj, stl or glb. May be repeated.", "--format", "-f"),
 ]
 Mesh = Annotated[bool, option("Reconstruct the surface mesh.")]
 Antenna = Annotated[
     str | None,
     option(
-        "Where that antenna or prism is, from the left camera: metres forward, left, up.",
-        default="0,0,0",
+        "Where that antenna or prism is: metres forward, left, up from the left camera.",
         metavar="X,Y,Z",
     ),
 ]
 Scheduler = Annotated[
     str | None,
-    option(
-        "Dask scheduler whose workers do the work, such as tcp://host:8786.",
-        default="workers on this machine",
-        metavar="ADDRESS",
-    ),
+    option("Dask scheduler whose workers do the work, e.g. tcp://host:8786.", metavar="ADDRESS"),
 ]
 Workers = Annotated[
     int | None,
-    option(
-        "Processes that share the work; they need the extra cluster.",
-        default="1: this process",
-        min=1,
-    ),
+    option("Processes that share the work; they need the extra cluster.", default="1", min=1),
 ]
 Threads = Annotated[
     int | None,
-    option(
-        "Number of threads. Does not change the results.", "--threads", default="all cores", min=1
-    ),
+    option("Number of threads. Does not change the results.", default="all cores", min=1),
 ]
+POSITIONS = " Rows of time, easting, northing and height (s, m), on the clock of the images."
 SOURCES_HELP = (
     "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "
     "ROS bag, MCAP file, or Middlebury scene."

@@ -45,7 +45,7 @@ Ndisp = Annotated[
     opt.setting(
         _disparities,
         "Number of disparities to search.",
-        default="from the calibration, else estimated from the pair",
+        default="calibration, else estimated",
         min=1,
     ),
 ]

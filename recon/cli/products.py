@@ -10,6 +10,11 @@ import typer
 from recon.cli import options as opt
 from recon.cli.drive_options import open_workers
 
+Resolution = Annotated[
+    float | None,
+    opt.setting("occupancy.resolution_m", "Cell size in metres.", default="as in the run"),
+]
+
 
 @opt.takes_groups
 def export(
@@ -17,33 +22,22 @@ def export(
     to: Annotated[
         list[str] | None,
         opt.option(
-            "What to make: cloud, grid, octomap, mesh, and on request las or laz, the cloud "
-            "for surveying programs; several separated by commas. A pair has cloud and mesh.",
-            default="cloud, grid, octomap, mesh",
+            "cloud, grid, octomap, mesh, las, laz (for surveying programs); several with commas.",
+            default="all but las and laz",
         ),
     ] = None,
     out: opt.Out = None,
     formats: opt.Formats = None,
-    resolution: Annotated[
-        float | None,
-        opt.setting(
-            "occupancy.resolution_m",
-            "Cell size of grid and OctoMap in metres.",
-            default="as in the run",
-        ),
-    ] = None,
+    resolution: Resolution = None,
     georeference: Annotated[
         Path | None,
         opt.option(
-            "Measured positions, in whose coordinates las and laz are written: rows of time, "
-            "easting, northing and height (s, m), on the clock of the images.",
-            default="map coordinates",
+            "Measured positions, in whose coordinates las and laz are written." + opt.POSITIONS
         ),
     ] = None,
     antenna: opt.Antenna = None,
     crs: Annotated[
-        str | None,
-        opt.option("Coordinate system of the positions, such as EPSG:25832.", default="not stated"),
+        str | None, opt.option("Coordinate system of the positions, such as EPSG:25832.")
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
@@ -121,14 +115,11 @@ def mesh(
 def occupancy(
     run: Annotated[Path, typer.Argument(help="Folder of a recon map or recon demo run.")],
     out: opt.Out = None,
-    resolution: Annotated[
-        float | None,
-        opt.setting("occupancy.resolution_m", "Cell size in metres.", default="as in the run"),
-    ] = None,
+    resolution: Resolution = None,
     min_height: Annotated[
         float | None,
         opt.setting(
-            "grid.min_height_m", "Lower end of the obstacle height band, in metres above ground."
+            "grid.min_height_m", "Lower end of the band of obstacles, in metres above ground."
         ),
     ] = None,
     max_height: Annotated[
@@ -136,10 +127,7 @@ def occupancy(
     ] = None,
     max_range: Annotated[
         float | None,
-        opt.setting(
-            "occupancy.max_range_m",
-            "Ignore obstacles farther than this from the camera, in metres.",
-        ),
+        opt.setting("occupancy.max_range_m", "Ignore obstacles farther than this, in metres."),
     ] = None,
     *,
     shared: opt.Shared,
