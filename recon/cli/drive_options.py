@@ -32,15 +32,12 @@ def _memory_limit(text: str) -> dict[str, Any]:
     return {"memory.limit_mb": parse_size_mb(text)}
 
 
-Start = Annotated[
-    int | None, setting("source.start", "First frame to use.", "--start", default="0")
-]
+Start = Annotated[int | None, setting("source.start", "First frame to use.", default="0")]
 StartInMap = Annotated[
     str | None,
     setting(
         _first_frame,
         "Where the drive begins in map axes: metres, degrees from x to y; or its first frame.",
-        "--start",
         default="anywhere in the map, frame 0",
         metavar="X,Y,YAW|FRAME",
     ),
@@ -53,9 +50,7 @@ class RectifiedOptions:
 
     focal: Annotated[
         float | None,
-        setting(
-            "source.focal_px", "Focal length of rectified images, without --calib.", metavar="PX"
-        ),
+        setting("source.focal_px", "Focal length if rectified, without --calib.", metavar="PX"),
     ] = None
     baseline: Annotated[
         float | None,

@@ -76,13 +76,10 @@ def _check_surroundings() -> None:
         raise SettingsError("not a number of threads", where=where, got=threads, expected=expected)
     limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit_bytes != resource.RLIM_INFINITY and limit_bytes < _ADDRESS_BYTES:
-        raise SettingsError(
-            "too little address space for the libraries",
-            where="ulimit -v",
-            got=f"{limit_bytes / 1e6:.0f} MB",
-            expected=f"at least {_ADDRESS_BYTES / 1e6:.0f} MB",
-            hint="raise it, and bound memory with --memory-limit",
-        )
+        got, least = f"{limit_bytes / 1e6:.0f} MB", f"at least {_ADDRESS_BYTES / 1e6:.0f} MB"
+        what = "too little address space for the libraries"
+        hint = "raise it, and bound memory with --memory-limit"
+        raise SettingsError(what, where="ulimit -v", got=got, expected=least, hint=hint)
 
 
 def report_unforeseen(error: BaseException) -> int:

@@ -15,7 +15,6 @@ from recon.cli.tables import print_evaluation, print_figures, print_json
 app = Commands(name="evaluate", no_args_is_help=True, help="Compare results with ground truth.")
 
 
-_NONE = "none"
 Matchers = Annotated[
     str | None,
     opt.option(
@@ -100,10 +99,8 @@ def middlebury(
 
 
 def _names(matcher: str | None) -> list[str] | None:
-    """Return the matchers of the option; None = the configured one."""
-    if matcher is None:
-        return None
-    return [] if matcher == _NONE else [name.strip() for name in matcher.split(",")]
+    names = None if matcher is None else [name.strip() for name in matcher.split(",")]
+    return [] if matcher == "none" else names
 
 
 @app.command()
@@ -139,7 +136,7 @@ def disparity(
     if json:
         print_json(figures)
         return
-    shown = {name: value for name, value in figures.items() if not isinstance(value, dict)}
+    shown = dict(figures)
     for kind in ("sparse", "dense"):
         flat = {f"bad {limit}": share for limit, share in figures[kind]["bad"].items()}
         shown |= {f"{kind} {name}": value for name, value in (flat | figures[kind]).items()}

@@ -6,7 +6,7 @@ import os
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -149,16 +149,16 @@ def piece(
     Examples:
       recon piece outputs/long/.partial/.state/pieces.json 0 --out piece0
     """
-    folder = resume or out
-    if folder is None:
+    if out is None and resume is None:
         raise typer.BadParameter("give --out FOLDER or --resume FOLDER")
     with one_line_errors(quiet=quiet):
         from recon.cli.progress import choose_viewer
+        from recon.commands.map_options import MapOptions
         from recon.commands.map_pieces import run_piece
 
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        going_on = resume is not None
-        summary = run_piece(plan, number, folder, resume=going_on, threads=threads, progress=viewer)
+        viewer, going_on = choose_viewer(quiet=quiet, verbose=verbose), resume is not None
+        how: Any = {"progress": viewer, "resume": going_on}
+        summary = run_piece(plan, number, MapOptions("piece", resume or out, threads, **how))
     print_json(summary) if json else print_run(summary, stages=verbose)
 
 

@@ -61,9 +61,7 @@ Set = Annotated[
 Matcher = Annotated[
     str | None,
     setting(
-        "matching.matcher",
-        "sad, sgm, opencv-bm, opencv-sgbm, onnx, or that of a plug-in.",
-        default="sad",
+        "matching.matcher", "sad, sgm, opencv-bm, opencv-sgbm, onnx or plug-in.", default="sad"
     ),
 ]
 Json = Annotated[bool, option("Print the summary as JSON and nothing else.", "--json")]
@@ -71,12 +69,7 @@ Quiet = Annotated[
     bool, option("Show no progress: only results, warnings and errors.", "--quiet", "-q")
 ]
 Verbose = Annotated[
-    bool,
-    option(
-        "Also print the time of each stage; without a terminal, progress as JSON lines.",
-        "--verbose",
-        "-v",
-    ),
+    bool, option("Also print stage times; where there is no bar, JSON lines.", "--verbose", "-v")
 ]
 Formats = Annotated[
     list[str] | None,
@@ -85,10 +78,7 @@ Formats = Annotated[
 Mesh = Annotated[bool, option("Reconstruct the surface mesh.")]
 Antenna = Annotated[
     str | None,
-    option(
-        "Where that antenna or prism is: metres forward, left, up from the left camera.",
-        metavar="X,Y,Z",
-    ),
+    option("Antenna or prism, from the left camera: metres forward, left, up.", metavar="X,Y,Z"),
 ]
 Scheduler = Annotated[
     str | None,
@@ -116,9 +106,8 @@ def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
     try:
         return tuple(map(parse_number, text.split(",")))
     except ValueError as error:
-        raise SettingsError(
-            "not numbers separated by commas", where=option, got=text, expected="0.1,0.2,0.5"
-        ) from error
+        what, expected = "not numbers separated by commas", "0.1,0.2,0.5"
+        raise SettingsError(what, where=option, got=text, expected=expected) from error
 
 
 def survey_of(positions: Path | None, antenna: str | None, crs: str | None = None) -> Survey | None:
@@ -126,12 +115,11 @@ def survey_of(positions: Path | None, antenna: str | None, crs: str | None = Non
     from recon.map.sessions.measured import Survey
 
     if positions is None:
-        if antenna is None and crs is None:
-            return None
-        given = "--crs" if antenna is None else "--antenna"
-        raise SettingsError(
-            "there are no positions that it describes", where=given, expected="--georeference FILE"
-        )
+        for given, value in (("--antenna", antenna), ("--crs", crs)):
+            if value is not None:
+                what, expected = "there are no positions that it describes", "--georeference FILE"
+                raise SettingsError(what, where=given, expected=expected)
+        return None
     offset = parse_numbers(antenna or "0,0,0", "--antenna")
     if offset is None or len(offset) != 3 or not all(map(math.isfinite, offset)):
         raise SettingsError("not three numbers", where="--antenna", got=antenna, expected="X,Y,Z")
@@ -161,13 +149,11 @@ class Asked:
         return [*(self.set_ or ()), *read]
 
     def settings(self, defaults: Mapping[str, Any] | None = None) -> ReconConfig:
-        """Return the configuration of the command."""
         from recon.commands.config import load_config
 
         return load_config(self.config, self.changes, defaults)
 
     def one_line_errors(self) -> AbstractContextManager[None]:
-        """Return what the body of the command runs in."""
         return one_line_errors(quiet=self.quiet)
 
 
@@ -179,7 +165,6 @@ class Shared(Asked):
     threads: Threads = None
 
     def viewer(self) -> Progress:
-        """Choose what shows the progress."""
         from recon.cli.progress import choose_viewer
 
         return choose_viewer(quiet=self.quiet, verbose=self.verbose)
@@ -191,7 +176,6 @@ class Shared(Asked):
         return MapOptions(command, out, self.threads, progress=self.viewer(), **more)
 
     def show(self, summary: Mapping[str, Any]) -> None:
-        """Print the figures of a run."""
         print_json(summary) if self.json else print_run(summary, stages=self.verbose)
 
 
@@ -202,7 +186,9 @@ def takes_groups(command: Callable[..., None]) -> Callable[..., None]:
     all options that stand for a setting.
     """
     own = inspect.signature(command, eval_str=True)
-    groups: dict[str, Any] = {n: p.annotation for n, p in own.parameters.items() if _is_group(p)}
+    groups: dict[str, Any] = {
+        n: p.annotation for n, p in own.parameters.items() if is_dataclass(p.annotation)
+    }
     options = [one for name, one in own.parameters.items() if name not in groups]
     members = {name: _options_of(group) for name, group in groups.items()}
     options += [option for inside in members.values() for option in inside]
@@ -223,12 +209,7 @@ def takes_groups(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-def _is_group(parameter: inspect.Parameter) -> bool:
-    return is_dataclass(parameter.annotation)
-
-
 def _options_of(group: Any) -> list[inspect.Parameter]:
-    """Return the fields of a group that are options, as parameters of a command."""
     hints = get_type_hints(group, None, None, True)
     return [
         inspect.Parameter(one.name, _KEYWORD, default=one.default, annotation=hints[one.name])

@@ -47,7 +47,6 @@ def plan_jobs(listed: JobList) -> list[Job]:
 
 
 def _swept(job: Job, listed: JobList) -> Iterator[Job]:
-    """Yield a job with each combination of a sweep."""
     for swept in listed.combinations():
         words = [word for text in _texts(swept) for word in ("--set", text)]
         name = name_of_swept(job.name, swept)
@@ -111,7 +110,6 @@ def _command(name: str) -> Any:
 
 @cache
 def _check(name: str, sources: int, options: tuple[str, ...]) -> None:
-    """Check the options of a job, and how many sources it has."""
     if wrong := {"--", "--help"} & {*options}:
         raise SettingsError("a job cannot have this option", got=wrong.pop())
     command, words = _command(name), [*["SOURCE"] * sources, *options]

@@ -51,19 +51,15 @@ class JsonLines:
         self._stream = stream
 
     def on_start(self, name: str, total: int, unit: str = "frames") -> None:
-        """Write the name of the source and its number of items."""
         self._write({"event": "start", "name": name, unit: total})
 
     def on_step(self, step: Step) -> None:
-        """Write the figures of an item."""
         self._write(step.event)
 
     def on_stage(self, name: str) -> None:
-        """Write the name of the stage that starts."""
         self._write({"event": "stage", "name": name})
 
     def on_finish(self) -> None:
-        """Write that all items are done."""
         self._write({"event": "finish"})
 
     def _write(self, event: Mapping[str, Any]) -> None:
@@ -82,7 +78,6 @@ class ProgressBar:
         self._bad = 0
 
     def on_start(self, name: str, total: int, unit: str = "frames") -> None:
-        """Draw an empty bar."""
         self.on_finish()
         self._seconds, self._unit, self._bad = math.nan, unit, 0
         self._progress = Progress(
@@ -100,7 +95,6 @@ class ProgressBar:
         self._progress.start()
 
     def on_step(self, step: Step) -> None:
-        """Move the bar by one item."""
         if self._progress is None:
             return
         self._bad += not step.ok
@@ -110,11 +104,9 @@ class ProgressBar:
         self._progress.update(task, advance=1, rate=self._rate(step), state=step.state, bad=bad)
 
     def on_stage(self, name: str) -> None:
-        """Print the name of the stage that starts."""
         self._console.print(f"{name} …", style="dim", markup=False, highlight=False)
 
     def on_finish(self) -> None:
-        """Leave the bar as it is."""
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
@@ -143,7 +135,6 @@ class FittingColumn(ProgressColumn):
         self._if_room = if_room
 
     def render(self, task: Task) -> RenderableType:
-        """Return the line of a task."""
         bar = Bar(
             total=task.total,
             completed=task.completed,
@@ -167,9 +158,7 @@ class _Line:
     if_room: list[Text]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        room = (
-            options.max_width - 1
-        )  # the last cell of a line stays free: some terminals wrap there
+        room = options.max_width - 1  # some terminals wrap in the last cell
         name = min(self.name.cell_len, int(_NAME_SHARE * room))
         shown = list(self.always)
         for text in self.if_room:

@@ -16,7 +16,7 @@ from rich.text import Text
 from recon.core.text import counted, with_unit
 
 if TYPE_CHECKING:
-    from recon.commands.config import SettingEntry, SettingGroup
+    from recon.commands.config import SettingGroup
     from recon.commands.doctor import Check
 
 
@@ -111,20 +111,17 @@ def print_datasets(found: Mapping[str, Any]) -> None:
     """Print data sets or the parts of one: name, size, what is there, and what else is known."""
     table = Table(show_edge=False, pad_edge=False, show_header=False)
     for entry in found.get("datasets", found.get("parts", ())):
-        size = entry.get("bytes")
-        there = entry.get("out") or _how_much(entry)
+        size, fetched = entry.get("bytes"), entry.get("fetched")
+        there = "fetched" if fetched else ""
+        if not isinstance(fetched, bool):
+            there = f"{fetched} of {entry.get('parts')}"
         about = (entry[key] for key in ("about", "licence") if key in entry)
-        table.add_row(entry["name"], f"{size / 1e9:.2f} GB" if size else "", there, *about)
+        shown = f"{size / 1e9:.2f} GB" if size else ""
+        table.add_row(entry["name"], shown, entry.get("out") or there, *about)
     Console().print(table)
     for key in ("page", "licence", "cite", "layout", "use", "unchecked"):
         if found.get(key):
             typer.echo(f"{key}: {found[key]}")
-
-
-def _how_much(entry: Mapping[str, Any]) -> str:
-    if isinstance(entry["fetched"], bool):
-        return "fetched" if entry["fetched"] else ""
-    return f"{entry['fetched']} of {entry['parts']}"
 
 
 def print_checks(checks: Sequence[Check], console: Console | None = None) -> None:
@@ -150,7 +147,8 @@ def print_settings(groups: Sequence[SettingGroup], console: Console | None = Non
     for group in groups:
         out.print(Text.assemble((group.name, "bold"), f"  {group.purpose}"))
         for entry in group.settings:
-            out.print(_headline(entry))
+            default, values = f" = {entry.shown_default}", f"   [{entry.values}]"
+            out.print(Text.assemble("  ", (entry.name, "cyan"), default, (values, "dim")))
             out.print(Padding(Text(entry.description, style="dim"), (0, 0, 0, 6)))
         out.print()
 
@@ -159,9 +157,3 @@ def _mark(check: Check) -> Text:
     if check.ok:
         return Text("ok", style="green")
     return Text("missing", style="bold red") if check.needed else Text("note", style="yellow")
-
-
-def _headline(entry: SettingEntry) -> Text:
-    return Text.assemble(
-        "  ", (entry.name, "cyan"), f" = {entry.shown_default}", (f"   [{entry.values}]", "dim")
-    )

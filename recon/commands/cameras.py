@@ -75,7 +75,9 @@ def run_calibrate(
     with both views. The calibration is also written to ``file``, in its ``form``; ``out`` gets
     report, images and figures.
     """
-    _check_file(file)
+    if file is not None and file.is_dir():
+        hint = f"--out {file / 'calibration.yaml'}; pictures and report go to --report"
+        raise OutputError("the calibration file is a folder", where=file, hint=hint)
     videos = _videos(left, right)
     images = ImagePairs((), by_order=False) if videos else pair_images(left, right or "")
     inputs = videos or [path for pair in images.pairs for path in pair]
@@ -104,17 +106,12 @@ def run_calibrate(
             summary["files"] = [str(path) for path in write_calibration(file, result, form)]
         with run.report(summary):
             write_calibration_page(result, run)
-        run.finish(
-            summary,
-            source=" ".join(filter(None, (left, right))),
-            inputs=inputs,
-            record={"board": str(seen.board)},
-        )
+        source, record = " ".join(filter(None, (left, right))), {"board": str(seen.board)}
+        run.finish(summary, source=source, inputs=inputs, record=record)
     return result
 
 
 def _videos(left: str, right: str | None) -> list[Path]:
-    """Return the arguments if they are videos, else nothing."""
     sides = [side for side in (left, right) if side is not None]
     videos = [Path(side) for side in sides if is_video(side)]
     if len(videos) != len(sides) and (videos or right is None):
@@ -124,15 +121,6 @@ def _videos(left: str, right: str | None) -> list[Path]:
             hint="recon calibrate LEFT RIGHT --board …",
         )
     return videos
-
-
-def _check_file(path: Path | None) -> None:
-    if path is not None and path.is_dir():
-        raise OutputError(
-            "the calibration file is a folder",
-            where=path,
-            hint=f"--out {path / 'calibration.yaml'}; pictures and report go to --report",
-        )
 
 
 _WARN_ROW_PX: Final = 0.5
@@ -163,9 +151,8 @@ def run_rectify(
             if calibration is None:
                 plan = plan_by_features(images)
             else:
-                plan = plan_by_calibration(
-                    calibration, images, config.rectification, metres_per_unit=metres_per_unit
-                )
+                how: Any = {"metres_per_unit": metres_per_unit}
+                plan = plan_by_calibration(calibration, images, config.rectification, **how)
         with run.stage("rectify"):
             for pair, (left_file, right_file) in read_pairs(images):
                 left_image, right_image = plan.warp(pair)

@@ -157,7 +157,7 @@ def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[st
 
 
 def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:
-    """Return the plain values of settings, without what is open here and in the usual ones."""
+    """Return plain values, without what is open here and in the usual settings."""
     plain = settings.model_dump(mode="json")
     for name in type(settings).model_fields:
         value, others = getattr(settings, name), [getattr(other, name) for other in usual]
@@ -195,7 +195,6 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def _nested(key: str, value: Any) -> dict[str, Any]:
-    """Return a value as it stands in a file: below the parts of its dotted key."""
     for part in reversed(key.split(".")):
         value = {part: value}
     return dict(value)
@@ -287,25 +286,20 @@ def _groups(
 ) -> Iterator[SettingGroup]:
     """Yield the groups of a model, each before those inside; ``purpose`` replaces its docstring."""
     own, inside = [], []
-    for name, field in type(drive).model_fields.items():
-        value, paired = getattr(drive, name), getattr(pair, name)
+    for key, field in type(drive).model_fields.items():
+        value, paired, name = getattr(drive, key), getattr(pair, key), f"{prefix}{key}"
+        text = " ".join((field.description or "").split())
         if isinstance(value, Settings):
-            inside.append(
-                (value, paired, f"{prefix}{name}.", " ".join((field.description or "").split()))
-            )
+            inside.append((value, paired, f"{name}.", text))
         else:
-            own.append(_entry(f"{prefix}{name}", field, value, paired))
+            unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
+            values = (_as_yaml(value), _as_yaml(paired), unit, _values(field))
+            own.append(SettingEntry(name, *values, text))
     if own:
         about = purpose or (type(drive).__doc__ or "").partition("\n")[0].replace("``", "`")
         yield SettingGroup(prefix.removesuffix("."), about, tuple(own))
     for group in inside:
         yield from _groups(*group)
-
-
-def _entry(name: str, field: FieldInfo, drive: Any, pair: Any) -> SettingEntry:
-    unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
-    text = " ".join((field.description or "").split())
-    return SettingEntry(name, _as_yaml(drive), _as_yaml(pair), unit, _values(field), text)
 
 
 def _as_yaml(value: Any) -> str:

@@ -25,12 +25,11 @@ def run_list(name: str | None = None, folder: Path = FOLDER) -> dict[str, Any]:
     """List all data sets, or one with its parts."""
     if name is None:
         return {"datasets": [_described(parts_of(one), folder) for one in datasets().values()]}
-    parts = find_parts(name)
     shown = [
         {"name": part.name, "bytes": part.size, "fetched": is_fetched(folder / part.name)}
-        for part in parts
+        for part in find_parts(name)
     ]
-    return {**_described(parts, folder), "parts": shown}
+    return {**_described(find_parts(name), folder), "parts": shown}
 
 
 def run_fetch(

@@ -18,7 +18,7 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling
 from recon.core.values import StereoPair
 from recon.io.models.octomap import read_octomap
-from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.sequence import map_sequence
 from recon.map.fusion import fusion_range_m
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
@@ -40,19 +40,13 @@ def run_demo(
     threads: int | None = None,
     progress: Progress = SILENT,
 ) -> MapRun:
-    """Render a street and map it: what `recon demo` does.
-
-    ``street`` of the configuration says what is rendered.
-    """
+    """Render the street of the configuration and map it: what `recon demo` does."""
     options = MapOptions("demo", out, threads, mesh=mesh, progress=progress, audit=False)
     return run_map(demo_source(config), config, options)
 
 
 def demo_source(config: ReconConfig) -> SyntheticSource:
-    """Return a street whose true surface extends as far as the map does.
-
-    Surfaces beyond the range limit are not fused, so the ground truth leaves them out.
-    """
+    """Return a street whose true surface extends as far as the map: what is fused of it."""
     range_m = fusion_range_m(rig(config.street), config.fusion)
     return SyntheticSource(config.street, surface_range_m=min(range_m, FARTHEST_M))
 
@@ -79,7 +73,12 @@ def compile_kernels() -> dict[str, Any]:
         run_map(source, config, options)
         run_occupancy(folder / "drive", out=folder / "occupancy")
         read_octomap(folder / "drive" / OCTOMAP)  # as an evaluation does
-        _move_submaps(map_sequence(source, config))
+        # Submaps are moved as closed loops do it, of which so small a drive has none.
+        mapped = map_sequence(source, config)
+        turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
+        submaps = mapped.session.submaps
+        turns = np.stack([turn] * len(submaps))
+        len(Tiles.of_submaps(submaps, mapped.config, mapped.T_map_world, turns))
         colour = next(iter(source))
         grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
         for kind, pair in {"colour": colour, "grey": grey}.items():
@@ -89,11 +88,3 @@ def compile_kernels() -> dict[str, Any]:
                 FrameReconstructor(source.calibration, config).reconstruct(pair)
     seconds = round(time.perf_counter() - begun, 1)
     return {"kernels": len(compiled), "seconds": seconds}
-
-
-def _move_submaps(mapped: MappedSequence) -> None:
-    """Move the submaps as closed loops do; so small a drive has none."""
-    turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
-    submaps = mapped.session.submaps
-    turns = np.stack([turn] * len(submaps))
-    len(Tiles.of_submaps(submaps, mapped.config, mapped.T_map_world, turns))

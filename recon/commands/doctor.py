@@ -58,7 +58,6 @@ def check_kernels() -> Iterator[Check]:
         yield Check(f"kernels of {room}", ran, "run" if ran else printed, hint)
 
 
-_MIN_PYTHON: Final = (3, 10)
 # GB that are needed, and what to do where there is less
 _MEMORY: Final = (3.0, "long drives need 3 GB: map fewer frames")
 _DISK: Final = (1.0, "free some space, or use --out on another disk")
@@ -96,10 +95,9 @@ class Check:
 
 
 def check_packages() -> Iterator[Check]:
-    """Check the version of Python, and of each package whether it can be imported."""
-    least = ".".join(map(str, _MIN_PYTHON))
-    old = sys.version_info < _MIN_PYTHON
-    yield Check("Python", not old, platform.python_version(), f"install Python >= {least}")
+    """Check Python, and whether each package can be imported."""
+    new = sys.version_info >= (3, 10)
+    yield Check("Python", new, platform.python_version(), "install Python >= 3.10")
     with ThreadPoolExecutor(max_workers=available_cores()) as pool:
         yield from pool.map(check_package, PACKAGES, PACKAGES.values())
 

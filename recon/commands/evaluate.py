@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.commands.config import ReconConfig, run_settings
+from recon.commands.config import run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError, SettingsError
 from recon.core.text import counted
@@ -61,7 +61,6 @@ from recon.report.style import colour_grid_errors
 from recon.run.directory import recorded_files
 from recon.run.finished import CLOUD, GRID, OCTOMAP, command_of_map
 from recon.run.run import Run, plain
-from recon.sources.synthetic import SyntheticSource
 from recon.sources.times import read_times
 
 
@@ -79,14 +78,16 @@ def run_evaluate_trajectory(
     Poses are associated by time if both files have timestamps, else in order; the paths are
     aligned as the rules say. With a folder, the aligned paths and a report go there.
 
-    The files are KITTI or TUM; ``times`` has the timestamps of the poses of a KITTI file (s, one
-    per line), ``tolerance_s`` is the largest time difference of two associated poses.
+    ``times`` has the timestamps of the poses of a KITTI file (s, one per line), ``tolerance_s`` is
+    the largest time difference of two associated poses.
     """
     ours, true, by_time = _read_paths(estimate, truth, times)
     poses = {"estimate_poses": len(ours), "true_poses": len(true)}
+    fewer = min(poses.values())
     if by_time:
         ours, true = associate(ours, true, tolerance_s)
     comparison = compare_paths(ours, true, rules)
+    few = f"a partner in time for only {len(true)} of {counted(fewer, 'pose')}; see --tolerance"
     summary = {
         **plain(comparison.metrics),
         "T_truth_estimate": comparison.motion.T_to_from.tolist(),
@@ -96,7 +97,7 @@ def run_evaluate_trajectory(
         **poses,
         "warnings": [
             *doubts_of_file(estimate),
-            *_warnings(len(true), min(poses.values())),
+            *([few] if 2 * len(true) < fewer else ()),
             *interpolation_warnings(comparison.truth, comparison.segments),
         ],
     }
@@ -125,12 +126,6 @@ def _read_paths(
     return paths[0], paths[1], all(stamped)
 
 
-def _warnings(compared: int, fewer: int) -> list[str]:
-    if 2 * compared >= fewer:
-        return []
-    return [f"a partner in time for only {compared} of {counted(fewer, 'pose')}; see --tolerance"]
-
-
 def run_evaluate_map(
     run: Path,
     reference: Path,
@@ -152,11 +147,11 @@ def run_evaluate_map(
         reference: A PLY file.
         frame: Axes of the reference: those of the first left camera, or the map's; None = those in
             which ICP finds more, without it the camera's.
-        align_to: Ground-truth poses of the run's cameras, in the axes of the reference; the run's
-            path is aligned rigidly to them, and its map moves with it.
+        align_to: True poses in the axes of the reference: the path is aligned rigidly to them, and
+            its map moves with it.
         icp: Whether the cloud is then aligned to the reference by ICP.
-        thresholds_m: Distances below which a point counts as correct; the figures returned are
-            those of the first, with those of each in ``by_threshold``.
+        thresholds_m: Distances below which a point counts as correct: figures are those of the
+            first, with those of each in ``by_threshold``.
         out: Result folder; None = nothing is written.
     """
     if not thresholds_m:
@@ -232,11 +227,10 @@ def run_evaluate_disparity(
 
 
 def _rated(values: Float32, path: Path) -> Disparity:
-    confidence = read_pfm(path)
+    confidence, known = read_pfm(path), np.isfinite(values)
     if confidence.shape != values.shape:
         what, got = "confidence and map differ in size", confidence.shape
         raise EvaluationError(what, where=path, got=got, expected=values.shape)
-    known = np.isfinite(values)
     if not ((confidence[known] >= 0) & (confidence[known] <= 1)).all():
         raise EvaluationError("confidence is not between 0 and 1", where=path)
     return Disparity(
@@ -268,24 +262,16 @@ def run_evaluate_occupancy(
     """
     if image is not None:
         check_targets([image], (folder / name for name in recorded_files(folder)))
-    config = run_settings(folder)
-    source, map_ = _rendered_again(folder, config), map_of_run(folder)
+    config, command = run_settings(folder), command_of_map(folder)
+    if command != "demo":
+        what, got = "the true occupancy of this run is not known", f"a run of recon {command}"
+        expected = "a run of recon demo, whose street can be rendered again"
+        hint = "recon evaluate map compares a run with a reference cloud"
+        raise EvaluationError(what, where=folder, got=got, expected=expected, hint=hint)
+    source, map_ = demo_source(config), map_of_run(folder)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
     truth = source.occupancy_truth(**occupancy_view(config, map_.T_map_world, least_frames))
     if image is not None:
         write_image(image, colour_grid_errors(grid, truth))
     metrics = evaluate_occupancy(voxels, grid, truth)
     return OccupancyComparison(metrics, grid, truth, list(map_.doubts))
-
-
-def _rendered_again(folder: Path, config: ReconConfig) -> SyntheticSource:
-    command = command_of_map(folder)
-    if command != "demo":
-        raise EvaluationError(
-            "the true occupancy of this run is not known",
-            where=folder,
-            got=f"a run of recon {command}",
-            expected="a run of recon demo, whose street can be rendered again",
-            hint="recon evaluate map compares a run with a reference cloud",
-        )
-    return demo_source(config)

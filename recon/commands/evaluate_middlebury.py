@@ -73,10 +73,9 @@ def run_middlebury(
         ReconError: A scene cannot be read or matched, or the folder cannot be written; nothing is
             left behind.
     """
-    config = config or load_config()
+    config, truths = config or load_config(), None if truth is None else Path(truth)
     chosen = (config.matching.matcher,) if matchers is None else matchers
     names = check_names(chosen)
-    truths = None if truth is None else Path(truth)
     if truths is not None:
         check_folder(truths)
     paths = find_scenes(Path(folder))
@@ -112,15 +111,10 @@ def run_middlebury(
         with run.report(summary):
             write_middlebury_page(summary, run)
         files = [file for path in paths.values() for file in sorted(path.iterdir())]
-        run.finish(
-            summary,
-            source=str(folder),
-            inputs=[
-                *(file for file in files if file.is_file()),
-                *(file for other in others for file in other.files.values()),
-            ],
-            record={key: summary[key] for key in ("folder", "results", "threads", "parallel")},
-        )
+        files = [file for file in files if file.is_file()]
+        files += [file for other in others for file in other.files.values()]
+        record = {key: summary[key] for key in ("folder", "results", "threads", "parallel")}
+        run.finish(summary, source=str(folder), inputs=files, record=record)
     return summary
 
 

@@ -152,14 +152,8 @@ def run_occupancy(
 ) -> dict[str, Any]:
     """Make voxels and grid of a run with other settings: what `recon occupancy` does.
 
-    Args:
-        run: Folder of the run that mapped the drive.
-        config: As for `run_export`, like all that follows.
-        out: As before.
-        threads: As before.
-
-    Raises:
-        ReconError: As for `run_export`.
+    The arguments and errors are those of `run_export`; ``run`` is the folder of a run that mapped a
+    drive.
     """
     if is_pair_run(Path(run)):
         raise FormatError("the run made no map: it is one of recon pair", where=run)

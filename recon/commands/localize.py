@@ -77,10 +77,8 @@ def run_localize(
 
 
 _SLOWEST: Final = 1e-3
-_FIRST: Final = 3
-"""Pairs that are worked on before the first one counts: the first use of a library takes long."""
-_PACE_S: Final = 0.1
-"""Time between them, whatever their own times are: a recording may begin with a gap."""
+_FIRST: Final = 3  # pairs that do not count: the first use of a library takes long
+_PACE_S: Final = 0.1  # between them, whatever their own times are: there may be a gap
 
 
 def run_live(
@@ -103,8 +101,8 @@ def run_live(
         config: The configuration; None = the defaults.
         options: Options of the run; None = the defaults.
         rate: How many times as fast as recorded a recording is played.
-        map_path: Find the drive in this map instead of making one: folder of a run, or map file.
-        start: Where the drive begins in it, roughly; None = anywhere.
+        map_path: Find the drive in this map instead of making one, as `run_localize` does.
+        start: As there.
         stopped: Asked now and then; True ends the drive, whose map is then completed.
 
     Returns:
@@ -121,7 +119,12 @@ def run_live(
     if config.odometry.method == "kiss":
         what = "while images arrive, poses come before the points that kiss-icp needs"
         raise SettingsError(what, where="odometry.method", got="kiss", expected="visual")
-    _warm_up(LiveSource(_Beginning(source), stopped=stopped), config, map_path)
+    first = LiveSource(_Beginning(source), stopped=stopped)  # what comes is done once and forgotten
+    with Map.temporary() if map_path is None else Map.open(map_path) as map_:
+        if map_path is None:
+            map_sequence(first, config, workspace=Workspace(map_))
+        else:
+            localize_sequence(first, Workspace(map_), config)
     played = LiveSource(source, None if source.live else rate, stopped)
     options = replace(options, audit=False)
     if map_path is not None:
@@ -149,13 +152,3 @@ class _Beginning(DerivedSource):
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         return iter(self._pairs[start:])
-
-
-def _warm_up(source: LiveSource, config: ReconConfig, map_path: StrPath | None) -> None:
-    """Do once with the first pairs what comes, and forget it."""
-    if map_path is None:
-        with Map.temporary() as map_:
-            map_sequence(source, config, workspace=Workspace(map_))
-    else:
-        with Map.open(map_path) as map_:
-            localize_sequence(source, Workspace(map_), config)

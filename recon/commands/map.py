@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
@@ -145,7 +144,6 @@ def map_drive(
 
 
 def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
-    """Return what the user should know about the drive."""
     return [
         *source.warnings(),
         *health_warnings(mapped.health),
@@ -158,7 +156,6 @@ def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
 def _summary(
     source: StereoSource, result: MapRun, warnings: list[str], options: MapOptions
 ) -> dict[str, Any]:
-    """Return the figures of path, map and errors."""
     mapped, errors, given = result.mapped, result.errors, options.known_poses is not None
     frames, drift, prior = len(mapped.trajectory), mapped.expected_drift, mapped.prior
     known = {"trajectory": errors.path, "map": errors.surface, "occupancy": errors.occupancy}
@@ -193,16 +190,12 @@ def with_resume_hint(run: RunDirectory, source: StereoSource) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, MemoryError, OSError, ReconError) as error:
-        hinted = _with_hint(error, _way_on(run.folder, source)) if run.begun else None
+        way_on = f"recon map --resume {shlex.quote(str(run.folder))} goes on from there"
+        left = f"the map so far is in {state_folder(run.folder) / STARTED}"
+        hinted = _with_hint(error, left if source.live else way_on) if run.begun else None
         if hinted is None:
             raise
         raise hinted from error
-
-
-def _way_on(folder: Path, source: StereoSource) -> str:
-    if source.live:
-        return f"the map so far is in {state_folder(folder) / STARTED}"
-    return f"recon map --resume {shlex.quote(str(folder))} goes on from there"
 
 
 def _with_hint(error: BaseException, hint: str) -> BaseException | None:

@@ -32,12 +32,9 @@ from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 
 _OTHER: Final = {
-    "config": "other settings",
-    "source": "another source",
-    "poses": "other poses",
-    "prior": "another prior",
-    "versions": "other versions",
-}
+    "config": "other settings", "source": "another source", "poses": "other poses",
+    "prior": "another prior", "versions": "other versions",
+}  # fmt: skip
 _HEAD_BYTES: Final = 4096
 
 
@@ -139,16 +136,11 @@ class MapOptions:
         settings = load_config(file, changes, started["identity"]["config"])
         now = {"config": settings.model_dump(mode="json")}
         _refuse_others(now, started["identity"], folder)
-        return replace(
-            self,
-            out=folder,
-            resume=True,
-            mesh=earlier.mesh,
-            source=self.source or earlier.source,
-            kind=self.kind or earlier.kind,
-            poses_file=self.poses_file or earlier.poses_file,
-            prior_from=self.prior_from or earlier.prior_from,
-        ), settings
+        given = {
+            name: getattr(self, name) or getattr(earlier, name)
+            for name in ("source", "kind", "poses_file", "prior_from")
+        }
+        return replace(self, out=folder, resume=True, mesh=earlier.mesh, **given), settings
 
     def run(self, config: ReconConfig) -> Run:
         """Return the run, which begins when it is entered."""
@@ -201,7 +193,6 @@ def _read_started(folder: Path) -> dict[str, Any]:
 
 
 def _checked(started: Any) -> dict[str, Any]:
-    """Check that it has the form that `MapOptions.begin` writes."""
     parts = (started["identity"], started["identity"]["config"], started["arguments"])
     plain = all(isinstance(part, dict) for part in parts)
     if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
@@ -239,7 +230,6 @@ def _absolute(path: StrPath | None) -> str | None:
 
 
 def _digest(path: Trajectory | None) -> str | None:
-    """Return SHA-256 of the poses and timestamps; None = no trajectory."""
     if path is None:
         return None
     return hashlib.sha256(path.T_world_camera.tobytes() + path.timestamps_s.tobytes()).hexdigest()

@@ -27,7 +27,6 @@ from recon.map.store.map_file import MAP_FILE
 from recon.run.batch.cluster import BatchOptions
 from recon.run.batch.job import Job
 from recon.run.batch.results import JobResult, work_off
-from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 from recon.sources.source import SourcePart, StereoSource
 
@@ -112,16 +111,8 @@ def read_plan(plan: Path) -> tuple[list[Piece], dict[str, Any], dict[str, Any]]:
         return [Piece(*piece) for piece in pieces], arguments, config
 
 
-def run_piece(
-    plan: Path,
-    number: int,
-    out: Path,
-    *,
-    resume: bool = False,
-    threads: int | None = None,
-    progress: Progress = SILENT,
-) -> dict[str, Any]:
-    """Map a piece of a drive into a folder, or go on with it: what the jobs do."""
+def run_piece(plan: Path, number: int, options: MapOptions) -> dict[str, Any]:
+    """Map a piece of a drive, or go on with it: what the jobs do."""
     pieces, arguments, settings = read_plan(plan)
     # Loops are looked for in the whole drive.
     config = ReconConfig.parse(settings, where=str(plan))
@@ -129,10 +120,9 @@ def run_piece(
     config = config.model_copy(update={"loops": loops})
     source, _ = MapOptions.of(arguments).open(config)
     part = SourcePart(source, *pieces[number])
-    options = MapOptions("piece", out, threads, progress=progress, resume=resume)
     with options.run(config) as run, options.begin(run, part, config) as map_:
         work = Workspace(map_, run.watch, run.threads)
-        map_sequence(part, config, progress=progress, workspace=work)
+        map_sequence(part, config, progress=options.progress, workspace=work)
         keep_map(map_, run.path(MAP_FILE))
         summary = {"frames": len(part), "warnings": []}
         run.finish(summary, source=part.name, inputs=())
@@ -154,14 +144,9 @@ def _refuse_what_does_not_combine(config: ReconConfig, options: MapOptions) -> N
 def piece_job(plan: Path, number: int, piece: Piece, threads: int | None) -> Job:
     """Return what a worker does for a piece: it runs `run_piece`."""
     limit = () if threads is None else ("--threads", str(threads))
-    return Job(
-        name=str(number),
-        command="piece",
-        source=f"{piece.first} to {piece.last - 1}",
-        words=("piece", str(resolved(plan)), str(number), *limit, "--json", "--verbose"),
-        writes=True,
-        folder=str(Path.cwd()),
-    )
+    frames = f"{piece.first} to {piece.last - 1}"
+    words = ("piece", str(resolved(plan)), str(number), *limit, "--json", "--verbose")
+    return Job(str(number), "piece", frames, words, writes=True, folder=str(Path.cwd()))
 
 
 def _checked(one: JobResult) -> dict[str, Any]:

@@ -139,10 +139,7 @@ def _make_joined(
     replaced: Path | None = None,
     survey: Survey | None = None,
 ) -> dict[str, Any]:
-    """Fill the map of a run, link and place its drives, and make its products and its report.
-
-    It may take the place of a run; positions may be measured beside those that drives have already.
-    """
+    """Fill the map of a run, which may replace another, link and place its drives, and report."""
     how: Any = {"threads": options.threads, "progress": options.progress}
     with (
         WholeRun(options.command, replaced or options.out, settings, **how) as run,
@@ -157,25 +154,19 @@ def _make_joined(
         with run.stage("map"):
             placed = place_map(map_, settings, run.threads)
         made = make(Order(map_, placed, run, settings.mesh), options.products)
-        T_map_world = map_.first.T_map_world.tolist()
-        warnings = [*left_out, *_warnings(map_), *made.warnings]
-        summary = {**_figures(map_), **made.figures, "T_map_world": T_map_world}
-        summary["warnings"] = warnings
+        axes = {"T_map_world": map_.first.T_map_world.tolist()}
+        summary = {**_figures(map_), **made.figures, **axes}
+        summary["warnings"] = [*left_out, *_warnings(map_), *made.warnings]
         export_sessions(map_, run)
         with run.report(summary):
             write_joined_page(map_, made, summary, run)
         map_.close()
-        run.finish(
-            summary,
-            source=", ".join(session["name"] for session in summary["sessions"]),
-            inputs=inputs,
-            record={"T_map_world": T_map_world},
-        )
+        names = ", ".join(session["name"] for session in summary["sessions"])
+        run.finish(summary, source=names, inputs=inputs, record=axes)
     return summary
 
 
 def _figures(map_: Map) -> dict[str, Any]:
-    """Return the figures of the drives and their links."""
     placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)

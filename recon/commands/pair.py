@@ -184,11 +184,8 @@ def match(
     config = ReconConfig.parse({"matching": _own_settings(matcher, settings)}).with_matcher(matcher)
     pair = StereoPair(left, right)
     height_px, width_px = pair.left.shape[:2]
-    if calibration is None:
-        camera: _Rig = stand_in_camera(width_px, height_px)
-    else:
-        camera = _rig_of(calibration, pair)
-    return FrameReconstructor(camera, config).match(pair)[1]
+    camera = stand_in_camera(width_px, height_px) if calibration is None else calibration
+    return FrameReconstructor(_rig_of(camera, pair), config).match(pair)[1]
 
 
 def reconstruct(
@@ -228,10 +225,7 @@ def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[s
         return {field_of(matcher): settings}
     if settings:
         check_matcher(matcher)
-        raise SettingsError(
-            "only recon's own matchers take settings",
-            where=f"matcher {name_of(matcher)!r}",
-            got=", ".join(settings),
-            hint="make the object with them",
-        )
+        where, hint = f"matcher {name_of(matcher)!r}", "make the object with them"
+        what = "only recon's own matchers take settings"
+        raise SettingsError(what, where=where, got=", ".join(settings), hint=hint)
     return {}

@@ -73,9 +73,8 @@ def run_paper(
         }
         with run.report(summary):
             write_paper_page(source, done, summary, run)
-        run.finish(
-            summary, source=str(source), inputs=[f for one in experiments for f in one.files]
-        )
+        inputs = [file for one in experiments for file in one.files]
+        run.finish(summary, source=str(source), inputs=inputs)
     return summary
 
 
