@@ -285,9 +285,7 @@ def test_the_principal_point_looks_straight_ahead_right_is_x_and_down_is_y(dtype
     xyz = unproject(u, v, np.ones(3, dtype), CAMERA)
     assert xyz.dtype == dtype
     np.testing.assert_allclose(np.sign(xyz), [[0, 0, 1], [1, 0, 1], [0, 1, 1]])
-
-
-def test_points_behind_the_camera_have_no_pixel() -> None:
+    # Points behind the camera have no pixel.
     for values in project(np.array([[0.0, 0, -1], [0, 0, 0], [0, 0, 1]]), CAMERA):
         assert np.isnan(values).tolist() == [True, True, False]
 

@@ -203,7 +203,7 @@ def surface(street) -> PointCloud:
     return true_surface(street, range_m=25.0, voxel_m=0.1)
 
 
-def test_surface_points_lie_on_what_the_camera_sees(street, surface):
+def test_the_surface_is_what_the_camera_sees_thin_and_within_its_range(street, surface):
     assert surface.frame == "world"
     # World is the first camera, so points in its view are hit by rays through their projections.
     inside, found = _depths_at(street, 0, surface.xyz.astype(np.float64))
@@ -211,9 +211,6 @@ def test_surface_points_lie_on_what_the_camera_sees(street, surface):
     # float32 coordinates of 25 m are good to 1e-6 m; grazing rays magnify that.
     assert np.isclose(found, z, rtol=1e-4, atol=1e-3).mean() > 0.8
     assert (found > z * 1.0001 + 1e-3).mean() < 0.01
-
-
-def test_the_surface_is_thin_above_the_road_and_within_its_range(street, surface):
     cells = np.floor(surface.xyz / np.float32(0.1)).astype(int)
     assert len(np.unique(cells, axis=0)) == len(surface)
     assert len(surface) > 10_000
@@ -225,7 +222,7 @@ def test_the_surface_is_thin_above_the_road_and_within_its_range(street, surface
     assert ((xyz - last[:3, 3]) @ last[:3, 2]).max() < 25.5
 
 
-def test_the_ground_plan_of_a_box_is_that_on_paper(box_world):
+def test_the_ground_plan_of_a_box_is_that_on_paper_and_turns_with_the_map_axes(box_world):
     camera = StreetCamera(box_world)
     truth = true_occupancy(camera, resolution_m=0.25, band_m=(0.3, 2.0), range_m=30.0)
     grid = truth.grid
@@ -242,9 +239,6 @@ def test_the_ground_plan_of_a_box_is_that_on_paper(box_world):
     # Up to 5.5 m rows of pixels meet the road less than a cell apart: Z² / (f·h) = 0.2 m.
     assert truth.seen[(x > 3) & (x < 5.5) & (np.abs(y) < 0.9)].all()
     assert not truth.seen[(x > 10.5) & (x < 14) & (np.abs(y) < 0.5)].any()
-
-
-def test_the_grid_turns_with_the_map_axes_and_has_what_is_in_the_band(box_world):
     camera = StreetCamera(box_world)
     turn = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
     plain = true_occupancy(camera, range_m=15.0)
@@ -257,7 +251,9 @@ def test_the_grid_turns_with_the_map_axes_and_has_what_is_in_the_band(box_world)
     assert none == 0
 
 
-def test_seen_obstacles_of_the_street_are_where_surface_points_are(street, surface):
+def test_obstacles_are_where_surface_points_are_and_frames_count_how_often_they_were_seen(
+    street, surface
+):
     truth = true_occupancy(street, range_m=60.0)
     world = street.world
     xyz = surface.xyz.astype(np.float64)
@@ -268,9 +264,6 @@ def test_seen_obstacles_of_the_street_are_where_surface_points_are(street, surfa
     hit = truth.grid.cells[cells[:, 1], cells[:, 0]] == OCCUPIED
     assert hit.mean() > 0.97
     assert 0.02 < (truth.grid.cells == OCCUPIED).mean() < 0.4
-
-
-def test_frames_count_how_often_a_cell_was_seen(street):
     T = street.world.T_map_world
     truth = true_occupancy(street, range_m=15.0, least_frames=3)
     assert 0 <= truth.frames.min() < truth.frames.max() == len(street)
@@ -357,7 +350,7 @@ def block() -> StreetCamera:
     return StreetCamera(build_street(settings))
 
 
-def test_the_line_around_a_block_closes_and_the_second_lap_runs_where_the_first_did(block):
+def test_laps_around_a_block_are_the_same_and_nothing_stands_on_the_road(block):
     road = centre_line(StreetScene(path="block", block_m=BLOCK_M), 0.0)
     assert road.loop_m == pytest.approx(LAP_M)
     # Steps of 0.25 m replace each corner's arc by chords, all four alike.
@@ -370,9 +363,6 @@ def test_the_line_around_a_block_closes_and_the_second_lap_runs_where_the_first_
     assert block.world.trajectory.distances_m[100] == pytest.approx(expected_m, rel=0.005)
     assert np.array_equal(block.pair(3).left, block.pair(103).left)
     assert not np.array_equal(block.pair(3).left, block.pair(53).left)
-
-
-def test_nothing_stands_on_the_road_around_a_block_nor_inside_its_corners(block):
     road = centre_line(block.world.settings, 0.0)
     corners = block.world.soup.vertices.reshape(-1, 3)
     standing = corners[(corners[:, 2] > 0.3) & (corners[:, 2] < 2.5), :2]
@@ -454,15 +444,12 @@ def test_shapes_have_their_area_and_are_closed(soup, area: float, closed: bool):
     assert np.allclose(np.linalg.norm(soup.normals, axis=2), 1.0)
 
 
-@pytest.mark.parametrize("splits", [0, 1, 3])
-def test_an_icosphere_is_closed_and_round(splits):
-    triangles = icosphere(splits)
-    assert len(triangles) == 20 * 4**splits
-    assert np.allclose(np.linalg.norm(triangles, axis=2), 1.0)
-    assert _open_edges(triangles) == 0
-
-
-def test_a_bumpy_ball_is_closed_and_near_its_radius():
+def test_an_icosphere_is_closed_and_round_and_a_bumpy_ball_near_its_radius():
+    for splits in (0, 1, 3):
+        triangles = icosphere(splits)
+        assert len(triangles) == 20 * 4**splits
+        assert np.allclose(np.linalg.norm(triangles, axis=2), 1.0)
+        assert _open_edges(triangles) == 0
     ball = bumpy_ball([2.0, 2.0, 2.0], PAINT, bump=0.2, wavelength=0.4)
     radius = np.linalg.norm(ball.vertices, axis=2)
     assert _open_edges(ball.vertices) == 0

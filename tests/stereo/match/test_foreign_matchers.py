@@ -117,6 +117,7 @@ def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named() -> No
     valid[:, :9] = False
     found = make_matcher(mine).match(RectifiedPair(image(), image(), CAMERA, valid=valid))
     assert np.array_equal(found.valid, valid)
+    assert all(isinstance(make_matcher(name, threads=1), Matcher) for name in MATCHERS)
     assert mine.ndisp is not None
     assert mine.ndisp >= 1
 
@@ -164,12 +165,15 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("plugin")
-def test_a_registered_matcher_has_a_name_but_not_one_of_ours() -> None:
+def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path: Path) -> None:
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
     made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
     assert type(made) is MATCHERS["sad"]
     with pytest.raises(SettingsError, match=r"unknown matcher.*'cencus'.*fails, flat.*sad, sgm"):
         recon.match(image(), image(), matcher="cencus")
+    install_plugin(tmp_path, "other-matcher", {}, {"flat": "other_matcher:Flat"})
+    with pytest.raises(SettingsError, match=r"same name.*flat-matcher.*and.*other-matcher"):
+        recon.match(image(), image(), matcher="flat")
 
 
 @pytest.mark.usefixtures("plugin")
@@ -187,18 +191,6 @@ def test_a_broken_plugin_is_named_in_one_line(name: str, words: str) -> None:
         recon.match(image(), image(), matcher=name)
     assert f"matcher {name!r}" in str(raised.value)
     assert "of package flat-matcher" in str(raised.value)
-
-
-@pytest.mark.usefixtures("plugin")
-def test_two_plugins_of_one_name_are_refused(tmp_path: Path) -> None:
-    install_plugin(tmp_path, "other-matcher", {}, {"flat": "other_matcher:Flat"})
-    with pytest.raises(SettingsError, match=r"same name.*flat-matcher.*and.*other-matcher"):
-        recon.match(image(), image(), matcher="flat")
-
-
-@pytest.mark.parametrize("name", MATCHERS)
-def test_a_matcher_whose_range_is_estimated_is_a_matcher(name: str) -> None:
-    assert isinstance(make_matcher(name, MatchingSettings(), threads=1), Matcher)
 
 
 def test_the_example_of_the_page_finds_a_shift_when_it_is_installed(

@@ -77,16 +77,15 @@ def write_mean(path: Path, inputs: list[str], shape: tuple[int | None, ...]) -> 
     return path
 
 
-def test_inputs_channels_and_size_are_those_that_the_network_declares(tmp_path: Path) -> None:
+def test_inputs_are_those_that_the_network_declares_and_what_is_not_finite_no_match(
+    tmp_path: Path,
+) -> None:
     path = write_mean(tmp_path / "one.onnx", ["both"], (1, None, None, None))
     stacked = match(path, pair_of(4, 8), std=(1 / 255,))
     assert np.nanmedian(stacked.values) == pytest.approx(6, abs=1e-3)
     path = write_mean(tmp_path / "fixed.onnx", ["left", "right"], (1, 3, 20, 30))
     fixed = match(path, pair_of(18, 10), mean=(0.1, 0.1, 0.1), std=(1 / 255,))
     assert np.nanmedian(fixed.values) == pytest.approx(16)
-
-
-def test_what_is_not_finite_is_no_match(tmp_path: Path) -> None:
     nodes = [(["left", "right"], "x", "Sub"), (["x"], "d", "Log")]
     path = write_network(tmp_path / "log.onnx", ["left", "right"], nodes)
     assert (match(path, pair_of(10, 30)).reason == Reason.AMBIGUOUS).all()
