@@ -52,7 +52,6 @@ def bend_m(path: Trajectory, truth: Trajectory) -> float:
 
 def test_a_path_runs_through_measured_positions(truth: Trajectory, odometry: Trajectory) -> None:
     found = held(odometry, measured(truth, 0.01))
-    assert found is not None
     assert bend_m(odometry, truth) > 1.0
     assert bend_m(found.trajectories[0], truth) < 0.1
     first = found.trajectories[0].T_world_camera[0]
@@ -61,7 +60,6 @@ def test_a_path_runs_through_measured_positions(truth: Trajectory, odometry: Tra
 
 def test_rough_positions_leave_a_smooth_path_smooth(truth: Trajectory) -> None:
     found = held(truth, measured(truth, 1.0))
-    assert found is not None
     paths = (truth.T_world_camera, found.trajectories[0].T_world_camera)
     before, after = (invert(T[:-1]) @ T[1:] for T in paths)
     off = invert(before) @ after

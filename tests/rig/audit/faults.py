@@ -57,13 +57,7 @@ def changed(
     return Spoiled(rectified(source), len(source), take)
 
 
-def turned(
-    source: StereoSource,
-    pitch_deg: float = 0.0,
-    roll_deg: float = 0.0,
-    yaw_deg: float = 0.0,
-    enlarged: float = 1.0,
-) -> Spoiled:
+def turned(source: StereoSource, pitch_deg=0.0, roll_deg=0.0, yaw_deg=0.0, enlarged=1.0) -> Spoiled:
     """The right camera turned, and its lens changed: another view from the same place."""
     camera = rectified(source)
     K = camera.matrix.copy()
@@ -125,9 +119,13 @@ def duplicated(source: StereoSource, every: int = 5) -> Spoiled:
     return Spoiled(rectified(source), len(order), take)
 
 
+def half_as_large(source: StereoSource) -> Spoiled:
+    return changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
+
+
 def wrong_size(source: StereoSource) -> Spoiled:
     """The images are half as large as those that were calibrated."""
-    half = changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
+    half = half_as_large(source)
 
     def take(index: int) -> StereoPair:
         pair = half.take(index)
@@ -142,7 +140,7 @@ def wrong_size(source: StereoSource) -> Spoiled:
 
 def silently_wrong_size(source: StereoSource) -> Spoiled:
     """The same, with a calibration file that does not contain the image size."""
-    half = changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
+    half = half_as_large(source)
     height, width = half.take(0).left.shape[:2]
     return replace(half, camera=replace(rectified(half), width_px=width, height_px=height))
 

@@ -160,10 +160,8 @@ def test_nothing_is_found_on_scenes_of_one_pair(recon_data: Path, scene: str) ->
 @pytest.mark.slow
 def test_a_turn_planted_in_a_real_drive_is_found(recon_data: Path) -> None:
     source = open_source(recon_data / "driven" / "kitti_raw_0013")
-    yaw = [
-        audit_source(drive, CONFIG).motion.turn.values[1]
-        for drive in (source, faults.turned(source, yaw_deg=0.06))
-    ]
+    drives_ = (source, faults.turned(source, yaw_deg=0.06))
+    yaw = [audit_source(drive, CONFIG).motion.turn.values[1] for drive in drives_]
     assert np.degrees(yaw[1] - yaw[0]) == pytest.approx(-0.06, rel=0.2)
 
 

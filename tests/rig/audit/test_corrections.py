@@ -97,7 +97,6 @@ def test_what_is_seen_follows_a_place_as_its_derivatives_say() -> None:
 )
 def test_a_turn_of_the_right_camera_is_recovered(turn: tuple[float, ...]) -> None:
     found = estimate_turn([tracks(np.array(turn), seed) for seed in range(10)], CAMERA)
-    assert found is not None
     # 5e-5 rad are 0.035 px.
     np.testing.assert_allclose(found.values[:4], turn[:4], atol=5e-5)
     shown = np.array(turn[:4]) != 0
@@ -139,7 +138,6 @@ def drive(left: np.ndarray, right: np.ndarray) -> list[StereoTracks]:
 
 def test_rows_meet_and_disparities_fit_with_the_lenses_that_are_found() -> None:
     found = estimate_lenses(drive(LEFT, RIGHT), CAMERA)
-    assert found is not None
     v, u = np.mgrid[20:350:12j, 150:1050:20j]
     uv = np.stack([u, v], axis=-1)
     rig = found.calibration

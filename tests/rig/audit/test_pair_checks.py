@@ -42,25 +42,15 @@ def run(
     return run_command(PairInput(pair, camera), SETTINGS, out=out)
 
 
-class Notes(Silent):
-    """The stages of a run, as they begin."""
-
-    def __init__(self) -> None:
-        self.told: list[str] = []
-
-    def on_stage(self, name: str) -> None:
-        self.told.append(name)
-
-
 @pytest.fixture(scope="module")
 def good_run(
     pair: StereoPair, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[PairRun, Path, list[str]]:
     """A run of the pair with a mesh, its folder, and the stages that it told of."""
-    notes, out = Notes(), tmp_path_factory.mktemp("pair") / "run"
+    progress, out, told = Silent(), tmp_path_factory.mktemp("pair") / "run", []
+    progress.on_stage = told.append
     given = PairInput(pair, CAMERA)
-    made = run_pair(given, SETTINGS, out=out, formats=("glb",), progress=notes)
-    return made, out, notes.told
+    return run_pair(given, SETTINGS, out=out, formats=("glb",), progress=progress), out, told
 
 
 def test_images_that_show_nothing_are_refused_and_leave_nothing(
