@@ -23,6 +23,7 @@ from recon.core.values import (
 from recon.core.values.arrays import Float64
 from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
+from recon.report.scene import T_UPRIGHT_CAMERA
 
 HEIGHT_PX, WIDTH_PX = 24, 60
 METRICS = TrajectoryMetrics(0.62, 0.7, 0.41, 0.01, 0.03, 10.0, 11, (5.0,), 3)
@@ -46,11 +47,9 @@ def disparity() -> Disparity:
 
 
 @pytest.fixture
-def nothing_found() -> Disparity:
+def nothing_found(disparity: Disparity) -> Disparity:
     """A disparity map without any value."""
-    nan = np.full((HEIGHT_PX, WIDTH_PX), np.nan, dtype=np.float32)
-    reason = np.full(nan.shape, Reason.LOW_TEXTURE, dtype=np.uint8)
-    return Disparity(nan, np.zeros_like(nan), nan, reason)
+    return disparity.reject(np.ones(disparity.values.shape, bool), Reason.LOW_TEXTURE)
 
 
 @pytest.fixture
@@ -64,9 +63,7 @@ def trajectory() -> Trajectory:
 @pytest.fixture
 def T_map_world() -> Float64:
     """Camera axes turned so that x is forward and z up."""
-    T = np.zeros((4, 4))
-    T[0, 2], T[1, 0], T[2, 1], T[3, 3] = 1, -1, -1, 1
-    return T
+    return T_UPRIGHT_CAMERA
 
 
 @pytest.fixture
@@ -95,8 +92,7 @@ def cloud() -> PointCloud:
 @pytest.fixture
 def mesh() -> TriangleMesh:
     """A flat sheet of 2 × 19 × 19 triangles."""
-    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0), indexing="ij")
-    vertices = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
+    vertices = np.stack(np.mgrid[:20.0, :20.0, :1.0], axis=-1).reshape(-1, 3).astype(np.float32)
     number = np.arange(400, dtype=np.int32).reshape(20, 20)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])

@@ -25,12 +25,7 @@ from recon.core.values import Disparity, DisparityTruth, PointCloud, Reason, Tra
 from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 from recon.report.map_page import map_content, write_joined_page, write_map_page
-from recon.report.page import (
-    command_line,
-    page_environment,
-    render_page,
-    summary_rows,
-)
+from recon.report.page import command_line, page_environment, render_page, summary_rows
 from recon.report.pair_page import pair_content, write_pair_page
 from recon.report.scene import Scene, plot_scene
 from recon.report.style import REASON_COLOURS
@@ -48,12 +43,11 @@ class Loads(HTMLParser):
 
     VOID: ClassVar = frozenset({"meta", "img", "br", "wbr", "link", "input"})
 
-    def __init__(self) -> None:
+    def __init__(self, page: str) -> None:
         super().__init__()
-        self.loads: list[str] = []
-        self.tags: list[str] = []
-        self.open: list[str] = []
-        self.text = ""
+        self.loads, self.tags, self.open, self.text = list[str](), list[str](), list[str](), ""
+        self.feed(page)
+        self.close()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
@@ -68,24 +62,10 @@ class Loads(HTMLParser):
         self.text += data
 
 
-def parse(page: str) -> Loads:
-    parser = Loads()
-    parser.feed(page)
-    parser.close()
-    return parser
-
-
 def blocks(page: str) -> dict[str, str]:
     """The HTML of each block by its title."""
-    found = re.findall(
-        r"<figure class=\"block[^>]*>\s*<h3>(.*?)</h3>(.*?)</figure>", page, re.DOTALL
-    )
+    found = re.findall(r'<figure class="block[^>]*>\s*<h3>(.*?)</h3>((?s:.*?))</figure>', page)
     return {unescape(title): inside for title, inside in found}
-
-
-def images(page: str) -> set[str]:
-    """Titles of the blocks that are images."""
-    return {title for title, inside in blocks(page).items() if "<img" in inside}
 
 
 def key_figures(page: str) -> dict[str, str]:
@@ -174,14 +154,14 @@ def test_report_loads_nothing_from_outside_and_the_browser_would_refuse_it() -> 
     assert policy is not None
     assert "default-src 'none'" in policy[1]
     for page in (audit_page(), scene_page(view())):
-        assert all(target.startswith(("data:", "#")) for target in parse(page).loads)
-        assert "link" not in parse(page).tags
+        assert all(target.startswith(("data:", "#")) for target in Loads(page).loads)
+        assert "link" not in Loads(page).tags
         assert not re.search(r"@import|url\(", page)
         assert not re.search(r"https?://", page)
 
 
 def test_all_text_is_escaped_and_every_element_closed() -> None:
-    page, plain = parse(audit_page(NASTY)), parse(audit_page())
+    page, plain = Loads(audit_page(NASTY)), Loads(audit_page())
     assert page.open == []
     assert page.tags == plain.tags
     parts = ("Source", "Description", "Frames", "Check", "Cell", "Warning", "Word", "Package")
@@ -216,7 +196,7 @@ def test_text_in_a_scene_cannot_end_its_script() -> None:
     plot = {"data": [{"name": "</script><b>"}], "layout": {}}
     page = scene_page(plot)
     assert "</script><b>" not in page
-    assert parse(page).open == []
+    assert Loads(page).open == []
     (packed,) = re.findall(r'<script type="application/json">(.*?)</script>', page)
     assert json.loads(packed) == plot
 
@@ -278,7 +258,7 @@ def test_report_names_the_command_that_made_it_and_no_other_program(
 
 def test_page_of_a_drive_shows_all_that_the_run_has(drive: SimpleNamespace) -> None:
     page = map_html(drive)
-    assert images(page) == {
+    assert {title for title, inside in blocks(page).items() if "<img" in inside} == {
         "Occupancy grid", "Path from above", "Error along the path", "Health of the odometry",
         "Input pair", "Disparity", "Depth", "Why pixels have no disparity", "Confidence",
         "Time by stage",
@@ -311,9 +291,7 @@ def test_page_of_a_pair_shows_all_that_the_run_has(view: SimpleNamespace) -> Non
     assert "every m in this report is one baseline" in pair_html(view)
 
 
-def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
-    drive: SimpleNamespace,
-) -> None:
+def test_loops_that_were_closed_and_that_were_not_are_in_the_report(drive: SimpleNamespace) -> None:
     session, figures = drive.map_.first, {"found": 3, "keyframes": 11, "largest_correction_m": 2.5}
     session.loops = {"closed": [{"first": 0, "last": 9}]}
     drive.summary["loops"] = {**figures, "closed": 1}

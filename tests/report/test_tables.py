@@ -178,6 +178,7 @@ def test_a_sweep_is_drawn_with_a_point_per_job_and_medians(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert (folder / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    assert sweep_figure([JobResult(job("later", swept={"window": 9}))]) == b""
     figures: list[Figure] = []
     monkeypatch.setattr(style, "to_png", lambda figure: figures.append(figure) or b"")
     jobs = [replace(one, figures={"seconds": float(n)}) for n, one in enumerate(results()[:6])]
