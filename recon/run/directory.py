@@ -33,8 +33,8 @@ STARTED: Final = "map.recon"  # state file of a run that can be resumed: the map
 _PARTIAL: Final = ".partial"
 _STATE: Final = ".state"
 _LOCK: Final = ".lock"
+# What an address begins with, such as ``s3:``; of ``s3://`` a path keeps one slash.
 _SCHEME: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
-"""What an address begins with, such as ``s3:``; of ``s3://`` a path keeps one slash."""
 #: Errors that the input did not cause: the run can be resumed later.
 _PASSING: Final = (
     ClusterError, OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt,
@@ -75,18 +75,14 @@ def refuse_links(folder: Path, *, below: Path | None = None) -> None:
 
 
 class RunDirectory:
-    """Context manager: files are written to `path` and appear in `folder` on success.
+    """Context manager: files are written to `path` and appear in `folder` on success."""
 
-    Attributes:
-        begun: Whether there is a map from which the run can be resumed; who begins one says so.
-        whole: Write beside the folder, and put the new one in its place in one step.
-    """
-
-    whole: ClassVar[bool] = False
+    whole: ClassVar[bool] = False  # written beside the folder, and takes its place in one step
 
     def __init__(self, folder: Path, *, latest: bool = False, resume: bool = False) -> None:
         self.folder = folder
         self.resumes = resume
+        # Whether there is a map from which the run can be resumed; who begins one says so.
         self.begun = resume and (state_folder(folder) / STARTED).is_file()
         self._latest = latest
         self._made: list[Path] = []
@@ -101,9 +97,7 @@ class RunDirectory:
 
     def state(self, name: str) -> Path:
         """Return the path of the state file ``name``, which is deleted when the run is done."""
-        target = self._content / _STATE / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        return target
+        return self.path(f"{_STATE}/{name}")
 
     def files(self) -> list[str]:
         """Return sorted names of the files written so far, without those of the state."""

@@ -13,15 +13,8 @@ from pathlib import Path
 from typing import Final
 
 _RECORDED: Final = (
-    "recon",
-    "numpy",
-    "numba",
-    "opencv-python-headless",
-    "open3d",
-    "kiss-icp",
-    "pymeshlab",
-)
-
+    "recon", "numpy", "numba", "opencv-python-headless", "open3d", "kiss-icp", "pymeshlab",
+)  # fmt: skip
 _STATUS: Final = Path("/proc/self/status")
 _PEAK: Final = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
 

@@ -133,9 +133,8 @@ class OneBehind:
 _UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", re.ASCII)
 #: Shares of the limit for an open submap, the cells of one tile, and what was read from the map.
-#: Sums grow by doubling
-#: and are copied when closed, so each briefly costs several times its size; most of the limit is
-#: left to the libraries, the images and the matcher.
+#: Sums grow by doubling and are copied when closed, so each briefly costs several times its size;
+#: most of the limit is left to the libraries, the images and the matcher.
 _SUBMAP_SHARE: Final = 1 / 40
 _TILE_SHARE: Final = 1 / 24
 _CACHE_SHARE: Final = 1 / 10
