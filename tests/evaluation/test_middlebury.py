@@ -218,6 +218,8 @@ def test_scenes_and_results_of_a_folder_become_figures(tmp_path: Path) -> None:
     write_pfm(submitted / "disp0X.pfm", true + np.float32(0.5))
     (submitted / "timeX.txt").write_text("1.5\n")
     (theirs,) = find_results([tmp_path / "theirs"], paths, ["shifted"])
+    (named,) = find_results([tmp_path / "theirs"], paths, ["theirs"])
+    assert (theirs.name, named.name) == ("theirs", f"{tmp_path.name}/theirs")
     given = read_result(theirs, teddy)
     assert given is not None
     assert read_result(theirs, scenes["Vintage"]) is None

@@ -123,12 +123,11 @@ def test_an_alignment_takes_away_what_it_may(alignment: str, ate_m: float, scale
 def test_segments_are_those_for_which_a_drive_has_room(
     frames: int, by_length: dict[float, int]
 ) -> None:
-    truth = trajectory(bend(frames, 0.01))
-    metrics = evaluate_trajectory(trajectory(bend(frames, 0.0101)), trajectory(straight(frames)))
+    truth = trajectory(straight(frames))
+    metrics = evaluate_trajectory(trajectory(bend(frames, 0.0101)), truth)
     assert {one.length_m: one.segments for one in metrics.by_length} == by_length
     assert metrics.segment_lengths_m == tuple(by_length)
     assert metrics.segments == sum(by_length.values())
-    metrics = evaluate_trajectory(trajectory(bend(frames, 0.0101)), truth)
     weights = [one.segments for one in metrics.by_length]
     for name in ("t_rel_percent", "r_rel_deg_per_100m"):
         mean = np.average([getattr(one, name) for one in metrics.by_length], weights=weights)
@@ -145,9 +144,8 @@ def test_lengths_and_steps_can_be_asked_for() -> None:
 
 def test_a_path_is_taken_from_a_file_and_from_the_truth_of_a_source(tmp_path: Path) -> None:
     path = trajectory(bend(100, 0.01))
-    found = evaluate_trajectory(path, path)
     write_tum(tmp_path / "path.txt", path)
-    assert evaluate_trajectory(path, SequenceTruth(path)) == found
+    assert evaluate_trajectory(path, SequenceTruth(path)) == evaluate_trajectory(path, path)
     assert evaluate_trajectory(str(tmp_path / "path.txt"), tmp_path / "path.txt").ate_m < 1e-9
     for nothing, got in (
         (SequenceTruth(), "SequenceTruth without a path"),
@@ -184,7 +182,7 @@ def test_every_path_of_a_metre_or_more_has_a_finite_error(steps: list[float]) ->
 @pytest.mark.parametrize(
     ("estimate", "truth", "told"),
     [
-        (straight(5), straight(6), "differ in length (got 5 poses, expected 6 poses)"),
+        (straight(5), straight(6), "differ in length .got 5 poses, expected 6 poses"),
         (straight(1), straight(1), "too few poses"),
         (straight(9), straight(9, 0.0), "too short"),
     ],
@@ -192,9 +190,8 @@ def test_every_path_of_a_metre_or_more_has_a_finite_error(steps: list[float]) ->
 def test_what_cannot_be_compared_is_reported(
     estimate: np.ndarray, truth: np.ndarray, told: str
 ) -> None:
-    with pytest.raises(EvaluationError) as error:
+    with pytest.raises(EvaluationError, match=told):
         evaluate_trajectory(trajectory(estimate), trajectory(truth))
-    assert told in str(error.value)
 
 
 @pytest.mark.real
@@ -391,13 +388,3 @@ def test_association_agrees_with_evo() -> None:
     for one, other in zip(ours, theirs, strict=True):
         np.testing.assert_array_equal(one.timestamps_s, other.timestamps)
     assert 0 < len(ours[0]) < len(kept)
-
-
-def test_segments_agree_with_evo_where_its_rules_are_kittis(evo: Any) -> None:
-    """Over one length, from every frame, and measured along the true path."""
-    estimate, truth = drive(400, seed=9)
-    found = compare_paths(estimate, truth, TrajectoryRules(lengths_m=(100.0,), step_frames=1))
-    metric = evo.RPE(evo.PoseRelation.translation_part, 100.0, evo.Unit.meters, 0.01, True, True)
-    mean_m = evo_statistics((of_evo(truth), of_evo(estimate)), metric)["mean"]
-    # evo ends at the frame nearest to 100 m, KITTI at the first beyond: steps are 0.9 m.
-    assert found.metrics.t_rel_percent == pytest.approx(mean_m, rel=0.01)

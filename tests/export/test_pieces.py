@@ -156,9 +156,9 @@ CONFIG = load_config(None, ["submaps.tile_m=6.4"])
 SETTINGS = MeshSettings(tile_m=8.0, trim_density_quantile=0.0)
 
 
-def street(seed: int = 0) -> PointCloud:
+def street() -> PointCloud:
     """A bumpy street from x = -2 to 11.5 m, 6 m wide, with a wall along it; 1 cm of noise."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     x, y = (axes.ravel() for axes in np.mgrid[-2:11.5:STEP_M, -3:3:STEP_M])
     ground = np.stack([x, y, 0.1 * np.sin(x) + 0.05 * np.cos(2 * y)], axis=1)
     along, up = (axes.ravel() for axes in np.mgrid[-2:11.5:STEP_M, 0.3:2.5:STEP_M])
@@ -170,28 +170,10 @@ def street(seed: int = 0) -> PointCloud:
     return PointCloud(xyz.astype(np.float32), rgb, normals, frame="map")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, list[TriangleMesh]]:
-    """The mesh of the street, and its tiles."""
-    folder = tmp_path_factory.mktemp("street")
-    with pytest.MonkeyPatch.context() as patch:
-        overlap_less(patch)
-        whole, tiles, warnings = written(filled(), folder / "out", threads=1)
-    assert warnings == []
-    return whole, tiles
-
-
-def overlap_less(patch: pytest.MonkeyPatch) -> None:
-    """Let tiles overlap in the proportion of the pieces of 8 m, which are small."""
-    patch.setattr("recon.export.mesh.pieces.OVERLAP_M", 1.5)
-
-
 @pytest.fixture
-def store() -> Tiles:
-    return filled()
-
-
-def filled() -> Tiles:
+def store(monkeypatch: pytest.MonkeyPatch) -> Tiles:
+    """The street in tiles, which overlap as little as the pieces of 8 m, which are small, do."""
+    monkeypatch.setattr("recon.export.mesh.pieces.OVERLAP_M", 1.5)
     store = Tiles(CONFIG, np.eye(4))
     cloud = street()
     # As from a drive: in pieces that do not know the tiles.
@@ -209,15 +191,15 @@ def written(
         write_ply(layer, street())
         found = export_mesh(store, settings, directory, layer, threads)
         directory.write_json("run.json", {"files": directory.files()})
-    tiles = [read_mesh(path) for path in sorted((folder / "mesh" / "tiles").glob("*.ply"))]
+    tiles = [*map(read_mesh, sorted((folder / "mesh" / "tiles").glob("*.ply")))]
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)
 
 
-def test_tiles_lie_on_the_surface_and_are_the_whole(
-    made: tuple[TriangleMesh, list[TriangleMesh]],
+def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(
+    store: Tiles, tmp_path: Path
 ) -> None:
-    whole, tiles = made
-    assert len(tiles) == 2
+    whole, tiles, warnings = written(store, tmp_path / "alone", threads=1)
+    assert (warnings, len(tiles)) == ([], 2)
     assert sum(len(tile.faces) for tile in tiles) == len(whole.faces)
     np.testing.assert_array_equal(whole.vertices, np.concatenate([t.vertices for t in tiles]))
     # Within what was sampled; beyond it the surface goes on for two spacings, as it likes.
@@ -227,25 +209,13 @@ def test_tiles_lie_on_the_surface_and_are_the_whole(
     assert np.abs(z - 0.1 * np.sin(x) - 0.05 * np.cos(2 * y)).max() < 0.03
     assert whole.rgb is not None
     assert set(np.unique(whole.rgb)) >= {90, 200}
-
-
-def test_no_gap_is_left_where_tiles_meet(made: tuple[TriangleMesh, list[TriangleMesh]]) -> None:
-    distance_m = gaps_m(*made[1], Plane(0, 4.0))
+    distance_m = gaps_m(*tiles, Plane(0, 4.0))
     assert len(distance_m) > 2 * 60 * 7
     assert distance_m.max() < 0.1
     assert np.percentile(distance_m, 95) < 1e-4
-
-
-def test_tiles_made_at_once_are_those_made_one_by_one(
-    made: tuple[TriangleMesh, list[TriangleMesh]],
-    store: Tiles,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    overlap_less(monkeypatch)
-    alone, together = made[0], written(store, tmp_path / "out", threads=3)[0]
-    np.testing.assert_array_equal(together.vertices, alone.vertices)
-    np.testing.assert_array_equal(together.faces, alone.faces)
+    together = written(store, tmp_path / "at once", threads=3)[0]
+    np.testing.assert_array_equal(together.vertices, whole.vertices)
+    np.testing.assert_array_equal(together.faces, whole.faces)
 
 
 def test_a_target_is_that_of_all_tiles(store: Tiles, tmp_path: Path) -> None:
@@ -255,16 +225,10 @@ def test_a_target_is_that_of_all_tiles(store: Tiles, tmp_path: Path) -> None:
 
 
 def test_what_hangs_where_cameras_looked_is_cut_off(store: Tiles, tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    ball = rng.normal(0, 1, (3000, 3))
+    ball = np.random.default_rng(5).normal(0, 1, (3000, 3)).astype(np.float32)
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-    ghost = PointCloud(
-        (0.5 * ball + [1.0, 0.0, 1.6]).astype(np.float32),
-        rgb=np.full((3000, 3), 255, np.uint8),
-        normals=ball.astype(np.float32),
-        frame="map",
-    )
-    store.put_cloud(ghost)
+    xyz, rgb = 0.5 * ball + np.float32([1.0, 0.0, 1.6]), np.full((3000, 3), 255, np.uint8)
+    store.put_cloud(PointCloud(xyz, rgb, ball, frame="map"))
     cells = np.stack(np.meshgrid(*[np.arange(-8, 20)] * 2, np.arange(3, 13), indexing="ij"), -1)
     free = cells.reshape(-1, 3).astype(np.int32)
     store.put_voxels(OccupancyVoxels(free, np.full(len(free), -1, np.float32), 0.2))

@@ -49,7 +49,9 @@ def folder(tmp_path: Path) -> Iterator[Run]:
         yield run
 
 
-def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: Run) -> None:
+def test_cloud_and_octomap_of_tiles_are_those_of_the_whole(
+    mapped: MappedSequence, folder: Run
+) -> None:
     written = write_products(mapped, folder)
     whole = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     back = read_ply(folder.path("map/cloud.ply"))
@@ -57,13 +59,9 @@ def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: Run) ->
     assert back.frame == "map"
     for name in ("xyz", "normals", "rgb"):
         np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
-
-
-def test_the_octomap_of_tiles_is_that_of_the_whole(mapped: MappedSequence, folder: Run) -> None:
-    written = write_products(mapped, folder)
     assert written.figures["voxels"] == len(mapped.voxels) > 1000
-    whole = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels))
-    for theirs, end in zip(whole, ("bt", "ot"), strict=True):
+    files = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels))
+    for theirs, end in zip(files, ("bt", "ot"), strict=True):
         assert folder.path(f"map/octomap.{end}").read_bytes() == theirs.read_bytes()
 
 
@@ -145,20 +143,17 @@ def test_a_band_that_the_ground_or_nothing_falls_into_is_warned_of(
     assert said is None or re.search(said, warnings[0])
 
 
-def test_an_empty_height_band_is_reported(mapped: MappedSequence, folder: Run) -> None:
+def test_an_empty_height_band_and_a_grid_that_a_far_pose_makes_too_large_are_refused(
+    mapped: MappedSequence, folder: Run, tmp_path: Path
+) -> None:
     config = load_config(None, [*SETTINGS, "grid.min_height_m=2", "grid.max_height_m=1"])
     with pytest.raises(MappingError, match="height band"):
         write_products(replace(mapped, config=config), folder)
-
-
-def test_a_grid_that_a_far_pose_makes_too_large_is_refused(
-    mapped: MappedSequence, tmp_path: Path
-) -> None:
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
     path_m[-1] = (1e4, 1e4, 0.0)
     with pytest.raises(MappingError, match="grid would be too large"):
         export_grid(PlacedMap(mapped.tiles, path_m, np.ones(len(path_m), bool)), tmp_path / "grid")
-    assert list(tmp_path.iterdir()) == []
+    assert not [*tmp_path.glob("grid*")]
 
 
 def _random_cloud(seed: int, points: int) -> PointCloud:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -43,13 +42,8 @@ def boundary_edges(mesh: TriangleMesh) -> int:
 WHOLE = MeshSettings(depth=5, trim_density_quantile=0)
 
 
-@cache
-def whole_sphere() -> TriangleMesh:
-    return reconstruct_mesh(sphere(), WHOLE)
-
-
 def test_the_mesh_of_a_sphere_lies_on_it_is_closed_faces_out_and_has_its_colours() -> None:
-    mesh = whole_sphere()
+    mesh = reconstruct_mesh(sphere(), WHOLE)
     # Cells of 2.2 m / 2^5 = 69 mm; the surface is placed far better than a cell.
     assert np.abs(radii(mesh) - 1).max() < 0.005
     assert boundary_edges(mesh) == 0
@@ -105,9 +99,7 @@ def test_the_same_cloud_gives_the_same_mesh_and_nothing_else_is_touched(
 
 
 @pytest.mark.parametrize("viewpoint_m", [None, (3.0, 0.0, 5.0)])
-def test_a_cloud_without_normals_gets_them(
-    viewpoint_m: tuple[float, float, float] | None,
-) -> None:
+def test_a_cloud_without_normals_gets_them(viewpoint_m: tuple[float, float, float] | None) -> None:
     cloud = PointCloud(sphere(1000).xyz)
     mesh = reconstruct_mesh(cloud, MeshSettings(depth=4, trim_density_quantile=0), viewpoint_m)
     assert np.abs(radii(mesh) - 1).max() < 0.02
