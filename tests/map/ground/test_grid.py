@@ -1,15 +1,24 @@
-"""Flattening: obstacles stand above the local ground, and unknown stays unknown."""
+"""Axes on the ground, the flat grid above it, and the space that a vehicle took up."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
 from recon.core.errors import MappingError
-from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
+from recon.core.geometry.se3 import apply, exp_so3
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels, PointCloud
+from recon.core.values.grid import log_odds
 from recon.map.ground import grid as grid_file
+from recon.map.ground.axes import AxesSettings, GroundPlane, base_axes, estimate_ground, map_axes
+from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
 from recon.map.ground.surface import GroundSurface
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
+from recon.map.occupancy.part import OccupancyPart, free_part, join_occupancy
+from tests.map.walls import T_MAP_WORLD
 
 SLOPE = 0.1
 
@@ -39,9 +48,8 @@ def _road(low: tuple[float, float], high: tuple[float, float]) -> tuple[tuple, t
 
 
 def _cell(grid: OccupancyGrid, x: float, y: float) -> int:
-    column = int((x - grid.origin_m[0]) / grid.resolution_m)
-    row = int((y - grid.origin_m[1]) / grid.resolution_m)
-    return int(grid.cells[row, column])
+    column, row = (np.array([x, y]) - grid.origin_m) // grid.resolution_m
+    return int(grid.cells[int(row), int(column)])
 
 
 def _flatten(voxels: OccupancyVoxels, ground: GroundSurface, **settings: float) -> OccupancyGrid:
@@ -90,10 +98,8 @@ def test_unknown_stays_unknown() -> None:
     # A parked car whose sides gave no match: the road below it is seen, nothing above it.
     below = (_box((2, 0, -1.6), (4, 2, -1.4)), 2.0)
     over = (_box((2, 0, 0.0), (4, 2, 0.4)), -2.0)
-    assert (
-        _cell(_flatten(_voxels(*_road((0, 0), (2, 2)), below, over), _ground()), 3.0, 1.0)
-        == UNKNOWN
-    )
+    grid = _flatten(_voxels(*_road((0, 0), (2, 2)), below, over), _ground())
+    assert _cell(grid, 3.0, 1.0) == UNKNOWN
     # Where no ground is known, even what is full is unknown.
     far = _voxels((_box((100, 0, -1.6), (104, 4, 1.0)), 2.0))
     assert (_flatten(far, _ground()).cells == UNKNOWN).all()
@@ -155,11 +161,8 @@ def test_a_cell_beside_an_obstacle_that_was_hit_low_is_not_free() -> None:
 
 
 def test_undecided_voxels_are_dropped() -> None:
-    voxels = OccupancyVoxels(
-        np.arange(15, dtype=np.int32).reshape(5, 3),
-        np.array([2.0, 0.3, 0.1, -0.4, -0.8], np.float32),
-        0.2,
-    )
+    values = np.array([2.0, 0.3, 0.1, -0.4, -0.8], np.float32)
+    voxels = OccupancyVoxels(np.arange(15, dtype=np.int32).reshape(5, 3), values, 0.2)
     # 0.55 and 0.35 are log-odds of 0.20 and -0.62: one look is not enough for free.
     kept = drop_undecided(voxels)
     assert kept.log_odds.tolist() == pytest.approx([2.0, 0.3, -0.8])
@@ -179,3 +182,178 @@ def test_the_ground_is_as_thick_as_what_is_seen_below_it_but_not_as_deep_as_a_ho
     unsure = _box((0, -2, -2.0), (4, 2, -1.8)), 0.05
     depths_m = ground_depths(_voxels(road, low, hole, unsure), _ground())
     np.testing.assert_allclose(depths_m, np.full(200, 0.1), atol=1e-6)
+
+
+HEIGHT_M, CELL_M = 1.6, 0.2
+EMPTY = log_odds(0.12)
+
+
+def _road_of(drops_m: float | None = None) -> GroundSurface:
+    """A level road, 20 x 20 m, 1.6 m below the map's origin."""
+    heights = np.full((20, 20), -HEIGHT_M)
+    drops = None if drops_m is None else np.full((20, 20), drops_m)
+    return GroundSurface(heights, 1.0, (-10.0, -10.0), HEIGHT_M, drops)
+
+
+def _line(length_m: float = 4.0) -> np.ndarray:
+    x = np.arange(0.0, length_m, CELL_M / 2)
+    return np.stack([x, np.full(len(x), 0.05), np.zeros(len(x))], axis=1)
+
+
+def _through(path: np.ndarray, trusted: list[bool] | None = None) -> DrivenPath:
+    sure = np.ones(len(path), bool) if trusted is None else np.array(trusted)
+    return DrivenPath.through(path, sure, np.arange(len(path)), 0.1)
+
+
+def test_a_vehicle_takes_up_its_width_from_the_ground_to_the_camera() -> None:
+    keys = sweep(_line(), _road_of(), 1.0, CELL_M)
+    centres = (keys + 0.5) * CELL_M
+    assert len(np.unique(keys, axis=0)) == len(keys)
+    # Centres of voxels within half a width of y = 0.05, and between -1.6 and 0 m.
+    assert np.abs(centres[:, 1] - 0.05).max() <= 0.5
+    assert np.unique(centres[:, 1]).tolist() == pytest.approx([-0.3, -0.1, 0.1, 0.3, 0.5])
+    assert (centres[:, 2].min(), centres[:, 2].max()) == pytest.approx((-1.5, -0.1))
+    # Half a width before the start, and behind the end.
+    assert centres[:, 0].min() == pytest.approx(-0.3)
+    narrow = sweep(np.array([[0.45, 0.45, 0.0]]), _road_of(), 0.1, 0.5)
+    assert np.unique(narrow[:, :2], axis=0).tolist() == [[0, 0]]
+    # Above a table, or without ground, nothing.
+    assert len(sweep(np.array([[30.0, 0.0, 0.0]]), _road_of(), 1.0, CELL_M)) == 0
+    assert len(sweep(_line(), _road_of(drops_m=0.7), 1.0, CELL_M)) == 0
+    assert len(sweep(_line(), _road_of(drops_m=1.7), 1.0, CELL_M)) > 0
+
+
+def test_a_path_is_filled_in_between_trusted_poses_alone() -> None:
+    path = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], float)
+    whole = _through(path)
+    assert np.diff(whole.points_m[:, 0]) == pytest.approx(np.full(40, 0.1))
+    assert whole.submap[:12].tolist() == [0] + [1] * 10 + [2]
+    broken = _through(path, [True, True, False, True, False])
+    assert broken.points_m[:, 0] == pytest.approx([*np.arange(0, 1.05, 0.1), 3.0])
+    assert len(_through(path, [False] * 5).points_m) == 0
+    assert len(_through(np.zeros((1, 3))).points_m) == 1
+    assert _through(np.zeros((5, 3))).submap.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_cars_and_walkers_drive_and_drones_do_not() -> None:
+    steps = np.arange(200)
+    walker = 1.5 + 0.05 * np.sin(steps)
+    assert is_driven(walker, 1.5)
+    # A flight between half a metre and three metres: the commonest height is one of many.
+    drone = 1.75 + 1.25 * np.sin(steps / 20)
+    assert not any(is_driven(drone, height) for height in np.arange(0.5, 3.1, 0.25))
+    assert not is_driven(walker, float("nan"))
+    # A given height of a camera that never sees the ground below its path is believed.
+    assert is_driven(np.zeros(0), 0.3)
+
+
+def _part_of(clouds: list[np.ndarray]) -> OccupancyPart:
+    builder = OccupancyBuilder(OccupancySettings(), T_MAP_WORLD)
+    for xyz in clouds:
+        builder.integrate(PointCloud(xyz.astype("f4")), np.eye(4))
+    return builder.part()
+
+
+def _plate(z_m: float) -> np.ndarray:
+    """A car's rear at depth z, 0.1 to 1.4 m above the road."""
+    x, y = np.meshgrid(np.arange(-0.8, 0.8, 0.04), np.arange(0.2, 1.5, 0.04))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, z_m)], axis=1)
+
+
+def _flat(parts: list[OccupancyPart]) -> OccupancyGrid:
+    return flatten(join_occupancy(parts).voxels(CELL_M), _road_of(), GridSettings())
+
+
+def test_what_drove_off_before_the_vehicle_came_leaves_no_trace() -> None:
+    before = _part_of([_plate(3.1)] * 6)
+    assert _cell(_flat([before]), 3.1, 0.1) == OCCUPIED
+    passed = free_part(sweep(_line(), _road_of(), 1.8, CELL_M), EMPTY)
+    after = _flat([before, passed])
+    assert _cell(after, 3.1, 0.1) == FREE
+    # Seen on the track on a later visit, it is there.
+    assert _cell(_flat([passed]), 3.1, 0.1) == FREE
+    assert _cell(_flat([passed, before]), 3.1, 0.1) == OCCUPIED
+    # Beside the vehicle's width, what was seen stays.
+    narrow = free_part(sweep(_line(), _road_of(), 0.6, CELL_M), EMPTY)
+    assert _cell(_flat([before, narrow]), 3.1, 0.6) == OCCUPIED
+
+
+def test_what_hangs_above_the_camera_stays() -> None:
+    # A robot 0.5 m high under a table of 0.75 m: whether others fit below it says the height band.
+    low = _line() - np.array([0, 0, HEIGHT_M - 0.5])
+    x, z = np.meshgrid(np.arange(-0.5, 0.5, 0.04), np.arange(2.0, 3.0, 0.04))
+    table = np.stack([x.ravel(), np.full(x.size, HEIGHT_M - 0.75), z.ravel()], axis=1)
+    parts = [_part_of([table] * 6), free_part(sweep(low, _road_of(), 1.0, CELL_M), EMPTY)]
+    assert _cell(_flat(parts), 2.5, 0.1) == OCCUPIED
+    assert _cell(_flat(parts), 0.5, 0.1) == FREE
+
+
+def test_the_base_is_on_the_ground_below_the_camera() -> None:
+    T = base_axes(T_MAP_WORLD, 1.65)
+    # A point on the road, 1.65 m below a level camera and 10 m ahead.
+    assert apply(T, np.array([[0.0, 1.65, 10.0]])) == pytest.approx(np.array([[10.0, 0.0, 0.0]]))
+    assert base_axes(T_MAP_WORLD, None)[:3, 3].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 2.0, 10.0])
+def test_with_its_origin_on_the_ground_the_map_starts_at_zero(tilt_deg: float) -> None:
+    normal = exp_so3(np.array([np.deg2rad(tilt_deg), 0.0, 0.0])) @ np.array([0.0, -1.0, 0.0])
+    ground = GroundPlane(normal, 1.5)
+    T = map_axes(ground, AxesSettings(origin="ground"))
+    straight_down = T[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+    below = straight_down * 1.5 / -(straight_down @ normal)
+    assert apply(T, below[None]) == pytest.approx(np.zeros((1, 3)), abs=1e-9)
+    T = map_axes(ground, AxesSettings(origin="ground"), camera_height_m=1.4)
+    assert T[2, 3] == 1.4
+    with pytest.raises(MappingError, match=r"no ground.*camera_height_m"):
+        map_axes(None, AxesSettings(origin="ground"))
+    assert map_axes(None, AxesSettings(origin="ground"), camera_height_m=0.4)[2, 3] == 0.4
+
+
+def _street(pitch_deg: float, roll_deg: float = 0.0, height: float = 1.5) -> PointCloud:
+    """Ground, a wall to the right and a box, seen by a tilted camera; camera axes."""
+    rng = np.random.default_rng(0)
+    ground = np.stack([rng.uniform(-4, 4, 6000), np.full(6000, height), rng.uniform(3, 18, 6000)])
+    wall = np.stack([np.full(5000, 4.0), rng.uniform(-3, height, 5000), rng.uniform(3, 18, 5000)])
+    box = np.stack([rng.uniform(-1, 1, 2000), rng.uniform(0.7, 0.7, 2000), rng.uniform(7, 9, 2000)])
+    xyz = np.hstack([ground, wall, box]).T + rng.normal(0, 0.01, (13_000, 3))
+    # Camera pitched down: the ground rises in its image.
+    turn = exp_so3(np.array([math.radians(-pitch_deg), 0, math.radians(roll_deg)]))
+    return PointCloud((xyz @ turn.T).astype(np.float32))
+
+
+def test_map_axes_are_forward_left_up() -> None:
+    T = map_axes(None, AxesSettings())
+    right_down_forward = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    assert apply(T, right_down_forward).tolist() == [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (2.0, -1.0), (12.0, 0.0), (-8.0, 6.0)])
+def test_the_ground_is_found_among_walls_and_boxes(pitch: float, roll: float) -> None:
+    street = _street(pitch, roll)
+    plane = estimate_ground(street)
+    # 6000 points with 1 cm of noise fix a plane much better than this.
+    assert plane.height_m == pytest.approx(1.5, abs=0.01)
+    assert plane.tilt_deg == pytest.approx(math.hypot(pitch, roll), abs=0.1)
+    assert plane.inliers > 5000
+    np.testing.assert_array_equal(plane.normal, estimate_ground(_street(pitch, roll)).normal)
+    T = map_axes(plane, AxesSettings())
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-12)
+    exact = np.array_equal(T, map_axes(None, AxesSettings()))
+    assert exact == (math.hypot(pitch, roll) < 3)
+    if not exact:  # large tilts are levelled
+        ground = apply(T, street.xyz[:6000].astype(np.float64))
+        # Noise of the points is 1 cm; a degree that was left would give 7 cm.
+        assert ground[:, 2].std() < 0.02
+        assert ground[:, 2].mean() == pytest.approx(-1.5, abs=0.02)
+        # Forward stays forward: the short way turns nothing about z.
+        assert abs(T[1, 2]) < 0.03
+
+
+def test_walls_ceilings_and_nothing_are_no_ground() -> None:
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-5, 5, 8000), rng.uniform(-2, 2, 8000)
+    wall = np.stack([x, y, np.full(8000, 6.0)], 1)
+    ceiling = np.stack([x, np.full(8000, -1.5), rng.uniform(4, 15, 8000)], 1)
+    for xyz in (wall, ceiling, np.zeros((0, 3))):
+        assert estimate_ground(PointCloud(xyz.astype(np.float32))) is None

@@ -133,9 +133,8 @@ def test_height_is_linear_between_centres_of_cells() -> None:
 
 
 EDGE_M = 0.2
-NOTHING = PointCloud(
-    np.zeros((0, 3), np.float32), normals=np.zeros((0, 3), np.float32), frame="map"
-)
+NONE = np.zeros((0, 3), np.float32)
+NOTHING = PointCloud(NONE, normals=NONE, frame="map")
 
 
 def _columns(x: range, y: range, heights: dict[int, float]) -> tuple[np.ndarray, np.ndarray]:

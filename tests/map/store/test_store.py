@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +41,11 @@ TREES = st.dictionaries(
     max_size=4,
 )
 KEYS = st.integers(-3, 3) | st.tuples(st.integers(-2, 2), st.integers(-20, 20))
+KIND = st.sampled_from(KINDS)
 STEPS = st.lists(
-    st.one_of(
-        st.tuples(st.just("put"), st.sampled_from(KINDS), KEYS, st.integers(0, 99), st.booleans()),
-        st.tuples(st.just("delete"), st.sampled_from(KINDS), KEYS),
-        st.tuples(st.just("read"), st.sampled_from(KINDS), KEYS),
-        st.tuples(st.just("commit")),
-        st.tuples(st.just("kill")),
-    ),
+    st.tuples(st.just("put"), KIND, KEYS, st.integers(0, 99), st.booleans())
+    | st.tuples(st.sampled_from(["delete", "read"]), KIND, KEYS)
+    | st.tuples(st.sampled_from(["commit", "kill"])),
     max_size=25,
 )
 
@@ -57,30 +55,26 @@ def _record(seed: int) -> dict[str, Any]:
     return {"seed": seed, "values": rng.normal(size=(seed, 3)), "none": None}
 
 
+def _plain(value: Any) -> Any:
+    """The value to the last bit, to be compared; the order of bytes in arrays does not count."""
+    if isinstance(value, np.ndarray):
+        native = value.astype(value.dtype.newbyteorder("="))
+        return native.dtype.str, native.shape, native.tobytes()
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    return [*map(_plain, value)] if isinstance(value, list) else repr(value)
+
+
 def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray):
-        alike = one.dtype.newbyteorder("=") == other.dtype.newbyteorder("=")
-        return (
-            alike
-            and one.shape == other.shape
-            and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
-        )
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(_same(one[k], other[k]) for k in one)
-    if isinstance(one, list):
-        return len(one) == len(other) and all(map(_same, one, other))
-    return type(one) is type(other) and (one == other or math.isnan(one))
+    return bool(_plain(one) == _plain(other))
 
 
 def _reopened(path: Path) -> Store:
     """The store as another process finds it after a kill: a copy of all files, opened."""
-    copy = path.with_name("copy") / path.name
-    copy.parent.mkdir(exist_ok=True)
-    for stale in copy.parent.iterdir():
-        stale.unlink()
-    for file in path.parent.glob(f"{path.name}*"):
-        (copy.parent / file.name).write_bytes(file.read_bytes())
-    return Store.open(copy)
+    copy = path.parent / "copy"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(path.parent, copy, ignore=lambda *_: ["copy"])
+    return Store.open(copy / path.name)
 
 
 @settings(max_examples=60)
@@ -168,15 +162,6 @@ def test_a_reader_sees_whole_commits_while_another_program_writes(tmp_path: Path
         assert [p.name for p in tmp_path.iterdir()] == ["map.recon"]
 
 
-def test_records_are_copied_as_they_are(tmp_path: Path) -> None:
-    with Store.create(tmp_path / "a") as one, Store.create(tmp_path / "b") as other:
-        for number in range(3):
-            one.put("rays", number, _record(number), compress=True)
-        one.copy("rays", other, {0: 0, 2: 5})
-        assert other.keys("rays") == [0, 5]
-        assert _same(other.get("rays", 5), _record(2))
-
-
 _WRITER = """
 import sys
 import numpy as np
@@ -239,56 +224,43 @@ def test_a_full_disk_at_a_commit_leaves_the_one_before(tmp_path: Path) -> None:
         store.commit()
 
 
-def _view(path: Path) -> None:
-    """A file that would read for ever."""
-    Store.create(path).close()
-    with sqlite3.connect(path) as database:
-        database.execute("DROP TABLE record")
-        database.execute(
-            "CREATE VIEW record AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id FROM n) "
-            "SELECT 'rays' AS kind, id AS key, '' AS tree, 0 AS checksum, '' AS content FROM n"
-        )
-    database.close()
+def _changed(*statements: str) -> Callable[[Path], None]:
+    def make(path: Path) -> None:
+        Store.create(path).close()
+        with sqlite3.connect(path) as database:
+            for statement in statements:
+                database.execute(statement)
+        database.close()
+
+    return make
 
 
-def _foreign(path: Path) -> None:
-    Store.create(path).close()
-    with sqlite3.connect(path) as database:
-        database.execute("PRAGMA application_id = 1")
-    database.close()
-
-
-def _newer(path: Path) -> None:
-    Store.create(path).close()
-    with sqlite3.connect(path) as database:
-        database.execute("PRAGMA user_version = 99")
-    database.close()
-
-
+ENDLESS = """CREATE VIEW record AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id FROM n)
+SELECT 'rays' AS kind, id AS key, '' AS tree, 0 AS checksum, '' AS content FROM n"""
 FILES = {
     "text": lambda path: path.write_text("rays of a drive\n" * 100),
     "empty": lambda path: path.write_bytes(b""),
-    "another program's": _foreign,
-    "format 99": _newer,
-    "endless": _view,
+    "another program's": _changed("PRAGMA application_id = 1"),
+    "format 99": _changed("PRAGMA user_version = 99"),
+    "endless": _changed("DROP TABLE record", ENDLESS),
     "folder": Path.mkdir,
     "missing": lambda path: None,
     "pipe": os.mkfifo,
 }
 
 
-@pytest.mark.parametrize("make", FILES.values(), ids=FILES)
+@pytest.mark.parametrize("kind", FILES)
 @pytest.mark.parametrize("read_only", [False, True])
 def test_files_of_others_are_refused_with_one_line(
-    tmp_path: Path, make: Any, read_only: bool
+    tmp_path: Path, kind: str, read_only: bool
 ) -> None:
     path = tmp_path / "map.recon"
-    make(path)
+    FILES[kind](path)
     with pytest.raises(FormatError) as caught:
         Store.open(path, read_only=read_only)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert ("got format 99" in str(caught.value)) == (make is _newer)
+    assert ("got format 99" in str(caught.value)) == (kind == "format 99")
 
 
 @settings(max_examples=60)
@@ -311,10 +283,7 @@ def test_a_damaged_file_is_refused_or_gives_what_was_put(
                 assert isinstance(key, int)
                 assert _same(store.read("rays", key), _record(90 + key))
     except ReconError as error:
-        line = str(error)
-    else:
-        return
-    assert str(path) in line
+        assert str(path) in str(error)  # noqa: PT017
 
 
 def test_a_missing_record_is_named(tmp_path: Path) -> None:
@@ -345,11 +314,6 @@ def test_the_cache_stays_within_its_limit_and_returns_what_was_made(
 
 def test_values_used_last_stay_in_the_cache() -> None:
     cache, made = Cache(2000), []
-
-    def make(key: str) -> np.ndarray[Any, Any]:
-        made.append(key)
-        return np.zeros(800, np.uint8)
-
     for key in "abaca":
-        cache.get(key, lambda key=key: make(key))
+        cache.get(key, lambda key=key: made.append(key) or np.zeros(800, np.uint8))
     assert made == ["a", "b", "c"]
