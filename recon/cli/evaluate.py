@@ -14,7 +14,6 @@ from recon.cli.tables import print_evaluation, print_figures, print_json
 
 app = Commands(name="evaluate", no_args_is_help=True, help="Compare results with ground truth.")
 
-
 Matchers = Annotated[
     str | None,
     opt.option(

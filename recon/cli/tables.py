@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from recon.commands.config import SettingGroup
     from recon.commands.doctor import Check
 
-
 _MOST_JOBS: Final = 200  # more lines of a batch than these nobody reads
 
 

@@ -17,6 +17,7 @@ from recon.sources.settings import SourceSettings
 from tests.rig.audit import faults
 from tests.sources import drives
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
 Drive = tuple[list[StereoPair], RectifiedCamera]
 FRAMES = 6
 

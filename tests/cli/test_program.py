@@ -54,7 +54,6 @@ SOURCES = {
     "evaluate map": 2, "evaluate disparity": 2,
 }  # fmt: skip
 
-
 INPUTS = {
     "--poses", "--calib", "--config", "--map", "--georeference", "--truth", "--align-to", "--mask",
     "--confidence", "--results", "--times",

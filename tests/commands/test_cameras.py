@@ -40,6 +40,7 @@ from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.scenery.patience import LONG_S
 from tests.sources import drives
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
 BOARD = parse_board("chess:9x6:25mm")
 SIDES = ("left", "right")
 

@@ -24,6 +24,7 @@ from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import read_trajectory, write_kitti_poses, write_tum
 from recon.report.map_page import widest_axes
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
 T_MAP_WORLD = make_transform(exp_so3(np.array([0.3, -1.2, 0.8])), np.zeros(3))
 
 

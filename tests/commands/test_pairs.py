@@ -20,6 +20,7 @@ from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from tests.sources.test_drives import ALL
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
 Noise = tuple[np.ndarray, np.ndarray]
 
 
@@ -129,32 +130,26 @@ def test_an_unknown_focal_length_or_one_in_millimetres_is_refused(
         read(images, SourceSettings(baseline_m=0.2, **known))
 
 
-def test_a_drive_takes_the_same_numbers_and_a_file_is_not_needed(images: tuple[Path, Path]) -> None:
-    folder = images[0].parent
-    with pytest.raises(ReconError, match=r"calibration is missing.*--focal PX and --baseline M"):
-        open_source(folder)
-    settings = SourceSettings(focal_px=300, baseline_m=0.2, cx_px=100)
-    camera = open_source(folder, settings=settings).calibration
-    assert isinstance(camera, RectifiedCamera)
-    assert (camera.focal_px, camera.baseline_m, camera.cx_px) == (300, 0.2, 100)
+LAYOUTS = ("folders", "kitti", "kitti-raw", "euroc", "tum", "two videos", "mcap")
 
 
-@pytest.mark.parametrize("layout", ["kitti", "kitti-raw", "euroc", "tum", "two videos", "mcap"])
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_numbers_take_the_place_of_the_calibration_of_every_layout(
     tmp_path: Path, layout: str
 ) -> None:
     grey = [np.full((32, 64), 10 * k, np.uint8) for k in range(4)]
     pairs = [StereoPair(image, image, 0.1 * k, k) for k, image in enumerate(grey)]
     path = ALL[layout](pairs, RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32), tmp_path)
-    numbers = SourceSettings(focal_px=50, baseline_m=0.1)
+    numbers = SourceSettings(focal_px=50, baseline_m=0.1, cx_px=30)
     camera = open_source(path, settings=numbers).calibration
     assert isinstance(camera, RectifiedCamera)
-    assert (camera.focal_px, camera.baseline_m) == (50, 0.1)
+    assert (camera.focal_px, camera.baseline_m, camera.cx_px) == (50, 0.1, 30)
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [
+        ({}, r"calibration is missing.*--focal PX and --baseline M"),
         ({"focal_px": 300}, r"needs focal length and baseline \(got focal_px=300"),
         ({"baseline_m": 0.1}, r"needs focal length and baseline"),
         ({"focal_px": 300, "baseline_m": 0.1, "calibration": "rig.yaml"}, r"--calib: .*replace"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -74,26 +74,13 @@ def lidar(path: Path) -> None:
     write_ply(path, PointCloud(xyz=np.asarray(truth.surface.xyz, np.float32)))
 
 
-def poses(path: Path) -> None:
-    write_kitti_poses(path, true_path())
-
-
 def drive_with_truth(folder: Path) -> None:
     drive(folder)
     lidar(folder.parent / "lidar_map.ply")
 
 
-def image(number: int) -> Callable[[Path], None]:
-    def write(path: Path) -> None:
-        pair = next(iter(street()))
-        write_image(path, pair.right if number else pair.left)
-
-    return write
-
-
-def kitti_calibration(path: Path) -> None:
-    """Without the size of the images, which KITTI's do not have."""
-    drives.write_calib(path.parent, street().calibration)
+def image(side: str, path: Path) -> None:
+    write_image(path, getattr(next(iter(street())), side))
 
 
 def camchain(path: Path) -> None:
@@ -137,11 +124,6 @@ def survey(path: Path) -> None:
     """Positions of the recording above, which drives straight ahead at 10 Hz, to the north-east."""
     lines = (f"{n / 10} {5e5 + 0.24 * n} {5e6 + 0.32 * n} 100 0 0 0 1\n" for n in range(12))
     path.write_text("".join(lines))
-
-
-def disparity(path: Path) -> None:
-    """As large as the images."""
-    write_pfm(path, np.full((96, 256), 5.0, np.float32))
 
 
 def results(folder: Path) -> None:
@@ -241,18 +223,18 @@ class StandIn:
 
 
 STAND_INS = (
-    StandIn("im0.png", image(0)),
-    StandIn("im1.png", image(1)),
-    StandIn("left.png right.png --", image(0), "left.png"),
-    StandIn("left.png right.png --", image(1), "right.png"),
-    StandIn("calib.txt", kitti_calibration),
-    StandIn("disp0GT.pfm", disparity),
+    StandIn("im0.png", partial(image, "left")),
+    StandIn("im1.png", partial(image, "right")),
+    StandIn("left.png right.png --", partial(image, "left"), "left.png"),
+    StandIn("left.png right.png --", partial(image, "right"), "right.png"),
+    StandIn("calib.txt", lambda path: drives.write_calib(path.parent, street().calibration)),
+    StandIn("disp0GT.pfm", lambda path: write_pfm(path, np.full((96, 256), 5.0, np.float32))),
     StandIn("left*.png", board_images),
     StandIn("left/ right/", board_folders, "left"),
     StandIn("board/left board/right", board_folders, "board/left"),
     StandIn("left.mp4", board_videos),
     StandIn("~/kitti/sequences/06", drive),
-    StandIn("~/kitti/poses/06.txt", poses),
+    StandIn("~/kitti/poses/06.txt", lambda path: write_kitti_poses(path, true_path())),
     StandIn("~/long", drive),
     StandIn("DRIVE", drive_with_truth),
     StandIn("recon audit drive --calib rig.yaml", drive_of_that_rig, "drive"),
