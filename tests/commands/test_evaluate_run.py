@@ -102,14 +102,23 @@ def drifted(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_fit_of_the_paths_undoes_what_both_share(drifted: Path) -> None:
-    files = (drifted / "drift", drifted / "reference.ply")
+def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_their_errors(
+    drifted: Path,
+) -> None:
+    files, out = (drifted / "drift", drifted / "reference.ply"), drifted / "out"
     assert run_evaluate_map(*files)["f_score"] < 0.7
-    found = run_evaluate_map(*files, align_to=drifted / "poses.txt")
-    assert found["f_score"] == 1.0
-    assert found["alignment"] == "poses"
+    found = run_evaluate_map(*files, align_to=drifted / "poses.txt", out=out)
+    assert (found["f_score"], found["alignment"]) == (1.0, "poses")
     # The written path has twelve decimals; the turn made was 0.84 degrees.
     assert found["path_turned_deg"] == pytest.approx(np.degrees(np.sqrt(2.16e-4)), rel=1e-3)
+    assert json.loads((out / "summary.json").read_text()) == found
+    for cloud in (read_ply(out / "error.ply"), read_ply(out / "missed.ply")):
+        assert len(cloud) == 21000
+        assert cloud.rgb is not None
+        # All lie on the truth: the blue end of the scale.
+        assert (cloud.rgb[:, 2] > cloud.rgb[:, 0]).all()
+        assert cloud.confidence is not None
+        assert cloud.confidence.max() < 0.01
 
 
 def test_icp_lays_the_cloud_onto_the_reference_and_every_threshold_has_its_figures(
@@ -143,41 +152,17 @@ def test_icp_finds_out_in_which_axes_the_reference_is(drifted: Path) -> None:
         run_evaluate_map(folder, reference, icp=True)
 
 
-def test_poses_in_another_unit_do_not_move_a_map(drifted: Path) -> None:
-    rows = np.loadtxt(drifted / "poses.txt")
-    rows[:, 3::4] *= 1000.0
-    np.savetxt(drifted / "poses.txt", rows)
-    files = (drifted / "drift", drifted / "reference.ply")
-    with pytest.raises(EvaluationError, match="neither drift nor noise explains"):
-        run_evaluate_map(*files, align_to=drifted / "poses.txt")
-
-
 def test_what_stands_above_all_of_the_reference_is_not_judged(drifted: Path) -> None:
     cloud = read_ply(drifted / "drift" / "map" / "cloud.ply")
     up = T_MAP_WORLD[:3, :3] @ np.array([0.0, -6.0, 0.0])
     crowns = cloud.xyz[9000:18000] + up.astype(np.float32)
     xyz = np.concatenate([cloud.xyz, crowns])
     write_ply(drifted / "drift" / "map" / "cloud.ply", PointCloud(xyz, frame="map"))
-    found = run_evaluate_map(
-        drifted / "drift", drifted / "reference.ply", align_to=drifted / "poses.txt"
-    )
+    files = (drifted / "drift", drifted / "reference.ply")
+    found = run_evaluate_map(*files, align_to=drifted / "poses.txt")
     assert found["precision"] < 0.8
     assert found["precision_in_reach"] == 1.0
     assert found["beyond_reach"] == pytest.approx(9000 / len(xyz), abs=1e-3)
-
-
-def test_clouds_are_coloured_by_their_errors(drifted: Path) -> None:
-    files, poses = (drifted / "drift", drifted / "reference.ply"), drifted / "poses.txt"
-    found = run_evaluate_map(*files, align_to=poses, out=drifted / "out")
-    assert json.loads((drifted / "out" / "summary.json").read_text()) == found
-    for name in ("error", "missed"):
-        cloud = read_ply(drifted / "out" / f"{name}.ply")
-        assert len(cloud) == 21000
-        assert cloud.rgb is not None
-        # All lie on the truth: the blue end of the scale.
-        assert (cloud.rgb[:, 2] > cloud.rgb[:, 0]).all()
-        assert cloud.confidence is not None
-        assert cloud.confidence.max() < 0.01
 
 
 def test_what_cannot_be_aligned_is_reported(drifted: Path) -> None:
@@ -192,6 +177,11 @@ def test_what_cannot_be_aligned_is_reported(drifted: Path) -> None:
         run_evaluate_map(drifted / "drift", reference, align_to=poses)
     with pytest.raises(SettingsError, match="no threshold"):
         run_evaluate_map(reference, reference, thresholds_m=())
+    rows = np.loadtxt(lines)
+    rows[:, 3::4] *= 1000.0
+    np.savetxt(poses, rows)
+    with pytest.raises(EvaluationError, match="neither drift nor noise explains"):
+        run_evaluate_map(drifted / "drift", reference, align_to=poses)
 
 
 RULES = TrajectoryRules()
