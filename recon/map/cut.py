@@ -68,10 +68,7 @@ class Cut:
         return limit is None or max(self.nbytes.values(), default=0) <= limit
 
     def submap_of_frame(self, drives: Sequence[int]) -> Int64:
-        """Return int64 (N,), number of the submap of each frame; -1 between two drives.
-
-        ``drives`` is the number of submaps of each drive; empty = all are of one.
-        """
+        """Return int64 (N,), submap of each frame, -1 between drives of so many submaps each."""
         found = np.repeat(np.arange(len(self.frames)), self.frames)
         ends = np.searchsorted(found, np.cumsum(drives, dtype=np.int64)[:-1])
         return np.insert(found, ends, -1)

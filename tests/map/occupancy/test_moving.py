@@ -344,59 +344,56 @@ def _while(frames: slice, number: int) -> np.ndarray:
     return seen
 
 
-def test_what_was_there_as_a_whole_for_a_while_came_or_went() -> None:
-    once = _while(slice(10, 15), len(WALL))
-    assert _judged(WALL, once).all()
-    # Two that pass one after the other.
-    twice = once.copy()
-    twice[20:24] = 1
-    assert _judged(WALL, twice).all()
-    # Column after column is hit, each for six frames: it enters by one edge.
-    since = np.arange(LOOKS)[:, None] - 2 * WALL[:, 0]
-    assert _judged(WALL, np.where((since >= 3) & (since < 9), 1, -1)).all()
+def _at_random(share: float) -> np.ndarray:
+    return np.where(np.random.default_rng(3).random((LOOKS, len(WALL))) < share, 1, -1)
 
 
-def test_what_each_frame_hits_at_random_did_not_move() -> None:
-    for share in (0.1, 0.3, 0.5):
-        rng = np.random.default_rng(3)
-        seen = np.where(rng.random((LOOKS, len(WALL))) < share, 1, -1)
-        assert not _judged(WALL, seen).any()
-    # Boards of a fence are hit or looked through from top to bottom, whatever the others are.
-    boards = rng.random((LOOKS, 8)) < 0.3
-    assert not _judged(WALL, np.where(boards[:, WALL[:, 0]], 1, -1)).any()
-    for always in (-1, 0, 1):
-        assert not _judged(WALL, np.full((LOOKS, len(WALL)), always)).any()
-    # Beside a body, but apart from it.
+SINCE = np.arange(LOOKS)[:, None] - 2 * WALL[:, 0]
+BOARDS = np.random.default_rng(3).random((LOOKS, 8)) < 0.3
+BODY = _while(slice(5, 9), len(WALL))
+ALONE = _while(slice(3, 5), 1)
+
+
+@pytest.mark.parametrize(
+    ("seen", "moved"),
+    [
+        (BODY, True),
+        (np.maximum(BODY, _while(slice(20, 24), len(WALL))), True),  # one after the other
+        # Column after column is hit, each for six frames: it enters by one edge.
+        (np.where((SINCE >= 3) & (SINCE < 9), 1, -1), True),
+        *((_at_random(share), False) for share in (0.1, 0.3, 0.5)),
+        # Boards of a fence are hit or looked through from top to bottom, whatever the others are.
+        (np.where(BOARDS[:, WALL[:, 0]], 1, -1), False),
+        *((np.full((LOOKS, len(WALL)), always), False) for always in (-1, 0, 1)),
+        # One cell alone: hit in one run of frames, in two, or never looked through.
+        (ALONE, True),
+        (np.maximum(ALONE, _while(slice(9, 10), 1)), False),
+        (np.maximum(ALONE, 0), False),
+    ],
+)
+def test_what_was_there_as_a_whole_for_a_while_moved(seen: np.ndarray, moved: bool) -> None:
+    assert (_judged(WALL[: seen.shape[1]], seen) == moved).all()
+
+
+def test_what_is_apart_from_a_body_did_not_move() -> None:
     cells = np.concatenate([WALL, WALL + np.array([20, 0, 0])])
-    judged = _judged(cells, np.concatenate([_while(slice(5, 9), len(WALL)), seen], axis=1))
+    judged = _judged(cells, np.concatenate([BODY, _at_random(0.5)], axis=1))
     assert judged.tolist() == [True] * len(WALL) + [False] * len(WALL)
     assert len(_judged(WALL[:0], np.zeros((LOOKS, 0)))) == 0
-
-
-def test_a_cell_alone_moved_if_it_was_hit_in_one_run_of_frames() -> None:
-    cell = WALL[:1]
-    assert _judged(cell, _while(slice(3, 5), 1)).all()
-    twice = _while(slice(3, 5), 1)
-    twice[9] = 1
-    assert not _judged(cell, twice).any()
-    never_through = np.zeros((LOOKS, 1), np.int8)
-    never_through[3:5] = 1
-    assert not _judged(cell, never_through).any()
 
 
 def test_cells_that_frames_could_place_outweigh_the_others_of_their_piece() -> None:
     placed = WALL[:, 0] < 3
     rng = np.random.default_rng(9)
     noise = np.where(rng.random((LOOKS, len(WALL))) < 0.4, 1, -1)
-    body = _while(slice(5, 9), len(WALL))
-    assert _judged(WALL, np.where(placed, body, noise), placed).all()
-    assert not _judged(WALL, np.where(placed, noise, body), placed).any()
-    assert _judged(WALL, body, np.zeros(len(WALL), np.bool_)).all()
+    assert _judged(WALL, np.where(placed, BODY, noise), placed).all()
+    assert not _judged(WALL, np.where(placed, noise, BODY), placed).any()
+    assert _judged(WALL, BODY, np.zeros(len(WALL), np.bool_)).all()
 
 
 def test_cells_of_which_too_little_is_known_belong_to_a_body_beside_them() -> None:
     beside = [[9, 0, 0], [12, 0, 0]]  # each two cells from the one before, both alone
-    seen = np.concatenate([_while(slice(5, 9), len(WALL)), np.zeros((LOOKS, 2))], axis=1)
+    seen = np.concatenate([BODY, np.zeros((LOOKS, 2))], axis=1)
     assert _judged(np.concatenate([WALL, beside]), seen)[len(WALL) :].tolist() == [True, False]
 
 
