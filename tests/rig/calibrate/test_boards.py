@@ -1,15 +1,22 @@
+"""Boards are found in images, told from others, and printed in their size."""
+
 from __future__ import annotations
 
+import re
+import zlib
 from functools import cache
 from itertools import chain
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from recon.core.errors import CalibrationError, SettingsError
+from recon.core.errors import CalibrationError, OutputError, SettingsError
 from recon.core.values.arrays import UInt8
 from recon.core.values.board import parse_board
+from recon.rig.board_sheet import choose_sheet, write_board
 from recon.rig.calibrate.detect import (
     check_charuco,
     check_chessboard,
@@ -19,6 +26,7 @@ from recon.rig.calibrate.detect import (
 )
 from tests.scenery.boards import BoardView, board_rig, place_boards, render_views
 
+CHESS = "chess:9x6:25mm"
 CHARUCO = "charuco:8x6:30mm:22mm:5x5_100"
 
 
@@ -42,7 +50,6 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(text: str, lens: str) -> None:
     board, errors = parse_board(text), []
     for view, left, _ in rendered(text, lens):
         seen = find_board(left, board)
-        assert seen is not None
         truth = view.left_px[seen.numbers]
         found = (
             seen.pixels if board.kind == "charuco" else orient_like(truth, seen.pixels, board.inner)
@@ -53,11 +60,8 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(text: str, lens: str) -> None:
 
 
 def test_corners_of_a_large_image_are_found_in_a_small_copy_and_refined_in_it() -> None:
-    board = parse_board("chess:9x6:25mm")
-    view, left, _ = rendered("chess:9x6:25mm")[0]
-    large = np.kron(left, np.ones((4, 4), np.uint8))
-    seen = find_board(large, board)
-    assert seen is not None
+    board, (view, left, _) = parse_board(CHESS), rendered(CHESS)[0]
+    seen = find_board(np.kron(left, np.ones((4, 4), np.uint8)), board)
     truth = (view.left_px + 0.5) * 4 - 0.5
     found = orient_like(truth, seen.pixels, board.inner)
     # Four times the pixels: an error of 0.12 of the small ones.
@@ -70,7 +74,6 @@ def test_a_charuco_board_that_is_half_covered_is_used_in_part() -> None:
     covered = left.copy()
     covered[:, : int(np.median(view.left_px[:, 0]))] = 90
     seen = find_board(covered, board)
-    assert seen is not None
     assert 8 <= len(seen.numbers) < 30
     np.testing.assert_allclose(seen.pixels, view.left_px[seen.numbers], atol=0.5)
 
@@ -112,50 +115,40 @@ def test_a_wrong_size_is_found_out_and_the_true_one_said(claimed: str, true: str
         check_chessboard(sizes, shown.__getitem__, board)
 
 
-def test_squares_that_were_counted_for_corners_are_reported() -> None:
-    board, shown = parse_board("chess:10x7:25mm"), images("chess:9x6:25mm")
+def test_squares_that_were_counted_and_larger_boards_of_which_parts_passed_are_reported() -> None:
+    shown = images(CHESS)
     with pytest.raises(CalibrationError, match="count inner corners, not squares"):
-        check_chessboard([None] * len(shown), shown.__getitem__, board)
-
-
-def test_a_part_of_a_grid_grows_to_the_whole_and_the_whole_no_further() -> None:
-    view, left, _ = rendered("chess:9x6:25mm")[0]
-    grid = view.left_px.reshape(6, 9, 2)
-    assert grown_size(left, grid[1:5, 2:8].reshape(-1, 2), (6, 4)) == (9, 6)
-    assert grown_size(left, view.left_px, (9, 6)) == (9, 6)
-
-
-def test_markers_of_another_dictionary_are_reported() -> None:
-    board = parse_board("charuco:8x6:30mm:22mm:4x4_50")
-    with pytest.raises(CalibrationError, match=r"another dictionary \(got \S+, expected 4x4_50"):
-        check_charuco(1, images(CHARUCO).__getitem__, board)
-
-
-def test_a_charuco_board_of_another_size_is_reported() -> None:
-    board = parse_board("charuco:5x4:30mm:22mm:5x5_100")
-    with pytest.raises(CalibrationError, match=r"marker ids up to 2\d, expected 0 to 9 for 5x4"):
-        check_charuco(1, images(CHARUCO).__getitem__, board)
-
-
-def test_a_larger_board_is_reported_although_parts_of_it_passed_for_the_claimed_one() -> None:
-    shown = images("chess:9x6:25mm")
+        check_chessboard([None] * 4, shown.__getitem__, parse_board("chess:10x7:25mm"))
     sizes = [(7, 5), None, None, (7, 5), None, None, None]
     with pytest.raises(CalibrationError, match=r"does not have 7x5.*got 9x6 in \d of 5"):
         check_chessboard(sizes, lambda n: shown[n % 4], parse_board("chess:7x5:25mm"))
 
 
-def test_views_of_a_part_of_the_claimed_board_are_no_other_board() -> None:
-    """Most images cut the board off: what is left of it is no proof."""
-    view, left, _ = rendered("chess:9x6:25mm")[0]
+def test_a_part_of_a_grid_grows_to_the_whole_but_what_is_cut_off_is_no_other_board() -> None:
+    view, left, _ = rendered(CHESS)[0]
+    grid = view.left_px.reshape(6, 9, 2)
+    assert grown_size(left, grid[1:5, 2:8].reshape(-1, 2), (6, 4)) == (9, 6)
+    assert grown_size(left, view.left_px, (9, 6)) == (9, 6)
     cut = left.copy()
-    cut[:, : int(view.left_px.reshape(6, 9, 2)[:, 1].max())] = 90
-    sizes = [(9, 6), (9, 6), None, None, None, None]
-    check_chessboard(sizes, lambda n: cut, parse_board("chess:9x6:25mm"))
+    cut[:, : int(grid[:, 1].max())] = 90
+    check_chessboard([(9, 6)] * 2 + [None] * 4, lambda n: cut, parse_board(CHESS))
+
+
+@pytest.mark.parametrize(
+    ("board", "message"),
+    [
+        (CHARUCO.replace("5x5_100", "4x4_50"), r"another dictionary \(got \S+, expected 4x4_50"),
+        (CHARUCO.replace("8x6", "5x4"), r"marker ids up to 2\d, expected 0 to 9 for 5x4"),
+    ],
+)
+def test_another_charuco_board_is_reported(board: str, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        check_charuco(1, images(CHARUCO).__getitem__, parse_board(board))
 
 
 def test_a_chessboard_for_a_charuco_board_is_reported_and_the_other_way_round() -> None:
     with pytest.raises(CalibrationError, match=r"without markers \(got 9x6 .*chess:9x6"):
-        check_charuco(1, images("chess:9x6:25mm").__getitem__, parse_board(CHARUCO))
+        check_charuco(1, images(CHESS).__getitem__, parse_board(CHARUCO))
     shown = images(CHARUCO)
     with pytest.raises(CalibrationError, match=r"board with markers \(ChArUco\) .*5x5_"):
         check_chessboard([None], shown.__getitem__, parse_board("chess:11x9:25mm"))
@@ -163,10 +156,10 @@ def test_a_chessboard_for_a_charuco_board_is_reported_and_the_other_way_round() 
 
 def test_no_board_is_seen_in_noise() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
-    assert find_board(noise, parse_board("chess:9x6:25mm")) is None
+    assert find_board(noise, parse_board(CHESS)) is None
     assert find_board(noise, parse_board(CHARUCO)) is None
     flat = np.full((240, 320), 90, np.uint8)
-    check_chessboard([None], lambda _: flat, parse_board("chess:9x6:25mm"))
+    check_chessboard([None], lambda _: flat, parse_board(CHESS))
     check_charuco(1, lambda _: flat, parse_board(CHARUCO))
 
 
@@ -176,3 +169,104 @@ def test_an_unknown_or_small_dictionary_is_refused() -> None:
         find_board(blank, parse_board("charuco:8x6:30mm:22mm:9x9_10"))
     with pytest.raises(SettingsError, match=r"too few markers.*4x4_50 with 50.*at least 96"):
         find_board(blank, parse_board("charuco:16x12:30mm:22mm:4x4_50"))
+
+
+PT_PER_MM = 72 / 25.4
+
+
+@pytest.mark.parametrize(("text", "square_mm"), [(CHESS, 25.0), (CHARUCO, 30.0)])
+def test_a_png_has_its_corners_where_they_are_on_paper(
+    tmp_path: Path, text: str, square_mm: float
+) -> None:
+    board = parse_board(text)
+    figures = write_board(tmp_path / "b.png", board, dpi=150)
+    with Image.open(tmp_path / "b.png") as image:
+        dpi = image.info["dpi"]
+        size_mm = np.array(image.size) * 25.4 / dpi
+    assert dpi[0] == pytest.approx(figures["dpi"], rel=1e-4)
+    # A page is a whole number of pixels.
+    np.testing.assert_allclose(size_mm, (297, 210), atol=0.2)
+    grey = cv2.imread(str(tmp_path / "b.png"), cv2.IMREAD_GRAYSCALE)
+    seen = find_board(grey, board)
+    assert len(seen.numbers) == len(board.corners_m)
+    columns, rows = board.inner
+    grid = seen.pixels.reshape(rows, columns, 2)
+    for axis in (0, 1):
+        steps = np.linalg.norm(np.diff(grid, axis=axis), axis=2) * 25.4 / dpi[0]
+        np.testing.assert_allclose(steps, square_mm, atol=0.02)
+    assert grey[0, 0] == 255
+
+
+@pytest.mark.parametrize(
+    ("text", "paper", "page_mm"),
+    [(CHESS, "a4", (297, 210)), ("chess:6x9:25mm", "letter", (215.9, 279.4))],
+)
+def test_a_pdf_has_the_size_of_its_paper_and_squares_of_theirs(
+    tmp_path: Path, text: str, paper: str, page_mm: tuple[float, float]
+) -> None:
+    board = parse_board(text)
+    for name in ("a.pdf", "b.pdf"):
+        write_board(tmp_path / name, board, paper)
+    content = (tmp_path / "b.pdf").read_bytes()
+    assert content == (tmp_path / "a.pdf").read_bytes()
+    box = re.search(rb"/MediaBox \[\s*0 0 ([\d.]+) ([\d.]+)", content)
+    np.testing.assert_allclose([float(box[1]), float(box[2])], np.array(page_mm) * PT_PER_MM, 1e-5)
+    packed = re.findall(rb"stream\r?\n(x.*?)\r?\nendstream", content, re.DOTALL)
+    drawn = "\n".join(zlib.decompress(part).decode("latin-1") for part in packed)
+    starts = np.array(re.findall(r"([\d.]+) ([\d.]+) m\b", drawn), dtype=float)
+    columns, rows = board.squares
+    dark = starts[1 : 1 + (columns * rows + 1) // 2]  # the first is the page itself
+    x, y = (np.unique(np.round(each, 3)) for each in dark.T)
+    assert (len(x), len(y)) == (columns, rows)
+    np.testing.assert_allclose(np.diff(x), 25 * PT_PER_MM, atol=2e-3)
+    np.testing.assert_allclose(np.diff(y), 25 * PT_PER_MM, atol=2e-3)
+    # In the middle: as much paper before the first square as after the last.
+    assert x[0] == pytest.approx(float(box[1]) - x[-1] - 25 * PT_PER_MM, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "paper", "name", "across"),
+    [
+        (CHESS, None, "a4", True),
+        ("chess:6x9:25mm", None, "a4", False),
+        ("chess:9x6:30mm", None, "a3", True),
+        ("chess:11x8:100mm", None, None, True),
+        ("chess:9x6:60mm", "700x500mm", "700x500mm", True),
+    ],
+)
+def test_paper_is_the_smallest_that_will_do_and_turned_as_needed(
+    text: str, paper: str | None, name: str | None, across: bool
+) -> None:
+    board = parse_board(text)
+    if name is None:
+        with pytest.raises(SettingsError, match=r"does not fit on a0 .*at most \d") as caught:
+            choose_sheet(board, paper)
+        # Squares as large as the error allows do fit.
+        largest = re.search(r"at most ([\d.]+) mm", str(caught.value))
+        assert choose_sheet(parse_board(f"chess:11x8:{largest[1]}mm"), paper).name == "a0"
+        return
+    sheet = choose_sheet(board, paper)
+    assert sheet.name == name
+    assert (sheet.width_mm > sheet.height_mm) is across
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "options", "error", "message"),
+    [
+        ("chess:9x6", "b.pdf", {}, SettingsError, "needs the size of its squares"),
+        (CHESS, "b.jpg", {}, OutputError, r"b\.jpg: .*PDF or PNG \(got \.jpg"),
+        (CHESS, "b", {}, OutputError, "got no suffix"),
+        (CHESS, "b.pdf", {"paper": "a9"}, SettingsError, "unknown paper .*a4.*600x400mm"),
+        (CHESS, "b.pdf", {"paper": "10x10mm"}, SettingsError, "too small for any board"),
+        (
+            "chess:9x6:90mm", "b.png", {"dpi": 2400}, SettingsError, "too large .*a smaller --dpi"
+        ),
+        ("charuco:30x20:5mm:4mm:4x4_50", "b.pdf", {}, SettingsError, "too few markers")
+    ],
+)  # fmt: skip
+def test_what_cannot_be_drawn_is_one_clear_line_and_no_file(
+    tmp_path: Path, text: str, name: str, options, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        write_board(tmp_path / name, parse_board(text), **options)
+    assert not list(tmp_path.iterdir())

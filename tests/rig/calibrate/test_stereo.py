@@ -11,7 +11,7 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import angle_rad, apply
 from recon.core.values import StereoCalibration
 from recon.rig.calibrate import stereo
-from recon.rig.calibrate.bootstrap import measure_depth, measure_spread
+from recon.rig.calibrate.bootstrap import Spread, measure_depth, measure_spread
 from recon.rig.calibrate.bundle import Sighting, View
 from recon.rig.calibrate.stereo import StereoFit, calibrate_stereo
 from recon.rig.settings import CalibrationSettings
@@ -19,6 +19,14 @@ from recon.stereo.rectify.lens import project_raw, rays_of
 
 SIZE = (640, 480)
 LENSES = ("radtan", "rational", "fisheye")
+
+
+def calibrated(views: list[View], **settings: object) -> StereoFit:
+    return calibrate_stereo(views, SIZE, CalibrationSettings(**settings))
+
+
+def spread_of(views: list[View]) -> Spread:
+    return measure_spread(calibrated(views), CalibrationSettings())
 
 
 def assert_rig(fit: StereoFit, want: StereoCalibration, tolerance: float, turn_deg: float) -> None:
@@ -34,16 +42,15 @@ def assert_rig(fit: StereoFit, want: StereoCalibration, tolerance: float, turn_d
 @pytest.mark.parametrize(("lens", "off"), [("radtan", 0.35), ("fisheye", 0.15)])
 def test_the_first_guess_of_a_focal_length_is_near(make_views, lens: str, off: float) -> None:
     rig, views = make_views(lens, count=10)
-    seen = [view.seen[0] for view in views]
-    guess = stereo._guess_fisheye(seen, SIZE)
-    assert guess.cameras[0].matrix[0, 0] == pytest.approx(rig.left.matrix[0, 0], rel=off)
-    assert guess.cameras[0].matrix[:2, 2].tolist() == [319.5, 239.5]
+    guess = stereo._guess_fisheye([view.seen[0] for view in views], SIZE).cameras[0].matrix
+    assert guess[0, 0] == pytest.approx(rig.left.matrix[0, 0], rel=off)
+    assert guess[:2, 2].tolist() == [319.5, 239.5]
 
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_without_noise_the_true_rig_comes_back(make_views, lens: str) -> None:
     rig, views = make_views(lens, sigma_px=0.0)
-    fit = calibrate_stereo(views, SIZE, CalibrationSettings(model=lens))
+    fit = calibrated(views, model=lens)
     # A rational lens is held near zero by as much as 0.1 px would, so it is not quite free.
     assert fit.rms_px < 0.01
     assert_rig(fit, rig, *((2e-3, 0.02) if lens == "rational" else (1e-6, 1e-5)))
@@ -55,7 +62,7 @@ def test_with_a_tenth_of_a_pixel_of_noise_the_rig_is_right_within_the_bounds(
     make_views, lens: str, seed: int
 ) -> None:
     rig, views = make_views(lens, count=30, seed=seed, board="chess:11x8:20mm")
-    fit = calibrate_stereo(views, SIZE, CalibrationSettings(model=lens))
+    fit = calibrated(views, model=lens)
     # Two coordinates of 0.1 px each, less what 200-odd numbers take up of 10560.
     assert fit.rms_px == pytest.approx(0.1414, rel=0.05)
     assert_rig(fit, rig, 0.003, 0.05)
@@ -65,16 +72,12 @@ def test_with_a_tenth_of_a_pixel_of_noise_the_rig_is_right_within_the_bounds(
 def test_the_minimum_is_that_of_opencv(make_views) -> None:
     """OpenCV's own solver, from our result, finds nothing better: both minimise the same sum."""
     _, views = make_views(count=12)
-    fit = calibrate_stereo(views, SIZE, CalibrationSettings())
+    fit = calibrated(views)
     left, right = fit.calibration.left, fit.calibration.right
     rms, K1, _, K2, _, R, T, *_ = cv2.stereoCalibrate(
         [v.seen[0].board_m.astype(np.float32) for v in views],
-        [v.seen[0].pixels.astype(np.float32) for v in views],
-        [v.seen[1].pixels.astype(np.float32) for v in views],
-        left.matrix.copy(),
-        left.distortion.copy(),
-        right.matrix.copy(),
-        right.distortion.copy(),
+        *([v.seen[k].pixels.astype(np.float32) for v in views] for k in (0, 1)),
+        *(m.copy() for m in (left.matrix, left.distortion, right.matrix, right.distortion)),
         SIZE,
         flags=cv2.CALIB_USE_INTRINSIC_GUESS,
         criteria=(3, 200, 1e-12),
@@ -88,10 +91,9 @@ def test_the_minimum_is_that_of_opencv(make_views) -> None:
 
 
 def spoil(view: View, side: int, sigma_px: float) -> View:
-    rng = np.random.default_rng(7)
-    seen = list(view.seen)
-    shift = rng.normal(0, sigma_px, seen[side].pixels.shape)
-    seen[side] = replace(seen[side], pixels=seen[side].pixels + shift)
+    seen, pixels = list(view.seen), view.seen[side].pixels
+    noise = np.random.default_rng(7).normal(0, sigma_px, pixels.shape)
+    seen[side] = replace(seen[side], pixels=pixels + noise)
     return replace(view, seen=tuple(seen))
 
 
@@ -100,12 +102,12 @@ def test_views_that_do_not_fit_are_dropped_and_named(make_views) -> None:
     views[3], views[8] = spoil(views[3], 0, 3.0), spoil(views[8], 1, 5.0)
     # A pair of images of different moments: each fits its own camera well.
     views[12] = replace(views[12], seen=(views[12].seen[0], views[11].seen[1]))
-    fit = calibrate_stereo(views, SIZE, CalibrationSettings())
+    fit = calibrated(views)
     assert sorted(fit.dropped) == ["v03", "v08", "v12"]
     assert min(fit.dropped.values()) > 1
     assert len(fit.views) == len(fit.errors_px) == 12
     assert fit.calibration.left.matrix[0, 0] == pytest.approx(rig.left.matrix[0, 0], rel=0.003)
-    clean = calibrate_stereo(list(fit.views), SIZE, CalibrationSettings())
+    clean = calibrated(list(fit.views))
     np.testing.assert_allclose(
         fit.calibration.T_right_left, clean.calibration.T_right_left, atol=1e-7
     )
@@ -114,40 +116,34 @@ def test_views_that_do_not_fit_are_dropped_and_named(make_views) -> None:
 def test_a_board_seen_in_part_by_either_camera_counts_with_what_is_seen(make_views) -> None:
     rig, views = make_views(count=20, board="chess:9x6:25mm")
     rng = np.random.default_rng(4)
-    parts = []
-    for view in views:
-        seen = []
-        for sighting in view.seen:
-            kept = np.sort(rng.choice(54, 30, replace=False))
-            parted = (each[kept] for each in (sighting.numbers, sighting.board_m, sighting.pixels))
-            seen.append(Sighting(*parted))
-        parts.append(replace(view, seen=tuple(seen)))
-    assert_rig(calibrate_stereo(parts, SIZE, CalibrationSettings()), rig, 0.005, 0.2)
+
+    def part(seen: Sighting) -> Sighting:
+        kept = np.sort(rng.choice(54, 30, replace=False))
+        return Sighting(seen.numbers[kept], seen.board_m[kept], seen.pixels[kept])
+
+    parts = [replace(view, seen=tuple(map(part, view.seen))) for view in views]
+    assert_rig(calibrated(parts), rig, 0.005, 0.2)
 
 
-def test_images_of_different_moments_are_refused_as_such(make_views) -> None:
+def test_other_moments_other_lenses_and_too_few_views_are_refused_as_such(
+    make_views, monkeypatch
+) -> None:
     _, views = make_views(count=12)
     shuffled = [
         replace(view, seen=(view.seen[0], views[(n + 5) % 12].seen[1]))
         for n, view in enumerate(views)
     ]
-    with pytest.raises(CalibrationError, match=r"alone.*together.*same time"):
-        calibrate_stereo(shuffled, SIZE, CalibrationSettings())
-
-
-def test_a_lens_of_another_kind_is_refused_as_such(make_views, monkeypatch) -> None:
+    repeated = again(views[:3], 5, 0.1)
+    for given, message in (
+        (shuffled, r"alone.*together.*same time"),
+        (views[:4], r"too few views.*got 4.*at least 5"),
+        (repeated, r"got 3, and 12 that repeat them"),
+    ):
+        with pytest.raises(CalibrationError, match=message):
+            calibrated(given)
     monkeypatch.setattr(stereo, "_MAX_RMS_PX", 0.5)
-    _, views = make_views("fisheye", count=12)
     with pytest.raises(CalibrationError, match=r"no lens of this model.*--model"):
-        calibrate_stereo(views, SIZE, CalibrationSettings(radial_terms=2))
-
-
-def test_too_few_views_are_refused(make_views) -> None:
-    _, views = make_views(count=4)
-    with pytest.raises(CalibrationError, match=r"too few views.*got 4.*at least 5"):
-        calibrate_stereo(views, SIZE, CalibrationSettings())
-    with pytest.raises(CalibrationError, match=r"got 3, and 12 that repeat them"):
-        calibrate_stereo(again(views[:3], 5, 0.1), SIZE, CalibrationSettings())
+        calibrated(make_views("fisheye", count=12)[1], radial_terms=2)
 
 
 def test_depth_of_matched_pixels_is_that_of_the_point(make_views) -> None:
@@ -159,11 +155,8 @@ def test_depth_of_matched_pixels_is_that_of_the_point(make_views) -> None:
 
 
 def test_the_spread_shrinks_with_noise_and_with_views(make_views) -> None:
-    settings = CalibrationSettings()
-
     def width(count: int, sigma_px: float) -> float:
-        _, views = make_views(count=count, sigma_px=sigma_px)
-        low, high = measure_spread(calibrate_stereo(views, SIZE, settings), settings).baseline_m
+        low, high = spread_of(make_views(count=count, sigma_px=sigma_px)[1]).baseline_m
         return high - low
 
     wide = width(12, 0.2)
@@ -171,19 +164,12 @@ def test_the_spread_shrinks_with_noise_and_with_views(make_views) -> None:
     assert width(48, 0.2) < 0.7 * wide
 
 
-def test_the_same_views_give_the_same_spread(make_views) -> None:
-    _, views = make_views(count=10)
-    settings = CalibrationSettings()
-    spreads = [measure_spread(calibrate_stereo(views, SIZE, settings), settings) for _ in range(2)]
-    # Sums of several threads are rounded in any order.
-    assert spreads[0].focal_px == pytest.approx(spreads[1].focal_px, rel=1e-8)
-    assert spreads[0].baseline_m == pytest.approx(spreads[1].baseline_m, rel=1e-8)
-
-
-def test_depth_errors_grow_with_the_square_of_depth(make_views) -> None:
+def test_depth_errors_grow_with_the_square_of_depth_and_are_the_same_each_time(make_views) -> None:
     _, views = make_views(count=15)
-    settings = CalibrationSettings()
-    spread = measure_spread(calibrate_stereo(views, SIZE, settings), settings)
+    spread, other = (spread_of(views) for _ in range(2))
+    # Sums of several threads are rounded in any order.
+    assert spread.focal_px == pytest.approx(other.focal_px, rel=1e-8)
+    assert spread.baseline_m == pytest.approx(other.baseline_m, rel=1e-8)
     near, _, far, _ = spread.depths
     assert far.matching_m == pytest.approx(25 * near.matching_m)
     assert 9 < far.calibration_m / near.calibration_m < 40
@@ -238,12 +224,9 @@ def test_views_captured_five_times_do_not_make_the_forecast_better(
     make_views, fresh_px: float
 ) -> None:
     """Noise of a still board that repeats (0.1 px) and, on top of it, noise that does not."""
-    settings = CalibrationSettings()
     _, views = make_views(count=13)
-    single = again(views, 1, fresh_px)
-    once = measure_spread(calibrate_stereo(single, SIZE, settings), settings)
-    fit = calibrate_stereo(again(views, 5, fresh_px), SIZE, settings)
-    five = measure_spread(fit, settings)
+    once, fit = spread_of(again(views, 1, fresh_px)), calibrated(again(views, 5, fresh_px))
+    five = measure_spread(fit, CalibrationSettings())
     assert (len(fit.views), len(fit.repeated)) == (13, 52)
     # Another draw of the fresh noise; a spread from 13 views is itself known to a quarter or so.
     tolerance = 0.5 if fresh_px else 1e-6
@@ -254,12 +237,9 @@ def test_views_captured_five_times_do_not_make_the_forecast_better(
 
 def test_a_board_whose_corners_begin_at_the_other_end_repeats_the_view(make_views) -> None:
     _, views = make_views(count=40)
-    turned = replace(
-        views[2],
-        name="turned",
-        seen=tuple(replace(seen, pixels=seen.pixels[::-1]) for seen in views[2].seen),
-    )
-    fit = calibrate_stereo([*views, turned], SIZE, CalibrationSettings(radial_terms=2))
+    seen = tuple(replace(seen, pixels=seen.pixels[::-1]) for seen in views[2].seen)
+    turned = replace(views[2], name="turned", seen=seen)
+    fit = calibrated([*views, turned], radial_terms=2)
     assert fit.repeated == ("turned",)  # and none of those that only resemble each other
     assert fit.calibration.left.distortion.size == 4
 
@@ -268,11 +248,10 @@ def test_depth_is_judged_where_matching_errs_by_two_percent_or_where_the_user_wo
     make_views,
 ) -> None:
     rig, views = make_views(count=10)
-    fit = calibrate_stereo(views, SIZE, CalibrationSettings())
+    fit = calibrated(views)
     own = measure_spread(fit, CalibrationSettings()).working
     assert own.matching_m == pytest.approx(0.02 * own.depth_m)
-    assert own.depth_m == pytest.approx(
-        0.02 * rig.left.matrix[0, 0] * rig.baseline_m / 0.25, rel=0.01
-    )
+    depth_m = 0.02 * rig.left.matrix[0, 0] * rig.baseline_m / 0.25
+    assert own.depth_m == pytest.approx(depth_m, rel=0.01)
     asked = measure_spread(fit, CalibrationSettings(working_m=1.5)).working
     assert asked.depth_m == 1.5
