@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -23,56 +23,36 @@ width=48
 height=32
 ndisp=16
 """
-OPENCV: Final = """\
-%YAML:1.0
----
-image_width: 48
-image_height: 32
-M1: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 50., 0., 24., 0., 50., 16., 0., 0., 1. ]
-D1: !!opencv-matrix
-   rows: 1
-   cols: 4
-   dt: d
-   data: [ 0., 0., 0., 0. ]
-M2: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 50., 0., 24., 0., 50., 16., 0., 0., 1. ]
-D2: !!opencv-matrix
-   rows: 1
-   cols: 4
-   dt: d
-   data: [ 0., 0., 0., 0. ]
-R: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]
-T: !!opencv-matrix
-   rows: 3
-   cols: 1
-   dt: d
-   data: [ -0.1, 0., 0. ]
+
+
+def _matrix(name: str, rows: int, cols: int, data: str) -> str:
+    size = f"   rows: {rows}\n   cols: {cols}\n"
+    return f"{name}: !!opencv-matrix\n{size}   dt: d\n   data: [ {data} ]\n"
+
+
+_LENS: Final = "50., 0., 24., 0., 50., 16., 0., 0., 1."
+OPENCV: Final = "%YAML:1.0\n---\nimage_width: 48\nimage_height: 32\n" + "".join(
+    _matrix(*each)
+    for each in (
+        ("M1", 3, 3, _LENS),
+        ("D1", 1, 4, "0., 0., 0., 0."),
+        ("M2", 3, 3, _LENS),
+        ("D2", 1, 4, "0., 0., 0., 0."),
+        ("R", 3, 3, "1., 0., 0., 0., 1., 0., 0., 0., 1."),
+        ("T", 3, 1, "-0.1, 0., 0."),
+    )
+)
+_CHAIN: Final = """\
+  camera_model: pinhole
+  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [50.0, 50.0, 24.0, 16.0]
+  resolution: [48, 32]
 """
-KALIBR: Final = """\
+KALIBR: Final = f"""\
 cam0:
-  camera_model: pinhole
-  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
-  distortion_model: radtan
-  intrinsics: [50.0, 50.0, 24.0, 16.0]
-  resolution: [48, 32]
-cam1:
-  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-  camera_model: pinhole
-  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
-  distortion_model: radtan
-  intrinsics: [50.0, 50.0, 24.0, 16.0]
-  resolution: [48, 32]
+{_CHAIN}cam1:
+{_CHAIN}  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 """
 CAMERA_INFO: Final = """\
 image_width: 48
@@ -126,13 +106,11 @@ NUMBERS: Final = {
 
 
 def replace_one(text: str, old: str, new: str) -> str:
-    """The text with the first occurrence replaced, which must exist."""
     assert old in text
     return text.replace(old, new, 1)
 
 
 def deep(levels: int) -> dict[str, str]:
-    """Texts of a deep nesting."""
     storage = "<?xml version='1.0'?>\n<opencv_storage>\n"
     opencv = "%YAML:1.0\n---\n"
     hidden = '[ "]", ' * levels
@@ -154,12 +132,11 @@ def deep(levels: int) -> dict[str, str]:
     }
 
 
-def expanding() -> Iterator[str]:
-    """Lines of YAML that expand to 10^10 values."""
-    yield "l0: &l0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"
-    for n in range(1, 10):
-        yield f"l{n}: &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]"
-
+#: Lines of YAML that expand to 10^10 values.
+EXPANDING: Final = (
+    "l0: &l0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]",
+    *(f"l{n}: &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]" for n in range(1, 10)),
+)
 
 #: Bytes that replace the content of a calibration file.
 CONTENT: Final[dict[str, Callable[[bytes], bytes]]] = {

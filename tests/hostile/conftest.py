@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,22 @@ from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.io.images.image import write_image
+from recon.map.drive.mapper import FrameResult
+from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
-from tests.hostile.runs import DRIVE, interrupt_run
 from tests.scenery.kitti import write_kitti
+
+DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}
+STATE = Path(".partial") / ".state"
+
+
+class _Stops(Silent):
+    """A progress that interrupts a run at its fourth frame."""
+
+    def on_step(self, result: FrameResult) -> None:
+        if result.index == 3:
+            raise KeyboardInterrupt
 
 
 @pytest.fixture
@@ -71,7 +84,12 @@ def finished(good_run: Path, here: Path) -> Path:
 def good_state(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a drive (``drive``) and an interrupted run of it (``run``)."""
     folder = tmp_path_factory.mktemp("interrupted")
-    interrupt_run(folder)
+    write_kitti(SyntheticSource(StreetScene(smooth_edges=False, **DRIVE)), folder / "drive")
+    config = load_config(None, ["checkpoints.every_frames=1", "submaps.length_m=1"])
+    source, options = MapOptions(source=folder / "drive", mesh=False).open(config)
+    options = replace(options, audit=False, out=folder / "run", progress=_Stops())
+    with pytest.raises(KeyboardInterrupt):
+        run_map(source, config, options)
     return folder
 
 

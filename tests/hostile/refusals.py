@@ -33,7 +33,6 @@ class Ended:
 
 
 def run(*arguments: str | Path) -> Ended:
-    """Run a command inside this process, which takes no time to start."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         warnings.simplefilter("ignore", ResourceWarning)  # of whatever ran before

@@ -1,11 +1,12 @@
-"""Result folders from elsewhere that lead to other files: by links, and by what their records say.
+"""Files that lead elsewhere, by links or by what records say, and files that commands may replace.
 
-Files outside of the folder, of which ``outside`` has one, stay as they are in all of these tests.
+Files outside of a folder, of which ``outside`` has one, stay as they are in all of these tests.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -21,8 +22,8 @@ from recon.core.errors import FormatError
 from recon.io.atomic import check_targets
 from recon.io.files import resolved
 from recon.sources.datasets import RECORD
+from tests.hostile.conftest import DRIVE
 from tests.hostile.refusals import assert_refused, refusal, run
-from tests.hostile.runs import DRIVE
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 EXPORT: Final = ("export", "run", "--to", "cloud", "--out", "evil")
@@ -41,66 +42,40 @@ def content(folder: Path) -> dict[str, str]:
     return {path.name: path.read_text() for path in folder.iterdir()}
 
 
+def state(folder: Path) -> dict[str, tuple[int, int, bytes]]:
+    """Kind, number and content of all that is in a folder, links not followed."""
+    return {
+        str(path): (*path.lstat()[:2], path.read_bytes() if path.is_file() else b"")
+        for path in folder.rglob("*")
+    }
+
+
 def evil(record: object = None) -> Path:
-    """Make a result folder with a record."""
     folder = Path("evil")
     folder.mkdir()
     (folder / "run.json").write_text(json.dumps(record or {}))
     return folder
 
 
-def a_stale_file_behind_a_link(outside: Path) -> str:
-    (evil({"files": ["sub/file"]}) / "sub").symlink_to(outside)
-    return "evil/sub"
-
-
-def a_link_where_products_go(outside: Path) -> str:
-    (evil() / "map").symlink_to(outside)
-    return "evil/map"
-
-
-def a_link_deep_in_the_folder(outside: Path) -> str:
-    (evil() / "map" / "deep").mkdir(parents=True)
-    (Path("evil") / "map" / "deep" / "er").symlink_to(outside)
-    return "evil/map/deep/er"
-
-
-def a_link_where_partial_files_go(outside: Path) -> str:
-    (evil() / ".partial").symlink_to(outside)
-    return "evil/.partial"
-
-
-def a_link_for_the_lock(outside: Path) -> str:
-    (evil() / ".partial").mkdir()
-    (Path("evil") / ".partial" / ".lock").symlink_to(outside / "lock")
-    return "evil/.partial/.lock"
-
-
-def a_link_for_a_file(outside: Path) -> str:
-    (evil() / "config.yaml").symlink_to(outside / "file")
-    return "evil/config.yaml"
-
-
-PLACES: Final[dict[str, Callable[[Path], str]]] = {
-    make.__name__: make
-    for make in (
-        a_stale_file_behind_a_link,
-        a_link_where_products_go,
-        a_link_deep_in_the_folder,
-        a_link_where_partial_files_go,
-        a_link_for_the_lock,
-        a_link_for_a_file,
-    )
-}
-
-
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    ("link", "target"),
+    [
+        ("sub", ""),  # before a stale file
+        ("map", ""),
+        ("map/deep/er", ""),
+        (".partial", ""),
+        (".partial/.lock", "lock"),
+        ("config.yaml", "file"),
+    ],
+)
 def test_no_link_below_a_result_folder_is_followed(
-    place: str, finished: Path, outside: Path
+    link: str, target: str, finished: Path, outside: Path
 ) -> None:
-    named = PLACES[place](outside)
+    path = evil({"files": ["sub/file"]}) / link
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.symlink_to(outside / target)
     before = sorted(Path("evil").iterdir())
-    assert_refused(run(*EXPORT), named, "link")
+    assert_refused(run(*EXPORT), f"evil/{link}", "link")
     assert content(outside) == {"file": "precious"}
     assert sorted(Path("evil").iterdir()) == before
 
@@ -113,36 +88,32 @@ def test_the_result_folder_itself_may_be_a_link(finished: Path) -> None:
     assert Path("evil").is_symlink()
 
 
-READERS: Final = {
-    "export": ("export", "run", "--out", "out"),
-    "mesh": ("mesh", "run", "--out", "out"),
-    "occupancy": ("occupancy", "run", "--out", "out"),
-    "evaluate map": ("evaluate", "map", "run", "run/map/cloud.ply"),
-    "evaluate occupancy": ("evaluate", "occupancy", "run"),
-    "merge": ("merge", "other", "run", "--out", "out"),
-    "merge first": ("merge", "run", "other", "--out", "out"),
-    "remove": ("map", "--into", "run", "--remove", "0"),
-}
+READERS: Final = (
+    "export run --out out",
+    "mesh run --out out",
+    "occupancy run --out out",
+    "evaluate map run run/map/cloud.ply",
+    "evaluate occupancy run",
+    "merge other run --out out",
+    "merge run other --out out",
+    "map --into run --remove 0",
+    "localize drive --map run --out out --quiet",
+    "map drive --into run --quiet",
+)
 
 
 @pytest.mark.parametrize("command", READERS)
 @pytest.mark.parametrize("link", ["map", "map/map.recon"])
-def test_a_run_that_leads_elsewhere_is_not_read(command: str, link: str, finished: Path) -> None:
+def test_a_run_that_leads_elsewhere_is_not_read(
+    command: str, link: str, finished: Path, good_state: Path
+) -> None:
+    Path("drive").symlink_to(good_state / "drive")
     shutil.copytree(finished, "other")
     place = finished / link
     moved = place.rename(finished.parent / "moved")
     place.symlink_to(moved)
-    assert_refused(run(*READERS[command]), f"run/{link}", "link")
+    assert_refused(run(*command.split()), f"run/{link}", "link")
     assert place.is_symlink()
-    assert not Path("out").exists()
-
-
-def test_a_map_that_leads_elsewhere_finds_no_drive(finished: Path, good_state: Path) -> None:
-    (finished / "map").rename("moved")
-    (finished / "map").symlink_to(finished.parent / "moved")
-    drive = good_state / "drive"
-    assert_refused(run("localize", drive, "--map", "run", "--out", "out", "--quiet"), "run/map")
-    assert_refused(run("map", drive, "--into", "run", "--quiet"), "run/map")
     assert not Path("out").exists()
 
 
@@ -157,14 +128,13 @@ def test_an_unfinished_run_that_leads_elsewhere_is_not_resumed(
     assert (outside / "state" / "map.recon").read_bytes() == before
 
 
-def test_a_batch_that_leads_elsewhere_is_not_resumed(here: Path) -> None:
-    (here / "outside").mkdir()
+def test_a_batch_that_leads_elsewhere_is_not_resumed(here: Path, outside: Path) -> None:
     (here / "batch").mkdir()
-    (here / "batch" / "job").symlink_to(here / "outside")
+    (here / "batch" / "job").symlink_to(outside)
     plan = {"folder": str(here), "job": [{"name": "job", "command": "demo"}]}
     (here / "batch" / "jobs.json").write_text(json.dumps(plan))
     assert_refused(run("batch", "--resume", "batch"), "batch/job", "link")
-    assert list((here / "outside").iterdir()) == []
+    assert content(outside) == {"file": "precious"}
 
 
 def test_the_folder_in_which_a_merge_is_made_leads_nowhere(finished: Path, outside: Path) -> None:
@@ -175,28 +145,28 @@ def test_the_folder_in_which_a_merge_is_made_leads_nowhere(finished: Path, outsi
 
 
 RECORDS: Final = {
-    "a number": [1],
-    "null": [None],
-    "no list": 5,
-    "NUL": ["a\0b"],
-    "a surrogate": ["\ud800"],
-    "an empty name": [""],
-    "a long name": ["x" * 5000],
-    "a table": {"a": 1},
+    "a number": '{"files": [1]}',
+    "null": '{"files": [null]}',
+    "no list": '{"files": 5}',
+    "NUL": '{"files": ["a\\u0000b"]}',
+    "a surrogate": '{"files": ["\\ud800"]}',
+    "an empty name": '{"files": [""]}',
+    "a long name": json.dumps({"files": ["x" * 5000]}),
+    "a table": '{"files": {"a": 1}}',
+    "deep": "[" * 100_000,
+    "a list": "[]",
+    "1": "1",
+    "nothing": "",
+    "deep files": '{"files":' + "[" * 100_000,
+    "a NUL": "\0",
 }
 
 
-@pytest.mark.parametrize("files", RECORDS)
-def test_a_record_whose_list_of_files_is_none_is_refused(files: str, finished: Path) -> None:
-    evil({"files": RECORDS[files]})
+@pytest.mark.parametrize("record", RECORDS)
+def test_a_folder_whose_record_is_none_is_refused(record: str, finished: Path) -> None:
+    (evil() / "run.json").write_text(RECORDS[record])
     assert_refused(run(*EXPORT), "evil/run.json")
     assert [path.name for path in Path("evil").iterdir()] == ["run.json"]
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, "[]", "1", "", '{"files":' + "[" * 100_000, "\0"])
-def test_a_folder_whose_record_is_none_is_refused(text: str, finished: Path) -> None:
-    (evil() / "run.json").write_text(text)
-    assert_refused(run(*EXPORT), "evil/run.json")
 
 
 def test_folders_and_outside_files_in_a_list_of_files_stay(finished: Path, outside: Path) -> None:
@@ -238,22 +208,17 @@ def test_a_loop_of_links_is_refused_in_python_too(taker: str, loop: str, here: P
 
 
 PART: Final = "middlebury-2014/Pipes"
-LINKS_OF_DATA: Final = {
-    "a family": "middlebury-2014",
-    "a data set": PART,
-    "downloads": ".partial",
-    "a download": f".partial/{PART}",
-    "an archive": f".partial/{PART}/Pipes-perfect.zip",
-    "what was unpacked": f".partial/{PART}/files",
-}
+DOWN: Final = f".partial/{PART}"
 
 
-@pytest.mark.parametrize("link", LINKS_OF_DATA)
-def test_no_link_below_a_folder_of_data_sets_is_followed(link: str, here: Path) -> None:
-    outside = here / "outside"
-    outside.mkdir()
-    (outside / "file").write_text("precious")
-    path = here / "data" / LINKS_OF_DATA[link]
+@pytest.mark.parametrize(
+    "link",
+    ["middlebury-2014", PART, ".partial", DOWN, f"{DOWN}/Pipes-perfect.zip", f"{DOWN}/files"],
+)
+def test_no_link_below_a_folder_of_data_sets_is_followed(
+    link: str, here: Path, outside: Path
+) -> None:
+    path = here / "data" / link
     path.parent.mkdir(parents=True)
     path.symlink_to(outside)
     with pytest.raises(FormatError, match="link") as refused:
@@ -264,20 +229,98 @@ def test_no_link_below_a_folder_of_data_sets_is_followed(link: str, here: Path) 
 
 @pytest.mark.parametrize("link", ["middlebury-2014", PART, f"{PART}/deep"])
 def test_data_that_lead_elsewhere_are_not_verified(link: str, here: Path) -> None:
-    place = here / "data" / PART
+    place = here / "real" / PART
     (place / "deep").mkdir(parents=True)
     (place / RECORD).write_text('{"files": {}}')
+    (here / "data").symlink_to(here / "real")  # the folder itself may be a link
     assert run_verify([PART], here / "data")["datasets"]
-    moved = (here / "data" / link).rename(here / "moved")
-    (here / "data" / link).symlink_to(moved)
+    moved = (here / "real" / link).rename(here / "moved")
+    (here / "real" / link).symlink_to(moved)
     with pytest.raises(FormatError, match="link") as refused:
-        run_verify([PART], here / "data")
-    assert refused.value.where == here / "data" / link
+        run_verify([PART], here / "real")
+    assert refused.value.where == here / "real" / link
 
 
-def test_the_folder_of_data_sets_itself_may_be_a_link(here: Path) -> None:
-    place = here / "real" / PART
-    place.mkdir(parents=True)
-    (place / RECORD).write_text('{"files": {}}')
-    (here / "data").symlink_to(here / "real")
-    assert run_verify([PART], here / "data")["datasets"]
+TARGETS: Final[dict[str, Callable[[Path], None]]] = {
+    "a device": lambda path: path.symlink_to(os.devnull),
+    "a pipe": os.mkfifo,
+    "a folder": Path.mkdir,
+    "the calibration by a hard link": lambda path: path.hardlink_to("drive/calib.txt"),
+    "the calibration by a link": lambda path: path.symlink_to("drive/calib.txt"),
+    "an image by a link to a link": lambda path: path.symlink_to("between"),
+    "the configuration": lambda path: path.symlink_to("config.yaml"),
+}
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_mended_calibration_replaces_no_input_and_no_device(drive: Path, target: str) -> None:
+    Path("config.yaml").write_text("matching: {matcher: sad}\n")
+    Path("between").symlink_to("drive/image_0/000001.png")
+    TARGETS[target](Path("target"))
+    before = state(drive.parent)
+    command = ("audit", "drive", "--config", "config.yaml", "--mend", "target", "--quiet")
+    assert_refused(run(*command), "target: ")
+    assert state(drive.parent) == before
+
+
+@pytest.mark.parametrize("name", ["drive/calib.txt", "", ".", "drive/times.txt"])
+def test_a_mended_calibration_is_a_file_of_its_own(drive: Path, name: str) -> None:
+    before = state(drive)
+    assert_refused(run("audit", "drive", "--mend", name, "--quiet"), name)
+    assert state(drive) == before
+
+
+def test_a_calibration_replaces_no_picture_of_the_board(pair: tuple[Path, Path]) -> None:
+    Path("rig_left.yaml").hardlink_to("left.png")
+    before = state(pair[0].parent)
+    board = ("--board", "chess:9x6:25mm", "--report", "report")
+    for words in (("left.png",), ("right.png",), ("rig.yaml", "--format", "ros")):
+        command = ("calibrate", "left.png", "right.png", *board, "-o", *words)
+        assert_refused(run(*command), "would replace an input")
+    assert state(pair[0].parent) == before
+
+
+def test_a_board_is_not_printed_into_a_device(here: Path) -> None:
+    Path("board.pdf").symlink_to(os.devnull)
+    assert_refused(run("board", "chess:9x6:25mm"), "board.pdf: ", "a device")
+    assert Path("board.pdf").is_symlink()
+
+
+@pytest.mark.parametrize("name", ["map/grid.pgm", "run.json"])
+def test_a_drawing_replaces_no_file_of_the_run(finished: Path, name: str) -> None:
+    before = state(finished)
+    command = ("evaluate", "occupancy", "run", "--picture", f"run/{name}")
+    assert_refused(run(*command), f"run/{name}", "would replace an input")
+    assert state(finished) == before
+
+
+MADE_OF: Final = {
+    "a map compared with itself": "evaluate map run run/map/cloud.ply",
+    "its cloud": "evaluate map run/map/cloud.ply run/map/cloud.ply",
+    "its path": "evaluate trajectory run/trajectory_tum.txt run/trajectory_tum.txt",
+    "a drive at its poses": "map drive --poses run/trajectory_tum.txt",
+}
+
+
+@pytest.mark.parametrize("command", MADE_OF)
+@pytest.mark.parametrize("out", ["run", "linked"])
+def test_results_do_not_replace_the_files_that_they_are_made_of(
+    command: str, out: str, finished: Path, good_state: Path
+) -> None:
+    Path("drive").symlink_to(good_state / "drive")
+    shutil.copytree(finished, "linked")
+    for name in ("map/cloud.ply", "trajectory_tum.txt"):
+        Path("linked", name).unlink()
+        Path("linked", name).hardlink_to(finished / name)
+    before = state(Path(out))
+    assert_refused(run(*MADE_OF[command].split(), "--out", out), "would replace an input")
+    assert state(Path(out)) == before
+
+
+def test_results_do_not_replace_what_is_no_regular_file(finished: Path) -> None:
+    shutil.copytree(finished, "other")
+    Path("other/map/cloud.ply").unlink()
+    os.mkfifo("other/map/cloud.ply")
+    before = state(Path("other"))
+    assert_refused(run("export", "run", "--to", "cloud", "--out", "other"), "a named pipe")
+    assert state(Path("other")) == before

@@ -1,8 +1,11 @@
-"""Records of a map with a valid checksum, and nonsense in any one place of them."""
+"""Records of a map that claim very much, or with a valid checksum and nonsense in any one place."""
 
 from __future__ import annotations
 
+import struct
+import tracemalloc
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +15,7 @@ import pytest
 
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import RayCloud, RectifiedCamera
+from recon.io.models.octomap import read_octomap
 from recon.map.fusion import FusedPart, join_fused
 from recon.map.kernels.clamped import CellRows
 from recon.map.map import Map
@@ -47,31 +51,23 @@ def _add_drive(map_: Map) -> None:
     session = map_.begin(SessionInfo("drive", "of a test", FRAMES))
     session.set_axes(np.eye(4), RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12, 8))
     grain, ones = ray_grain(OccupancySettings()), np.ones(4, np.uint8)
+    rays = RayCloud(np.ones((4, 3), np.int16), ones.astype(np.float16), ones, ones, grain.unit_m)
     for frame in range(FRAMES):
-        places = np.ones((4, 3), np.int16)
-        rays = RayCloud(places, ones.astype(np.float16), ones, ones, grain.unit_m)
         session.add_frame(np.eye(4), float(frame), OdometryHealth(notes=("note",)))
         session.add_rays(frame, rays, grain)
-    seen = Keyframe(
-        1, np.ones((4, 3), np.float32), np.ones((4, 32), np.uint8), np.ones((2, 2), np.float32)
-    )
+    uvd, coarse = np.ones((4, 3), np.float32), np.ones((2, 2), np.float32)
+    seen = Keyframe(1, uvd, np.ones((4, 32), np.uint8), coarse)
     session.keyframes.put(StoredKeyframe(seen, np.eye(4), 1.0, (LOOP,), ("few inliers",)))
-    session.submaps.add(Submap(0, 0, FRAMES, _fused(), _occupancy()))
+    two = np.ones(2, np.float32)
+    fused = FusedPart(KEYS, np.ones((2, 11), np.float32), two, np.ones(2, np.int32))
+    starts, cells = np.array([0, 1, 2], np.int64), np.array([0, 511], np.uint16)
+    rows = CellRows(KEYS, starts, cells, np.ones((2, 3), np.float32))
+    occupancy = OccupancyPart(rows, SurfacePoints(KEYS, np.ones((2, 4), np.float32)))
+    session.submaps.add(Submap(0, 0, FRAMES, fused, occupancy))
     path = np.stack([np.eye(4)] * FRAMES)
     session.set_loops({"closed": [asdict(LOOP)], "refused": [], BENT: path, ALONE: path})
     frames, places_m = np.arange(3, dtype=np.int32), np.zeros((3, 3))
     session.set_fixes(Fixes(frames, places_m, places_m, 0.1))
-
-
-def _fused() -> FusedPart:
-    ones = np.ones(2, np.float32)
-    return FusedPart(KEYS, np.ones((2, 11), np.float32), ones, np.ones(2, np.int32))
-
-
-def _occupancy() -> OccupancyPart:
-    starts, cells = np.array([0, 1, 2], np.int64), np.array([0, 511], np.uint16)
-    rows = CellRows(KEYS, starts, cells, np.ones((2, 3), np.float32))
-    return OccupancyPart(rows, SurfacePoints(KEYS, np.ones((2, 4), np.float32)))
 
 
 def read_map(path: Path) -> None:
@@ -80,6 +76,7 @@ def read_map(path: Path) -> None:
         _ = map_.doubts, map_.links, list(MapViews(map_))
         for session in map_.sessions:
             _ = session.camera, session.fixes, session.trajectory, session.corrections()
+            _ = session.loops, session.state()
             _ = [session.rays(frame)[0].cloud() for frame in range(session.ray_frames)]
             _ = [stored.keyframe.xyz(session.camera) for stored in session.keyframes]
             join_fused(submap.fused for submap in session.submaps).cloud(0.1, 1)
@@ -142,7 +139,6 @@ def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, .
 
 
 def changed(tree: Any, path: tuple[Any, ...], value: Any) -> Any:
-    """Return a tree with another part."""
     if not path:
         return value
     copy = tree.copy()
@@ -251,5 +247,91 @@ def test_a_key_that_is_no_number_is_refused(
     database.execute("DELETE FROM record WHERE kind = ? AND key = ?", (kind, key))
     database.execute("UPDATE record SET kind = ? WHERE kind = 'kept'", (kind,))
     store.commit()
-    assert line is not None
     assert "map.recon" in line
+
+
+MOST_BYTES: Final = 64_000_000  # more than these files take, much less than they claim
+
+
+@contextmanager
+def little_memory() -> Iterator[None]:
+    """Fail where numpy and Python take more memory than a small file needs."""
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < MOST_BYTES, f"{peak / 1e6:.0f} MB"
+
+
+def claim(path: Path, kind: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    """Change the first record of a kind, or make one, in a map that stays a valid file."""
+    with Store.open(path) as store:
+        keys = store.keys(kind)
+        key = keys[0] if keys else 0
+        content = store.read(kind, key, most_bytes=1 << 40) if keys else {}
+        store.put(kind, key, change(content), compress=True)
+        store.commit()
+
+
+@pytest.fixture
+def map_file(finished: Path) -> Path:
+    return finished / "map" / "map.recon"
+
+
+def assert_claims_too_much(map_file: Path) -> None:
+    with little_memory():
+        line = refusal(lambda: read_map(map_file)) or ""
+    assert "claims more than it can hold" in line
+    assert str(map_file) in line
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "state"])
+def test_a_record_with_arrays_of_deflated_zeros_is_refused(kind: str, map_file: Path) -> None:
+    with little_memory():
+        assert refusal(lambda: read_map(map_file)) is None
+    zeros = {f"zeros{number}": np.zeros(5_000_000) for number in range(3)}
+    claim(map_file, kind, lambda content: {**content, "claimed": zeros})
+    assert map_file.stat().st_size < 10_000_000
+    assert_claims_too_much(map_file)
+
+
+def many(rows: int) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """Make every array of a tree, and of those in it, as long; all zeros."""
+
+    def longer(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return np.zeros((rows, *value.shape[1:]), value.dtype)
+        if isinstance(value, dict):
+            return {name: longer(item) for name, item in value.items()}
+        return value
+
+    return longer
+
+
+ROWS: Final = {"frames": 10**6, "rays": 10**7, "keyframe": 2 * 10**6, "submap": 2 * 10**6}
+
+
+@pytest.mark.parametrize("kind", ROWS)
+@pytest.mark.parametrize("neighbours", ["true", "forged"])
+def test_a_record_of_very_many_rows_is_refused(kind: str, neighbours: str, map_file: Path) -> None:
+    claim(map_file, kind, many(ROWS[kind]))
+    if neighbours == "forged":
+        if kind != "keyframe":  # before which a forged entry is noticed
+            forged = {"voxels": 10**9, "cells": 10**9}
+            claim(map_file, "submap_entry", lambda entry: {**entry, **forged})
+        camera = RectifiedCamera(1e5, 5e4, 5e4, 5e4, 0.5, 100_000, 100_000).__dict__
+        claim(map_file, "axes", lambda axes: {**axes, "camera": camera})
+    assert_claims_too_much(map_file)
+
+
+def test_an_octomap_of_few_nodes_that_cover_very_many_cells_is_refused(here: Path) -> None:
+    """Eight levels of one child each, then eight leaves of 256 cells along each side."""
+    inner = struct.pack("<fB", 0.5, 1) * 7 + struct.pack("<fB", 0.5, 255)
+    nodes = inner + struct.pack("<fB", 0.5, 0) * 8
+    header = f"# Octomap OcTree file\nid OcTree\nsize {len(nodes) // 5}\nres 0.1\ndata\n"
+    Path("claims.ot").write_bytes(header.encode() + nodes)
+    with little_memory():
+        line = refusal(lambda: read_octomap("claims.ot")) or ""
+    assert line.startswith("claims.ot: the OctoMap claims far more cells than it has nodes")

@@ -1,12 +1,17 @@
-"""Limits, signals and streams that a command meets, and options with values that nobody means."""
+"""Limits, signals, streams and bugs that a command meets, and options that nobody means."""
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -18,10 +23,12 @@ from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, MemoryLimitError
+from recon.io.files import reading
 from recon.map.store.records import Store
 from recon.run.run import Run
-from tests.hostile.refusals import assert_refused, run
-from tests.hostile.runs import DRIVE
+from recon.stereo.match import registry
+from tests.hostile.conftest import DRIVE
+from tests.hostile.refusals import Ended, assert_refused, run
 from tests.scenery.patience import LONG_S
 
 PROGRAM: Final = f"PYTHONPATH={Path(recon.__file__).parents[1]} {sys.executable} -m recon"
@@ -54,26 +61,24 @@ def test_too_little_address_space_is_said_before_libraries_are_loaded(
     assert_refused(run("map", "drive"), "ulimit -v", f"{limit_mb} MB", "at least 2500 MB")
 
 
-OPTIONS: Final = {
-    "a device of twenty digits": ("capture", "99999999999999999999", "1", "--out", "out"),
-    "a text as a video": ("capture", "calib.txt", "calib.txt", "--out", "out"),
-    "half an address": ("datasets", "fetch", "euroc", "--address", "http://[::1"),
-    "a loop as --out": ("mesh", "cloud.ply", "--out", "loop"),
-    "a loop as --map": ("localize", "drive", "--map", "loop", "--out", "out"),
-    "a loop to merge": ("merge", "loop", "loop", "--out", "out"),
-    "a loop as both folders": ("map", "drive", "--out", "loop", "--resume", "loop"),
-    "an antenna far away": (
-        "merge", "run", "--georeference", "gnss.txt", "--antenna=1e300,0,0", "--out", "out",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("option", OPTIONS)
-def test_a_value_that_nobody_means_is_refused(option: str, here: Path, drive: Path) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [
+        "capture 99999999999999999999 1 --out out",
+        "capture calib.txt calib.txt --out out",
+        "datasets fetch euroc --address http://[::1",
+        "mesh cloud.ply --out loop",
+        "localize drive --map loop --out out",
+        "merge loop loop --out out",
+        "map drive --out loop --resume loop",
+        "merge run --georeference gnss.txt --antenna=1e300,0,0 --out out",
+    ],
+)
+def test_a_value_that_nobody_means_is_refused(command: str, drive: Path) -> None:
     Path("loop").symlink_to("loop")
     Path("calib.txt").write_text("P0: 1 0 0 0\n")
     Path("gnss.txt").write_text("0 0 0 0\n1 1 0 0\n")
-    assert_refused(run(*OPTIONS[option]))
+    assert_refused(run(*command.split()))
     assert not Path("out").exists()
 
 
@@ -97,12 +102,11 @@ CAMERAS: Final = {
 def test_a_camera_that_nobody_has_is_refused(
     camera: str, command: str, pair: tuple[Path, Path]
 ) -> None:
-    left, right = pair
-    source = [left, right] if command == "pair" else ["drive"]
-    for side, image in (("left", left), ("right", right)):
+    source = pair if command == "pair" else ("drive",)
+    for image in pair:
+        (folder := Path("drive", image.stem)).mkdir(parents=True)
         for name in ("0.png", "1.png"):
-            (target := Path("drive", side, name)).parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(image.read_bytes())
+            shutil.copy(image, folder / name)
     ended = run(command, *source, *camera.split(), "--quiet", "--out", "out")
     assert_refused(ended, CAMERAS[camera])
     assert not Path("out").exists()
@@ -132,29 +136,31 @@ def test_a_demo_that_cannot_be_resumed_does_not_advise_it(here: Path) -> None:
     assert list(here.iterdir()) == []
 
 
+SURROUNDINGS: Final = os.environ | {"PYTHONPATH": str(Path(recon.__file__).parents[1])}
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_run_that_is_ended_by_a_signal_leaves_nothing(here: Path, number: int) -> None:
     """As during `recon map --into`, whose new folder stands beside the old one."""
-    script = (
-        "import signal, time\nfrom pathlib import Path\nimport recon.cli as cli\n"
-        "from recon.run.run import WholeRun\n"
-        # Whoever runs the tests in the background may have them ignore signals.
-        f"signal.signal({int(number)}, signal.SIG_DFL)\n"
-        "def app():\n"
-        "    with WholeRun('merge', Path('run')) as run:\n"
-        "        run.path('file').write_text('half')\n"
-        "        print('ready', flush=True)\n"
-        "        time.sleep(600)\n"
-        "cli.app = app\ncli.main()\n"
-    )
-    surroundings = os.environ | {"PYTHONPATH": str(Path(recon.__file__).parents[1])}
+    script = f"""
+import signal, time
+from pathlib import Path
+import recon.cli as cli
+from recon.run.run import WholeRun
+# Whoever runs the tests in the background may have them ignore signals.
+signal.signal({int(number)}, signal.SIG_DFL)
+def app():
+    with WholeRun('merge', Path('run')) as run:
+        run.path('file').write_text('half')
+        print('ready', flush=True)
+        time.sleep(600)
+cli.app = app
+cli.main()
+"""
+    command, quiet = [sys.executable, "-c", script], subprocess.DEVNULL
     with subprocess.Popen(
-        [sys.executable, "-c", script],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=surroundings,
+        command, stdout=subprocess.PIPE, stderr=quiet, env=SURROUNDINGS
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"
         assert (here / ".run.partial" / "file").exists()
         process.send_signal(number)
@@ -164,25 +170,26 @@ def test_a_run_that_is_ended_by_a_signal_leaves_nothing(here: Path, number: int)
 
 def test_a_signal_that_comes_where_exceptions_are_lost_comes_again() -> None:
     """As in the callback of a weak reference, in one of some ten runs."""
-    script = (
-        "import signal, time, weakref\nimport recon.cli as cli\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # perhaps ignored
-        "class Thing: pass\n"
-        "def gone(_):\n"
-        "    signal.raise_signal(signal.SIGINT)\n"
-        "    for _ in range(9): pass\n"
-        "def app():\n"
-        "    thing = Thing()\n"
-        "    weak = weakref.ref(thing, gone)\n"
-        "    del thing\n"
-        "    print('lost', flush=True)\n"
-        "    time.sleep(600)\n"
-        "cli.app = app\ncli.main()\n"
-    )
-    surroundings = os.environ | {"PYTHONPATH": str(Path(recon.__file__).parents[1])}
+    script = """
+import signal, time, weakref
+import recon.cli as cli
+signal.signal(signal.SIGINT, signal.default_int_handler)  # perhaps ignored
+class Thing: pass
+def gone(_):
+    signal.raise_signal(signal.SIGINT)
+    for _ in range(9): pass
+def app():
+    thing = Thing()
+    weak = weakref.ref(thing, gone)
+    del thing
+    print('lost', flush=True)
+    time.sleep(600)
+cli.app = app
+cli.main()
+"""
     command = [sys.executable, "-c", script]
     done = subprocess.run(
-        command, env=surroundings, capture_output=True, timeout=LONG_S, check=False
+        command, env=SURROUNDINGS, capture_output=True, timeout=LONG_S, check=False
     )
     assert (done.stdout, done.returncode) == (b"lost\n", -signal.SIGINT)
     assert b"ignored" not in done.stderr
@@ -194,3 +201,147 @@ def test_a_damaged_record_is_named_by_the_map_that_it_is_copied_from(here: Path)
         store._database.execute("UPDATE record SET checksum = checksum + 1")
         with pytest.raises(FormatError, match="damaged: a record of the map is damaged"):
             store.copy("kind", new)
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+
+
+def _break_the_matcher(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    class Broken:
+        def match(self, pair: object) -> None:
+            raise error
+
+    monkeypatch.setitem(registry.MATCHERS, "sad", lambda *_: Broken())
+
+
+@pytest.mark.usefixtures("scratch")
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("two\nlines"),
+        KeyError("x"),
+        TypeError("bad"),
+        RecursionError("deep"),
+        ModuleNotFoundError("No module named 'recon.nothing'", name="recon.nothing"),
+        ImportError("cannot import name 'nothing' from 'recon'", name="recon"),
+    ],
+)
+def test_a_bug_in_matching_is_no_fault_of_the_file(
+    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    _break_the_matcher(monkeypatch, error)
+    ended = run("disparity", *pair, "--quiet", "--out", "out")
+    assert ended.code == 3
+    assert ended.out == ""
+    (line,) = ended.lines
+    found = re.fullmatch(r"error: internal error \((.*)\), please report: (\S+)", line)
+    assert found is not None, line
+    assert found[1].startswith(type(error).__name__)
+    told = Path(found[2]).read_text()
+    assert "Traceback" in told
+    assert "in match" in told
+    assert not Path("out").exists()
+
+
+@pytest.mark.usefixtures("scratch")
+def test_a_bug_is_reported_without_a_folder_for_temporary_files(
+    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _break_the_matcher(monkeypatch, ValueError("bad"))
+    monkeypatch.setattr(tempfile, "tempdir", "/nonexistent")
+    ended = run("disparity", *pair, "--quiet", "--out", "out")
+    assert ended.code == 3
+    assert len(ended.lines) == 1
+    assert "TMPDIR" in ended.lines[0]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ModuleNotFoundError("No module named 'cv2'", name="cv2"),
+        ImportError("libGL.so.1: cannot open shared object file"),
+        ImportError("cannot import name 'x' from 'reconnect'", name="reconnect"),
+    ],
+)
+def test_a_package_that_cannot_be_imported_is_no_bug(
+    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    _break_the_matcher(monkeypatch, error)
+    ended = run("disparity", *pair, "--quiet", "--out", "out")
+    assert_refused(ended, str(error), "recon doctor")
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["cv2 pair a b", "numba map drive", "open3d mesh cloud.ply", "rich settings", "typer --help"],
+)
+def test_a_command_names_the_package_that_it_lacks(command: str, here: Path) -> None:
+    package, *words = command.split()
+    lacking = (
+        f"import sys; sys.modules[{package!r}] = None; from recon.__main__ import main; "
+        f"sys.argv = ['recon', *{words!r}]; main()"
+    )
+    (here / "drive").mkdir()
+    done = subprocess.run([sys.executable, "-c", lacking], capture_output=True, check=False)
+    assert_refused(Ended(done.returncode, done.stdout.decode(), done.stderr.decode()), package)
+
+
+def test_a_missing_package_is_no_fault_of_the_file_that_is_read(here: Path) -> None:
+    with pytest.raises(ModuleNotFoundError), reading(here / "file"):
+        raise ModuleNotFoundError("No module named 'cv2'", name="cv2")
+
+
+_FORBIDDEN: Final = frozenset(
+    {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
+)
+_UNSAFE_YAML: Final = frozenset(
+    {"load", "load_all", "full_load", "unsafe_load", "full_load_all", "unsafe_load_all"}
+)
+_RUNS_TEXT: Final = frozenset({"eval", "exec", "compile", "__import__"})
+_ROOT: Final = Path(recon.__file__).parent
+
+
+def dangers(tree: ast.AST) -> Iterator[str]:
+    """What could run code that a file contains."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import(names=names):
+                yield from (n.name for n in names if n.name.partition(".")[0] in _FORBIDDEN)
+            case ast.ImportFrom(module=str(module)) if module.partition(".")[0] in _FORBIDDEN:
+                yield module
+            case ast.keyword(arg="allow_pickle", value=value):
+                if not (isinstance(value, ast.Constant) and value.value is False):
+                    yield "allow_pickle"
+            case ast.Attribute(value=ast.Name(id="yaml"), attr=attr) if attr in _UNSAFE_YAML:
+                yield f"yaml.{attr}"
+            case ast.Attribute(value=ast.Name(id="torch"), attr="load"):
+                yield "torch.load"
+            case ast.Call(func=ast.Name(id=name)) if name in _RUNS_TEXT:
+                yield name
+
+
+def test_no_module_can_run_what_it_reads() -> None:
+    found = {path: list(dangers(ast.parse(path.read_text()))) for path in _ROOT.rglob("*.py")}
+    assert len(found) > 200
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "import os, marshal as m",
+        "np.load(f, allow_pickle=True)",
+        "np.load(f, allow_pickle=allowed)",
+        "yaml.load(text)",
+        "yaml.unsafe_load(text)",
+        "eval(text)",
+    ],
+)
+def test_the_search_finds_what_it_looks_for(code: str) -> None:
+    assert list(dangers(ast.parse(code)))

@@ -1,0 +1,315 @@
+"""Hostile calibrations, settings and documents: refused in one line that names the file."""
+
+from __future__ import annotations
+
+import resource
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from recon.commands.config import ReconConfig, load_config
+from recon.core.errors import ReconError, SettingsError
+from recon.export.make import make
+from recon.export.product import Order
+from recon.io.cameras.calibration import read_calibration
+from recon.io.files import SMALL_FILE_BYTES
+from recon.map.drive.sequence import map_sequence
+from recon.map.settings import DriveSettings
+from recon.run.run import Run
+from recon.sources.synthetic import SyntheticSource
+from recon.street.settings import StreetScene
+from tests.hostile.calibrations import (
+    CONTENT,
+    EXPANDING,
+    KALIBR,
+    NUMBERS,
+    OPENCV,
+    OURS,
+    VALID,
+    deep,
+    replace_one,
+    write_valid,
+)
+from tests.hostile.conftest import DRIVE
+from tests.hostile.refusals import assert_refused, refusal, run, run_apart
+from tests.scenery.bounds import Number, numbers_of
+
+pytestmark = pytest.mark.usefixtures("blank_figures")
+LEVELS: Final = 20_000
+
+
+def refusal_of(path: Path) -> str | None:
+    """The line that refuses a calibration, which must name it."""
+    line = refusal(lambda: read_calibration(path, 48, 32))
+    assert line is None or path.stem.split("_")[0] in line
+    return line
+
+
+@pytest.mark.parametrize("change", CONTENT)
+@pytest.mark.parametrize("kind", VALID)
+def test_spoiled_content_is_refused_or_harmless(kind: str, change: str, tmp_path: Path) -> None:
+    path = write_valid(tmp_path, kind)
+    assert refusal_of(path) is None
+    path.write_bytes(CONTENT[change](path.read_bytes()))
+    refusal_of(path)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize(
+    ("name", "text", "old"),
+    [
+        *(("rig.yaml", OURS, old) for old in ("48", "50.0", "0.1", "1\n")),
+        *(("chain.yaml", KALIBR, old) for old in ("50.0", "48", "-0.1", "[48, 32]", "radtan")),
+        *(("stereo.yml", OPENCV, old) for old in ("48", "50.", "-0.1", "rows: 3")),
+    ],
+    ids=lambda value: value if len(value) < 10 else "",
+)
+def test_a_hostile_number_raises_nothing_but_our_errors(
+    name: str, text: str, old: str, number: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text(replace_one(text, old, NUMBERS[number] + "\n" * old.endswith("\n")))
+    line = refusal_of(path)
+    never = {"5000 digits", "date", "tag int abc", "list", "nan", "zero"}
+    assert line or text != OURS or old == "1\n" or number not in never
+
+
+@pytest.mark.parametrize("nesting", deep(1))
+def test_deep_nesting_is_refused(nesting: str, tmp_path: Path) -> None:
+    path, text = tmp_path / "rig.yaml", deep(LEVELS)[nesting]
+    path.write_text(text)
+    assert refusal_of(path)
+    line = refusal(lambda: load_config(path))
+    assert "rig.yaml" in line
+    assert refusal(lambda: load_config(None, [f"matching={text}"]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nesting", ["opencv yaml lists", "opencv xml", "opencv json"])
+def test_very_deep_nesting_does_not_end_the_process(nesting: str, pair: tuple[Path, Path]) -> None:
+    Path("rig.yml").write_text(deep(200_000)[nesting])
+    assert_refused(run_apart("pair", *pair, "--calib", "rig.yml", "--out", "out"), "rig.yml")
+    assert not Path("out").exists()
+
+
+def test_what_is_more_than_any_calibration_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("\n".join([*EXPANDING, replace_one(KALIBR, "[50.0, 50.0, 24.0, 16.0]", "*l9")]))
+    assert "aliases" in (refusal_of(path) or "")
+    path.write_text(OPENCV.replace("rows: 3", "rows: 300000").replace("cols: 3", "cols: 300000"))
+    read_calibration(path, 48, 32)  # matrices larger than their data are not allocated
+    with path.open("wb") as file:
+        file.truncate(50 * SMALL_FILE_BYTES)
+    assert "too large" in (refusal_of(path) or "")
+
+
+@pytest.mark.parametrize("command", ["pair", "disparity", "rectify", "map", "audit"])
+def test_every_command_names_the_file(command: str, pair: tuple[Path, Path], drive: Path) -> None:
+    Path("rig.yaml").write_text(OURS.replace("48", "!!int abc"))
+    inputs = pair if command in {"pair", "disparity", "rectify"} else (drive,)
+    out = () if command == "audit" else ("--out", "out")
+    assert_refused(run(command, *inputs, "--calib", "rig.yaml", *out), "rig.yaml")
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("number", sorted(set(NUMBERS) - {"minus 1e300", "null"}))
+@pytest.mark.parametrize("setting", ["matching.sad.window_px", "source.tolerance_s", "matching"])
+def test_a_hostile_value_of_a_setting_is_refused(setting: str, number: str) -> None:
+    assert refusal(lambda: load_config(None, [f"{setting}={NUMBERS[number]}"]))
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["", ".", "..", "a" * 5000, ".".join("a" * 5000), "\0", "matching.", ".matching", "é.²", "[1]"],
+    ids=["empty", "dot", "dots", "long", "deep", "NUL", "dot last", "dot first", "letters", "list"],
+)
+def test_a_hostile_name_of_a_setting_is_refused(key: str) -> None:
+    assert refusal(lambda: load_config(None, [f"{key}=1"]))
+
+
+@pytest.mark.parametrize("change", CONTENT)
+def test_a_spoiled_configuration_is_refused_or_harmless(change: str, tmp_path: Path) -> None:
+    content = b"matching:\n  sad: {window_px: 9, ndisp: 50}\nmesh: {max_depth: 8}\n"
+    (tmp_path / "c.yaml").write_bytes(CONTENT[change](content))
+    line = refusal(lambda: load_config(tmp_path / "c.yaml"))
+    assert line is None or "c.yaml" in line
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["2020-13-45", "!!int abc", "1" * 5000, "[" * 20_000, "&a [*a]", "\udc80", "*b"],
+    ids=["date", "tag", "digits", "nested", "alias", "surrogate", "unknown"],
+)
+def test_the_option_is_named(value: str, pair: tuple[Path, Path]) -> None:
+    ended = run("disparity", *pair, "--set", f"matching.sad.window_px={value}")
+    assert_refused(ended, "window_px")
+
+
+@pytest.mark.parametrize(
+    "command", ["pair", "map", "audit", "rectify", "paper", "demo", "calibrate", "mesh"]
+)
+def test_every_command_names_the_option(command: str, pair: tuple[Path, Path]) -> None:
+    inputs = {
+        "pair": (*pair, "--calib", "rig.yaml"),
+        "map": (".",),
+        "mesh": ("cloud.ply",),
+        "audit": (".",),
+        "rectify": pair,
+        "calibrate": (*pair, "--board", "9x6:25mm"),
+    }
+    ended = run(command, *inputs.get(command, ()), "--set", "matching.sad.window_px=!!int abc")
+    assert_refused(ended, "matching.sad.window_px")
+    assert sorted(path.name for path in Path().iterdir()) == ["left.png", "right.png"]
+
+
+@pytest.mark.parametrize("threads", ["1000000", "99999999999999999999"])
+def test_more_threads_than_cores_are_harmless(threads: str, pair: tuple[Path, Path]) -> None:
+    ended = run("disparity", *pair, "--threads", threads, "--quiet", "--out", "out")
+    assert ended.code in {0, 1}
+    assert len(ended.lines) <= 1
+
+
+@pytest.mark.parametrize("limit", ["1e3", "-1G", "²G", "1" * 5000, "0.0", "G", "nan", "inf"])
+def test_a_hostile_memory_limit_is_refused(limit: str, here: Path) -> None:
+    ended = run("map", here, "--memory-limit", limit)
+    assert ended.code in {1, 2}
+    assert len(ended.lines[-1]) < 6000
+    assert list(here.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", ["1_0", "\u0661\u0662"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        "pair left.png right.png --threads",
+        "pair left.png right.png --focal",
+        "map drive --focal",
+        "evaluate disparity a.pfm b.pfm --scale",
+        "piece plan",
+    ],
+)
+def test_an_option_takes_decimals_alone_for_numbers(option: str, number: str, here: Path) -> None:
+    """Wrong usage, as is any other text that is no number; but a file may be named so."""
+    ended = run(*option.split(), number)
+    assert ended.code == 2
+    assert "Invalid value for" in ended.err
+    assert not list(here.iterdir())
+    assert_refused(run("map", number), number, "exist")
+
+
+TEXTS: Final = {
+    "nothing": b"",
+    "a word": b"word",
+    "a list": b"[1]",
+    "null": b"null",
+    "a list of null": b"[null]",
+    "a number": b"5",
+    "5000 digits": b"9" * 5000,
+    "too large a number": b'{"a": 1e999}',
+    "a NUL": b'{"a": "\\u0000"}\x00',
+    "a surrogate": b'{"\\ud800": ["\\udfff"]}',
+    "nested": b"[" * 100_000,
+    "nested mappings": b'{"a":' * 100_000,
+    "not UTF-8": b"\xff\xfe{}",
+}
+READERS: Final = {
+    "settings": ("c.yaml", "disparity left.png right.png --config c.yaml"),
+    "jobs in YAML": ("jobs.yaml", "batch jobs.yaml"),
+    "jobs in TOML": ("jobs.toml", "batch jobs.toml"),
+    "calibration": ("calib.yaml", "pair left.png right.png --calib calib.yaml"),
+    "poses": ("poses.txt", "map drive --poses poses.txt"),
+    "prior": ("prior.txt", "map drive --prior prior.txt"),
+    "summary of a pair": ("one/summary.json", "mesh one"),
+}
+
+
+@pytest.mark.parametrize("text", TEXTS)
+@pytest.mark.parametrize("reader", READERS)
+def test_a_document_that_is_none_is_refused(
+    reader: str, text: str, drive: Path, pair: tuple[Path, Path]
+) -> None:
+    name, command = READERS[reader]
+    Path("one").mkdir()
+    Path("one/run.json").write_text('{"command": "pair"}')
+    Path(name).write_bytes(TEXTS[text])
+    if reader == "settings" and text in ("nothing", "null"):
+        pytest.skip("settings that are left out are the defaults")
+    assert_refused(run(*command.split(), "--out", "out"), name)
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_measured_positions_that_are_none_are_refused(text: str, finished: Path) -> None:
+    pytest.importorskip("laspy")
+    Path("gnss.txt").write_bytes(TEXTS[text])
+    words = ("export", "run", "--to", "las", "--georeference", "gnss.txt", "--antenna=0,0,0")
+    assert_refused(run(*words, "--out", "out"), "gnss.txt")
+    assert not Path("out").exists()
+
+
+MATCHERS: Final = ("sad", "sgm", "opencv")
+BOUNDED: Final = [one for one in numbers_of(DriveSettings) if "onnx" not in one.name]
+# Of address space, for a drive of three small frames that takes a twentieth of it by default.
+MORE_BYTES: Final = 4_000_000_000
+
+
+@pytest.fixture(scope="module")
+def street() -> SyntheticSource:
+    return SyntheticSource(StreetScene(smooth_edges=False, **{**DRIVE, "frames": 3}))
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MORE_BYTES, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def _overrides(number: Number, value: float) -> list[str]:
+    """Return the setting, with whatever makes it matter."""
+    part = number.name.split(".")[1]
+    text = int(value) if number.whole else value
+    matcher = [f"matching.matcher={part}"] if part in MATCHERS else []
+    return [f"{number.name}={text}", *matcher]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("number", BOUNDED, ids=lambda number: number.name)
+@pytest.mark.parametrize("end", ["low", "high"])
+def test_a_setting_at_its_bound_gives_a_map_or_one_line(
+    number: Number, end: str, street: SyntheticSource, tmp_path: Path
+) -> None:
+    overrides, line = _overrides(number, getattr(number, end)), ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # of numpy: of what overflows, or is NaN
+        try:
+            config = load_config(None, overrides)
+            with Run("map", tmp_path / "out", config) as made:
+                mapped = map_sequence(street, config)
+                order = Order(mapped.map, mapped.placed, made, config.mesh)
+                make(order, ("cloud", "octomap", "grid"))
+        except ReconError as error:
+            line = str(error)
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    "setting", ["map_filters.voxel_m=26", "map_filters.radius_m=51", "grid.min_blob_cells=251"]
+)
+def test_margins_beyond_a_tile_are_refused(setting: str) -> None:
+    name = setting.partition("=")[0]
+    with pytest.raises(SettingsError, match=f"{name} reaches 5.* m, beyond a tile of 50 m"):
+        load_config(None, [setting])
+    load_config(None, [setting, "submaps.tile_m=60"])
+    with pytest.raises(SettingsError, match=r"mesh\.tile_m.*greater than or equal to 6"):
+        load_config(None, ["mesh.tile_m=5.9"])
+    assert ReconConfig().mesh.tile_m > 6
