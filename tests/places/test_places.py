@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.geometry import se3
+from recon.core.values import Trajectory
 from recon.places import places as places_file
 from recon.places.places import (
     SIGMAS,
     Place,
     Places,
     WordIndex,
+    drift_at_end,
     drift_over,
     fit_to_path,
     most_alike,
@@ -120,3 +122,11 @@ def test_a_fit_to_a_path_states_misfit_and_scale(scale, off_m):
     spread_m = np.sqrt(np.square(ours_m - ours_m.mean(axis=0)).sum(axis=1).mean())
     assert found.rms_m == pytest.approx(np.hypot(off_m, (scale - 1) * spread_m), rel=0.02, abs=1e-9)
     assert found.most_m == pytest.approx(SIGMAS * np.hypot(1.0, 0.1))
+
+
+def test_the_drift_at_the_end_is_what_is_possible_or_what_is_stated_if_that_is_more():
+    poses = np.tile(np.eye(4), (101, 1, 1))
+    poses[:, 2, 3] = np.arange(101)
+    path = Trajectory(poses, np.arange(101.0))
+    assert drift_at_end(path) == pytest.approx(drift_over(100.0).position_m)
+    assert drift_at_end(path, stated_percent=50.0) == pytest.approx(50.0)

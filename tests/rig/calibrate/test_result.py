@@ -99,7 +99,7 @@ def judge(board: str = CHESS, **other: Any) -> tuple[str, dict[str, str]]:
         (CHESS, 0.03, "usable", "at 4 m is expected to be wrong by 12 cm (3.0 %)"),
         (CHESS, 0.06, "repeat", "at 4 m is expected to be wrong by 24 cm (6.0 %)"),
         ("chess:9x6", 0.06, "repeat", "at 4 squares is expected to be wrong by 0.24 squares"),
-        (CHESS, None, "repeat", ""),
+        (CHESS, None, "repeat", None),
     ],
 )
 def test_the_verdict_is_that_of_the_depth_error_at_the_working_distance(
