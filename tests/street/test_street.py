@@ -402,6 +402,36 @@ def test_an_impossible_street_is_refused(values, words: str):
         StreetScene.parse(values)
 
 
+def _weighed(values: np.ndarray) -> float:
+    weights = np.random.default_rng(0).random(values.size)
+    return float(weights @ values.ravel() / values.size)
+
+
+@pytest.mark.parametrize(
+    ("shape", "figures"),
+    [
+        ({}, [16.022485422, 0.003546223, 0.352370272, 0.164386557, 51.748, 47.441]),
+        (
+            {"path": "block", "block_m": (80.0, 60.0)},
+            [9.605114471, 0.003257997, 0.652068615, 0.164711061, 53.947, 49.506],
+        ),
+        (
+            {"path": "straight", "repeat_m": 40.0, "fences": True},
+            [7.594344046, 0.00596996, 0.087696586, 0.151292417, 52.937, 48.734],
+        ),
+    ],
+    ids=["curve", "block", "fences"],
+)
+def test_equal_settings_give_the_streets_and_images_that_they_gave_before(shape, figures):
+    scene = StreetScene(frames=1, right_gain=0.9, right_offset_dn=3.0, **TINY, **shape)
+    camera = StreetCamera(build_street(scene))
+    soup, pair = camera.world.soup, camera.pair(0)
+    parts = (soup.vertices, soup.normals, soup.uv, soup.rgb, pair.left, pair.right)
+    # The table is rounded; a ray that grazes an edge may hit the other side of it.
+    assert [_weighed(part) for part in parts[:4]] == pytest.approx(figures[:4], abs=5e-9)
+    assert [_weighed(part) for part in parts[4:]] == pytest.approx(figures[4:], abs=0.05)
+
+
 PAINT = Paint(Material.BRICK, (0.2, 0.4, 0.6), 5)
 
 

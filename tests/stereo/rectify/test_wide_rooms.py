@@ -200,6 +200,10 @@ def test_views_of_a_lens_beyond_a_half_space_keep_the_resolution_of_its_centre()
     for field_deg in (70.0, 140.0):
         set_to = Rectifier(tum_vi(), RectificationSettings(field_of_view_deg=field_deg))
         assert set_to.camera.field_of_view_deg == pytest.approx(field_deg)
+        # The centre of the image goes on looking where it did.
+        ahead = [(511.5 - c.cx_px, 511.5 - c.cy_px) for c in (set_to.camera, rectifier.camera)]
+        zoom = set_to.camera.focal_px / rectifier.camera.focal_px
+        assert ahead[0] == pytest.approx(np.array(ahead[1]) * zoom)
     view = RectifiedCamera(1.02e6, 511.5, 511.5, 511.5, 0.1, 1024, 1024)
     with pytest.raises(CalibrationError, match=r"out of all proportion \(got 1.02e\+06 px"):
         _check_focal(view, tum_vi().left)
