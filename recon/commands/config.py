@@ -68,7 +68,7 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
 
 _FRAME: Final = ("source", "rectification", "matching", "cloud", "filters")
 _DRIVE: Final = (
-    *_FRAME, "map_filters", "odometry", "loops", "axes", "fusion", "occupancy", "submaps",
+    *_FRAME, "map_filters", "rig", "odometry", "loops", "axes", "fusion", "occupancy", "submaps",
     "memory", "ground", "grid", "mesh", "street",
 )  # fmt: skip
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {

@@ -21,6 +21,7 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
+from recon.odometry.rig.refine import refine_rig
 from recon.report.map_page import write_localize_page
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
@@ -58,6 +59,9 @@ def run_localize(
         folder = map_path if map_path.is_dir() else None
         inputs = [*source.files, map_path if folder is None else folder / MAP_FILE]
         run.check_targets(inputs)
+        with run.stage("rig"):
+            rig = refine_rig(source, config, config.rig)
+        source = rig.applied(source)
         workspace = Workspace(map_, run.watch, run.threads)
         drive = localize_sequence(source, workspace, config, start=start, progress=options.progress)
         has_grid = folder is not None and (folder / GRID).is_file()
@@ -65,7 +69,8 @@ def run_localize(
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, map_run=str(map_path), **drive.figures())
         made.summary["T_map_world"] = drive.T_map_world.tolist()
-        made.summary["warnings"] = [*map_.doubts, *drive.warnings(), *source.warnings()]
+        warnings = [*map_.doubts, *rig.warnings(), *drive.warnings(), *source.warnings()]
+        made.summary["warnings"], made.summary["rig"] = warnings, rig.figures()
         made.summary.update(source.figures())
         with run.stage("write"):
             height_m = None if folder is None else figure_of(folder, "camera_height_m")

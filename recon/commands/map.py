@@ -6,8 +6,8 @@ import errno
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions
@@ -19,6 +19,7 @@ from recon.evaluation.map_comparison import DriveErrors, compare_with_truth
 from recon.export.make import Products, make
 from recon.export.product import Order
 from recon.export.trajectories import export_paths
+from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.sequence import MappedSequence, check_map, map_sequence
@@ -26,6 +27,7 @@ from recon.map.map import Map
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import health_warnings
+from recon.odometry.rig.refine import RefinedRig, refine_rig
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
 from recon.run.directory import STARTED, RunDirectory, state_folder
@@ -102,6 +104,11 @@ def run_map(
         with_resume_hint(run, source),
         options.begin(run, source, config) as map_,
     ):
+        rig = refine_drive(source, config, run)
+        source = rig.applied(source)
+        if options.known_poses is not None and rig.refined:
+            poses = rig.poses(options.known_poses, config.rectification)
+            options = replace(options, known_poses=poses)
         if options.workers is not None or begun_in_pieces(run):
             map_pieces(source, config, options, run, map_)
         mapped = map_drive(source, config, options, run, map_)
@@ -111,9 +118,10 @@ def run_map(
         with run.stage("compare"):
             given = options.known_poses is not None
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
-        warnings = [*findings, *_warnings(source, mapped), *made.warnings, *errors.warnings]
+        doubts = [*rig.warnings(), *_warnings(source, mapped)]
+        warnings = [*findings, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
-        result.summary.update(_summary(source, result, warnings, options))
+        result.summary.update(_summary(source, result, warnings, options), rig=rig.figures())
         with run.stage("write"):
             export_paths(map_.first, made.camera_height_m, run)
             keep_map(map_, run.path(MAP_FILE))
@@ -127,6 +135,18 @@ def run_map(
         }
         run.finish(result.summary, source=source.name, inputs=source.files, record=record)
     return result
+
+
+RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of the run
+
+
+def refine_drive(source: StereoSource, config: ReconConfig, run: Run) -> RefinedRig:
+    """Refine the rig of a drive; the folder of the run gets its calibration."""
+    with run.stage("rig"):
+        rig = refine_rig(source, config, config.rig)
+        if rig.refined:
+            write_recon_calibration(run.path(RIG_FILE), rig.calibration)
+        return rig
 
 
 def map_drive(

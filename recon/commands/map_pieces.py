@@ -16,6 +16,7 @@ from recon.commands.config import ReconConfig
 from recon.commands.map_options import MapOptions
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
 from recon.io.atomic import write_text
+from recon.io.cameras.recon_yaml import read_recon_calibration, write_recon_calibration
 from recon.io.files import read_text, reading, resolved
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import odometry_of
@@ -36,6 +37,7 @@ _LEAST: Final = 2 * LEAD  # frames of the shortest piece, without its lead
 _MOST: Final = 1000
 """Frames of the longest piece: what is lost with a worker, and the time that others wait for it."""
 _PLAN: Final = "pieces.json"
+_RIG: Final = "pieces_rig.yaml"  # the calibration that all pieces are mapped with
 _PLAN_BYTES: Final = 1 << 26
 
 
@@ -84,6 +86,7 @@ def map_pieces(
     with run.stage("pieces"), spread.connect() as cluster:
         pieces = read_plan(plan)[0] if plan.is_file() else cut_drive(len(source), cluster.at_once)
         # Again for a run that is resumed, which may have another memory limit.
+        write_recon_calibration(run.state(_RIG), source.calibration)
         planned = (pieces, options.arguments, config.model_dump(mode="json"))
         write_text(plan, json.dumps(planned, indent=1))
         jobs = [piece_job(plan, number, piece, threads) for number, piece in enumerate(pieces)]
@@ -119,6 +122,7 @@ def run_piece(plan: Path, number: int, options: MapOptions) -> dict[str, Any]:
     loops = config.loops.model_copy(update={"enabled": False})
     config = config.model_copy(update={"loops": loops})
     source, _ = MapOptions.of(arguments).open(config)
+    source = source.with_calibration(read_recon_calibration(plan.with_name(_RIG)))
     part = SourcePart(source, *pieces[number])
     with options.run(config) as run, options.begin(run, part, config) as map_:
         work = Workspace(map_, run.watch, run.threads)

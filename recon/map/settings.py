@@ -13,7 +13,7 @@ from recon.map.ground.surface import GroundSettings
 from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
-from recon.odometry.settings import OdometrySettings
+from recon.odometry.settings import OdometrySettings, RigSettings
 from recon.run.threads import MemorySettings
 from recon.stereo.cloud.back_project import FilterSettings
 from recon.stereo.frame import StereoSettings
@@ -38,6 +38,7 @@ class DriveSettings(StereoSettings):
 
     map_filters: FilterSettings = FilterSettings(radius_m=0.3)
     """Filters of the fused cloud on export, in this order; none turns one off."""
+    rig: RigSettings = RigSettings()
     odometry: OdometrySettings = OdometrySettings()
     loops: LoopSettings = LoopSettings()
     axes: AxesSettings = AxesSettings()

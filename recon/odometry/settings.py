@@ -35,6 +35,14 @@ def _name_today(name: object) -> object:
     return "visual" if name == "fused" else name
 
 
+class RigSettings(Settings):
+    """Whether the calibration is refined by what the motion of a drive shows."""
+
+    refine: Literal["auto", "off"] = "auto"
+    """auto = how the right camera is turned, its focal length, and what both lenses bend, as far as
+    the drive shows it; off = the calibration as it is."""
+
+
 class OdometrySettings(Settings):
     """Where the camera is in each frame."""
 

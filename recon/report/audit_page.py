@@ -133,23 +133,22 @@ def _known(figures: Mapping[str, Any], text: str) -> str:
 
 
 def _by_motion(found: Mapping[str, Any]) -> str:
-    each = (found[name] for name in ("disparity_px", "focal_percent", "lens_px"))
-    disparity, focal, lens = (f"{x['value']:+.2f} ± {1.96 * x['sigma']:.2f}" for x in each)
-    depths = ", ".join(f"{off:+.1f} % at {z} m" for z, off in found["depth_percent"].items())
+    off, depths = found["disparity_px"], found["depth_percent"].items()
+    far = ", ".join(f"{x['mean']:+.1f} ± {1.96 * x['sigma']:.1f} % at {z} m" for z, x in depths)
     return (
-        f"disparities lack {disparity} px (depth {depths}), at the sides another {lens} px by the "
-        f"lenses; right focal length {focal} %; the baseline cannot be seen"
+        f"disparities {off['mean']:+.2f} ± {1.96 * off['sigma']:.2f} px off, {off['rms']:.2f} px "
+        f"rms over the image (depth {far}); {_turned(found)}; the baseline cannot be seen"
     )
 
 
 def _mended(mended: Mapping[str, Any]) -> str:
-    turn = ", ".join(f"{mended[f'{x}_deg']:+.3f} deg {x}" for x in ("pitch", "yaw", "roll"))
-    text = f"{mended['calibration']}: right camera rotated by {turn}, its focal length changed by "
-    text += f"{mended['focal_percent']:+.2f} %"
-    if mended["lenses_px"] is None:
-        return text
-    left, right = mended["lenses_px"]
-    return f"{text}, and both lenses straightened, by {left:.2f} and {right:.2f} px (rms)"
+    return f"{mended['calibration']}: {_turned(mended)}"
+
+
+def _turned(found: Mapping[str, Any]) -> str:
+    turn = ", ".join(f"{found[f'{x}_deg']:+.3f} deg {x}" for x in ("pitch", "yaw", "roll"))
+    focal = f"{found['focal_percent']:+.2f} %"
+    return f"right camera rotated by {turn}, its focal length changed by {focal}"
 
 
 def _frames(summary: Mapping[str, Any]) -> str:

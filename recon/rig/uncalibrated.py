@@ -20,7 +20,6 @@ from recon.core.least_squares import Problem, minimise
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, UInt8
-from recon.rig.audit.row_alignment import align_rows
 from recon.stereo.rectify.features import (
     MOST_FEATURES,
     PairFeatures,
@@ -28,6 +27,7 @@ from recon.stereo.rectify.features import (
     match_exactly,
     pool_features,
 )
+from recon.stereo.rectify.row_alignment import align_rows
 
 Size = tuple[int, int]
 Homographies = tuple[Float64, Float64]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -91,6 +92,15 @@ class StereoSource(ABC):
 
     def __iter__(self) -> Iterator[StereoPair]:
         return self.frames()
+
+    def with_calibration(self, calibration: Rig) -> StereoSource:
+        """Return this source with another calibration of the same cameras."""
+        other = copy(self)
+        # Of a subclass the calibration may be a property, or an attribute of its own, and frozen.
+        kind = type(type(self).__name__, (type(self),), {"calibration": calibration})
+        object.__setattr__(other, "__class__", kind)
+        vars(other)["calibration"] = calibration
+        return other
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name}, pairs: {len(self)}, {self.description})"

@@ -10,21 +10,22 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
 from recon.core.geometry.projection import depth_sigma
-from recon.core.values import Disparity, RectifiedCamera, Rig, StereoCalibration, StereoPair
+from recon.core.values import Disparity, RectifiedCamera, Rig, StereoPair
 from recon.core.values.arrays import Float64
 from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.odometry.rig.refine import RefinedRig, refine_rig
+from recon.odometry.settings import RigSettings
 from recon.rig.audit.findings import Finding, Measured, Verdict, find_faults, verdict_of
 from recon.rig.audit.measures import find_gaps
-from recon.rig.audit.row_alignment import RowAlignment, correct_rig
 from recon.rig.audit.sample import Look, measure_geometry, take_sample
-from recon.rig.audit.seen_motion import SeenMotion, measure_turn, turn_figures
 from recon.rig.settings import AuditedSettings
 from recon.run.run import plain
 from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
-from recon.stereo.rectify.rectifier import Rectifier, plan_turns
+from recon.stereo.rectify.rectifier import Rectifier, turns_of
+from recon.stereo.rectify.row_alignment import RowAlignment, correct_rig
 
 _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
 # Findings of a pair that images alone support, and those that need a calibration. The inspection of
@@ -34,7 +35,7 @@ _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 # Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs, even
 # of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %.
 _FEW_VALID_SHARE: Final = 0.25
-_MATCHED_ROWS_PX: Final = 0.3  # rms row error that does not spoil matching
+_TURNED: Final = ("pitch_deg", "yaw_deg", "roll_deg", "focal_percent")
 _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 
 
@@ -47,7 +48,7 @@ class Audit:
         findings: Problems found, fatal ones first.
         figures: All measures, ready for JSON.
         alignment: Row errors of all pairs together; None if there are too few features.
-        motion: What the motion of the drive shows of the rig; None if it was not measured.
+        rig: The rig as the motion of the drive shows it; None if it was not measured.
         looks: What was measured in each pair, and a few of the images.
         corrected: What `correct_calibration` did, if it was asked to.
     """
@@ -56,7 +57,7 @@ class Audit:
     findings: tuple[Finding, ...]
     figures: dict[str, Any]
     alignment: RowAlignment | None
-    motion: SeenMotion | None = None
+    rig: RefinedRig | None = None
     looks: tuple[Look, ...] = ()
     corrected: dict[str, Any] | None = None
 
@@ -82,12 +83,12 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     camera = rectifier.camera
     sample = take_sample(source, rectifier, quick=quick)
     geometry = measure_geometry(sample, camera)
-    motion = None if quick else _measure_motion(source, config, geometry.alignment)
-    measured = Measured(source, camera, sample, geometry, find_gaps(source), motion)
+    rig = None if quick else refine_rig(source, config, RigSettings())
+    measured = Measured(source, camera, sample, geometry, find_gaps(source), rig)
     findings = find_faults(measured, config, _reach_px(camera, config.matching))
     verdict, looks = verdict_of(findings), tuple(sample.looks)
     figures = _figures(measured)
-    return Audit(verdict, tuple(findings), figures, geometry.alignment, motion, looks)
+    return Audit(verdict, tuple(findings), figures, geometry.alignment, rig, looks)
 
 
 def correct_calibration(
@@ -95,62 +96,29 @@ def correct_calibration(
 ) -> dict[str, Any]:
     """Write the calibration with which rows and motion agree, and return how it differs.
 
-    Lenses of rectified images that bend are straightened, and the right camera is turned, by what
-    the drive shows beyond two standard deviations; the baseline stays.
+    It is the one that `recon map` uses; of a drive that is too short for it, rows alone are
+    aligned. The baseline stays.
     """
-    if audit.alignment is None:
+    rig, rows = audit.rig, audit.alignment
+    if rows is None:
         raise CalibrationError(
             "too few features to correct the calibration",
             where=source.name,
             hint="record scenes with more texture, or recalibrate the cameras",
         )
-    lenses = None if audit.motion is None else audit.motion.bent_lenses(source.calibration)
-    if lenses is None:
-        rig, turn = _corrected_turn(source.calibration, audit.alignment, audit, config)
+    figures = {"row_error_before_px": rows.rms_px}
+    if rig is None or rig.fitted is None:
+        R_left = turns_of(source.calibration, config.rectification).R_left
+        corrected: Rig = correct_rig(source.calibration, rows.turn, R_left)
+        pitch_deg, _, roll_deg, _ = np.degrees(rows.turn).tolist()
+        figures |= {"pitch_deg": pitch_deg, "yaw_deg": 0.0, "roll_deg": roll_deg}
+        figures["focal_percent"] = 0.0
     else:
-        rig, turn = lenses.calibration, lenses.turn
-    pitch_deg, yaw_deg, roll_deg = np.degrees(turn[:3]).tolist()
-    figures = {
-        "pitch_deg": pitch_deg,
-        "yaw_deg": yaw_deg,
-        "roll_deg": roll_deg,
-        "focal_percent": -100.0 * float(turn[3]),
-        "lenses_px": None if lenses is None else list(lenses.moved_px),
-        "row_error_before_px": audit.alignment.rms_px,
-    }
-    write_recon_calibration(path, rig, figures)
+        corrected, own = rig.calibration, rig.figures()
+        figures |= {name: own[name] for name in _TURNED}
+        figures["disparity_rms_px"] = own["disparity_px"]["rms"]
+    write_recon_calibration(path, corrected, figures)
     return {**figures, "calibration": str(path)}
-
-
-def _corrected_turn(
-    rig: Rig, alignment: RowAlignment, audit: Audit, config: AuditedSettings
-) -> tuple[Rig, Float64]:
-    """Return a calibration with the right camera turned as rows and motion show, and the turn."""
-    turn = None if audit.motion is None else audit.motion.turn
-    turns = [alignment.turn] if turn is None or alignment.rms_px > _MATCHED_ROWS_PX else []
-    turns += [] if turn is None else [turn.telling]
-    for each in turns:
-        rig = _turned(rig, each, config)
-    return rig, np.asarray(np.sum(turns, axis=0))
-
-
-def _measure_motion(
-    source: StereoSource, config: AuditedSettings, alignment: RowAlignment | None
-) -> SeenMotion | None:
-    """Return what the motion shows of the rig; rows that are off are aligned first, to match."""
-    if alignment is None:
-        return None
-    rig = source.calibration
-    if alignment.rms_px > _MATCHED_ROWS_PX:
-        rig = _turned(rig, alignment.turn, config)
-    return measure_turn(source, rig, config)
-
-
-def _turned(rig: Rig, turn: Float64, config: AuditedSettings) -> StereoCalibration:
-    left = np.eye(3)
-    if isinstance(rig, StereoCalibration):
-        left = plan_turns(rig, config.rectification).R_left
-    return correct_rig(rig, turn, left)
 
 
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
@@ -163,7 +131,7 @@ def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None
 
 def _figures(measured: Measured) -> dict[str, Any]:
     source, sample, gaps = measured.source, measured.sample, measured.gaps
-    geometry, camera, motion = measured.geometry, measured.camera, measured.motion
+    geometry, camera, rig = measured.geometry, measured.camera, measured.rig
     sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
     gains = np.concatenate([np.zeros(0), *sample.gains])
     return {
@@ -190,7 +158,7 @@ def _figures(measured: Measured) -> dict[str, Any]:
         "field_of_view_deg": camera.field_of_view_deg,
         "speed_m_per_s": float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else None,
         **_alignment_figures(geometry.alignment, geometry.disparity_px, camera),
-        **({"rig_by_motion": turn_figures(motion.turn, camera)} if motion and motion.turn else {}),
+        **({"rig_by_motion": rig.figures()} if rig and rig.fitted else {}),
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -11,10 +11,9 @@ import numpy as np
 from recon.core.text import counted
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
-from recon.rig.audit.corrections import RightTurn
+from recon.odometry.rig.refine import RefinedRig
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample
-from recon.rig.audit.seen_motion import SeenMotion, turn_figures
 from recon.rig.settings import AuditedSettings
 from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
@@ -26,7 +25,6 @@ _SIDES = ("left", "right")
 _SWAPPED_SHARE: Final = 0.8  # share of negative disparities from which the cameras count as swapped
 _ROW_PX: Final = 0.75  # rms row error above which it is reported
 _BAD_ROW_PX: Final = 1.5  # rms row error above which that finding is fatal
-_DISPARITY_PX: Final = 0.75  # error common to all disparities above which it is reported
 _GAIN: Final = 1.2  # brightness ratio above which a finding is reported
 _SHARPNESS_RATIO: Final = 0.65  # one camera counts as blurred below, relative to the other
 _SHARPNESS: Final = 0.14  # both cameras count as blurred below this sharpness
@@ -63,9 +61,8 @@ _TEXTS: Final = {
     "rows": "rows of left and right are not aligned: {rows.rms_px:.2f} px rms, mean "
     "{rows.mean_px:+.2f} px, spread {rows.spread_px:.2f} px; rotating the right camera by "
     "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: recon audit --mend FILE",
-    "yaw": "disparities are {off:+.2f} ± {limit:.2f} px off, as the motion shows: depth is off by "
-    "{depths}; turning the right camera by {yaw:+.3f} deg yaw corrects this: "
-    "recon audit --mend FILE",
+    "rig": "the rig is not as calibrated: {shown}; recon map uses the rig that the motion shows, "
+    "and recon audit --mend FILE writes it",
     "near": "{percent:.0f} % of the features are nearer than the disparity range covers "
     "({reach_px} px, {reach_m:.1f} m); give the matcher an ndisp of {most}",
     "far": "half of the features are farther away than {depth_m:.0f} m, at less than "
@@ -95,7 +92,7 @@ class Measured:
     sample: Sample
     geometry: Geometry
     gaps: Gaps
-    motion: SeenMotion | None  # None if it was not measured
+    rig: RefinedRig | None  # None if it was not measured
 
 
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
@@ -112,7 +109,7 @@ def find_faults(measured: Measured, config: AuditedSettings, reach_px: int | Non
         *_of_images(sample, config.matching.matcher),
         *_of_series(sample, measured.gaps),
         *_of_geometry(measured.geometry, measured.source),
-        *of_turn(rig, measured.motion, camera),
+        *_of_rig(measured.rig, measured.geometry.disparity_px),
         *_of_range(measured.geometry.disparity_px, reach_px, camera),
         *_of_calibration(sample, rig, camera, config.audit.baseline_m),
     ]
@@ -189,24 +186,13 @@ def _of_geometry(geometry: Geometry, source: StereoSource) -> Found:
         yield "rows", {"fatal": fatal, "rows": rows, "pitch": pitch, "roll": roll}
 
 
-def of_turn(rig: Rig, motion: SeenMotion | None, camera: RectifiedCamera) -> Found:
-    """Yield a right camera turned about the vertical, unless bent lenses explain it better."""
-    turn = None if motion is None else motion.turn
-    if motion is None or turn is None or not (found := list(_of_yaw(turn, camera))):
+def _of_rig(rig: RefinedRig | None, disparity_px: Float64) -> Found:
+    """Yield a rig with which depth is off where most of what it sees is."""
+    if rig is None or not rig.changes or not len(disparity_px):
         return
-    lenses = motion.bent_lenses(rig)
-    if lenses is not None:
-        found = list(_of_yaw(replace(turn, values=np.append(lenses.turn, 0.0)), camera))
-    yield from found
-
-
-def _of_yaw(turn: RightTurn, camera: RectifiedCamera) -> Found:
-    figures = turn_figures(turn, camera)
-    off, sigma = figures["disparity_px"]["value"], figures["disparity_px"]["sigma"]
-    if abs(off) > max(_DISPARITY_PX, 4 * sigma):
-        depths = ", ".join(f"{p:+.1f} % at {z} m" for z, p in figures["depth_percent"].items())
-        own = {"off": -off, "limit": 1.96 * sigma, "depths": depths}
-        yield "yaw", {**own, "yaw": figures["yaw_deg"]["value"]}
+    working_m = rig.camera.focal_px * rig.camera.baseline_m / max(np.median(disparity_px), 1.0)
+    if rig.wrong_at(float(working_m)):
+        yield "rig", {"shown": rig.describe()}
 
 
 def _of_range(disparity_px: Float64, reach_px: int | None, camera: RectifiedCamera) -> Found:

@@ -23,7 +23,6 @@ from recon.rig.audit.measures import (
     measure_time_skew,
     track,
 )
-from recon.rig.audit.row_alignment import RowAlignment, align_rows, count_aligned
 from recon.sources.source import StereoSource
 from recon.stereo.rectify.features import (
     NO_FEATURES,
@@ -33,6 +32,7 @@ from recon.stereo.rectify.features import (
     pool_features,
 )
 from recon.stereo.rectify.rectifier import Rectifier
+from recon.stereo.rectify.row_alignment import RowAlignment, align_rows, count_aligned
 
 Sides = tuple[float, float]  # of the left and of the right image
 _QUICK_RUNS = 2  # stretches of a quick audit, just long enough to detect a delayed camera

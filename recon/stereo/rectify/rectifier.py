@@ -149,6 +149,13 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
     return RectifyingTurns(R1, R2, _with_field(camera, settings.field_of_view_deg))
 
 
+def turns_of(rig: Rig, settings: RectificationSettings) -> RectifyingTurns:
+    """Return the rectifying rotations of any rig; none of one that is rectified."""
+    if isinstance(rig, StereoCalibration):
+        return plan_turns(rig, settings)
+    return RectifyingTurns(np.eye(3), np.eye(3), rig)
+
+
 def plan_rectification(
     calibration: StereoCalibration, settings: RectificationSettings
 ) -> tuple[RectifiedCamera, tuple[RemapTables, RemapTables]]:

@@ -90,6 +90,18 @@ def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) 
     return int(_consensus(*_linear(left_uv, right_uv, camera), camera.focal_px).sum())
 
 
+def as_raw(rig: Rig) -> StereoCalibration:
+    """Return a rectified rig as two cameras without distortion."""
+    if isinstance(rig, StereoCalibration):
+        return rig
+    left, right = (
+        CameraIntrinsics(matrix, np.zeros(0), rig.width_px, rig.height_px)
+        for matrix in (rig.matrix, rig.right_matrix)
+    )
+    beside = make_transform(np.eye(3), np.array([-rig.baseline_m, 0.0, 0.0]))
+    return StereoCalibration(left, right, beside)
+
+
 def correct_rig(rig: Rig, turn: Float64, R_rect_left: Float64) -> StereoCalibration:
     """Return the calibration with the right camera turned in place, and its focal length changed.
 
@@ -97,14 +109,7 @@ def correct_rig(rig: Rig, turn: Float64, R_rect_left: Float64) -> StereoCalibrat
     share by which its image is enlarged; ``R_rect_left`` the rotation from the left camera to the
     rectified one, the identity for a rectified rig.
     """
-    raw = rig
-    if isinstance(raw, RectifiedCamera):
-        left, right = (
-            CameraIntrinsics(matrix, np.zeros(0), raw.width_px, raw.height_px)
-            for matrix in (raw.matrix, raw.right_matrix)
-        )
-        beside = make_transform(np.eye(3), np.array([-raw.baseline_m, 0.0, 0.0]))
-        raw = StereoCalibration(left, right, beside)
+    raw = as_raw(rig)
     R, t = raw.T_right_left[:3, :3], raw.T_right_left[:3, 3]
     centre = -R.T @ t
     # Rectified right rays are R_rect_left @ R.T @ ray; the correction turns them further.

@@ -1,0 +1,190 @@
+"""The fault of a rig with which disparities fit the motion, and rows meet.
+
+Bundle adjustment of a few windows that share the fault; poses and points are eliminated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from recon.core.geometry.se3 import apply, invert
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Bool, Float64
+from recon.odometry.kernels import bundle
+from recon.odometry.rig.fault import Places, RigFault, shrink
+from recon.odometry.rig.tracks import StereoTracks
+from recon.odometry.window import (
+    CAUCHY_SIGMAS,
+    SIGMA_D_PX,
+    SIGMA_UV_PX,
+    TrackWindow,
+    adjust,
+    normal_equations,
+    weighted,
+)
+
+_ROUNDS: Final = 8  # times that all windows are adjusted, without the fault as known by then
+_RECALLED: Final = 4  # last rounds that the next one learns from
+_ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the right image
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFault:
+    """The parameters (P,) of a fault, and what is known of them."""
+
+    values: Float64
+    covariance: Float64  # (P, P)
+    scatter: float  # how much more windows contradict each other than their features say, 1 or more
+    windows: int
+
+
+def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> FittedFault:
+    """Fit the ``active`` parameters to windows of tracks; the others are 0.
+
+    Features of a window err together. By how much windows contradict each other beyond what their
+    features let expect, what they know counts less.
+
+    Ref: Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986 (the
+    covariance of clustered data).
+    """
+    sigmas = fault.sigmas[active]
+    prior, scatter = np.diag(1.0 / sigmas**2), 1.0
+    values, windows = np.zeros(len(active)), [part.window for part in tracks]
+    tried, stepped = list[Float64](), list[Float64]()
+    for _ in range(_ROUNDS):
+        systems: list[_System] = []
+        for k, part in enumerate(tracks):
+            places = fault.correct(part.window.uvd[..., :2], part.right_uv, values)
+            windows[k] = adjust(_seen(windows[k], part, places), fault.camera)
+            systems.append(_system(windows[k], places, fault.camera))
+        H = np.stack([system.H for system in systems])[:, active][:, :, active]
+        g = np.stack([system.g for system in systems])[:, active]
+        total = H.sum(axis=0)
+        step = np.linalg.solve(
+            total / scatter + prior, g.sum(axis=0) / scatter - prior @ values[active]
+        )
+        tried, stepped = [*tried, values[active]][-_RECALLED:], [*stepped, step][-_RECALLED:]
+        values[active] = _accelerated(tried, stepped, total / scatter + prior)
+        scatter = _scatter(total + prior, total, g - H @ step)
+    covariance = np.zeros((len(active),) * 2)
+    covariance[np.ix_(active, active)] = np.linalg.inv(total / scatter + prior)
+    values[active] = shrink(values[active], total / scatter, sigmas)
+    return FittedFault(values, covariance, scatter, len(tracks))
+
+
+def _accelerated(tried: Sequence[Float64], steps: Sequence[Float64], metric: Float64) -> Float64:
+    """Return where steps lead that become ever shorter: weights follow the residuals slowly.
+
+    Ref: Walker and Ni, "Anderson acceleration for fixed-point iterations", 2011.
+    """
+    x, step = tried[-1], steps[-1]
+    if len(tried) == 1:
+        return np.asarray(x + step)
+    whiten = np.linalg.cholesky(metric).T
+    by_step = np.diff(steps, axis=0).T
+    share = np.linalg.lstsq(whiten @ by_step, whiten @ step, rcond=None)[0]
+    return np.asarray(x + step - (np.diff(tried, axis=0).T + by_step) @ share)
+
+
+def _scatter(known: Float64, total: Float64, g: Float64) -> float:
+    """Return how much the gradients (K, P) of windows vary, relative to their information."""
+    inverse, apart = np.linalg.inv(known), g - g.mean(axis=0)
+    varied = np.einsum("ki,ij,kj->", apart, inverse, apart) * len(g) / (len(g) - 1)
+    return max(1.0, float(varied / np.trace(inverse @ total)))
+
+
+def _seen(window: TrackWindow, part: StereoTracks, places: Places) -> TrackWindow:
+    """Return a window with the features where they are without the fault."""
+    disparity = places.left_uv[..., :1] - places.right_uv[..., :1]
+    return replace(window, uvd=np.concatenate([places.left_uv, disparity], axis=2))
+
+
+class _System(NamedTuple):
+    """Normal equations of a further correction."""
+
+    H: Float64  # (P, P)
+    g: Float64  # (P,)
+
+
+def _system(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _System:
+    """Return the normal equations of a further correction, poses and points eliminated."""
+    normal = normal_equations(window, camera)
+    shared = _of_places(window, places, camera)
+    rows = _of_rows(places)
+    frames, points = window.uvd.shape[:2]
+    size, parameters = 6 * (frames - 1), places.by_left.shape[-1]
+    # The correction follows the poses, of which the first is fixed, as one more block.
+    S, g = np.zeros((size + parameters,) * 2), np.zeros(size + parameters)
+    for k in range(1, frames):
+        at = slice(6 * (k - 1), 6 * k)
+        S[at, at], g[at] = normal.H_pose[k], normal.g_pose[k]
+        S[at, size:] = shared.H_pose[k]
+        S[size:, at] = shared.H_pose[k].T
+    S[size:, size:], g[size:] = shared.H + rows.H, shared.g + rows.g
+    of_poses = normal.H_cross[1:].transpose(1, 0, 2, 3).reshape(points, size, 3)
+    cross = np.concatenate([of_poses, shared.H_point], axis=1)
+    folded = cross @ np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
+    S -= np.tensordot(folded, cross, axes=((0, 2), (0, 2)))
+    g -= np.tensordot(folded, normal.g_point, axes=((0, 2), (0, 1)))
+    share = np.linalg.solve(S[:size, :size] + bundle.RIDGE * np.eye(size), S[:size, size:]).T
+    return _System(S[size:, size:] - share @ S[:size, size:], g[size:] - share @ g[:size])
+
+
+class _Shared(NamedTuple):
+    """What places say of the correction (P), with the poses (W, 6, P) and points (N, P, 3)."""
+
+    H: Float64
+    g: Float64
+    H_pose: Float64
+    H_point: Float64
+
+
+def _of_rows(places: Places) -> _System:
+    """Return normal equations of the row errors (W, N), which neither pose nor depth changes."""
+    error = places.right_uv[..., 1] - places.left_uv[..., 1]
+    residual = np.nan_to_num(error) / _ROW_SIGMA_PX
+    weight = np.isfinite(error) / (1.0 + (residual / CAUCHY_SIGMAS) ** 2)
+    by = np.nan_to_num(places.by_right[:, :, 1] - places.by_left[:, :, 1]) / _ROW_SIGMA_PX
+    J = by.reshape(residual.size, -1)
+    weighed = weight.reshape(-1, 1) * J
+    # A correction moves the observed row: it is to take the error away.
+    return _System(weighed.T @ J, -weighed.T @ residual.ravel())
+
+
+def _of_places(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _Shared:
+    T_camera_world = invert(window.T_world_camera)
+    residual, weight = weighted(window, camera)
+    frames, points = weight.shape
+    xyz = np.stack([apply(T, window.xyz_world) for T in T_camera_world])
+    by_place = _derivative(xyz, camera)
+    by = [places.by_left, (places.by_left - places.by_right)[:, :, :1]]
+    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
+    # A correction moves what is observed, a step what is predicted: hence the sign.
+    J = -np.nan_to_num(np.concatenate(by, axis=2)) / sigmas[:, None]
+    # What has no disparity has no residual and no derivative of one.
+    by_place = by_place * np.isfinite(window.uvd)[..., None] / sigmas[:, None]
+    by_pose = np.concatenate([-by_place, np.cross(by_place, xyz[:, :, None])], axis=3)
+    by_point = by_place @ T_camera_world[:, None, :3, :3]
+    weighed = weight[:, :, None, None] * J
+    flat = weighed.reshape(frames, 3 * points, -1)
+    whole = flat.reshape(3 * frames * points, -1)
+    by_track = weighed.transpose(1, 3, 0, 2).reshape(points, -1, 3 * frames)
+    return _Shared(
+        H=whole.T @ J.reshape(whole.shape),
+        g=whole.T @ residual.ravel(),
+        H_pose=by_pose.reshape(frames, 3 * points, 6).transpose(0, 2, 1) @ flat,
+        H_point=by_track @ by_point.transpose(1, 0, 2, 3).reshape(points, 3 * frames, 3),
+    )
+
+
+def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
+    """Return how column, row and disparity follow a place in camera axes: (W, N, 3, 3)."""
+    f, fb = camera.focal_px, camera.focal_px * camera.baseline_m
+    z = np.maximum(xyz[..., 2], bundle.MIN_DEPTH_M)
+    x, y, zero = xyz[..., 0] / z, xyz[..., 1] / z, np.zeros_like(z)
+    rows = [f / z, zero, -f * x / z], [zero, f / z, -f * y / z], [zero, zero, -fb / z**2]
+    return np.stack([np.stack(row, -1) for row in rows], axis=-2)

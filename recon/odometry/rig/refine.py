@@ -1,0 +1,261 @@
+"""The rig of a drive, refined by what its motion shows, and what that says of the rig given.
+
+Rigs are seldom as they were calibrated: lenses were fitted to a board, and cameras turned since. On
+a drive that is the largest error of the path, and the drive itself shows it.
+
+Ref: Cvisic et al., "Recalibrating the KITTI dataset camera setup for improved odometry accuracy",
+ECMR 2021.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import RectifiedCamera, Rig, Trajectory
+from recon.core.values.arrays import Float64
+from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, without_fault
+from recon.odometry.rig.fit import FittedFault, fit_fault
+from recon.odometry.rig.tracks import FRAMES, plan_stretches, track_stretches
+from recon.odometry.settings import RigSettings
+from recon.sources.source import StereoSource
+from recon.stereo.frame import FrameReconstructor, StereoSettings
+from recon.stereo.rectify.features import match_features, pool_features
+from recon.stereo.rectify.lens import project_raw
+from recon.stereo.rectify.rectifier import (
+    RectificationSettings,
+    Rectifier,
+    turns_of,
+)
+from recon.stereo.rectify.row_alignment import align_rows, as_raw, correct_rig
+
+MIN_WINDOWS: Final = 6  # fewer windows do not show how much they contradict each other
+DEPTHS_M: Final = (10.0, 30.0)  # distances for which the depth error is stated
+_MATCHED_ROWS_PX: Final = 0.3  # rms row error that does not spoil matching
+_PASSES: Final = 2  # a rig that was far off is matched, and fitted, once more
+_FAR_OFF_PX: Final = 1.0  # what features moved by, root mean square, if it was
+_FEATURES: Final = 800  # per image, to align rows by
+_LEAST_PX: Final = 0.05  # no matcher sees less; images are not warped for it
+_FIELD: Final = (16, 8)  # places across and down the image at which rigs are compared
+MOST_DEPTH_PERCENT: Final = 2.0
+"""Error of the depth from which the rig given is called wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigChange:
+    """What a rig saw otherwise than it is seen now, at places of its rectified left image."""
+
+    depth_m: float  # of what is seen
+    off_px: Float64  # (rows, columns), disparity as given minus as refined; NaN = not in both views
+    rows_px: Float64  # the same of the rows of right minus left
+
+    @property
+    def mean_px(self) -> float:
+        return float(np.nanmean(self.off_px))
+
+    @property
+    def rms_px(self) -> float:
+        return float(np.sqrt(np.nanmean(self.off_px**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedRig:
+    """The rig of a drive as given, and as the drive shows it."""
+
+    given: Rig
+    calibration: Rig  # the refined one; that given where the drive shows nothing else
+    camera: RectifiedCamera  # rectified views of the rig given
+    fitted: FittedFault | None = None  # None: too short a drive, or it was not asked for
+    turn: Float64 = field(default_factory=lambda: np.zeros(len(TURN)))  # of the right camera
+    changes: tuple[RigChange, ...] = ()  # at `DEPTHS_M`
+    sigma_px: float = float("nan")  # of the mean disparity
+
+    @property
+    def refined(self) -> bool:
+        """Whether the drive shows another rig than was given."""
+        return self.calibration is not self.given
+
+    def applied(self, source: StereoSource) -> StereoSource:
+        """Return the drive with the refined rig."""
+        return source.with_calibration(self.calibration) if self.refined else source
+
+    def poses(self, given: Trajectory, settings: RectificationSettings) -> Trajectory:
+        """Return poses of the rectified left camera as given for the refined one."""
+        before, now = turns_of(self.given, settings), turns_of(self.calibration, settings)
+        turned = make_transform(before.R_left @ now.R_left.T, np.zeros(3))
+        return replace(given, T_world_camera=given.T_world_camera @ turned)
+
+    def depth_percent(self, change: RigChange) -> tuple[float, float]:
+        """Return by how much depth is off on average over the image, and the standard deviation.
+
+        As given minus as refined, in per cent: positive = things seemed farther away.
+        """
+        share = 100.0 * change.depth_m / (self.camera.focal_px * self.camera.baseline_m)
+        return -share * change.mean_px, share * self.sigma_px
+
+    def wrong_at(self, depth_m: float) -> bool:
+        """Return whether depth there is off by more than 2 %, and two standard deviations."""
+        if not self.changes:
+            return False
+        share = 100.0 * depth_m / (self.camera.focal_px * self.camera.baseline_m)
+        off_px = self.changes[0].rms_px
+        return bool(off_px * share > MOST_DEPTH_PERCENT and off_px > 2.0 * self.sigma_px)
+
+    def figures(self) -> dict[str, Any]:
+        """Return what differs, ready for ``summary.json``; parameters in radians and shares."""
+        if self.fitted is None:
+            return {"refined": False}
+        sigmas = np.sqrt(np.diag(self.fitted.covariance))
+        rows = zip(NAMES, self.fitted.values, sigmas, RigFault(self.camera).sigmas, strict=True)
+        percent = [self.depth_percent(change) for change in self.changes]
+        return {
+            "refined": self.refined,
+            "windows": self.fitted.windows,
+            **{f"{n}_deg": float(np.degrees(x)) for n, x in zip(TURN[:3], self.turn, strict=False)},
+            "focal_percent": -100.0 * float(self.turn[3]),
+            "disparity_px": {
+                "mean": self.changes[-1].mean_px,
+                "sigma": self.sigma_px,
+                "rms": self.changes[-1].rms_px,
+            },
+            "rows_px": float(np.sqrt(np.nanmean(self.changes[-1].rows_px ** 2))),
+            "depth_percent": {
+                f"{change.depth_m:g}": {"mean": mean, "sigma": sigma}
+                for change, (mean, sigma) in zip(self.changes, percent, strict=True)
+            },
+            "parameters": {
+                name: {"prior": float(prior), "value": float(value), "sigma": float(sigma)}
+                for name, value, sigma, prior in rows
+            },
+            "not_visible": "baseline",
+        }
+
+    def describe(self) -> str:
+        """Return in words what the drive shows of the rig given."""
+        off = f"{self.changes[-1].mean_px:+.2f} ± {2 * self.sigma_px:.2f} px"
+        depths = ", ".join(
+            f"{self.depth_percent(change)[0]:+.1f} % at {change.depth_m:g} m"
+            for change in self.changes
+        )
+        rms_px = self.changes[-1].rms_px
+        return f"disparities are {off} off, {rms_px:.2f} px rms over the image: depth {depths}"
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know of a rig that is far off."""
+        if not self.wrong_at(DEPTHS_M[0]):
+            return []
+        used = "used is the rig that the motion shows (--set rig.refine=off keeps the calibration)"
+        return [f"the rig is not as calibrated: {self.describe()}; {used}"]
+
+
+def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -> RefinedRig:
+    """Refine the rig of a drive by its motion, before it is mapped.
+
+    A few windows of frames, from all over the drive, show how the right camera is turned, how long
+    its focal length is, and what both lenses bend; see `recon.odometry.rig.fault`. Where a drive
+    shows little the calibration stays. Drives of less than 36 frames, and live ones, are not
+    refined.
+    """
+    given = source.calibration
+    start = Rectifier(given, config.rectification)
+    found = RefinedRig(given, given, start.camera)
+    if rig.refine == "off" or source.live or len(source) < MIN_WINDOWS * FRAMES:
+        return found
+    refined, turn = _with_rows_aligned(source, given, start)
+    for _ in range(_PASSES):
+        reconstructor = FrameReconstructor(refined, config)
+        tracks = track_stretches(source, reconstructor)
+        if len(tracks) < MIN_WINDOWS:
+            return found
+        camera = reconstructor.camera
+        fitted = fit_fault(tracks, RigFault(camera), active(refined))
+        turn = turn + fitted.values[: len(TURN)]
+        before, refined = (
+            refined,
+            without_fault(refined, turns_of(refined, config.rectification), fitted.values),
+        )
+        change = compare_rigs(before, refined, DEPTHS_M[-1], config.rectification)
+        if np.hypot(change.rms_px, np.sqrt(np.nanmean(change.rows_px**2))) < _FAR_OFF_PX:
+            break
+    changes = tuple(compare_rigs(given, refined, z, config.rectification) for z in DEPTHS_M)
+    moved_px = np.hypot(changes[-1].rms_px, np.sqrt(np.nanmean(changes[-1].rows_px ** 2)))
+    return RefinedRig(
+        given,
+        refined if moved_px > _LEAST_PX else given,
+        start.camera,
+        fitted,
+        turn,
+        changes,
+        _mean_sigma(camera, fitted),
+    )
+
+
+def compare_rigs(
+    given: Rig, refined: Rig, depth_m: float, settings: RectificationSettings
+) -> RigChange:
+    """Compare what two calibrations of a rig make of what one of them sees at a depth."""
+    turns, now = turns_of(given, settings), turns_of(refined, settings)
+    raw, raw_now = as_raw(given), as_raw(refined)
+    camera, camera_now = turns.camera, now.camera
+    columns, rows = (
+        np.linspace(0, size - 1, count)
+        for size, count in zip((camera.width_px, camera.height_px), _FIELD, strict=True)
+    )
+    uv = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    disparity_px = camera.focal_px * camera.baseline_m / depth_m
+    right_uv = uv - [disparity_px - camera.doffs_px, 0.0]
+    pixels = [
+        project_raw(lens, np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(K).T @ R)
+        for lens, at, K, R in zip(
+            (raw.left, raw.right),
+            (uv, right_uv),
+            turns.matrices,
+            (turns.R_left, turns.R_right),
+            strict=True,
+        )
+    ]
+    left = now.place(raw_now, pixels[0])
+    right = now.place(raw_now, pixels[1], right=True)
+    scale = (camera.focal_px * camera.baseline_m) / (camera_now.focal_px * camera_now.baseline_m)
+    seen_px = scale * (left[:, 0] - right[:, 0] + camera_now.doffs_px)
+    shape = (len(rows), len(columns))
+    return RigChange(
+        depth_m,
+        (disparity_px - seen_px).reshape(shape),
+        (left[:, 1] - right[:, 1]).reshape(shape),
+    )
+
+
+def _with_rows_aligned(
+    source: StereoSource, given: Rig, rectifier: Rectifier
+) -> tuple[Rig, Float64]:
+    """Return a rig whose rows meet well enough to be matched, and what turned its right camera."""
+    none = np.zeros(len(TURN))
+    found = []
+    for start, _ in plan_stretches(len(source))[::2]:
+        for pair in islice(source.frames(start), 1):
+            level = rectifier.rectify(pair)
+            found.append(match_features(level.left, level.right, _FEATURES))
+    features = pool_features(found)
+    alignment = align_rows(features.left_uv, features.right_uv, rectifier.camera)
+    if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
+        return given, none
+    R_left = turns_of(given, rectifier.settings).R_left
+    return correct_rig(given, alignment.turn, R_left), alignment.turn
+
+
+def _mean_sigma(camera: RectifiedCamera, fitted: FittedFault) -> float:
+    """Return the standard deviation of the mean disparity that the fault explains."""
+    columns, rows = (
+        np.linspace(0, size - 1, count)
+        for size, count in zip((camera.width_px, camera.height_px), _FIELD, strict=True)
+    )
+    uv = np.stack(np.meshgrid(columns, rows), axis=-1)
+    right_uv = uv + np.array([camera.doffs_px, 0.0])
+    places = RigFault(camera).correct(uv, right_uv, np.zeros(len(fitted.values)))
+    by = (places.by_left - places.by_right)[..., 0, :].reshape(-1, len(fitted.values)).mean(axis=0)
+    return float(np.sqrt(by @ fitted.covariance @ by))

@@ -1,0 +1,84 @@
+"""Features tracked through a few windows of frames of a drive, in both images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final
+
+import numpy as np
+
+from recon.core.values.arrays import Float64
+from recon.odometry.features import find_in_right, surface_slopes
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.visual import VisualOdometry
+from recon.odometry.window import TrackWindow
+from recon.run.machine import available_cores
+from recon.run.threads import serial_algebra, side_by_side
+from recon.sources.source import StereoSource
+from recon.stereo.frame import FrameReconstructor
+
+FRAMES: Final = 6  # frames in a window
+_MIN_FRAMES: Final = 4  # windows of fewer frames, after a loss, are left out
+_READ: Final = 72  # frames to read in all
+_STRETCHES: Final = 6  # parts of the drive that they are from, two windows in each
+
+
+@dataclass(frozen=True, eq=False)
+class StereoTracks:
+    """Tracks in the left images of a window, and the same features in the right ones."""
+
+    window: TrackWindow
+    right_uv: Float64  # (W, N, 2), columns and rows; NaN = not found
+
+
+def plan_stretches(frames: int) -> list[tuple[int, int]]:
+    """Return first frame and end of each stretch, in the middle of equal parts of a drive."""
+    if frames <= _READ:
+        whole = frames - frames % FRAMES
+        half = whole // 2 - whole // 2 % FRAMES
+        return [(0, half), (half, whole)]
+    length = _READ // _STRETCHES
+    starts = [int((k + 0.5) * frames / _STRETCHES - length / 2) for k in range(_STRETCHES)]
+    return [(start, start + length) for start in starts]
+
+
+def track_stretches(
+    source: StereoSource, reconstructor: FrameReconstructor
+) -> tuple[StereoTracks, ...]:
+    """Return windows of tracks from all over a drive, stretches side by side in threads."""
+
+    def tracked(stretch: tuple[int, int]) -> list[StereoTracks]:
+        start, stop = stretch
+        pairs = islice(source.frames(start), stop - start)
+        matched = (reconstructor.match(pair) for pair in pairs)
+        return list(stereo_tracks(OdometryFrame(*found) for found in matched))
+
+    threads = min(2, available_cores())
+    with serial_algebra():
+        found = side_by_side(tracked, plan_stretches(len(source)), threads=threads)
+        return tuple(window for stretch in found for window in stretch)
+
+
+def stereo_tracks(frames: Iterable[OdometryFrame]) -> Iterator[StereoTracks]:
+    """Track features through consecutive frames, in windows without common frames."""
+    odometry, recent = VisualOdometry(), list[OdometryFrame]()
+    for frame in frames:
+        result = odometry.register(frame)
+        recent = [*recent, frame] if result.health.ok else []
+        if len(recent) == FRAMES:
+            window = odometry.window
+            if len(window.T_world_camera) >= _MIN_FRAMES:
+                yield StereoTracks(window, _in_right(window, recent))
+            recent = []
+
+
+def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:
+    """Return where the features of a window are in the right images: float64 (W, N, 2)."""
+    right_uv = np.full((*window.uvd.shape[:2], 2), np.nan)
+    for k, frame in enumerate(frames[-len(window.uvd) :]):
+        seen = np.isfinite(window.uvd[k, :, 2])
+        uv, d = window.uvd[k, seen, :2], window.uvd[k, seen, 2]
+        right_uv[k, seen] = find_in_right(frame.pair, uv, d, surface_slopes(frame.disparity, uv))
+    return right_uv
