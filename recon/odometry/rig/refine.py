@@ -90,12 +90,17 @@ class RefinedRig:
         return replace(given, T_world_camera=given.T_world_camera @ turned)
 
     def depth_percent(self, change: RigChange) -> tuple[float, float]:
-        """Return by how much depth is off on average over the image, and the standard deviation.
+        """Return by how much depth was off on average, and the standard deviation, in per cent.
 
-        As given minus as refined, in per cent: positive = things seemed farther away.
+        Of what is at the depth of ``change``; positive = it seemed farther away, infinite = behind
+        infinity.
         """
-        share = 100.0 * change.depth_m / (self.camera.focal_px * self.camera.baseline_m)
-        return -share * change.mean_px, share * self.sigma_px
+        disparity_px = self.camera.focal_px * self.camera.baseline_m / change.depth_m
+        given_px = disparity_px + change.mean_px
+        if given_px <= 0.0:
+            return float("inf"), float("inf")
+        share = disparity_px / given_px
+        return 100.0 * (share - 1.0), 100.0 * share * self.sigma_px / given_px
 
     def wrong_at(self, depth_m: float) -> bool:
         """Return whether depth there is off by more than 2 %, and two standard deviations."""
