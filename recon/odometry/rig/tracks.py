@@ -21,6 +21,7 @@ from recon.stereo.frame import FrameReconstructor
 
 FRAMES: Final = 6  # frames in a window
 _MIN_FRAMES: Final = 4  # windows of fewer frames, after a loss, are left out
+_LEAST_SEEN: Final = 3  # frames that a point is seen in; what is seen less checks hardly anything
 _READ: Final = 72  # frames to read in all
 _STRETCHES: Final = 6  # parts of the drive that they are from, two windows in each
 
@@ -52,7 +53,7 @@ def track_stretches(
     def tracked(stretch: tuple[int, int]) -> list[StereoTracks]:
         start, stop = stretch
         pairs = islice(source.frames(start), stop - start)
-        matched = (reconstructor.match(pair) for pair in pairs)
+        matched = (reconstructor.match_roughly(pair) for pair in pairs)
         return list(stereo_tracks(OdometryFrame(*found) for found in matched))
 
     threads = min(2, available_cores())
@@ -68,10 +69,15 @@ def stereo_tracks(frames: Iterable[OdometryFrame]) -> Iterator[StereoTracks]:
         result = odometry.register(frame)
         recent = [*recent, frame] if result.health.ok else []
         if len(recent) == FRAMES:
-            window = odometry.window
+            window = _often_seen(odometry.window)
             if len(window.T_world_camera) >= _MIN_FRAMES:
                 yield StereoTracks(window, _in_right(window, recent))
             recent = []
+
+
+def _often_seen(window: TrackWindow) -> TrackWindow:
+    often = window.seen.sum(axis=0) >= _LEAST_SEEN
+    return TrackWindow(window.T_world_camera, window.uvd[:, often], window.xyz_world[often])
 
 
 def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:
