@@ -28,6 +28,7 @@ from recon.odometry.window import (
 )
 
 _ROUNDS: Final = 8  # times that all windows are adjusted, without the fault as known by then
+_ROUNDING: Final = 1e-9  # share of the best known direction below which one is not known at all
 _RECALLED: Final = 4  # last rounds that the next one learns from
 _ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the right image
 
@@ -63,7 +64,7 @@ def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> 
             systems.append(_system(windows[k], places, fault.camera))
         H = np.stack([system.H for system in systems])[:, active][:, :, active]
         g = np.stack([system.g for system in systems])[:, active]
-        total = H.sum(axis=0)
+        total = _information(H.sum(axis=0), sigmas)
         step = np.linalg.solve(
             total / scatter + prior, g.sum(axis=0) / scatter - prior @ values[active]
         )
@@ -74,6 +75,13 @@ def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> 
     covariance[np.ix_(active, active)] = np.linalg.inv(total / scatter + prior)
     values[active] = shrink(values[active], total / scatter, sigmas)
     return FittedFault(values, covariance, scatter, len(tracks))
+
+
+def _information(H: Float64, sigmas: Float64) -> Float64:
+    """Return an information matrix without what rounding left of directions that nothing shows."""
+    D, V = np.linalg.eigh(sigmas[:, None] * (0.5 * (H + H.T)) * sigmas)
+    shown = np.where(D > _ROUNDING * D.max(initial=0.0), D, 0.0)
+    return np.asarray((V * shown) @ V.T / np.outer(sigmas, sigmas))
 
 
 def _accelerated(tried: Sequence[Float64], steps: Sequence[Float64], metric: Float64) -> Float64:

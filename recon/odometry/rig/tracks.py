@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.protocol import OdometryFrame
@@ -21,6 +22,7 @@ from recon.stereo.frame import FrameReconstructor
 
 FRAMES: Final = 6  # frames in a window
 _MIN_FRAMES: Final = 4  # windows of fewer frames, after a loss, are left out
+_LEAST_MOTION: Final = 0.1  # in baselines; a window that moves less shows no depth by its motion
 _LEAST_SEEN: Final = 3  # frames that a point is seen in; what is seen less checks hardly anything
 _READ: Final = 72  # frames to read in all
 _STRETCHES: Final = 6  # parts of the drive that they are from, two windows in each
@@ -70,9 +72,14 @@ def stereo_tracks(frames: Iterable[OdometryFrame]) -> Iterator[StereoTracks]:
         recent = [*recent, frame] if result.health.ok else []
         if len(recent) == FRAMES:
             window = _often_seen(odometry.window)
-            if len(window.T_world_camera) >= _MIN_FRAMES:
+            if len(window.T_world_camera) >= _MIN_FRAMES and _moves(window, frame.pair.camera):
                 yield StereoTracks(window, _in_right(window, recent))
             recent = []
+
+
+def _moves(window: TrackWindow, camera: RectifiedCamera) -> bool:
+    first, last = window.T_world_camera[[0, -1], :3, 3]
+    return bool(np.linalg.norm(last - first) >= _LEAST_MOTION * camera.baseline_m)
 
 
 def _often_seen(window: TrackWindow) -> TrackWindow:
