@@ -38,9 +38,9 @@ def _name_today(name: object) -> object:
 class RigSettings(Settings):
     """Whether the calibration is refined by what the motion of a drive shows."""
 
-    refine: Literal["auto", "off"] = "auto"
-    """auto = how the right camera is turned, its focal length, and what both lenses bend, as far as
-    the drive shows it; off = the calibration as it is."""
+    refine: bool = True
+    """Use the rig as the drive shows it: how the right camera is turned, its focal length, and what
+    both lenses bend. off = the calibration as it is."""
 
 
 class OdometrySettings(Settings):

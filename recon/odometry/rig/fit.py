@@ -80,7 +80,7 @@ def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> 
 def _information(H: Float64, sigmas: Float64) -> Float64:
     """Return an information matrix without what rounding left of directions that nothing shows."""
     D, V = np.linalg.eigh(sigmas[:, None] * (0.5 * (H + H.T)) * sigmas)
-    shown = np.where(D > _ROUNDING * D.max(initial=0.0), D, 0.0)
+    shown = np.where(_ROUNDING * D.max(initial=0.0) < D, D, 0.0)
     return np.asarray((V * shown) @ V.T / np.outer(sigmas, sigmas))
 
 

@@ -168,7 +168,7 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
     given = source.calibration
     start = Rectifier(given, config.rectification)
     found = RefinedRig(given, given, start.camera)
-    if rig.refine == "off" or source.live or len(source) < MIN_WINDOWS * FRAMES:
+    if not rig.refine or source.live or len(source) < MIN_WINDOWS * FRAMES:
         return found
     refined, turn = _with_rows_aligned(source, given, start)
     for _ in range(_PASSES):
