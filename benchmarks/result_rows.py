@@ -59,6 +59,7 @@ def lenses(found: Found) -> Rows:
         rows[label] = {
             "t_rel": path["t_rel_percent"],
             "r_rel": path["r_rel_deg_per_100m"],
+            "ATE": 100 * path["ate_m"],
             "length": one["path_length_m"] / path["path_length_m"],
         }
     return rows

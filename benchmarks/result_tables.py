@@ -64,7 +64,15 @@ SHARE: Final = "{:.3f}"
 CM: Final = "{:.1f} cm"
 MB: Final = "{:.0f} MB"
 MIDDLEBURY: Final = "recon evaluate middlebury $RECON_DATA/middlebury/MiddEval3/trainingQ --json"
-MENDED: Final = {"kitti_raw_0013": (D13, "13"), "sequence 06": (D06, "06")}
+RIGS: Final = {
+    "kitti_raw_0013": (D13, "13"),
+    "sequence 06": (D06, "06"),
+    "kitti_05_100": ("$RECON_DATA/driven/kitti_05_100", "05"),
+}
+REFINED: Final = {
+    "as calibrated (`rig.refine=off`)": ("--set rig.refine=off",),
+    "refined (default)": (),
+}
 
 TABLES: Final[dict[str, Table]] = {
     "kitti-drift": Table(
@@ -92,24 +100,18 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "kitti-lenses": Table(
         {
-            f"{name}, {how}": mend + map_drive(drive, f"{key}{how[:2]}", options)
-            for name, (drive, key) in MENDED.items()
-            for how, mend, options in (
-                ("as it comes", "", ""),
-                (
-                    "mended",
-                    f"recon audit {drive} --mend $OUT/{key}.yaml --json && ",
-                    f"--calib $OUT/{key}.yaml",
-                ),
-            )
+            f"{name}, {how}": map_drive(drive, f"{key}{how[:2]}", *options)
+            for name, (drive, key) in RIGS.items()
+            for how, options in REFINED.items()
         }
         | {
             f"kitti_raw_0013, {how}, F": against_lidar(
                 f"13{how[:2]}", f"--align-to {D13}/poses.txt"
             )
-            for how in ("as it comes", "mended")
+            for how in REFINED
         },
-        {"t_rel": PERCENT, "r_rel": "{:.2f} °/100 m", "length": SHARE, "F, own path": SHARE},
+        {"t_rel": "{:.3f} %", "r_rel": "{:.2f} °/100 m", "ATE": CM, "length": "{:.4f}"}
+        | {"F, own path": SHARE},
         rows_of.lenses,
     ),
     "kitti-altered": Table(

@@ -28,7 +28,8 @@ from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import health_warnings
 from recon.odometry.rig.refine import RefinedRig, refine_rig
-from recon.report.map_page import write_map_page
+from recon.report.map_page import map_content
+from recon.report.page import write_page
 from recon.rig.audit.audit import quick_warnings
 from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.run import Run, plain
@@ -126,7 +127,8 @@ def run_map(
             export_paths(map_.first, made.camera_height_m, run)
             keep_map(map_, run.path(MAP_FILE))
         with run.report(result.summary):
-            write_map_page(map_, made, errors, mapped.sample, result.summary, run)
+            shown = map_content(map_, made, errors, mapped.sample, rig)
+            write_page("map", run, result.summary, **shown)
         config.memory.check("report")
         record = {
             "source_description": source.description,

@@ -14,6 +14,7 @@ from recon.core.values import RectifiedPair
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import disparity_figure, is_wide, pair_figure
+from recon.report.rig_part import rig_content
 from recon.rig.audit.audit import Audit
 from recon.rig.audit.sample import Look
 from recon.run.directory import RunDirectory
@@ -34,6 +35,7 @@ def write_audit_page(
         audit.summary,
         source=source,
         lines=audit_lines(audit.summary),
+        rig=rig_content(audit.rig),
         frames=frames_figure(audit.looks) if audit.looks else None,
         pairs=[_pair(look, look.pair, matcher) for look in audit.looks if look.pair is not None],
         warnings=[finding.text for finding in audit.findings],

@@ -20,31 +20,25 @@ from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
 from recon.map.store.map_file import MapFile
 from recon.odometry.health import expected_drift
+from recon.odometry.rig.refine import RefinedRig
 from recon.report import drive_figures as figures
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import stereo_figures
+from recon.report.rig_part import rig_content
 from recon.report.scene import Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 from recon.stereo.frame import ReconstructedFrame
 
 
-def write_map_page(
+def map_content(
     map_: MapFile,
     made: Products,
     errors: DriveErrors,
     sample: ReconstructedFrame,
-    summary: Json,
-    run: RunDirectory,
-) -> None:
-    """Write ``report.html`` of a map of one drive, with a frame of it in full."""
-    write_page("map", run, summary, **map_content(map_, made, errors, sample))
-
-
-def map_content(
-    map_: MapFile, made: Products, errors: DriveErrors, sample: ReconstructedFrame
+    rig: RefinedRig,
 ) -> Json:
-    """Return what the page of a drive shows: map and path first, then the data behind them."""
+    """Return what the page of a drive shows: map and path, the rig, and a frame of it in full."""
     session, truth = map_.first, errors.true_path
     path, health, T_map_world = session.trajectory, session.health, session.T_map_world
     drift = expected_drift(path, health, session.camera)
@@ -64,6 +58,7 @@ def map_content(
             "drift": None if truth is None else figures.drift_figure(path, truth, health),
             "health": figures.health_figure(health) if health else None,
         },
+        "rig": rig_content(rig),
         "sample": stereo_figures(sample.pair, sample.disparity),
         "sample_frame": sample.pair.index,
     }

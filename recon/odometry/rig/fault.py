@@ -30,7 +30,7 @@ _TURN_SIGMAS: Final = np.array([0.0175, 0.0175, 0.0175, 0.02])
 """Standard deviations beforehand: a degree, and 2 % of the focal length. Wider than any rig that
 was ever calibrated: they only matter where a drive shows nothing."""
 
-_LENS_SIGMA_PX: Final = 1.0  # of what each term of a lens moves at the corners, beforehand
+LENS_SIGMA_PX: Final = 1.0  # of what each term of a lens moves at the corners, beforehand
 _UNBENDING: Final = 5  # rounds; each adds at least a digit where lenses are usable
 _GRID: Final = (24, 16)  # places in the image, across and down, at which lenses are fitted
 
@@ -60,7 +60,7 @@ class RigFault:
         """float64 (P,), standard deviations that are expected beforehand."""
         camera = self.camera
         corner = np.array([camera.width_px, camera.height_px]) / (2.0 * camera.focal_px)
-        lens = _LENS_SIGMA_PX / (camera.focal_px * np.linalg.norm(_bent_by(corner), axis=0))
+        lens = LENS_SIGMA_PX / (camera.focal_px * np.linalg.norm(_bent_by(corner), axis=0))
         return np.concatenate([_TURN_SIGMAS, lens, lens])
 
     def correct(self, left_uv: Float64, right_uv: Float64, values: Float64) -> Places:

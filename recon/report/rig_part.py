@@ -1,0 +1,94 @@
+"""What pages of drives show of the refined rig: the field of its correction, and its parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.odometry.rig.fault import LENS, LENS_SIGMA_PX, TURN
+from recon.odometry.rig.refine import RefinedRig, RigChange
+from recon.report import style
+from recon.report.scene import Json
+from recon.report.table import NOT_KNOWN
+
+_LEAST_PX = 0.1  # of the scale of the field: a rig that is as calibrated has faint colours
+_COLOURS = 24  # an even number, so that 0 lies between two of them
+
+
+def rig_content(rig: RefinedRig | None) -> Json | None:
+    """Return the field and the tables of a rig; None if it was not fitted."""
+    if rig is None or rig.fitted is None:
+        return None
+    found = rig.figures()
+    return {
+        "refined": rig.refined,
+        "depth_m": rig.changes[-1].depth_m,
+        "windows": found["windows"],
+        "field": field_figure(rig.changes[-1], (rig.camera.width_px, rig.camera.height_px)),
+        "off": _off_rows(found),
+        "turn": _turn_rows(found),
+        "lenses": _lens_rows(found["parameters"]),
+        "lens_px": LENS_SIGMA_PX,
+    }
+
+
+@style.styled
+def field_figure(change: RigChange, size_px: tuple[int, int]) -> bytes:
+    """Draw by how much disparities of the rig given are off, over its rectified left image."""
+    width, height = size_px
+    off_px = np.ma.masked_invalid(change.off_px)
+    limit = max(float(np.abs(off_px).max()) if off_px.count() else 0.0, _LEAST_PX)
+    rows, columns = change.off_px.shape
+    places = np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows)
+    figure, axes = style.subplots(style.HALF_IN, style.HALF_IN * height / width + 1.2)
+    levels = np.linspace(-limit, limit, _COLOURS + 1)
+    drawn = axes.contourf(*places, off_px, levels, cmap="coolwarm")
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set(xlabel="column of the rectified left image (px)", ylabel="row (px)")
+    axes.grid(visible=False)
+    figure.colorbar(drawn, location="bottom", format="%+.2f", ticks=np.linspace(-limit, limit, 5),
+        label="disparity as given minus as refined (px)", aspect=40)  # fmt: skip
+    return style.to_png(figure)
+
+
+def _off_rows(found: Json) -> list[tuple[str, str, str]]:
+    """Return what was wrong with what the rig given saw: figure, value, standard deviation."""
+    off = found["disparity_px"]
+    depths = (
+        (f"depth at {depth} m", f"{of['mean']:+.1f} %", f"{of['sigma']:.1f} %")
+        for depth, of in found["depth_percent"].items()
+    )
+    return [
+        ("disparity, mean", f"{off['mean']:+.2f} px", f"{off['sigma']:.2f} px"),
+        ("disparity, rms over the image", f"{off['rms']:.2f} px", NOT_KNOWN),
+        *depths,
+        ("rows, rms over the image", f"{found['rows_px']:.2f} px", NOT_KNOWN),
+    ]
+
+
+def _turn_rows(found: Json) -> list[tuple[str, str, str, str]]:
+    """Return how the right camera differs: parameter, value, standard deviation, prior."""
+    rows = []
+    for name in TURN:
+        of = found["parameters"][name]
+        sigmas = np.array([of["sigma"], of["prior"]])
+        if name == "zoom":
+            value, unit, label = found["focal_percent"], " %", "focal length"
+            sigmas *= 100.0
+        else:
+            value, unit, label = found[f"{name}_deg"], "°", name
+            sigmas = np.degrees(sigmas)
+        rows.append((label, f"{value:+.3f}{unit}", *(f"{x:.3f}{unit}" for x in sigmas)))
+    return rows
+
+
+def _lens_rows(parameters: Json) -> list[tuple[str, ...]]:
+    """Return what each term of both lenses moves at the corners, in px; [] if they were held."""
+    rows = []
+    for term in LENS:
+        both = [parameters[f"{side}_{term}"] for side in ("left", "right")]
+        if any(of["sigma"] for of in both):
+            moved = [
+                (LENS_SIGMA_PX * np.array([of["value"], of["sigma"]]) / of["prior"]) for of in both
+            ]
+            rows.append((term, *(f"{value:+.2f} ± {sigma:.2f}" for value, sigma in moved)))
+    return rows
