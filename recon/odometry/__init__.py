@@ -4,6 +4,7 @@
   known poses as one of them;
 - `visual.py`: features, found again from other positions (`features.py`), give a pose
   (`locate_camera.py`), adjusted in a short window of frames (`window.py`);
+- `rig/`: the rig as the motion of a drive shows it, before the drive is mapped;
 - `checked.py`: poses that cannot be trusted are marked, by all patches of the image;
 - `health.py`: what that says of a drive, and how far its path may be off;
 - `kiss.py`: clouds registered over time, also in a finished map (`recon.map.localize`);

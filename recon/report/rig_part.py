@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from recon.odometry.rig.fault import LENS, LENS_SIGMA_PX, TURN
 from recon.odometry.rig.refine import RefinedRig, RigChange
@@ -39,14 +40,15 @@ def field_figure(change: RigChange, size_px: tuple[int, int]) -> bytes:
     limit = max(float(np.abs(off_px).max()) if off_px.count() else 0.0, _LEAST_PX)
     rows, columns = change.off_px.shape
     places = np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows)
-    figure, axes = style.subplots(style.HALF_IN, style.HALF_IN * height / width + 1.2)
+    figure, axes = style.subplots(style.HALF_IN, 0.87 * style.HALF_IN * height / width + 1.25)
     levels = np.linspace(-limit, limit, _COLOURS + 1)
     drawn = axes.contourf(*places, off_px, levels, cmap="coolwarm")
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
     axes.set(xlabel="column of the rectified left image (px)", ylabel="row (px)")
     axes.grid(visible=False)
-    figure.colorbar(drawn, location="bottom", format="%+.2f", ticks=np.linspace(-limit, limit, 5),
-        label="disparity as given minus as refined (px)", aspect=40)  # fmt: skip
+    label = "disparity as given minus as refined (px)"
+    ticks = MaxNLocator(7, symmetric=True)
+    figure.colorbar(drawn, location="bottom", format="%+g", ticks=ticks, label=label, aspect=40)
     return style.to_png(figure)
 
 
@@ -77,7 +79,7 @@ def _turn_rows(found: Json) -> list[tuple[str, str, str, str]]:
         else:
             value, unit, label = found[f"{name}_deg"], "°", name
             sigmas = np.degrees(sigmas)
-        rows.append((label, f"{value:+.3f}{unit}", *(f"{x:.3f}{unit}" for x in sigmas)))
+        rows.append((label, f"{value:+.4f}{unit}", *(f"{x:.2g}{unit}" for x in sigmas)))
     return rows
 
 
