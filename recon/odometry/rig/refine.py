@@ -171,6 +171,7 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
     if not rig.refine or source.live or len(source) < MIN_WINDOWS * FRAMES:
         return found
     refined, turn = _with_rows_aligned(source, given, start)
+    values = np.concatenate([turn, np.zeros(len(NAMES) - len(turn))])
     for _ in range(_PASSES):
         reconstructor = FrameReconstructor(refined, config)
         tracks = track_stretches(source, reconstructor)
@@ -178,7 +179,7 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
             return found
         camera = reconstructor.camera
         fitted = fit_fault(tracks, RigFault(camera), active(refined))
-        turn = turn + fitted.values[: len(TURN)]
+        values = values + fitted.values
         before, refined = (
             refined,
             without_fault(refined, turns_of(refined, config.rectification), fitted.values),
@@ -192,8 +193,8 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
         given,
         refined if moved_px > _LEAST_PX else given,
         start.camera,
-        fitted,
-        turn,
+        replace(fitted, values=values),
+        values[: len(TURN)],
         changes,
         _mean_sigma(camera, fitted),
     )
