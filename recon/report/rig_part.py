@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import math
+from typing import Final
+
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from recon.odometry.rig.fault import LENS, LENS_SIGMA_PX, TURN
+from recon.odometry.rig.fault import LENS, LENS_SIGMA_PX
 from recon.odometry.rig.refine import RefinedRig, RigChange
 from recon.report import style
 from recon.report.scene import Json
 from recon.report.table import NOT_KNOWN
 
-_LEAST_PX = 0.1  # of the scale of the field: a rig that is as calibrated has faint colours
-_COLOURS = 24  # an even number, so that 0 lies between two of them
+_LEAST_PX: Final = 0.1  # of the scale of the field: a rig that is as calibrated has faint colours
+_TURN: Final = {
+    **{name: (name, "°", math.degrees(1.0)) for name in ("pitch", "yaw", "roll")},
+    "zoom": ("focal length", " %", -100.0),  # of an image to be enlarged
+}
+_KNOWN: Final = ("value", "sigma")
+_COLOURS: Final = 24  # an even number, so that 0 lies between two of them
 
 
 def rig_content(rig: RefinedRig | None) -> Json | None:
@@ -26,7 +34,7 @@ def rig_content(rig: RefinedRig | None) -> Json | None:
         "windows": found["windows"],
         "field": field_figure(rig.changes[-1], (rig.camera.width_px, rig.camera.height_px)),
         "off": _off_rows(found),
-        "turn": _turn_rows(found),
+        "turn": _turn_rows(found["parameters"]),
         "lenses": _lens_rows(found["parameters"]),
         "lens_px": LENS_SIGMA_PX,
     }
@@ -57,6 +65,8 @@ def _off_rows(found: Json) -> list[tuple[str, str, str]]:
     off = found["disparity_px"]
     depths = (
         (f"depth at {depth} m", f"{of['mean']:+.1f} %", f"{of['sigma']:.1f} %")
+        if of["mean"] is not None
+        else (f"depth at {depth} m", "infinite", NOT_KNOWN)
         for depth, of in found["depth_percent"].items()
     )
     return [
@@ -67,19 +77,13 @@ def _off_rows(found: Json) -> list[tuple[str, str, str]]:
     ]
 
 
-def _turn_rows(found: Json) -> list[tuple[str, str, str, str]]:
+def _turn_rows(parameters: Json) -> list[tuple[str, ...]]:
     """Return how the right camera differs: parameter, value, standard deviation, prior."""
     rows = []
-    for name in TURN:
-        of = found["parameters"][name]
-        sigmas = np.array([of["sigma"], of["prior"]])
-        if name == "zoom":
-            value, unit, label = found["focal_percent"], " %", "focal length"
-            sigmas *= 100.0
-        else:
-            value, unit, label = found[f"{name}_deg"], "°", name
-            sigmas = np.degrees(sigmas)
-        rows.append((label, f"{value:+.4f}{unit}", *(f"{x:.2g}{unit}" for x in sigmas)))
+    for name, (label, unit, scale) in _TURN.items():
+        of = parameters[name]
+        sigmas = (f"{abs(scale) * of[key]:.2g}{unit}" for key in ("sigma", "prior"))
+        rows.append((label, f"{scale * of['value']:+.4f}{unit}", *sigmas))
     return rows
 
 
@@ -89,8 +93,6 @@ def _lens_rows(parameters: Json) -> list[tuple[str, ...]]:
     for term in LENS:
         both = [parameters[f"{side}_{term}"] for side in ("left", "right")]
         if any(of["sigma"] for of in both):
-            moved = [
-                (LENS_SIGMA_PX * np.array([of["value"], of["sigma"]]) / of["prior"]) for of in both
-            ]
-            rows.append((term, *(f"{value:+.2f} ± {sigma:.2f}" for value, sigma in moved)))
+            moved_px = [[LENS_SIGMA_PX * of[x] / of["prior"] for x in _KNOWN] for of in both]
+            rows.append((term, *(f"{value:+.2f} ± {sigma:.2f}" for value, sigma in moved_px)))
     return rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +24,9 @@ from recon.core.values import (
 from recon.core.values.arrays import Float64
 from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
+from recon.odometry.rig.fault import NAMES, RigFault
+from recon.odometry.rig.fit import FittedFault
+from recon.odometry.rig.refine import DEPTHS_M, RefinedRig, RigChange
 from recon.report.scene import T_UPRIGHT_CAMERA
 
 HEIGHT_PX, WIDTH_PX = 24, 60
@@ -100,6 +104,19 @@ def mesh() -> TriangleMesh:
 
 
 @pytest.fixture
+def rig(pair: RectifiedPair) -> RefinedRig:
+    """A right camera that is turned by half a degree: what is 30 m away seems behind infinity."""
+    camera, values = pair.camera, np.zeros(len(NAMES))
+    values[:4] = np.radians(0.1), np.radians(-0.5), 0.0, 0.01
+    values[4] = -RigFault(camera).sigmas[4]
+    fitted = FittedFault(values, np.diag((0.1 * RigFault(camera).sigmas) ** 2), 1.0, 12)
+    off_px = np.linspace(-2.0, -1.0, 32).reshape(4, 8)
+    off_px[0, 0] = np.nan
+    changes = tuple(RigChange(z, off_px, np.full((4, 8), 0.25)) for z in DEPTHS_M)
+    return RefinedRig(camera, replace(camera), camera, fitted, values[:4], changes, 0.05)
+
+
+@pytest.fixture
 def drive(request: pytest.FixtureRequest) -> SimpleNamespace:
     """What the page of a drive is made from, with everything but loops."""
     names = ("pair", "disparity", "trajectory", "T_map_world", "health", "grid", "cloud", "mesh")
@@ -117,6 +134,7 @@ def drive(request: pytest.FixtureRequest) -> SimpleNamespace:
         made=given,
         errors=DriveErrors(METRICS, None, None, true_path=given.trajectory),
         sample=given,
+        rig=request.getfixturevalue("rig"),
         summary={
             "source": "drives/drive <1>", "fps": 4.25, "points": 2000, "stages": {"match": 1.0},
             "nested": {"a": [1, None]}, "warnings": ["frame 5: lost"],

@@ -29,7 +29,16 @@ from recon.core.values import (
 from recon.core.values.arrays import Float64, UInt8
 from recon.evaluation.paper import ABSOLUTE, AS_PRINTED, CORRECTED, TITLES
 from recon.odometry.protocol import OdometryHealth
-from recon.report import audit_page, calibration_page, middlebury_page, pair_page, paper_page, style
+from recon.odometry.rig.refine import RigChange
+from recon.report import (
+    audit_page,
+    calibration_page,
+    middlebury_page,
+    pair_page,
+    paper_page,
+    rig_part,
+    style,
+)
 from recon.report import drive_figures as figures
 from recon.report.page import timing_figure
 
@@ -365,13 +374,28 @@ def test_lines_of_an_audit_say_what_is_not_known() -> None:
         "rig": "baseline 54 cm, f 700 px (80 deg wide), moving at 9.5 m/s",
         "depth error": "3.1 cm at 10 m, 4.2 mm at 30 m, 3 m at 90 m",
     }
-    off = {"value": -0.5, "sigma": 0.1}
-    motion = dict.fromkeys(("disparity_px", "focal_percent", "lens_px"), off)
-    summary |= {"rig_by_motion": {**motion, "depth_percent": {"10": 1.0}}, "lag_frames": 2}
-    mended = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
-    summary["mended"] = {**mended, "calibration": "new.yaml", "lenses_px": (0.5, 0.25)}
-    lines = audit_page.audit_lines(summary)
+    off = {"mean": 0.5, "sigma": 0.1, "rms": 0.75}
+    turn = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
+    none = {"mean": None, "sigma": None}
+    motion = {"disparity_px": off, "depth_percent": {"10": off, "30": none}, **turn}
+    summary |= {"rig_by_motion": motion, "mended": {**turn, "calibration": "new.yaml"}}
+    lines = audit_page.audit_lines(summary | {"lag_frames": 2})
+    turned = "rotated by +0.100 deg pitch, -0.200 deg yaw, +0.000 deg roll"
     assert lines["time"] == "right camera +2 frames late"
-    assert "lack -0.50 ± 0.20 px (depth +1.0 % at 10 m)" in lines["by its motion"]
-    assert "by +0.100 deg pitch, -0.200 deg yaw, +0.000 deg roll" in lines["mended"]
-    assert lines["mended"].endswith("both lenses straightened, by 0.50 and 0.25 px (rms)")
+    assert "disparities +0.50 ± 0.20 px off, 0.75 px rms" in lines["by its motion"]
+    assert "(depth +0.5 ± 0.2 % at 10 m, infinite at 30 m)" in lines["by its motion"]
+    assert turned in lines["by its motion"]
+    assert lines["mended"].startswith("new.yaml")
+    assert turned in lines["mended"]
+
+
+@pytest.mark.parametrize(("off_px", "limit"), [(-2.0, 2.0), (0.01, 0.1), (math.nan, 0.1)])
+def test_the_field_of_a_rig_is_drawn_around_no_change(
+    off_px: float, limit: float, drawn: list[Figure]
+) -> None:
+    field = np.full((4, 8), off_px)
+    field[0, :] = np.nan
+    rig_part.field_figure(RigChange(30.0, field, np.zeros((4, 8))), (60, 24))
+    axes, bar = drawn[0].axes
+    assert (axes.get_xlim(), axes.get_ylim()) == ((-0.5, 59.5), (23.5, -0.5))
+    assert bar.get_xlim() == (-limit, limit)

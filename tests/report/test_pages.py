@@ -8,6 +8,7 @@ import io
 import json
 import re
 import sys
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -24,8 +25,8 @@ from plotly.offline import get_plotlyjs
 from recon.core.values import Disparity, DisparityTruth, PointCloud, Reason, Trajectory
 from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
-from recon.report.map_page import map_content, write_joined_page, write_map_page
-from recon.report.page import command_line, page_environment, render_page, summary_rows
+from recon.report.map_page import map_content, write_joined_page
+from recon.report.page import command_line, page_environment, render_page, summary_rows, write_page
 from recon.report.pair_page import pair_content, write_pair_page
 from recon.report.scene import Scene, plot_scene
 from recon.report.style import REASON_COLOURS
@@ -81,9 +82,13 @@ def rows(block: str) -> list[tuple[str, ...]]:
     return [tuple(unescape(cell.replace("<wbr>", "")) for cell in row) for row in cells]
 
 
+def drive_content(run: SimpleNamespace) -> dict[str, Any]:
+    return map_content(run.map_, run.made, run.errors, run.sample, run.rig)
+
+
 def map_html(run: SimpleNamespace) -> str:
-    content = map_content(run.map_, run.made, run.errors, run.sample)
-    return render_page("map", found=run.summary, warnings=run.summary["warnings"], **content)
+    found = run.summary
+    return render_page("map", found=found, warnings=found["warnings"], **drive_content(run))
 
 
 def pair_html(run: SimpleNamespace) -> str:
@@ -111,6 +116,7 @@ def audit_page(text: str = "plain", **changes: Any) -> str:
         "source": SimpleNamespace(name=f"Source {text}", description=f"Description {text}"),
         "lines": {"frames": f"Frames {text}", f"Check {text}": f"Cell {text}"},
         "found": {"baseline_m": 0.5, "row_error_rms_px": None, "depth_error_m": None},
+        "rig": None,
         "frames": None,
         "pairs": [{**pair, "valid_percent": 75.0}],
         "warnings": [f"Warning {text}"],
@@ -261,7 +267,7 @@ def test_page_of_a_drive_shows_all_that_the_run_has(drive: SimpleNamespace) -> N
     assert {title for title, inside in blocks(page).items() if "<img" in inside} == {
         "Occupancy grid", "Path from above", "Error along the path", "Health of the odometry",
         "Input pair", "Disparity", "Depth", "Why pixels have no disparity", "Confidence",
-        "Time by stage",
+        "Time by stage", "What the calibration does to disparities",
     }  # fmt: skip
     assert key_figures(page) == {
         "Path": "10.0 m", "Drift (t_rel)": "0.62 %", "Position error (ATE)": "0.41 m",
@@ -289,6 +295,25 @@ def test_page_of_a_pair_shows_all_that_the_run_has(view: SimpleNamespace) -> Non
     assert "baseline 0.5 m" in page
     view.summary["up_to_scale"] = True
     assert "every m in this report is one baseline" in pair_html(view)
+
+
+def test_the_rig_is_tabulated_where_it_was_fitted(drive: SimpleNamespace) -> None:
+    page = map_html(drive)
+    shown = blocks(page)
+    assert "The motion shows another rig" in page
+    assert ("depth at 30 m", "infinite", "–") in rows(shown["With the rig as given"])
+    assert "By the motion of 12 windows" in shown["With the rig as given"]
+    assert rows(shown["Right camera"])[1:] == [
+        ("yaw", "-0.5000°", "0.1°", "1°"), ("roll", "+0.0000°", "0.1°", "1°"),
+        ("focal length", "-1.0000 %", "0.2 %", "2 %"),
+    ]  # fmt: skip
+    assert rows(shown["Lenses"])[0] == ("k1", "-1.00 ± 0.10", "+0.00 ± 0.10")
+    drive.rig = replace(drive.rig, calibration=drive.rig.given)
+    assert "The motion shows no other rig" in map_html(drive)
+    drive.rig.fitted.covariance[4:] = 0.0  # lenses that cannot be corrected
+    assert "Lenses" not in blocks(map_html(drive))
+    drive.rig = replace(drive.rig, fitted=None)
+    assert "Right camera" not in map_html(drive)
 
 
 def test_loops_that_were_closed_and_that_were_not_are_in_the_report(drive: SimpleNamespace) -> None:
@@ -328,7 +353,7 @@ def test_a_map_compared_with_the_truth_is_tabulated(drive: SimpleNamespace) -> N
 
 
 def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> None:
-    plot: dict[str, Any] = map_content(drive.map_, drive.made, drive.errors, drive.sample)["view"]
+    plot: dict[str, Any] = drive_content(drive)["view"]
     assert [trace["name"] for trace in plot["data"]][-2:] == ["path", "true path"]
     low, high = plot["layout"]["scene"]["xaxis"]["range"]
     # Both run from 0 to 10 m forward in map axes.
@@ -362,7 +387,7 @@ def test_runs_leave_their_pages_and_images(
     drive: SimpleNamespace, view: SimpleNamespace, tmp_path: Path
 ) -> None:
     for name, write in (
-        ("drive", lambda run: write_map_page(**vars(drive), run=run)),
+        ("drive", lambda run: write_page("map", run, drive.summary, **drive_content(drive))),
         ("pair", lambda run: write_pair_page(view, run)),
     ):
         with RunDirectory(tmp_path / name) as directory:
