@@ -173,7 +173,7 @@ def rectify(
 def audit(
     source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     mend: Annotated[
-        Path | None, opt.option("Write a calibration that fits rows and motion to this file.")
+        Path | None, opt.option("Write the rig that rows and motion show to this file.")
     ] = None,
     out: Annotated[
         Path | None, opt.option("Folder for a report with images.", "--out", "-o", default="none")
@@ -188,7 +188,8 @@ def audit(
 
     Looks at row alignment, swapped, delayed or frozen cameras, missing and
     repeated frames, exposure, focus and baseline, and predicts the depth error.
-    The motion of the drive shows how the right camera is turned; not the scale.
+    The motion of the drive shows how the rig differs from its calibration, but
+    not the scale; recon map uses that rig by itself.
     With --out, sample pairs, row errors and disparities are drawn in a report.
 
     Examples:
