@@ -263,7 +263,7 @@ def run_audit(
         source: The recording.
         config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
         quick: A short check of a second or two, as `recon map` makes it.
-        mend: File for a calibration that fits rows and motion; None = none is written.
+        mend: File for the rig that rows and motion show; None = none is written.
         out: Folder for a report with images; None = none is written.
 
     Raises:

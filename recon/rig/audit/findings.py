@@ -60,8 +60,8 @@ _TEXTS: Final = {
     "geometry: the images show too little texture, or different scenes",
     "rows": "rows of left and right are not aligned: {rows.rms_px:.2f} px rms, mean "
     "{rows.mean_px:+.2f} px, spread {rows.spread_px:.2f} px; rotating the right camera by "
-    "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: recon map does so (from 36 frames "
-    "on), and recon audit --mend FILE writes it",
+    "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: recon map does so (from 36 "
+    "frames on), and recon audit --mend FILE writes it",
     "rig": "the rig is not as calibrated: {shown}; recon map uses the rig that the motion shows, "
     "and recon audit --mend FILE writes it",
     "near": "{percent:.0f} % of the features are nearer than the disparity range covers "
