@@ -36,12 +36,9 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         temporary.replace(target)
         _sync(target.parent)
     except OSError as error:
-        raise OutputError(
-            "cannot write the file",
-            where=target,
-            got=error.strerror or type(error).__name__,
-            hint="check that the folder is writable and the disk is not full",
-        ) from error
+        got = error.strerror or type(error).__name__
+        hint = "check that the folder is writable and the disk is not full"
+        raise OutputError("cannot write the file", where=target, got=got, hint=hint) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -70,13 +67,11 @@ def _file_of(path: Path) -> tuple[int, int] | None:
 
 def exchange(new: Path, old: Path) -> None:
     """Exchange two folders in one step; where the system cannot, the old one is moved aside."""
-    done = -1
+    rename = None
     if sys.platform == "linux":
         rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-        if rename is not None:
-            ends = os.fsencode(new.absolute()), os.fsencode(old.absolute())
-            done = rename(0, ends[0], 0, ends[1], _RENAME_EXCHANGE)
-    if done != 0:
+    ends = os.fsencode(new.absolute()), os.fsencode(old.absolute())
+    if rename is None or rename(0, ends[0], 0, ends[1], _RENAME_EXCHANGE) != 0:
         aside = old.with_name(f".{secrets.token_hex(6)}-{old.name}")
         old.replace(aside)
         try:

@@ -77,12 +77,9 @@ def _receive(address: str, part: Path, size: int | None, on_bytes: OnBytes) -> N
             raise _BrokenOffError("the server sends another part than was asked for")
         total = size if response.length is None else begin + response.length
         if size is not None and total is not None and total != size:
-            raise DownloadError(
-                "the server has another file than the list of data sets",
-                where=address,
-                got=counted(total, "byte"),
-                expected=counted(size, "byte"),
-            )
+            what = "the server has another file than the list of data sets"
+            got = counted(total, "byte")
+            raise DownloadError(what, where=address, got=got, expected=counted(size, "byte"))
         _need_room(part.parent, (total or 0) - begin)
         if begin == 0:
             _forget(part)

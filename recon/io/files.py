@@ -56,7 +56,8 @@ def reading(path: StrPath) -> Iterator[None]:
     Pipes and devices, whose reading may never end, are refused.
     """
     try:
-        _refuse_special(path)
+        if (kind := special_kind(path)) not in (None, FOLDER):
+            raise FormatError("not a regular file", where=path, got=kind)  # noqa: TRY301
         with naming(path), np.errstate(all="ignore"):
             yield
     except (ReconError, ImportError):  # a package that is missing is no fault of the file
@@ -85,11 +86,6 @@ def reader(read: Callable[_P, _R]) -> Callable[_P, _R]:
             return read(*args, **kwargs)
 
     return named
-
-
-def _refuse_special(path: StrPath) -> None:
-    if (kind := special_kind(path)) not in (None, FOLDER):
-        raise FormatError("not a regular file", where=path, got=kind)
 
 
 def resolved(path: StrPath) -> Path:
@@ -127,9 +123,8 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
     try:
         return read_bytes(path, at_most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FormatError(
-            "not a text file", where=path, got=f"byte {error.start} is not UTF-8"
-        ) from error
+        got = f"byte {error.start} is not UTF-8"
+        raise FormatError("not a text file", where=path, got=got) from error
 
 
 @reader

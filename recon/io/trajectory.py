@@ -69,13 +69,12 @@ def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
 
 def write_tum(path: StrPath, trajectory: Trajectory) -> None:
     """Write poses in TUM's format, 12 decimals (9 for the time), ``qw ≥ 0``, atomically."""
-    stamped = zip(trajectory.T_world_camera, trajectory.timestamps_s, strict=True)
-    write_text(path, "".join(_tum_line(T, float(time_s)) for T, time_s in stamped))
-
-
-def _tum_line(T: Float64, time_s: float) -> str:
-    numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
-    return f"{time_s:.9f} " + " ".join(f"{number:.12f}" for number in numbers) + "\n"
+    lines = []
+    for T, time_s in zip(trajectory.T_world_camera, trajectory.timestamps_s, strict=True):
+        numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
+        text = " ".join(f"{number:.12f}" for number in numbers)
+        lines.append(f"{float(time_s):.9f} {text}\n")
+    write_text(path, "".join(lines))
 
 
 def _from_kitti(
@@ -119,12 +118,9 @@ def check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
     far_m = np.abs(xyz_m).max(axis=1)
     worst = int(np.argmax(far_m))
     if far_m[worst] > _FARTHEST_M:
-        raise FormatError(
-            "position is implausibly far from the origin",
-            where=f"{path}:{lines[worst]}",
-            got=f"{far_m[worst]:.3g} m",
-            expected=f"at most {_FARTHEST_M:.0e} m",
-        )
+        what = "position is implausibly far from the origin"
+        got, expected = f"{far_m[worst]:.3g} m", f"at most {_FARTHEST_M:.0e} m"
+        raise FormatError(what, where=f"{path}:{lines[worst]}", got=got, expected=expected)
 
 
 @dataclass(frozen=True)

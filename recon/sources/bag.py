@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon.core.errors import CalibrationError, SourceError
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
-from recon.io.cameras.ros import ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
+from recon.io.cameras.ros import NS, ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
 from recon.io.files import reading, resolved
 from recon.sources.bag_prior import read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
@@ -25,7 +25,6 @@ from recon.sources.source import ReadPrior, Recording, join_pair, pair_frames
 from recon.sources.times import check_increasing, pair_stamps
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
-_S: Final = 1e-9
 _IMAGES: Final = (IMAGE, COMPRESSED)
 _LISTED: Final = 20  # most topics in a description
 
@@ -62,11 +61,9 @@ class BagSource(Recording):
         if start >= len(self):
             return
         # One reader per camera, so that pairs with messages far apart need no buffer.
-        views = zip(
-            *(self._images(side, [pair[side] for pair in self.pairs[start:]]) for side in (0, 1)),
-            strict=True,
-        )
-        for index, (left, right) in enumerate(views, start=start):
+        pairs = self.pairs[start:]
+        sides = (self._images(side, [pair[side] for pair in pairs]) for side in (0, 1))
+        for index, (left, right) in enumerate(zip(*sides, strict=True), start=start):
             stamp_s = float(self.left_s[self.pairs[index][0]])
             yield join_pair(left, right, stamp_s, index, f"{self.topics[0]}, pair {index}")
 
@@ -125,11 +122,8 @@ def _find_files(path: Path) -> list[Path]:
         raise SourceError("file does not exist", where=path)
     found = [path] if path.is_file() else find_bags(path)
     if not found or (path.is_file() and path.suffix not in BAGS):
-        raise SourceError(
-            "not a recording",
-            where=path,
-            expected="a .bag, .mcap or .db3 file, or a ROS 2 folder with metadata.yaml",
-        )
+        expected = "a .bag, .mcap or .db3 file, or a ROS 2 folder with metadata.yaml"
+        raise SourceError("not a recording", where=path, expected=expected)
     return found
 
 
@@ -141,7 +135,7 @@ def _stamps(
         if not len(times[topic]):
             raise SourceError("topic has no message", where=path, got=topic)
     stamped = all((times[topic][:, 1] != 0).all() for topic in topics)
-    left, right = ((times[topic][:, int(stamped)] * _S).astype(np.float64) for topic in topics)
+    left, right = ((times[topic][:, int(stamped)] * NS).astype(np.float64) for topic in topics)
     for topic, stamps in zip(topics, (left, right), strict=True):
         check_increasing(stamps, f"{path}: {topic}")
     return (left, right), "" if stamped else ", recording times as the headers have none"
@@ -150,12 +144,9 @@ def _stamps(
 def _rig_of_infos(bag: Bag, topics: tuple[str, str], path: Path) -> Rig:
     infos = [_info_topic(bag, topic) for topic in topics]
     if None in infos:
-        raise SourceError(
-            "recording has no calibration of both cameras",
-            where=path,
-            got=bag.list_topics((CAMERA_INFO,)) or "no CameraInfo",
-            hint=CALIBRATE,
-        )
+        what = "recording has no calibration of both cameras"
+        got = bag.list_topics((CAMERA_INFO,)) or "no CameraInfo"
+        raise SourceError(what, where=path, got=got, hint=CALIBRATE)
     left, right = (bag.camera_info(topic) for topic in infos if topic is not None)
     return as_rectified(rig_of_messages(left, right, path, all(map(_is_rectified, topics))))
 
@@ -175,12 +166,10 @@ def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str],
         if bag.topics[left].kind == bag.topics[right].kind
     )
     if not ranked:
-        raise SourceError(
-            "recording has no image topics of a left and a right camera",
-            where=bag.paths[0],
-            got=bag.list_topics(_IMAGES) or "no image topic",
-            hint="name them with --left and --right",
-        )
+        what = "recording has no image topics of a left and a right camera"
+        got = bag.list_topics(_IMAGES) or "no image topic"
+        hint = "name them with --left and --right"
+        raise SourceError(what, where=bag.paths[0], got=got, hint=hint)
     best, *others = [(left, right) for *_, left, right in ranked]
     also = ", ".join(left for left, _ in others)
     return best, f" (also there: {also}; choose with --left)" if also else ""
@@ -221,12 +210,9 @@ def _named(bag: Bag, settings: SourceSettings) -> tuple[str, str]:
         left = next((one for one, other in find_partners(bag.topics) if other == right), None)
     for name in (left, right):
         if name is None or name not in bag.topics or bag.topics[name].kind not in _IMAGES:
-            raise SourceError(
-                "recording has no such image topic",
-                where=bag.paths[0],
-                got=name or "one name alone",
-                expected=bag.list_topics(_IMAGES) or "an image topic",
-            )
+            what = "recording has no such image topic"
+            got, expected = name or "one name alone", bag.list_topics(_IMAGES) or "an image topic"
+            raise SourceError(what, where=bag.paths[0], got=got, expected=expected)
     return str(left), str(right)
 
 
@@ -234,12 +220,9 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
     """Return the rig of two CameraInfo messages; of rectified images only ``P`` is used."""
     for info in (left, right):
         if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:
-            raise CalibrationError(
-                "CameraInfo is of a camera that is not calibrated",
-                where=where,
-                got=f"focal length {info.P[0, 0]:g} px",
-                hint="name a calibration file with --calib",
-            )
+            what = "CameraInfo is of a camera that is not calibrated"
+            got, hint = f"focal length {info.P[0, 0]:g} px", "name a calibration file with --calib"
+            raise CalibrationError(what, where=where, got=got, hint=hint)
     if not rectified:
         cameras = [(_camera(info, where), info.R) for info in (left, right)]
         return rig_of_camera_infos(cameras[0], cameras[1], right.P, where)

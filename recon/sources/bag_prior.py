@@ -12,24 +12,21 @@ from recon.core.geometry.se3 import invert, make_transform, rotation_from_quater
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
+from recon.io.cameras.ros import NS
 from recon.sources.rosbags import POSES, TRANSFORMS, Bag, BagPose
 from recon.sources.source import ReadPrior
 
 _STATIC: Final = "tf_static"
 _ODOMETRY: Final = "odom"  # the frame in which wheels and inertial units measure, by REP 105
-_S: Final = 1e-9
 
 
 def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadPrior:
     """Read poses of a topic, as the camera's if static transforms connect them to its images."""
     where = f"{bag.paths[0]}: {name}"
     if name not in bag.topics or bag.topics[name].kind not in POSES:
-        raise SourceError(
-            "recording has no such topic of poses, and there is no such file",
-            where=bag.paths[0],
-            got=name,
-            expected=bag.list_topics(POSES) or "a file; the recording has no poses",
-        )
+        what = "recording has no such topic of poses, and there is no such file"
+        expected = bag.list_topics(POSES) or "a file; the recording has no poses"
+        raise SourceError(what, where=bag.paths[0], got=name, expected=expected)
     (parent, child), poses = _choose_frames(list(bag.poses(name)), where)
     path = _path_of(poses, where, stamped=stamped)
     camera = bag.frame_id(image_topic)
@@ -50,13 +47,10 @@ def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], l
         raise SourceError("topic has no message", where=where)
     chosen = list(found) if len(found) == 1 else [names for names in found if names[0] == _ODOMETRY]
     if len(chosen) != 1:
-        raise SourceError(
-            "topic has poses of several frames",
-            where=where,
-            got=", ".join(f"{child} in {parent}" for parent, child in list(found)[:8]),
-            expected="one, or one in the frame odom",
-            hint="name a topic of odometry or poses",
-        )
+        what = "topic has poses of several frames"
+        got = ", ".join(f"{child} in {parent}" for parent, child in list(found)[:8])
+        expected, hint = "one, or one in the frame odom", "name a topic of odometry or poses"
+        raise SourceError(what, where=where, got=got, expected=expected, hint=hint)
     return chosen[0], found[chosen[0]]
 
 
@@ -68,7 +62,7 @@ def _path_of(poses: list[BagPose], where: str, *, stamped: bool) -> Trajectory:
         if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
             raise FormatError("pose is not finite, or has no rotation", where=where)
     transforms = [_transform(poses[index]) for index in first]
-    return Trajectory(np.stack(transforms), times_ns * _S)
+    return Trajectory(np.stack(transforms), times_ns * NS)
 
 
 def _transform(pose: BagPose) -> Float64:

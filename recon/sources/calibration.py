@@ -18,14 +18,11 @@ _NAME: Final = re.compile(
 )
 # Focal lengths, skew and principal row: all of a camera matrix but the principal column.
 _ROWS: Final = ([0, 0, 1, 1], [0, 1, 1, 2])
-# Largest deviation from a rectified pair, given the digits that files print.
-_DIGITS_TOLERANCE: Final = 1e-9
-
-
+_DIGITS_TOLERANCE: Final = 1e-9  # deviation from a rectified pair, given the digits of files
+# What to do where a source lacks a calibration.
 CALIBRATE: Final = (
     "name one with --calib FILE; of rectified images --focal PX and --baseline M are enough"
 )
-"""What to do where a source lacks a calibration."""
 _WIDEST_DEG: Final = 165.0  # flat images see no more: pixels at the side would be 60 times as wide
 
 
@@ -44,12 +41,8 @@ def read_rig(
         return camera_of_numbers(settings, size), ()
     path = find_calibration(folder) if settings.calibration is None else Path(settings.calibration)
     if path is None:
-        raise SourceError(
-            "calibration is missing",
-            where=folder,
-            expected="calib.txt, calibration.yaml, … in the folder",
-            hint=CALIBRATE,
-        )
+        expected = "calib.txt, calibration.yaml, … in the folder"
+        raise SourceError("calibration is missing", where=folder, expected=expected, hint=CALIBRATE)
     rig = read_calibration(path, *size, metres_per_unit=settings.metres_per_unit, cameras=cameras)
     return as_rectified(rig), (path,)
 
@@ -57,12 +50,8 @@ def read_rig(
 def check_given_once(calibration: object, settings: SourceSettings) -> None:
     """Refuse a camera that is given both by a calibration file and in numbers."""
     if calibration is not None and settings.numbers:
-        raise SettingsError(
-            "--focal, --baseline, --cx and --cy replace a calibration file",
-            where="--calib",
-            got=calibration,
-            hint="give either",
-        )
+        what = "--focal, --baseline, --cx and --cy replace a calibration file"
+        raise SettingsError(what, where="--calib", got=calibration, hint="give either")
 
 
 def camera_of_numbers(
@@ -72,22 +61,13 @@ def camera_of_numbers(
     numbers = {**instead, **settings.numbers}
     focal_px, baseline_m = numbers.get("focal_px"), numbers.get("baseline_m")
     if focal_px is None or baseline_m is None:
-        raise CalibrationError(
-            "a rectified camera needs focal length and baseline",
-            where="--focal, --baseline",
-            got=", ".join(f"{name}={value:g}" for name, value in settings.numbers.items()),
-            hint="give both, or --calib FILE",
-        )
+        what = "a rectified camera needs focal length and baseline"
+        got = ", ".join(f"{name}={value:g}" for name, value in settings.numbers.items())
+        hint = "give both, or --calib FILE"
+        raise CalibrationError(what, where="--focal, --baseline", got=got, hint=hint)
     cx_px = numbers.get("cx_px", (size[0] - 1) / 2)
-    camera = RectifiedCamera(
-        focal_px=focal_px,
-        cx_px=cx_px,
-        cy_px=numbers.get("cy_px", (size[1] - 1) / 2),
-        cx_right_px=cx_px,
-        baseline_m=baseline_m,
-        width_px=size[0],
-        height_px=size[1],
-    )
+    cy_px = numbers.get("cy_px", (size[1] - 1) / 2)
+    camera = RectifiedCamera(focal_px, cx_px, cy_px, cx_px, baseline_m, *size)
     if camera.field_of_view_deg > _WIDEST_DEG:
         raise CalibrationError(
             "focal length is implausible",

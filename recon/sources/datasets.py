@@ -108,14 +108,11 @@ def datasets() -> dict[str, Dataset]:
 
 def parts_of(dataset: Dataset) -> list[Part]:
     """Return the parts of a data set, in the order of the list; at least one."""
-    return [
-        Part(
-            dataset,
-            f"{dataset.name}/{part}".rstrip("/"),
-            tuple(one.of_part(part, dataset.base, dataset.files) for one in dataset.archives),
-        )
-        for part in dataset.parts
-    ]
+    parts = []
+    for part in dataset.parts:
+        archives = (one.of_part(part, dataset.base, dataset.files) for one in dataset.archives)
+        parts.append(Part(dataset, f"{dataset.name}/{part}".rstrip("/"), tuple(archives)))
+    return parts
 
 
 def find_parts(name: str) -> list[Part]:

@@ -114,12 +114,10 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
         return _pair_as_listed(folder, settings)
     views = find_views(folder, settings)
     if views is None:
-        raise SourceError(
-            "folder does not contain images of two cameras",
-            where=folder,
-            expected="left/ and right/, cam0/ and cam1/, or similar",
-            hint="name them with --left and --right",
-        )
+        what = "folder does not contain images of two cameras"
+        expected = "left/ and right/, cam0/ and cam1/, or similar"
+        hint = "name them with --left and --right"
+        raise SourceError(what, where=folder, expected=expected, hint=hint)
     left, right = _list_both(*views)
     by = settings.pair_by
     timed = () if settings.rate_hz else (folder, views[0])
@@ -200,14 +198,11 @@ def _place(frame: tuple[Path | None, Path | None]) -> list[tuple[int, str]]:
 
 def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Frames:
     if len(left) != len(right) or by == "name":
-        raise SourceError(
-            "left and right images cannot be paired by name"
-            if by == "name"
-            else "numbers of left and right images differ",
-            where=folder,
-            got=f"{len(left)} left and {counted(len(right), 'right image')}",
-            hint="give both images of a pair the same name, or their timestamps as names",
-        )
+        apart = "numbers of left and right images differ"
+        what = "left and right images cannot be paired by name" if by == "name" else apart
+        got = f"{len(left)} left and {counted(len(right), 'right image')}"
+        hint = "give both images of a pair the same name, or their timestamps as names"
+        raise SourceError(what, where=folder, got=got, hint=hint)
     return list(zip(left, right, strict=True))
 
 

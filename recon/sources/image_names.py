@@ -16,22 +16,11 @@ from recon.core.text import counted
 IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 # Parts of names that mark the left camera, each with its counterpart for the right one.
 SIDES: Final = (
-    ("left", "right"),
-    ("Left", "Right"),
-    ("LEFT", "RIGHT"),
-    ("cam0", "cam1"),
-    ("cam_0", "cam_1"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("infra1", "infra2"),
-    ("image_0", "image_1"),
-    ("image_2", "image_3"),
-    ("view1", "view5"),
-    ("im0", "im1"),
-    ("l", "r"),
-    ("L", "R"),
-    ("0", "1"),
-)
+    ("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("cam0", "cam1"), ("cam_0", "cam_1"),
+    ("camera0", "camera1"), ("camera_0", "camera_1"), ("infra1", "infra2"),
+    ("image_0", "image_1"), ("image_2", "image_3"), ("view1", "view5"), ("im0", "im1"),
+    ("l", "r"), ("L", "R"), ("0", "1"),
+)  # fmt: skip
 _DIGITS: Final = re.compile(r"([0-9]+)")
 _Key = tuple[object, ...]
 
@@ -45,8 +34,7 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 def partner_names(name: str) -> list[str]:
     """Return possible names of the right camera for a name of the left one, most likely first."""
-    found = [other for left, right in SIDES for other in _replaced(name, left, right)]
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(other for mark in SIDES for other in _replaced(name, *mark)))
 
 
 def _replaced(name: str, left: str, right: str) -> list[str]:
@@ -57,10 +45,6 @@ def _replaced(name: str, left: str, right: str) -> list[str]:
     last = matches[-1]
     whole = re.sub(_bounded(left), right, name)
     return [whole, name[: last.start()] + right + name[last.end() :]]
-
-
-def _has(name: str, mark: str) -> bool:
-    return re.search(_bounded(mark), name) is not None
 
 
 def _bounded(mark: str) -> str:
@@ -75,9 +59,10 @@ def split_sides(names: Iterable[str]) -> tuple[list[str], list[str]]:
     if not pairs:
         return [], []
     mark = next(mark for mark in SIDES if pairs[0][1] in _replaced(pairs[0][0], *mark))
+    marks = [_bounded(one) for one in mark]
     paired = [{pair[side] for pair in pairs} for side in (0, 1)]
     left, right = (
-        [n for n in known if n in paired[k] or (n not in paired[1 - k] and _has(n, mark[k]))]
+        [n for n in known if n in paired[k] or (n not in paired[1 - k] and re.search(marks[k], n))]
         for k in (0, 1)
     )
     return left, right
@@ -113,41 +98,28 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     sides = (find_images(left), find_images(right))
     both = set(sides[0]) & set(sides[1])
     if both:
-        raise SourceError(
-            "left and right are the same images",
-            where=sorted(both)[0],
-            hint="give two patterns or folders without a common file",
-        )
+        hint = "give two patterns or folders without a common file"
+        raise SourceError("left and right are the same images", where=sorted(both)[0], hint=hint)
     for keyed in (_by_name, _by_numbers):
         keys = [keyed(side) for side in sides]
         if set(keys[0]) & set(keys[1]):
             return _match(sides, keys[0], keys[1])
     if len(sides[0]) != len(sides[1]):
-        raise SourceError(
-            "images do not pair up",
-            where=left,
-            got=f"{len(sides[0])} left, {len(sides[1])} right",
-            expected="as many left as right, or names that identify the pairs",
-        )
+        got = f"{len(sides[0])} left, {len(sides[1])} right"
+        expected = "as many left as right, or names that identify the pairs"
+        raise SourceError("images do not pair up", where=left, got=got, expected=expected)
     return ImagePairs(tuple(zip(*sides, strict=True)), by_order=len(sides[0]) > 1)
 
 
 def find_images(where: str | Path) -> list[Path]:
     """Return the images of a folder or pattern in natural order: 2 before 10."""
     folder = Path(where)
-    found = (
-        folder.iterdir()
-        if folder.is_dir()
-        else (Path(name) for name in glob.glob(str(where), recursive=True))  # noqa: PTH207
-    )
+    names = glob.glob(str(where), recursive=True)  # noqa: PTH207
+    found = folder.iterdir() if folder.is_dir() else map(Path, names)
     images = [path for path in found if path.suffix.lower() in IMAGES and path.is_file()]
     if not images:
-        raise SourceError(
-            "no images found",
-            where=where,
-            expected=", ".join(sorted(IMAGES)),
-            hint='put patterns in quotes: "left*.png"',
-        )
+        what, hint = "no images found", 'put patterns in quotes: "left*.png"'
+        raise SourceError(what, where=where, expected=", ".join(sorted(IMAGES)), hint=hint)
     return sorted(images, key=lambda path: natural_key(path.name))
 
 

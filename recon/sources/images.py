@@ -89,16 +89,14 @@ def pair_listed(
         check_most(sum(path.is_file() for _, path in one), len(one), where)
     stamps = [np.array([stamp for stamp, _ in one]) for one in lists]
     found = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, where)
-    frames = [
-        (
-            None if i is None or existing(lists[0][i][1]) is None else lists[0][i],
-            None if j is None else existing(lists[1][j][1]),
-        )
-        for i, j in found
-    ]
+
+    def entry(side: int, k: int | None) -> tuple[float, Path] | None:
+        return None if k is None or not lists[side][k][1].is_file() else lists[side][k]
+
     names = [(lists[1][j or 0] if i is None else lists[0][i])[1].stem for i, j in found]
+    frames = [(entry(0, i), entry(1, j)) for i, j in found]
     used, listing = pair_frames(frames, settings, where, names)
-    return [ImageFrame(left, right, stamp_s) for (stamp_s, left), right in used], listing
+    return [ImageFrame(left, right, stamp_s) for (stamp_s, left), (_, right) in used], listing
 
 
 def pair_named(

@@ -143,12 +143,8 @@ def _read_truth(
     poses = read_kitti_poses(path).T_world_camera
     lines = listing.lines(len(poses))
     if lines is None:
-        raise SourceError(
-            "fewer poses than images",
-            where=path,
-            got=counted(len(poses), "pose"),
-            expected=f"{len(listing.names)}",
-        )
+        what, got = "fewer poses than images", counted(len(poses), "pose")
+        raise SourceError(what, where=path, got=got, expected=f"{len(listing.names)}")
     calibration = folder / "calib.txt"
     # KITTI's poses are those of camera 0, which need not be the left camera of this pair.
     offset = read_kitti_offset(calibration, camera) if calibration.exists() else np.eye(4)
@@ -186,12 +182,8 @@ def _read_dated(view: Path) -> list[tuple[float, Path]]:
     if len(stamps) == len(images):
         return list(zip(stamps.tolist(), images, strict=True))
     if len(stamps) < len(images) or not all(is_count(image.stem) for image in images):
-        raise SourceError(
-            "numbers of times and images differ",
-            where=path,
-            got=counted(len(stamps), "time"),
-            expected=f"{len(images)}",
-        )
+        what, got = "numbers of times and images differ", counted(len(stamps), "time")
+        raise SourceError(what, where=path, got=got, expected=f"{len(images)}")
     named = {int(image.stem): image for image in images}
     missing = [view / "data" / f"{number:010d}.png" for number in range(len(stamps))]
     return [(stamp, named.get(k, missing[k])) for k, stamp in enumerate(stamps.tolist())]

@@ -75,12 +75,9 @@ def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
         return named
     found = list_files(folder)
     if not found:
-        raise SourceError(
-            "folder has no image lists of two cameras",
-            where=folder,
-            expected="left.txt and right.txt, or similar",
-            hint="name them with --left and --right",
-        )
+        what = "folder has no image lists of two cameras"
+        expected, hint = "left.txt and right.txt, or similar", "name them with --left and --right"
+        raise SourceError(what, where=folder, expected=expected, hint=hint)
     return folder / found[0][0], folder / found[0][1]
 
 

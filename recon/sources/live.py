@@ -15,10 +15,9 @@ from recon.core.text import counted
 from recon.core.values import StereoPair
 from recon.sources.source import DerivedSource, StereoSource
 
+# Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
+# gets the newest pair, and what is dropped is spread evenly.
 _WAITING: Final = 1
-"""Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
-gets the newest pair, and what is dropped is spread evenly."""
-
 _PATIENCE_S: Final = 0.2  # how long to wait for a pair before asking whether to stop
 
 
@@ -73,18 +72,17 @@ class LiveSource(DerivedSource):
         self._latency_s.append(time.monotonic() - self._due_s[index])
 
     def figures(self) -> dict[str, Any]:
-        latency_ms = 1e3 * np.array(self._latency_s or [np.nan])
-        p50, p95 = np.percentile(latency_ms, (50, 95)).tolist()
-        known = bool(self._latency_s)
+        marks = {"p50": 50, "p95": 95, "max": 100}
+        latency_ms: dict[str, float | None] = dict.fromkeys(marks)
+        if self._latency_s:
+            found = np.percentile(1e3 * np.array(self._latency_s), [*marks.values()]).tolist()
+            latency_ms = {name: round(value, 1) for name, value in zip(marks, found, strict=True)}
         live = {
             "rate": self.rate,
             "frames_arrived": len(self._due_s) + self.dropped,
             "frames_dropped": self.dropped,
             "frames_not_matched": self._unmatched,
-            "latency_ms": {
-                name: round(value, 1) if known else None
-                for name, value in (("p50", p50), ("p95", p95), ("max", float(latency_ms.max())))
-            },
+            "latency_ms": latency_ms,
         }
         return {"live": live}
 

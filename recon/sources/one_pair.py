@@ -56,12 +56,9 @@ def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
         height_px, width_px = scene.pair.left.shape[:2]
         rig, _ = read_rig(settings, folder, (width_px, height_px))
     if rig is None:
-        raise CalibrationError(
-            "no calibration is published for this scene, so there is no depth",
-            where=folder,
-            expected="calib.txt, or dmin.txt for scenes of 2005 and 2006",
-            hint=CALIBRATE,
-        )
+        what = "no calibration is published for this scene, so there is no depth"
+        expected = "calib.txt, or dmin.txt for scenes of 2005 and 2006"
+        raise CalibrationError(what, where=folder, expected=expected, hint=CALIBRATE)
     files = tuple(sorted(path for path in folder.iterdir() if path.is_file()))
     return OnePair(scene.pair, rig, files, "a Middlebury scene: one rectified pair")
 
@@ -73,19 +70,12 @@ def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIX
     images = [eight_bits(each, white) for each in levels]
     sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
     if sizes[0] != sizes[1]:
-        raise SourceError(
-            "left and right images differ in size",
-            where=right,
-            got=f"left {sizes[0]}, right {sizes[1]}",
-            hint="both cameras must record the same size",
-        )
+        what, got = "left and right images differ in size", f"left {sizes[0]}, right {sizes[1]}"
+        raise SourceError(what, where=right, got=got, hint="both cameras must record the same size")
     if min(images[0].shape[:2]) < LEAST_SIDE_PX:
-        raise SourceError(
-            "images are too small to be matched",
-            where=left,
-            got=sizes[0],
-            expected=f"at least {LEAST_SIDE_PX} pixels a side",
-        )
+        what = "images are too small to be matched"
+        expected = f"at least {LEAST_SIDE_PX} pixels a side"
+        raise SourceError(what, where=left, got=sizes[0], expected=expected)
     return join_pair(images[0], images[1], name=Path(left).name)
 
 
@@ -126,13 +116,8 @@ def read_pair_input(
     if calibration is None:
         given = PairInput(pair, stand_in_camera(width_px, height_px), (left, right))
         return given if known is None else _with_camera(given, known)
-    rig = read_calibration(
-        calibration,
-        width_px,
-        height_px,
-        metres_per_unit=metres_per_unit,
-        cameras=kitti_cameras_of(left),
-    )
+    size, cameras = (width_px, height_px), kitti_cameras_of(left)
+    rig = read_calibration(calibration, *size, metres_per_unit=metres_per_unit, cameras=cameras)
     return PairInput(pair, rig, (left, right, calibration))
 
 
@@ -143,11 +128,8 @@ def _with_camera(given: PairInput, known: SourceSettings) -> PairInput:
         left = given.files[0]
         found = read_focal_length(left, width_px, height_px)
         if found is None:
-            raise CalibrationError(
-                "focal length is unknown: there is no calibration and no EXIF data",
-                where=left,
-                hint="--calib FILE, or --focal PX",
-            )
+            what = "focal length is unknown: there is no calibration and no EXIF data"
+            raise CalibrationError(what, where=left, hint="--calib FILE, or --focal PX")
         instead["focal_px"] = found.focal_px
         notes.append(f"focal length of {found.focal_px:.0f} px from EXIF ({found.basis})")
     camera = camera_of_numbers(known, (width_px, height_px), **instead)
@@ -163,11 +145,8 @@ def with_truth(given: PairInput, path: Path | None) -> PairInput:
         return given
     values, shape = read_disparity(path), given.pair.left.shape[:2]
     if values.shape != shape:
-        raise FormatError(
-            "size of the ground truth differs from the images",
-            where=path,
-            got=f"{values.shape[1]}x{values.shape[0]}",
-            expected=f"{shape[1]}x{shape[0]}",
-        )
+        what = "size of the ground truth differs from the images"
+        got = f"{values.shape[1]}x{values.shape[0]}"
+        raise FormatError(what, where=path, got=got, expected=f"{shape[1]}x{shape[0]}")
     truth = DisparityTruth(values, np.isfinite(values))
     return replace(given, truth=truth, files=(*given.files, path))

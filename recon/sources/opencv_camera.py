@@ -36,12 +36,9 @@ class Camera:
             self._capture = cv2.VideoCapture(device if number is None else number)
         if not self._capture.isOpened():
             found = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
-            raise SourceError(
-                "camera cannot be opened",
-                where=device,
-                expected=f"one of {found}" if found else "a camera: there is no /dev/video*",
-                hint="another program may be using it",
-            )
+            expected = f"one of {found}" if found else "a camera: there is no /dev/video*"
+            hint = "another program may be using it"
+            raise SourceError("camera cannot be opened", where=device, expected=expected, hint=hint)
         if self.live:
             self._ask(size, rate_hz)
 
@@ -92,12 +89,8 @@ class Camera:
             self._capture.set(key, value)
         given = tuple(int(self._capture.get(key)) for key in keys)
         if given != size:
-            raise SourceError(
-                "camera does not support this image size",
-                where=self.name,
-                got=f"{given[0]}x{given[1]}",
-                expected=f"{size[0]}x{size[1]}",
-            )
+            what, got = "camera does not support this image size", f"{given[0]}x{given[1]}"
+            raise SourceError(what, where=self.name, got=got, expected=f"{size[0]}x{size[1]}")
 
 
 def _is_text(path: Path) -> bool:

@@ -27,8 +27,7 @@ class Kind(NamedTuple):
     name: str
     what: str
     open: Callable[[Path, SourceSettings], StereoSource]
-    fits: Callable[[Path, SourceSettings], object]
-    """Whether a folder looks like it."""
+    fits: Callable[[Path, SourceSettings], object]  # whether a folder looks like it
     suffixes: frozenset[str] = frozenset()
 
 
@@ -84,8 +83,6 @@ def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> s
     for kind in KINDS:
         if place.suffix.lower() in kind.suffixes if is_file else kind.fits(place, settings):
             return kind.name
-    raise SourceError(
-        f"{'file' if is_file else 'folder'} is not a source of stereo pairs",
-        where=path,
-        expected=", ".join(dict.fromkeys(kind.what for kind in KINDS)),
-    )
+    what = f"{'file' if is_file else 'folder'} is not a source of stereo pairs"
+    expected = ", ".join(dict.fromkeys(kind.what for kind in KINDS))
+    raise SourceError(what, where=path, expected=expected)

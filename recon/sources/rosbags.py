@@ -61,8 +61,7 @@ class BagPose(NamedTuple):
     """The pose of frame ``child`` (empty = the message does not say) in frame ``parent``."""
 
     recorded_ns: int
-    stamp_ns: int
-    """Header stamp; 0 = none."""
+    stamp_ns: int  # of the header; 0 = none
     parent: str
     child: str
     xyz_m: Float64
@@ -112,9 +111,8 @@ class Bag:
         for target in wanted:
             found = next(islice(messages, target - position, None), None)
             if found is None:
-                raise FormatError(
-                    "recording ends early", where=self.paths[0], got=f"{target} of {topic}"
-                )
+                got = f"{target} of {topic}"
+                raise FormatError("recording ends early", where=self.paths[0], got=got)
             position = target + 1
             where = f"{self.paths[0]}: {topic}, message {target}"
             yield _decode(self._parse(found[2], topic), where)
@@ -181,11 +179,8 @@ class Bag:
                 order = "<" if content[1] & 1 else ">"
                 seconds, nanoseconds = struct.unpack_from(order + "iI", content, 4)
         except (struct.error, IndexError) as error:
-            raise FormatError(
-                "message is too short",
-                where=self.paths[0],
-                got=f"{counted(len(content), 'byte')} on {topic}",
-            ) from error
+            got = f"{counted(len(content), 'byte')} on {topic}"
+            raise FormatError("message is too short", where=self.paths[0], got=got) from error
         return int(seconds) * _NS_PER_S + int(nanoseconds)
 
     @contextmanager
@@ -213,14 +208,9 @@ class Bag:
 def _decode(message: Any, where: str) -> UInt8:
     if hasattr(message, "format"):
         return decode_image(message.data.tobytes(), where)
-    return pixels_of_ros_image(
-        message.data,
-        message.encoding,
-        (message.height, message.width),
-        message.step,
-        big_endian=bool(message.is_bigendian),
-        where=where,
-    )
+    shape, big_endian = (message.height, message.width), bool(message.is_bigendian)
+    how = message.encoding, shape, message.step
+    return pixels_of_ros_image(message.data, *how, big_endian=big_endian, where=where)
 
 
 def _pose_of(message: Any, recorded_ns: int) -> BagPose:

@@ -64,12 +64,10 @@ class SourceSettings(Settings):
         if not (self.left or self.right):
             return None
         if not (self.left and self.right):
-            raise SourceError(
-                "only one of the two cameras is named",
-                where=folder,
-                got=f"--left {self.left}" if self.left else f"--right {self.right}",
-                hint="name them with --left and --right, or neither",
-            )
+            what = "only one of the two cameras is named"
+            got = f"--left {self.left}" if self.left else f"--right {self.right}"
+            hint = "name them with --left and --right, or neither"
+            raise SourceError(what, where=folder, got=got, hint=hint)
         return folder / self.left, folder / self.right
 
     def refuse_names(self, sides: Sequence[str], where: StrPath, hint: str) -> None:
@@ -82,8 +80,7 @@ class SourceSettings(Settings):
     @property
     def numbers(self) -> dict[str, float]:
         """What is known of rectified cameras instead of a calibration file, by setting."""
-        names = ("focal_px", "baseline_m", "cx_px", "cy_px")
-        given = {name: getattr(self, name) for name in names}
+        given = {name: getattr(self, name) for name in ("focal_px", "baseline_m", "cx_px", "cy_px")}
         return {name: value for name, value in given.items() if value is not None}
 
     @property

@@ -151,11 +151,9 @@ class StereoSource(ABC):
 def check_source(source: object) -> None:
     """Refuse what is not a `StereoSource`, such as a path."""
     if not isinstance(source, StereoSource):
-        raise SourceError(
-            "not a source of stereo pairs",
-            got=type(source).__name__,
-            expected="what recon.open_source returns, or a subclass of recon.StereoSource",
-        )
+        what = "not a source of stereo pairs"
+        expected = "what recon.open_source returns, or a subclass of recon.StereoSource"
+        raise SourceError(what, got=type(source).__name__, expected=expected)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -274,13 +272,10 @@ class FrameList:
             return self
         chosen = range(len(self.paired))[settings.start : settings.end : settings.stride]
         if not chosen:
-            raise SourceError(
-                "no frame is chosen",
-                where=where,
-                got=f"from {settings.start} to before {settings.end or len(self.paired)}",
-                expected=f"frames from 0 to {len(self.paired) - 1}",
-                hint="see --start and --end",
-            )
+            what = "no frame is chosen"
+            got = f"from {settings.start} to before {settings.end or len(self.paired)}"
+            expected, hint = f"frames from 0 to {len(self.paired) - 1}", "see --start and --end"
+            raise SourceError(what, where=where, got=got, expected=expected, hint=hint)
         return replace(self, chosen=chosen)
 
     def lines(self, count: int) -> list[int] | None:
@@ -322,12 +317,9 @@ def pair_frames(
         if left is not None and right is not None:
             pairs.append((left, right))
             places.append(place)
-    listing = FrameList(
-        names=[""] * len(frames) if names is None else names,
-        paired=places,
-        alone=(alone_left, alone_right),
-        shift=settings.shift_frames,
-    ).choose(settings, where)
+    known = [""] * len(frames) if names is None else names
+    listing = FrameList(known, places, (alone_left, alone_right), shift=settings.shift_frames)
+    listing = listing.choose(settings, where)
     return listing.used(pairs), listing
 
 
@@ -344,21 +336,16 @@ def _shift_right(
         rights[k] = frames[later][1]
     shifted = [(left, right) for (left, _), right in zip(frames, rights, strict=True)]
     if all(left is None or right is None for left, right in shifted):
-        raise SourceError(
-            "no pair is left with right images that were taken later",
-            where=where,
-            got=f"source.shift_frames={by}, {counted(len(chosen), 'frame')}",
-            expected="fewer frames than the recording has, or 0",
-        )
+        what = "no pair is left with right images that were taken later"
+        got = f"source.shift_frames={by}, {counted(len(chosen), 'frame')}"
+        expected = "fewer frames than the recording has, or 0"
+        raise SourceError(what, where=where, got=got, expected=expected)
     return shifted
 
 
 def check_most(pairs: int, images: int, where: Path) -> None:
     """Refuse a recording of which most is missing; ``images`` of one camera, found or listed."""
     if 2 * pairs < images:
-        raise SourceError(
-            "most images have no partner",
-            where=where,
-            got=f"{counted(pairs, 'pair')} of {counted(images, 'image')}",
-            hint="give both images of a pair the same name or time, and copy missing files again",
-        )
+        got = f"{counted(pairs, 'pair')} of {counted(images, 'image')}"
+        hint = "give both images of a pair the same name or time, and copy missing files again"
+        raise SourceError("most images have no partner", where=where, got=got, hint=hint)

@@ -38,12 +38,8 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
     seconds = table[:, table.shape[1] // 2]
     chosen = listing.lines(len(table))
     if chosen is None:
-        raise SourceError(
-            "fewer times than images",
-            where=path,
-            got=counted(len(table), "time"),
-            expected=f"{len(listing.names)}",
-        )
+        what, got = "fewer times than images", counted(len(table), "time")
+        raise SourceError(what, where=path, got=got, expected=f"{len(listing.names)}")
     check_seconds(seconds, path)
     times: Float64 = seconds[chosen]
     check_increasing(times, str(path), [lines[k] for k in chosen])
@@ -150,25 +146,21 @@ def check_increasing(stamps_s: Float64, where: str, lines: Sequence[int] | None 
     if backwards.size:
         at = int(backwards[0]) + 1
         still = stamps_s[at] == stamps_s[at - 1]
-        raise SourceError(
-            "two images have the same timestamp" if still else "timestamps are out of order",
-            where=f"{where}, image {at}" if lines is None else f"{where}:{lines[at]}",
-            got=f"{stamps_s[at]:.6f} s after {stamps_s[at - 1]:.6f} s",
-            hint="the images of each camera must be in the order of their exposure",
-        )
+        what = "two images have the same timestamp" if still else "timestamps are out of order"
+        place = f"{where}, image {at}" if lines is None else f"{where}:{lines[at]}"
+        got = f"{stamps_s[at]:.6f} s after {stamps_s[at - 1]:.6f} s"
+        hint = "the images of each camera must be in the order of their exposure"
+        raise SourceError(what, where=place, got=got, hint=hint)
 
 
 def check_seconds(stamps_s: Float64, where: str | Path) -> None:
     """Refuse times that cannot be seconds of a drive: milliseconds, or all the same."""
     step_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 1.0
     if not 0.0 < step_s <= _LONGEST_STEP_S:
-        raise SourceError(
-            "times are not those of a drive in seconds",
-            where=where,
-            got=f"{step_s:g} s from frame to frame",
-            expected=f"more than 0, at most {_LONGEST_STEP_S:g} s",
-            hint="convert them; --set source.rate_hz= replaces those of a times.txt",
-        )
+        what, got = "times are not those of a drive in seconds", f"{step_s:g} s from frame to frame"
+        expected = f"more than 0, at most {_LONGEST_STEP_S:g} s"
+        hint = "convert them; --set source.rate_hz= replaces those of a times.txt"
+        raise SourceError(what, where=where, got=got, expected=expected, hint=hint)
 
 
 def pair_stamps(
@@ -184,13 +176,10 @@ def pair_stamps(
     apart_s = np.abs(right_s[to_right] - left_s)
     paired = mutual & (apart_s <= tolerance_s)
     if not paired.any():
-        raise SourceError(
-            "no left and right images were taken at the same time",
-            where=where,
-            got=f"at best {apart_s.min():.4g} s apart",
-            expected=f"at most {tolerance_s:g} s",
-            hint="raise --set source.tolerance_s= if that is the true skew of the cameras",
-        )
+        what = "no left and right images were taken at the same time"
+        got, expected = f"at best {apart_s.min():.4g} s apart", f"at most {tolerance_s:g} s"
+        hint = "raise --set source.tolerance_s= if that is the true skew of the cameras"
+        raise SourceError(what, where=where, got=got, expected=expected, hint=hint)
     # Of two cameras with different rates, the slower one decides what is missing.
     check_most(int(paired.sum()), min(len(left_s), len(right_s)), where)
     rights = [

@@ -45,11 +45,9 @@ class VideoSource(Recording):
                 check_size(self.calibration, view.shape[1], view.shape[0], self.videos[0].path)
             time_s = number / self.settings.rate_hz if self.settings.rate_hz else stamp_s
             if time_s <= last_s:
-                raise FormatError(
-                    "times of the video do not increase",
-                    where=f"{self.videos[0].path}, frame {number}",
-                    hint="give the rate with --set source.rate_hz=",
-                )
+                what = "times of the video do not increase"
+                hint = "give the rate with --set source.rate_hz="
+                raise FormatError(what, where=f"{self.videos[0].path}, frame {number}", hint=hint)
             last_s = time_s
             yield StereoPair(left, right, time_s, index, f"frame {number}")
 
@@ -109,8 +107,21 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
 def open_videos(files: Sequence[Path]) -> tuple[VideoFile, ...]:
     """Open one video, or a left and a right one that belong together."""
     videos = tuple(open_video(file) for file in files)
-    if len(videos) == 2:
-        _check_alike(*videos)
+    if len(videos) == 1:
+        return videos
+    left, right = videos
+    both: dict[str, tuple[object, object]] = {
+        "sizes": ("{}x{}".format(*left.size_px), "{}x{}".format(*right.size_px)),
+        "frame rates": (round(left.rate_hz, 2), round(right.rate_hz, 2)),
+    }
+    if abs(left.frames - right.frames) > _LONGER * max(left.frames, right.frames):
+        both["numbers of frames"] = (left.frames, right.frames)
+    for name, (ours, theirs) in both.items():
+        if ours != theirs:
+            what = f"left and right videos have different {name}"
+            got = f"left {ours}, right {theirs}"
+            hint = "cut both to the frames that were taken together"
+            raise SourceError(what, where=right.path, got=got, hint=hint)
     return videos
 
 
@@ -126,12 +137,9 @@ def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
     stacked = settings.side_by_side in _STACKED
     whole = video.height_px if stacked else video.width_px
     if whole % 2:
-        raise SourceError(
-            "frames of the video cannot be halved",
-            where=video.path,
-            got=f"{video.width_px}x{video.height_px}",
-            hint="for two videos: recon map LEFT --right RIGHT",
-        )
+        what, got = "frames of the video cannot be halved", f"{video.width_px}x{video.height_px}"
+        hint = "for two videos: recon map LEFT --right RIGHT"
+        raise SourceError(what, where=video.path, got=got, hint=hint)
     width_px, height_px = video.size_px
     return (width_px, height_px // 2) if stacked else (width_px // 2, height_px)
 
@@ -157,27 +165,7 @@ def _find_videos(path: Path, settings: SourceSettings) -> list[Path]:
     if pairs:
         return [path / name for name in pairs[0]]
     if len(names) != 1:
-        raise SourceError(
-            "folder has neither one video nor a left and a right one",
-            where=path,
-            got=", ".join(names) or "no video",
-            hint="name them with --left and --right",
-        )
+        what = "folder has neither one video nor a left and a right one"
+        got = ", ".join(names) or "no video"
+        raise SourceError(what, where=path, got=got, hint="name them with --left and --right")
     return [path / names[0]]
-
-
-def _check_alike(left: VideoFile, right: VideoFile) -> None:
-    both: dict[str, tuple[object, object]] = {
-        "sizes": ("{}x{}".format(*left.size_px), "{}x{}".format(*right.size_px)),
-        "frame rates": (round(left.rate_hz, 2), round(right.rate_hz, 2)),
-    }
-    if abs(left.frames - right.frames) > _LONGER * max(left.frames, right.frames):
-        both["numbers of frames"] = (left.frames, right.frames)
-    for what, (ours, theirs) in both.items():
-        if ours != theirs:
-            raise SourceError(
-                f"left and right videos have different {what}",
-                where=right.path,
-                got=f"left {ours}, right {theirs}",
-                hint="cut both to the frames that were taken together",
-            )

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice, product
 from typing import Final, Literal
 
 import numpy as np
 
-from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration
 from recon.core.values.arrays import Float64, UInt8
@@ -22,6 +22,7 @@ Lens = Literal["radtan", "rational", "fisheye"]
 _TEXELS: Final = 48  # per square; corners lie on the borders between texels
 _WHITE, _DARK, _WALL = 225.0, 28.0, 120.0
 _MARGIN_PX: Final = 6.0
+_OFFSETS: Final = (np.arange(4) + 0.5) / 4 - 0.5  # of rays in a pixel
 _MAX_TILT_RAD: Final = math.radians(50)
 _LENSES: Final[dict[Lens, tuple[LensModel, float, tuple[float, ...]]]] = {
     "radtan": ("pinhole", 0.8, (-0.28, 0.09, 8e-4, -6e-4)),
@@ -45,7 +46,7 @@ class BoardView:
 
 
 def board_rig(
-    lens: Lens = "radtan", width_px: int = 640, height_px: int = 480, baseline_m: float = 0.12
+    lens: Lens = "radtan", width_px: int = 640, height_px: int = 480
 ) -> StereoCalibration:
     """A rig of two slightly different, slightly misaligned cameras."""
     model, focal, coefficients = _LENSES[lens]
@@ -56,9 +57,8 @@ def board_rig(
         matrix = np.array([[f, 0, cx * width_px], [0, 1.002 * f, cy * height_px], [0, 0, 1]])
         return CameraIntrinsics(matrix, bend * distortion, width_px, height_px, model)
 
-    T = make_transform(
-        exp_so3(np.array([0.008, -0.02, 0.012])), baseline_m * np.array([-1.0, 0.02, 0.015])
-    )
+    turn, offset = np.array([0.008, -0.02, 0.012]), 0.12 * np.array([-1.0, 0.02, 0.015])
+    T = make_transform(exp_so3(turn), offset)
     return StereoCalibration(camera(1.0, 0.507, 0.489, 1.0), camera(1.006, 0.494, 0.508, 0.95), T)
 
 
@@ -67,24 +67,17 @@ def place_boards(
 ) -> list[BoardView]:
     """Board poses that together cover both images, at various tilts and distances."""
     rng = np.random.default_rng(seed)
-    views: list[BoardView] = []
-    for _ in range(400 * count):
-        view = _try_place(rig, board, rng)
-        if view is not None:
-            views.append(view)
-        if len(views) == count:
-            return views
-    raise CalibrationError("board does not fit into both images", got=str(board))
+    tried = (_try_place(rig, board, rng) for _ in range(400 * count))
+    return list(islice((view for view in tried if view is not None), count))
 
 
 class BoardRenderer:
-    """Renders a board on white paper as seen by one camera, with samples² rays per pixel."""
+    """Renders a board on white paper as seen by one camera, with 4 x 4 rays per pixel."""
 
-    def __init__(self, camera: CameraIntrinsics, board: CalibrationBoard, samples: int = 4) -> None:
-        self._camera, self._board, self._samples = camera, board, samples
+    def __init__(self, camera: CameraIntrinsics, board: CalibrationBoard) -> None:
+        self._camera, self._board = camera, board
         v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
-        pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-        rays = rays_of(camera, pixels)[:, :2]
+        rays = rays_of(camera, np.stack([u.ravel(), v.ravel()], axis=1))[:, :2]
         self._rays = rays.reshape(camera.height_px, camera.width_px, 2)
         # Rays vary smoothly, so linear interpolation within a pixel has no visible error.
         self._by_v = np.asarray(np.gradient(self._rays, axis=0))
@@ -93,15 +86,13 @@ class BoardRenderer:
 
     def render(self, T_camera_board: Float64, sigma_grey: float = 0.0, seed: int = 0) -> UInt8:
         """uint8 (H, W), the board at a pose in front of a grey wall, with noise of that sigma."""
-        offsets = (np.arange(self._samples) + 0.5) / self._samples - 0.5
         grey = np.full((self._camera.height_px, self._camera.width_px), _WALL)
         box = self._box(T_camera_board)
         total = np.zeros(grey[box].shape)
         rays, by_u, by_v = (each[box] for each in (self._rays, self._by_u, self._by_v))
-        for dv in offsets:
-            for du in offsets:
-                total += self._sample(T_camera_board, rays + du * by_u + dv * by_v)
-        grey[box] = total / self._samples**2
+        for dv, du in product(_OFFSETS, repeat=2):
+            total += self._sample(T_camera_board, rays + du * by_u + dv * by_v)
+        grey[box] = total / len(_OFFSETS) ** 2
         if sigma_grey:
             grey += np.random.default_rng(seed).normal(0, sigma_grey, grey.shape)
         return np.asarray(np.clip(np.rint(grey), 0, 255), dtype=np.uint8)
@@ -118,9 +109,7 @@ class BoardRenderer:
     def _sample(self, T_camera_board: Float64, rays: Float64) -> Float64:
         """Grey level of the board where rays (H, W, 2) hit it, of the wall elsewhere."""
         # A point of the board is R[:, 0] x + R[:, 1] y + t; the scale of the ray cancels.
-        H = np.linalg.inv(
-            np.stack([T_camera_board[:3, 0], T_camera_board[:3, 1], T_camera_board[:3, 3]], axis=1)
-        )
+        H = np.linalg.inv(T_camera_board[:3, [0, 1, 3]])
         with np.errstate(invalid="ignore", divide="ignore"):
             w = rays @ H[2, :2] + H[2, 2]
             x = (rays @ H[0, :2] + H[0, 2]) / w / self._board.square_m
@@ -134,18 +123,14 @@ class BoardRenderer:
 
 
 def render_views(
-    rig: StereoCalibration,
-    board: CalibrationBoard,
-    views: Sequence[BoardView],
-    *,
-    sigma_grey: float = 2.0,
+    rig: StereoCalibration, board: CalibrationBoard, views: Sequence[BoardView]
 ) -> list[tuple[UInt8, UInt8]]:
     """Left and right image, uint8 (H, W), of each view."""
     left, right = (BoardRenderer(camera, board) for camera in (rig.left, rig.right))
     return [
         (
-            left.render(view.T_left_board, sigma_grey, 2 * number),
-            right.render(rig.T_right_left @ view.T_left_board, sigma_grey, 2 * number + 1),
+            left.render(view.T_left_board, 2.0, 2 * number),
+            right.render(rig.T_right_left @ view.T_left_board, 2.0, 2 * number + 1),
         )
         for number, view in enumerate(views)
     ]
@@ -180,7 +165,8 @@ def _try_place(
     xyz = apply(T, np.concatenate([board.corners_m, _outline(board)]))
     seen = project_raw(left, xyz), project_raw(rig.right, apply(rig.T_right_left, xyz))
     corners = len(board.corners_m)
-    if not all(_inside(left, px) for px in seen):
+    limit = np.array([left.width_px, left.height_px]) - 1 - _MARGIN_PX
+    if not all(((px >= _MARGIN_PX) & (px <= limit)).all() for px in seen):
         return None
     return BoardView(T, seen[0][:corners], seen[1][:corners])
 
@@ -202,8 +188,3 @@ def _outline(board: CalibrationBoard, margin: float = 0.0) -> Float64:
     upright = [np.stack([np.full_like(y, end), y], axis=1) for end in (x[0], x[-1])]
     flat = np.concatenate([*level, *upright]) * board.square_m
     return np.hstack([flat, np.zeros((len(flat), 1))])
-
-
-def _inside(camera: CameraIntrinsics, pixels: Float64) -> bool:
-    limit = np.array([camera.width_px, camera.height_px]) - 1 - _MARGIN_PX
-    return bool(np.all((pixels >= _MARGIN_PX) & (pixels <= limit)))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from recon.core.errors import SettingsError
 from recon.core.geometry.projection import disparity_from_depth
 from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float64, UInt8
@@ -29,13 +27,6 @@ class Plane:
     window_m: tuple[float, float, float, float] | None = None
 
 
-class _Texture(NamedTuple):
-    """The noise texture of all planes."""
-
-    spacing_m: float
-    seed: int
-
-
 @dataclass(frozen=True, eq=False)
 class PlanePair:
     """A grey pair with its ground truth; NaN where the left image sees no plane."""
@@ -44,61 +35,37 @@ class PlanePair:
     truth: DisparityTruth
 
 
-def fronto_parallel_pair(
-    camera: RectifiedCamera, depth_m: float, *, seed: int = 0, noise_dn: float = 0.0
-) -> PlanePair:
+def fronto_parallel_pair(camera: RectifiedCamera, depth_m: float, *, seed: int = 0) -> PlanePair:
     """A fronto-parallel textured wall: constant disparity."""
-    return plane_pair(camera, [Plane((0.0, 0.0, 1.0), depth_m)], seed=seed, noise_dn=noise_dn)
+    return plane_pair(camera, [Plane((0.0, 0.0, 1.0), depth_m)], seed)
 
 
 def slanted_pair(
-    camera: RectifiedCamera,
-    depth_m: float,
-    slope: tuple[float, float] = (0.5, 0.0),
-    *,
-    seed: int = 0,
-    noise_dn: float = 0.0,
+    camera: RectifiedCamera, depth_m: float, slope: tuple[float, float], *, seed: int = 0
 ) -> PlanePair:
     """A textured plane ``Z = depth_m + slope_x·X + slope_y·Y``: disparity is linear in u and v."""
-    plane = Plane((-slope[0], -slope[1], 1.0), depth_m)
-    return plane_pair(camera, [plane], seed=seed, noise_dn=noise_dn)
+    return plane_pair(camera, [Plane((-slope[0], -slope[1], 1.0), depth_m)], seed)
 
 
 def step_pair(
-    camera: RectifiedCamera,
-    near_m: float,
-    far_m: float,
-    half_width_px: float,
-    *,
-    seed: int = 0,
-    noise_dn: float = 0.0,
+    camera: RectifiedCamera, near_m: float, far_m: float, half_width_px: float, *, seed: int = 0
 ) -> PlanePair:
     """A square in the centre of the left image in front of a wall, with an occluded strip."""
     half = half_width_px * near_m / camera.focal_px
     x = ((camera.width_px - 1) / 2 - camera.cx_px) * near_m / camera.focal_px
     y = ((camera.height_px - 1) / 2 - camera.cy_px) * near_m / camera.focal_px
     square = Plane((0.0, 0.0, 1.0), near_m, (x - half, x + half, y - half, y + half))
-    wall = Plane((0.0, 0.0, 1.0), far_m)
-    return plane_pair(camera, [square, wall], seed=seed, noise_dn=noise_dn)
+    return plane_pair(camera, [square, Plane((0.0, 0.0, 1.0), far_m)], seed)
 
 
-def plane_pair(
-    camera: RectifiedCamera, planes: Sequence[Plane], *, seed: int = 0, noise_dn: float = 0.0
-) -> PlanePair:
+def plane_pair(camera: RectifiedCamera, planes: Sequence[Plane], seed: int) -> PlanePair:
     """Render planes; the nearest occludes the others."""
-    if not planes:
-        raise SettingsError("no plane to render", expected="at least one")
     left, right = stereo_views(camera, np.eye(4))
     depth, nearest = _first_plane(planes, left.origin, left.directions(left.pixels()))
-    if not np.isfinite(depth).any():
-        raise SettingsError("no plane is in view", hint="place them in front of the camera")
     size = (camera.height_px, camera.width_px)
     # Coarsest lattice spacing of 16 pixels in the left image, at any depth.
-    texture = _Texture(16.0 * float(np.nanmedian(depth)) / camera.focal_px, seed)
-    images = [
-        _image(view, planes, texture, np.random.default_rng([seed, side]), noise_dn)
-        for side, view in enumerate((left, right))
-    ]
+    spacing_m = 16.0 * float(np.nanmedian(depth)) / camera.focal_px
+    images = [_image(view, planes, spacing_m, seed) for view in (left, right)]
     truth = DisparityTruth(
         disparity_from_depth(depth, camera).reshape(size),
         _seen_by(right, planes, left, depth, nearest).reshape(size),
@@ -106,13 +73,7 @@ def plane_pair(
     return PlanePair(RectifiedPair(images[0], images[1], camera), truth)
 
 
-def _image(
-    view: View,
-    planes: Sequence[Plane],
-    texture: _Texture,
-    rng: np.random.Generator,
-    noise_dn: float,
-) -> UInt8:
+def _image(view: View, planes: Sequence[Plane], spacing_m: float, seed: int) -> UInt8:
     rays = view.directions(view.pixels())
     depth, nearest = _first_plane(planes, view.origin, rays)
     known = np.isfinite(depth)
@@ -120,10 +81,9 @@ def _image(
     xyz = view.origin + depth[known, None] * rays[known]
     # Offset each plane along the third axis of the noise, so that each has its own texture.
     xyz[:, 2] += 1000.0 * nearest[known]
-    width, spacing = depth[known] / view.focal_px, np.full(len(xyz), texture.spacing_m)
-    grain = fractal_noise(xyz, np.zeros_like(xyz), width, spacing, _OCTAVES, _GAIN, texture.seed)
+    width, spacing = depth[known] / view.focal_px, np.full(len(xyz), spacing_m)
+    grain = fractal_noise(xyz, np.zeros_like(xyz), width, spacing, _OCTAVES, _GAIN, seed)
     grey[known] += _CONTRAST_DN * grain
-    grey += noise_dn * rng.standard_normal(len(grey))
     levels = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
     return np.asarray(levels.reshape(view.height_px, view.width_px))
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Final
 
-from recon.core.errors import CalibrationError, FormatError, ReconError
+from recon.core.errors import CalibrationError, FormatError
 from recon.core.values import Rig, check_size
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import read_opencv_calibration
@@ -65,8 +65,18 @@ def read_calibration(
         rig = _read_kitti(path, size, cameras)
     elif form in _READERS:
         rig = _READERS[form](path)
+    elif form == "homographies":
+        raise CalibrationError(
+            "homographies know no focal length and no baseline: there is no depth in them",
+            hint="recon disparity takes the rectified images as they are; for depth use a "
+            "calibration of the cameras (recon calibrate)",
+        )
     else:
-        raise _unknown(form)
+        raise FormatError(
+            "not a calibration file",
+            expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
+            "OpenCV YAML/XML (M1 …), ROS CameraInfo or a kalibr camchain (cam0: …)",
+        )
     if size is not None:
         check_size(rig, *size, path)
     return rig
@@ -84,17 +94,3 @@ def _read_kitti(
     known = list_kitti_cameras(path)
     grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
     return read_kitti_rig(path, *size, cameras or (GREY_CAMERAS if grey else COLOUR_CAMERAS))
-
-
-def _unknown(form: str) -> ReconError:
-    if form == "homographies":
-        return CalibrationError(
-            "homographies know no focal length and no baseline: there is no depth in them",
-            hint="recon disparity takes the rectified images as they are; for depth use a "
-            "calibration of the cameras (recon calibrate)",
-        )
-    return FormatError(
-        "not a calibration file",
-        expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
-        "OpenCV YAML/XML (M1 …), ROS CameraInfo or a kalibr camchain (cam0: …)",
-    )

@@ -22,10 +22,14 @@ from recon.io.fields import numbers_of, parse_yaml, plain_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader, reading
 
 # Accepted names: those of OpenCV's samples first, then those of calibration tools and tutorials.
-_LEFT_MATRIX: Final = ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL")
-_RIGHT_MATRIX: Final = ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR")
-_LEFT_DISTORTION: Final = ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL")
-_RIGHT_DISTORTION: Final = ("D2", "distCoeffs2", "dist_coeffs_right", "distCoeffsR")
+_MATRICES: Final = (
+    ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL"),
+    ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR"),
+)
+_DISTORTIONS: Final = (
+    ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL"),
+    ("D2", "distCoeffs2", "dist_coeffs_right", "distCoeffsR"),
+)
 _ROTATION: Final = ("R", "rotation_matrix")
 _TRANSLATION: Final = ("T", "translation_vector")
 _SIZE: Final = ("image_size", "imageSize", "img_size")
@@ -36,13 +40,8 @@ _FISHEYE_NAMES: Final = frozenset({"fisheye", "equidistant", "kannala-brandt", "
 # OpenCV names no lens model, and both have four coefficients. A pinhole that sees more than 90
 # degrees has a distortion above this; a fisheye's polynomial is close to 1.
 _FISHEYE_LIKE: Final = 0.1
-
-# Numbers of coefficients that OpenCV's distortion model supports.
-_DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
-
-# Longer than any stereo rig: a longer baseline means millimetres read as metres.
-_LONGEST_BASELINE_M: Final = 20.0
-
+_DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})  # coefficients that OpenCV supports
+_LONGEST_BASELINE_M: Final = 20.0  # longer than any rig: millimetres read as metres
 _NOT_FINITE: Final = re.compile(r"\.(?:Nan|Inf)\b")
 _XML_ROOT: Final = "opencv_storage"
 Nodes = dict[str, Float64 | str]
@@ -70,8 +69,7 @@ def read_opencv_calibration(
         )
     model = _model(nodes)
     lens: LensModel = model or "pinhole"
-    left = _camera(nodes, _LEFT_MATRIX, _LEFT_DISTORTION, size, lens)
-    right = _camera(nodes, _RIGHT_MATRIX, _RIGHT_DISTORTION, size, lens)
+    left, right = (_camera(nodes, side, size, lens) for side in (0, 1))
     if model is None:
         for camera in (left, right):
             _check_model(camera)
@@ -85,12 +83,10 @@ def read_opencv_calibration(
         translation_m = _matrix(outer_nodes, _TRANSLATION, (3,)) * metres_per_unit
         calibration = StereoCalibration(left, right, make_transform(rotation, translation_m))
         if calibration.baseline_m > _LONGEST_BASELINE_M:
-            raise CalibrationError(
-                "baseline is implausibly long",
-                got=f"{calibration.baseline_m:g} m",
-                expected=f"at most {_LONGEST_BASELINE_M:g} m",
-                hint="if the file is in millimetres, pass 0.001 metres per unit",
-            )
+            what = "baseline is implausibly long"
+            got, expected = f"{calibration.baseline_m:g} m", f"at most {_LONGEST_BASELINE_M:g} m"
+            hint = "if the file is in millimetres, pass 0.001 metres per unit"
+            raise CalibrationError(what, got=got, expected=expected, hint=hint)
     return calibration
 
 
@@ -146,20 +142,14 @@ def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...]) -> Float
     return value.reshape(shape)
 
 
-def _camera(
-    nodes: Nodes,
-    matrix_names: Sequence[str],
-    distortion_names: Sequence[str],
-    size_px: tuple[int, int],
-    model: LensModel,
-) -> CameraIntrinsics:
-    matrix = _matrix(nodes, matrix_names, (3, 3))
-    found = _find(nodes, distortion_names)
+def _camera(nodes: Nodes, side: int, size: tuple[int, int], model: LensModel) -> CameraIntrinsics:
+    matrix = _matrix(nodes, _MATRICES[side], (3, 3))
+    found = _find(nodes, _DISTORTIONS[side])
     distortion = np.zeros(0) if found is None else found.ravel()
     if distortion.size not in _DISTORTION_COUNTS:
-        what, got = repr(distortion_names[0]), counted(distortion.size, "coefficient")
+        what, got = repr(_DISTORTIONS[side][0]), counted(distortion.size, "coefficient")
         raise FormatError(f"{what} has the wrong size", got=got, expected="4, 5, 8, 12 or 14")
-    return CameraIntrinsics(matrix, distortion, *size_px, model)
+    return CameraIntrinsics(matrix, distortion, *size, model)
 
 
 def _size(nodes: Nodes) -> tuple[int, int] | None:

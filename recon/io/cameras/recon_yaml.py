@@ -23,10 +23,12 @@ _HEADER: Final = """\
 # Pixel centres are at integers; camera axes: x right, y down, z forward.
 # xyz_right = rotation * xyz_left + translation_m
 """
-_PINHOLE: Final = (
-    "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty",
-)  # fmt: skip
-_FISHEYE: Final = ("k1", "k2", "k3", "k4")
+_NAMES: Final[dict[str, tuple[str, ...]]] = {  # of coefficients, by lens model
+    "pinhole": (
+        "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty",
+    ),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}  # fmt: skip
 _RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
 
 
@@ -50,9 +52,20 @@ def read_recon_calibration(path: StrPath) -> Rig:
         what = "version of the calibration file is not supported"
         raise FormatError(what, got=got, expected=expected)
     kind = fields.text("kind")
-    if kind not in ("stereo", "rectified"):
+    if kind == "rectified":
+        camera = fields.below("camera")
+        return RectifiedCamera(
+            **{name: camera.number(name) for name in _RECTIFIED},
+            width_px=camera.count("width_px"),
+            height_px=camera.count("height_px"),
+            ndisp=camera.count("ndisp") if "ndisp" in camera else None,
+        )
+    if kind != "stereo":
         raise FormatError("unknown kind of calibration", got=kind, expected="stereo or rectified")
-    return _read_rectified(fields) if kind == "rectified" else _read_stereo(fields)
+    pose = fields.below("right_from_left")
+    T = make_transform(pose.numbers("rotation", (3, 3)), pose.numbers("translation_m", (3,)))
+    left, right = (_read_camera(fields.below(side)) for side in ("left", "right"))
+    return StereoCalibration(left, right, T)
 
 
 def _content(calibration: Rig) -> dict[str, Any]:
@@ -73,39 +86,23 @@ def _content(calibration: Rig) -> dict[str, Any]:
 def _camera_content(camera: CameraIntrinsics) -> dict[str, Any]:
     K = camera.matrix
     pinhole = {"fx_px": K[0, 0], "fy_px": K[1, 1], "cx_px": K[0, 2], "cy_px": K[1, 2]}
-    names = _names(camera.model)
     return {
         "model": camera.model,
         "width_px": camera.width_px,
         "height_px": camera.height_px,
         **{name: float(value) for name, value in pinhole.items()},
-        "distortion": dict(zip(names, camera.distortion.tolist(), strict=False)),
+        "distortion": dict(zip(_NAMES[camera.model], camera.distortion.tolist(), strict=False)),
     }
 
 
-def _names(model: LensModel) -> tuple[str, ...]:
-    return _FISHEYE if model == "fisheye" else _PINHOLE
-
-
-def _read_stereo(fields: Fields) -> StereoCalibration:
-    pose = fields.below("right_from_left")
-    T = make_transform(pose.numbers("rotation", (3, 3)), pose.numbers("translation_m", (3,)))
-    left, right = (_read_camera(fields.below(side)) for side in ("left", "right"))
-    return StereoCalibration(left, right, T)
-
-
 def _read_camera(fields: Fields) -> CameraIntrinsics:
-    model = fields.text("model")
-    if model not in ("pinhole", "fisheye"):
+    model = cast("LensModel", fields.text("model"))
+    if model not in _NAMES:
         raise FormatError("unknown lens model", got=model, expected="pinhole or fisheye")
     fx, fy, cx, cy = (fields.number(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px"))
-    return CameraIntrinsics(
-        pinhole_matrix(fx, fy, cx, cy),
-        _read_distortion(fields.below("distortion"), _names(cast("LensModel", model))),
-        fields.count("width_px"),
-        fields.count("height_px"),
-        cast("LensModel", model),
-    )
+    distortion = _read_distortion(fields.below("distortion"), _NAMES[model])
+    size = fields.count("width_px"), fields.count("height_px")
+    return CameraIntrinsics(pinhole_matrix(fx, fy, cx, cy), distortion, *size, model)
 
 
 def _read_distortion(fields: Fields, names: tuple[str, ...]) -> Float64:
@@ -113,13 +110,3 @@ def _read_distortion(fields: Fields, names: tuple[str, ...]) -> Float64:
     if known != list(names[: len(known)]):
         raise FormatError("distortion has gaps", got=", ".join(known), expected=", ".join(names))
     return np.array([fields.number(name) for name in known], dtype=np.float64)
-
-
-def _read_rectified(fields: Fields) -> RectifiedCamera:
-    camera = fields.below("camera")
-    return RectifiedCamera(
-        **{name: camera.number(name) for name in _RECTIFIED},
-        width_px=camera.count("width_px"),
-        height_px=camera.count("height_px"),
-        ndisp=camera.count("ndisp") if "ndisp" in camera else None,
-    )

@@ -162,20 +162,15 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
 @reader
 def read_kalibr(path: StrPath) -> StereoCalibration:
     """Read kalibr's camera chain; ``T_cn_cnm1`` maps points of camera n-1 to camera n."""
-    fields = Fields(read_yaml(path))
-    right = fields.below("cam1")
-    T_right_left = orthonormalise(right.numbers("T_cn_cnm1", (4, 4)))
-    left_camera, right_camera = (_kalibr_camera(fields.below(n), path) for n in ("cam0", "cam1"))
-    return StereoCalibration(left_camera, right_camera, T_right_left)
-
-
-def _kalibr_camera(fields: Fields, path: StrPath) -> CameraIntrinsics:
-    kind = fields.text("camera_model")
-    if kind != "pinhole":
-        expected = "pinhole (with radtan or equidistant distortion)"
-        raise FormatError("camera model is not supported", got=kind, expected=expected)
-    name = fields.text("distortion_model")
-    return _camera(fields, _KALIBR_MODELS, name, "distortion_coeffs", path)
+    fields, cameras = Fields(read_yaml(path)), []
+    T_right_left = orthonormalise(fields.below("cam1").numbers("T_cn_cnm1", (4, 4)))
+    for part in (fields.below("cam0"), fields.below("cam1")):
+        if (kind := part.text("camera_model")) != "pinhole":
+            expected = "pinhole (with radtan or equidistant distortion)"
+            raise FormatError("camera model is not supported", got=kind, expected=expected)
+        name = part.text("distortion_model")
+        cameras.append(_camera(part, _KALIBR_MODELS, name, "distortion_coeffs", path))
+    return StereoCalibration(cameras[0], cameras[1], T_right_left)
 
 
 def _camera(
@@ -255,9 +250,7 @@ def _name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str
             padded = np.zeros(count)
             padded[:most] = camera.distortion[:most]
             return name, padded
-    raise CalibrationError(
-        f"a {form} file cannot store this lens model",
-        got=f"{camera.model} with {counted(most, 'coefficient')}",
-        expected=", ".join(models),
-        hint="calibrate with --set calibration.radial_terms=2, or write another format",
-    )
+    what = f"a {form} file cannot store this lens model"
+    got = f"{camera.model} with {counted(most, 'coefficient')}"
+    hint = "calibrate with --set calibration.radial_terms=2, or write another format"
+    raise CalibrationError(what, got=got, expected=", ".join(models), hint=hint)

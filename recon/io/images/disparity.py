@@ -83,13 +83,10 @@ def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0)
     known = np.isfinite(values)
     levels = np.rint(np.where(known, values, 0).astype(np.float64) * scale)
     if (levels < 0).any() or (levels > 65535).any():
-        raise OutputError(
-            "disparity does not fit a 16-bit image",
-            where=path,
-            got=f"{values[known].min():g} to {values[known].max():g} px",
-            expected=f"0 to {65535 / scale:g} px",
-            hint="write PFM instead, or use a smaller scale",
-        )
+        what = "disparity does not fit a 16-bit image"
+        got = f"{values[known].min():g} to {values[known].max():g} px"
+        expected, hint = f"0 to {65535 / scale:g} px", "write PFM instead, or use a smaller scale"
+        raise OutputError(what, where=path, got=got, expected=expected, hint=hint)
     write_image(path, np.where(known, np.maximum(levels, 1), 0).astype(np.uint16))
 
 

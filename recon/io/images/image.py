@@ -30,25 +30,15 @@ _WRITABLE: Final = _GREY_ONLY | _COLOUR_ONLY | _EIGHT_BIT_ONLY | {".png", ".tif"
 # Encoding: channels, bits per channel, and how OpenCV makes RGB of it, if it is not there already.
 # OpenCV names a Bayer pattern from pixel (1, 1) on, ROS from pixel (0, 0) on.
 _ENCODINGS: Final[dict[str, tuple[int, int, int | None]]] = {
-    "mono8": (1, 8, None),
-    "8uc1": (1, 8, None),
-    "mono16": (1, 16, None),
-    "16uc1": (1, 16, None),
-    "rgb8": (3, 8, None),
-    "bgr8": (3, 8, cv2.COLOR_BGR2RGB),
-    "8uc3": (3, 8, cv2.COLOR_BGR2RGB),
-    "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, 8, None), "8uc1": (1, 8, None), "mono16": (1, 16, None), "16uc1": (1, 16, None),
+    "rgb8": (3, 8, None), "bgr8": (3, 8, cv2.COLOR_BGR2RGB), "8uc3": (3, 8, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, 8, cv2.COLOR_RGBA2RGB), "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
     "8uc4": (4, 8, cv2.COLOR_BGRA2RGB),
-    "bayer_rggb8": (1, 8, cv2.COLOR_BayerBG2RGB),
-    "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
-    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB),
-    "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
-    "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
-}
+    "bayer_rggb8": (1, 8, cv2.COLOR_BayerBG2RGB), "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB), "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
+    "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY), "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2), "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
+}  # fmt: skip
 
 
 def read_image(
@@ -98,12 +88,9 @@ def _decode(content: bytes, max_megapixels: float) -> NDArray[Any]:
     size = stated_size(content)
     # A small file can hold very many pixels.
     if size is not None and size[0] * size[1] > max_megapixels * 1e6:
-        raise FormatError(
-            "image has too many pixels",
-            got=f"{size[0]}x{size[1]}",
-            expected=f"at most {max_megapixels:g} million",
-            hint="make it smaller; --set source.max_megapixels= allows more",
-        )
+        what, expected = "image has too many pixels", f"at most {max_megapixels:g} million"
+        hint = "make it smaller; --set source.max_megapixels= allows more"
+        raise FormatError(what, got=f"{size[0]}x{size[1]}", expected=expected, hint=hint)
     check_image_bytes(content)
     try:
         with silent_opencv() if is_tiff(content) else nullcontext():
@@ -203,9 +190,8 @@ def pixels_of_ros_image(
     if step < row or data.size < step * (height_px - 1) + row or min(shape) < 1:
         got = f"{counted(data.size, 'byte')}, {step} per row"
         expected = f"{width_px}x{height_px} pixels of {name}"
-        raise FormatError(
-            "image message has too few bytes", where=where, got=got, expected=expected
-        )
+        what = "image message has too few bytes"
+        raise FormatError(what, where=where, got=got, expected=expected)
     rows = np.lib.stride_tricks.as_strided(data, (height_px, row), (step, 1))
     pixels = np.ascontiguousarray(rows)
     if bits == 16:

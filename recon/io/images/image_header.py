@@ -39,11 +39,8 @@ _PNM_HEADER: Final = re.compile(
 )
 _BMP_HEADER: Final = struct.Struct("<2xI4xI4xiiHHII")
 _READERS: Final[dict[bytes, type[ImageFile]]] = {
-    b"\x89PNG": PngImageFile,
-    b"\xff\xd8": JpegImageFile,
-    b"BM": BmpImageFile,
-    b"P": PpmImageFile,
-}
+    b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"P": PpmImageFile,
+}  # fmt: skip
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _EXIF_IFD: Final = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405

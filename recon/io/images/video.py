@@ -80,13 +80,9 @@ def open_video(path: StrPath) -> VideoFile:
             raise FormatError("video has no frame that can be decoded", where=file)
     frames = _count(file)
     if frames < promised - _COUNT_TOLERANCE:
-        raise FormatError(
-            "video is truncated",
-            where=file,
-            got=counted(frames, "frame"),
-            expected=f"{promised:.0f}, as its header says",
-            hint=f"copy the file again, or repair it: ffmpeg -i {file.name} -c copy whole.mkv",
-        )
+        got, expected = counted(frames, "frame"), f"{promised:.0f}, as its header says"
+        hint = f"copy the file again, or repair it: ffmpeg -i {file.name} -c copy whole.mkv"
+        raise FormatError("video is truncated", where=file, got=got, expected=expected, hint=hint)
     return VideoFile(file, frames, size[0], size[1], rate_hz)
 
 
@@ -107,11 +103,8 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
-            raise FormatError(
-                "not a readable video",
-                where=path,
-                hint="it may be truncated or use an unknown codec; try: ffmpeg -i FILE copy.mkv",
-            )
+            hint = "it may be truncated or use an unknown codec; try: ffmpeg -i FILE copy.mkv"
+            raise FormatError("not a readable video", where=path, hint=hint)
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         yield capture
     finally:

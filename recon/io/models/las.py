@@ -66,12 +66,10 @@ def check_crs(crs: str) -> Any:
         ) from error
     units = {axis.unit_name for axis in found.axis_info}
     if not found.is_projected or units != {"metre"}:
-        raise SettingsError(
-            "the coordinates of this system are not metres to the east and north",
-            where="--crs",
-            got=f"{crs} ({found.name}; {', '.join(sorted(units))})",
-            expected="a projected system, such as EPSG:25832",
-        )
+        what = "the coordinates of this system are not metres to the east and north"
+        got = f"{crs} ({found.name}; {', '.join(sorted(units))})"
+        expected = "a projected system, such as EPSG:25832"
+        raise SettingsError(what, where="--crs", got=got, expected=expected)
     return found
 
 
@@ -110,12 +108,10 @@ def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> 
     _, _, apart_m = system.get_geod().inv(lons[[0, 0]], lats[[0, 0]], lons[1:], lats[1:])
     if on_earth and (np.abs(np.log(apart_m)) < np.log(_LARGEST_STRETCH)).all():
         return
-    raise EvaluationError(
-        "a metre of the coordinate system is not one on the ground where the positions are",
-        where=where,
-        got=f"longitude {lons[0]:g}, latitude {lats[0]:g} in {system.srs}",
-        expected="a projected system, such as EPSG:25832",
-    )
+    what = "a metre of the coordinate system is not one on the ground where the positions are"
+    got = f"longitude {lons[0]:g}, latitude {lats[0]:g} in {system.srs}"
+    expected = "a projected system, such as EPSG:25832"
+    raise EvaluationError(what, where=where, got=got, expected=expected)
 
 
 def _record(laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64) -> Any:

@@ -62,22 +62,16 @@ def _add_photo(group: ET.Element, photo: Photo, project: Path) -> None:
     pixel_mm = _SENSOR_MM / camera.width_px
     raster = ET.SubElement(group, "MLRaster", {"label": photo.file.stem})
     # MeshLab counts from the lower left corner of the image, and cameras look along -z.
-    centre = f"{camera.cx_px + 0.5:.10g} {camera.height_px - 0.5 - camera.cy_px:.10g}"
-    ET.SubElement(
-        raster,
-        "VCGCamera",
-        {
-            "TranslationVector": "0 0 0 1",
-            "RotationMatrix": " ".join(_rows(_IDENTITY).split()),
-            "FocalMm": f"{camera.focal_px * pixel_mm:.10g}",
-            "PixelSizeMm": f"{pixel_mm:.10g} {pixel_mm:.10g}",
-            "ViewportPx": f"{camera.width_px} {camera.height_px}",
-            "CenterPx": centre,
-            "LensDistortion": "0 0",
-            "CameraType": "0",
-            "BinaryData": "0",
-        },
-    )
+    lens = {
+        "TranslationVector": "0 0 0 1",
+        "RotationMatrix": " ".join(_rows(_IDENTITY).split()),
+        "FocalMm": f"{camera.focal_px * pixel_mm:.10g}",
+        "PixelSizeMm": f"{pixel_mm:.10g} {pixel_mm:.10g}",
+        "ViewportPx": f"{camera.width_px} {camera.height_px}",
+        "CenterPx": f"{camera.cx_px + 0.5:.10g} {camera.height_px - 0.5 - camera.cy_px:.10g}",
+    }
+    plain = {"LensDistortion": "0 0", "CameraType": "0", "BinaryData": "0"}
+    ET.SubElement(raster, "VCGCamera", lens | plain)
     ET.SubElement(raster, "Plane", {"semantic": "1", "fileName": _relative(photo.file, project)})
 
 

@@ -40,9 +40,26 @@ def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
     with atomic_path(image) as temporary, temporary.open("wb") as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode())
         for last in range(rows, 0, -_STRIP_ROWS):
-            file.write(_grey(grid.cells[max(0, last - _STRIP_ROWS) : last][::-1]).tobytes())
-    write_text(stem.with_name(f"{stem.name}.wld"), _world_file(grid))
-    write_text(description, yaml.safe_dump(_describe(grid, image.name), sort_keys=False))
+            cells = grid.cells[max(0, last - _STRIP_ROWS) : last][::-1]
+            grey = np.full(cells.shape, _GREY[UNKNOWN], np.uint8)
+            for cell, value in _GREY.items():
+                grey[cells == cell] = value
+            file.write(grey.tobytes())
+    # Size and turn of a pixel, and the centre of the first one: gdal.org, raster/wld.html.
+    side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
+    world = (side_m, 0, 0, -side_m, x_m + side_m / 2, y_m + (rows - 0.5) * side_m)
+    text = "".join(f"{_shortest(number)}\n" for number in world)
+    write_text(stem.with_name(f"{stem.name}.wld"), text)
+    described = {
+        "image": image.name,
+        "mode": "trinary",
+        "resolution": float(_shortest(grid.resolution_m)),
+        "origin": [*(float(_shortest(place)) for place in grid.origin_m), 0.0],
+        "negate": 0,
+        "occupied_thresh": _OCCUPIED_THRESH,
+        "free_thresh": _FREE_THRESH,
+    }
+    write_text(description, yaml.safe_dump(described, sort_keys=False))
     return image, description
 
 
@@ -61,32 +78,6 @@ def read_nav2(path: StrPath) -> OccupancyGrid:
     return OccupancyGrid(
         np.ascontiguousarray(cells[::-1]), float(fields["resolution"]), (float(x), float(y))
     )
-
-
-def _grey(cells: NDArray[np.int8]) -> UInt8:
-    grey = np.full(cells.shape, _GREY[UNKNOWN], np.uint8)
-    for cell, value in _GREY.items():
-        grey[cells == cell] = value
-    return grey
-
-
-def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
-    return {
-        "image": image,
-        "mode": "trinary",
-        "resolution": float(_shortest(grid.resolution_m)),
-        "origin": [*(float(_shortest(place)) for place in grid.origin_m), 0.0],
-        "negate": 0,
-        "occupied_thresh": _OCCUPIED_THRESH,
-        "free_thresh": _FREE_THRESH,
-    }
-
-
-def _world_file(grid: OccupancyGrid) -> str:
-    """Return size and turn of a pixel, and the centre of the first: gdal.org, raster/wld.html."""
-    side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
-    centre = (x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
-    return "".join(f"{_shortest(number)}\n" for number in (side_m, 0, 0, -side_m, *centre))
 
 
 def _shortest(number: float) -> str:

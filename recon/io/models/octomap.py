@@ -83,9 +83,14 @@ class _Node:
 
 def _nodes(voxels: OccupancyVoxels, depth: int, pieces: IO[bytes]) -> list[_Node]:
     """Return nodes for the cubes of a tile; their bytes are appended to ``pieces``."""
-    _check(voxels)
     if len(voxels) == 0:
         return []
+    if voxels.keys.min() < -KEY_LIMIT or voxels.keys.max() >= KEY_LIMIT:
+        raise MappingError(
+            "the map is too large for an OctoMap of this resolution",
+            got=f"{np.abs(voxels.keys).max() * voxels.resolution_m:.0f} m from the origin",
+            expected=f"at most {KEY_LIMIT * voxels.resolution_m:.0f} m",
+        )
     cubes = (voxels.keys.astype(np.int64) + KEY_LIMIT) >> depth
     number = pack_keys(cubes)  # numpy sorts rows slowly
     order = np.argsort(number, kind="stable")
@@ -145,16 +150,6 @@ def _write_node(file: IO[bytes], node: _Node, pieces: IO[bytes], *, binary: bool
         _write_node(file, child, pieces, binary=binary)
 
 
-def _check(voxels: OccupancyVoxels) -> None:
-    keys: Int32 = voxels.keys
-    if len(keys) and (keys.min() < -KEY_LIMIT or keys.max() >= KEY_LIMIT):
-        raise MappingError(
-            "the map is too large for an OctoMap of this resolution",
-            got=f"{np.abs(keys).max() * voxels.resolution_m:.0f} m from the origin",
-            expected=f"at most {KEY_LIMIT * voxels.resolution_m:.0f} m",
-        )
-
-
 @reader
 def read_octomap(path: StrPath) -> OccupancyVoxels:
     """Read an ``.ot`` file; pruned leaves are expanded."""
@@ -190,9 +185,8 @@ def _cells(nodes: NDArray[np.void], walk: TreeWalk, resolution_m: float) -> Occu
         return None
     cells = int((1 << 3 * (DEPTH - leaves.levels.astype(np.int64))).sum())
     if cells > max(_FEW_CELLS, _MOST_GROWTH * len(nodes)):
-        raise FormatError(
-            "the OctoMap claims far more cells than it has nodes", got=f"{cells} of {len(nodes)}"
-        )
+        what = "the OctoMap claims far more cells than it has nodes"
+        raise FormatError(what, got=f"{cells} of {len(nodes)}")
     keys, leaf = _expand(leaves)
     return OccupancyVoxels(keys, log_odds[leaf], resolution_m)
 
@@ -258,14 +252,8 @@ def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
         codes.append(parent[begin])
     full = _encode_full(codes, values, begins)
     binary, pruned_nodes = _encode_binary(codes, kinds, begins)
-    return Branch(
-        full=full,
-        binary=binary,
-        value=float(values[-1][0]),
-        kind=int(kinds[-1][0]),
-        nodes=sum(map(len, codes)),
-        pruned_nodes=pruned_nodes,
-    )
+    value, kind = float(values[-1][0]), int(kinds[-1][0])
+    return Branch(full, binary, value, kind, sum(map(len, codes)), pruned_nodes)
 
 
 def join_branches(children: dict[int, Branch]) -> Branch:

@@ -63,9 +63,8 @@ def decimate(
             target_faces, boundary_weight=3.0
         )
     if not smaller.has_triangles():
-        raise MeshingError(
-            "decimation left no face", got=f"target of {counted(target_faces, 'face')}"
-        )
+        got = f"target of {counted(target_faces, 'face')}"
+        raise MeshingError("decimation left no face", got=got)
     vertices, faces = np.asarray(smaller.vertices), np.asarray(smaller.triangles)
     return vertices.astype(np.float32), faces.astype(np.int32)
 
