@@ -103,13 +103,17 @@ class RefinedRig:
         share = disparity_px / given_px
         return 100.0 * (share - 1.0), 100.0 * share * self.sigma_px / given_px
 
+    def rms_percent(self, depth_m: float) -> float:
+        """Return the depth error there, root mean square over the image; 0 if none is known."""
+        if not self.changes:
+            return 0.0
+        share = 100.0 * depth_m / (self.camera.focal_px * self.camera.baseline_m)
+        return share * self.changes[0].rms_px
+
     def wrong_at(self, depth_m: float) -> bool:
         """Return whether depth there is off by more than 2 %, and two standard deviations."""
-        if not self.changes:
-            return False
-        share = 100.0 * depth_m / (self.camera.focal_px * self.camera.baseline_m)
-        off_px = self.changes[0].rms_px
-        return bool(off_px * share > MOST_DEPTH_PERCENT and off_px > 2.0 * self.sigma_px)
+        percent = self.rms_percent(depth_m)
+        return percent > MOST_DEPTH_PERCENT and self.changes[0].rms_px > 2.0 * self.sigma_px
 
     def figures(self) -> dict[str, Any]:
         """Return what differs, ready for ``summary.json``; parameters in radians and shares.
@@ -144,23 +148,19 @@ class RefinedRig:
         }
         return dict(plain(figures))
 
-    def describe(self) -> str:
-        """Return in words what the drive shows of the rig given."""
-        off = f"{self.changes[-1].mean_px:+.2f} ± {2 * self.sigma_px:.2f} px"
-        percent = [(self.depth_percent(change)[0], change.depth_m) for change in self.changes]
-        depths = ", ".join(
-            f"{f'{share:+.1f} %' if np.isfinite(share) else 'infinite'} at {z:g} m"
-            for share, z in percent
-        )
-        rms_px = self.changes[-1].rms_px
-        return f"disparities are {off} off, {rms_px:.2f} px rms over the image: depth {depths}"
+    def describe(self, depth_m: float) -> str:
+        """Return in words what the drive shows of the rig given, and what it does to a depth."""
+        near = self.changes[0]
+        off = f"{near.mean_px:+.2f} ± {1.96 * self.sigma_px:.2f} px"
+        depth = f"by {self.rms_percent(depth_m):.0f} % at {depth_m:.0f} m"
+        return f"disparities are {off} off, {near.rms_px:.2f} px rms over the image, depth {depth}"
 
     def warnings(self) -> list[str]:
         """Return what the user should know of a rig that is far off."""
         if not self.wrong_at(DEPTHS_M[0]):
             return []
         used = "used is the rig that the motion shows (--set rig.refine=off keeps the calibration)"
-        return [f"the rig is not as calibrated: {self.describe()}; {used}"]
+        return [f"the rig is not as calibrated: {self.describe(DEPTHS_M[0])}; {used}"]
 
 
 def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -> RefinedRig:

@@ -191,9 +191,11 @@ def _of_rig(rig: RefinedRig | None, disparity_px: Float64) -> Found:
     """Yield a rig with which depth is off where most of what it sees is."""
     if rig is None or not rig.changes or not len(disparity_px):
         return
-    working_m = rig.camera.focal_px * rig.camera.baseline_m / max(np.median(disparity_px), 1.0)
-    if rig.wrong_at(float(working_m)):
-        yield "rig", {"shown": rig.describe()}
+    working_m = (
+        rig.camera.focal_px * rig.camera.baseline_m / max(float(np.median(disparity_px)), 1.0)
+    )
+    if rig.wrong_at(working_m):
+        yield "rig", {"shown": rig.describe(working_m)}
 
 
 def _of_range(disparity_px: Float64, reach_px: int | None, camera: RectifiedCamera) -> Found:

@@ -7,12 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from recon.core.geometry.projection import project
-from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
-from recon.core.values import RectifiedCamera
-from recon.odometry.window import TrackWindow
-from recon.rig.audit import rig_fit
 from recon.rig.audit.corrections import (
     BentLenses,
     RightTurn,
@@ -23,9 +17,15 @@ from recon.rig.audit.corrections import (
     turned_places,
     turning,
 )
-from recon.rig.audit.findings import of_turn
 from recon.rig.audit.rig_fit import RigCorrection, StereoTracks
 from recon.rig.audit.seen_motion import SeenMotion
+
+from recon.core.geometry.projection import project
+from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.core.values import RectifiedCamera
+from recon.odometry.window import TrackWindow
+from recon.rig.audit import rig_fit
+from recon.rig.audit.findings import of_turn
 from recon.stereo.rectify.lens import rays_of
 
 CAMERA = RectifiedCamera(700.0, 600.0, 180.0, 600.0, 0.5, 1200, 370)
