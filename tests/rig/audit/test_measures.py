@@ -20,8 +20,8 @@ from recon.rig.audit.measures import (
     measure_speed,
     measure_time_skew,
 )
-from recon.stereo.rectify.row_alignment import align_rows, correct_rig, count_aligned, turn_features
 from recon.rig.audit.sample import FRAMES, plan_centres, plan_stretches
+from recon.stereo.rectify.row_alignment import align_rows, correct_rig, count_aligned, turn_features
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 
