@@ -134,11 +134,18 @@ def _known(figures: Mapping[str, Any], text: str) -> str:
 
 def _by_motion(found: Mapping[str, Any]) -> str:
     off, depths = found["disparity_px"], found["depth_percent"].items()
-    far = ", ".join(f"{x['mean']:+.1f} ± {1.96 * x['sigma']:.1f} % at {z} m" for z, x in depths)
+    far = ", ".join(f"{_share(x)} at {z} m" for z, x in depths)
     return (
         f"disparities {off['mean']:+.2f} ± {1.96 * off['sigma']:.2f} px off, {off['rms']:.2f} px "
         f"rms over the image (depth {far}); {_turned(found)}; the baseline cannot be seen"
     )
+
+
+def _share(depth: Mapping[str, float | None]) -> str:
+    mean, sigma = depth["mean"], depth["sigma"]
+    if mean is None or sigma is None:
+        return "behind infinity"
+    return f"{mean:+.1f} ± {1.96 * sigma:.1f} %"
 
 
 def _mended(mended: Mapping[str, Any]) -> str:

@@ -367,14 +367,15 @@ def test_lines_of_an_audit_say_what_is_not_known() -> None:
     }
     turn = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
     off = {"mean": -0.5, "sigma": 0.1, "rms": 0.75}
-    depth = {"10": {"mean": 1.0, "sigma": 0.5}, "30": {"mean": float("inf"), "sigma": float("inf")}}
+    depth = {"10": {"mean": 1.0, "sigma": 0.5}, "30": {"mean": None, "sigma": None}}
     summary |= {"rig_by_motion": {**turn, "disparity_px": off, "depth_percent": depth}}
     summary |= {"lag_frames": 2, "mended": {**turn, "calibration": "new.yaml"}}
     lines = audit_page.audit_lines(summary)
     assert lines["time"] == "right camera +2 frames late"
-    assert lines["by its motion"].startswith(
-        "disparities -0.50 ± 0.20 px off, 0.75 px rms over the image (depth +1.0 ± 1.0 % at 10 m, "
+    off_by = (
+        "disparities -0.50 ± 0.20 px off, 0.75 px rms over the image (depth +1.0 ± 1.0 % at 10 m"
     )
+    assert f"{off_by}, behind infinity at 30 m)" in lines["by its motion"]
     rotated = "by +0.100 deg pitch, -0.200 deg yaw, +0.000 deg roll, its focal length changed by"
     assert all(f"{rotated} +0.25 %" in lines[of] for of in ("by its motion", "mended"))
     assert lines["mended"].startswith("new.yaml: ")

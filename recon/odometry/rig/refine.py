@@ -22,6 +22,7 @@ from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, without_faul
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.tracks import FRAMES, plan_stretches, track_stretches
 from recon.odometry.settings import RigSettings
+from recon.run.run import plain
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.rectify.features import match_features, pool_features
@@ -111,13 +112,16 @@ class RefinedRig:
         return bool(off_px * share > MOST_DEPTH_PERCENT and off_px > 2.0 * self.sigma_px)
 
     def figures(self) -> dict[str, Any]:
-        """Return what differs, ready for ``summary.json``; parameters in radians and shares."""
+        """Return what differs, ready for ``summary.json``; parameters in radians and shares.
+
+        A depth error that is None is infinite.
+        """
         if self.fitted is None:
             return {"refined": False}
         sigmas = np.sqrt(np.diag(self.fitted.covariance))
         rows = zip(NAMES, self.fitted.values, sigmas, RigFault(self.camera).sigmas, strict=True)
         percent = [self.depth_percent(change) for change in self.changes]
-        return {
+        figures = {
             "refined": self.refined,
             "windows": self.fitted.windows,
             **{f"{n}_deg": float(np.degrees(x)) for n, x in zip(TURN[:3], self.turn, strict=False)},
@@ -138,12 +142,13 @@ class RefinedRig:
             },
             "not_visible": "baseline",
         }
+        return dict(plain(figures))
 
     def describe(self) -> str:
         """Return in words what the drive shows of the rig given."""
         off = f"{self.changes[-1].mean_px:+.2f} ± {2 * self.sigma_px:.2f} px"
         depths = ", ".join(
-            f"{self.depth_percent(change)[0]:+.1f} % at {change.depth_m:g} m"
+            f"{_percent(self.depth_percent(change)[0])} at {change.depth_m:g} m"
             for change in self.changes
         )
         rms_px = self.changes[-1].rms_px
@@ -155,6 +160,10 @@ class RefinedRig:
             return []
         used = "used is the rig that the motion shows (--set rig.refine=off keeps the calibration)"
         return [f"the rig is not as calibrated: {self.describe()}; {used}"]
+
+
+def _percent(off: float) -> str:
+    return f"{off:+.1f} %" if np.isfinite(off) else "behind infinity"
 
 
 def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -> RefinedRig:
