@@ -9,7 +9,7 @@ ECMR 2021.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Final
 
@@ -71,7 +71,6 @@ class RefinedRig:
     calibration: Rig  # the refined one; that given where the drive shows nothing else
     camera: RectifiedCamera  # rectified views of the rig given
     fitted: FittedFault | None = None  # None: too short a drive, or it was not asked for
-    turn: Float64 = field(default_factory=lambda: np.zeros(len(TURN)))  # of the right camera
     changes: tuple[RigChange, ...] = ()  # at `DEPTHS_M`
     sigma_px: float = float("nan")  # of the mean disparity
 
@@ -118,18 +117,18 @@ class RefinedRig:
     def figures(self) -> dict[str, Any]:
         """Return what differs, ready for ``summary.json``; parameters in radians and shares.
 
-        The error of a depth that is infinite is None.
+        A depth error that is None is infinite.
         """
         if self.fitted is None:
             return {"refined": False}
-        sigmas = np.sqrt(np.diag(self.fitted.covariance))
-        rows = zip(NAMES, self.fitted.values, sigmas, RigFault(self.camera).sigmas, strict=True)
+        values, sigmas = self.fitted.values, np.sqrt(np.diag(self.fitted.covariance))
+        rows = zip(NAMES, values, sigmas, RigFault(self.camera).sigmas, strict=True)
         percent = [self.depth_percent(change) for change in self.changes]
         figures = {
             "refined": self.refined,
             "windows": self.fitted.windows,
-            **{f"{n}_deg": float(np.degrees(x)) for n, x in zip(TURN[:3], self.turn, strict=False)},
-            "focal_percent": -100.0 * float(self.turn[3]),
+            **{f"{n}_deg": float(np.degrees(x)) for n, x in zip(TURN[:3], values, strict=False)},
+            "focal_percent": -100.0 * float(values[3]),
             "disparity_px": {
                 "mean": self.changes[-1].mean_px,
                 "sigma": self.sigma_px,
@@ -176,8 +175,8 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
     found = RefinedRig(given, given, start.camera)
     if not rig.refine or source.live or len(source) < MIN_WINDOWS * FRAMES:
         return found
-    refined, turn = _with_rows_aligned(source, given, start)
-    values = np.concatenate([turn, np.zeros(len(NAMES) - len(turn))])
+    values = np.zeros(len(NAMES))
+    refined, values[: len(TURN)] = _with_rows_aligned(source, given, start)
     for _ in range(_PASSES):
         reconstructor = FrameReconstructor(refined, config)
         tracks = track_stretches(source, reconstructor)
@@ -185,7 +184,7 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
             return found
         camera = reconstructor.camera
         fitted = fit_fault(tracks, RigFault(camera), active(refined))
-        values = values + fitted.values
+        values += fitted.values
         before, refined = (
             refined,
             without_fault(refined, turns_of(refined, config.rectification), fitted.values),
@@ -200,7 +199,6 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
         refined if moved_px > _LEAST_PX else given,
         start.camera,
         replace(fitted, values=values),
-        values[: len(TURN)],
         changes,
         _mean_sigma(camera, fitted),
     )
