@@ -25,6 +25,7 @@ _MIN_FRAMES: Final = 4  # windows of fewer frames, after a loss, are left out
 _LEAST_MOTION: Final = 0.1  # in baselines; a window that moves less shows no depth by its motion
 _LEAST_SEEN: Final = 3  # frames that a point is seen in; what is seen less checks hardly anything
 _READ: Final = 72  # frames to read in all
+_REACH: Final = 600  # frames from the start that they are among: a video is decoded up to each
 _STRETCHES: Final = 6  # parts of the drive that they are from, two windows in each
 
 
@@ -38,6 +39,7 @@ class StereoTracks:
 
 def plan_stretches(frames: int) -> list[tuple[int, int]]:
     """Return first frame and end of each stretch, in the middle of equal parts of a drive."""
+    frames = min(frames, _REACH)
     if frames <= _READ:
         whole = frames - frames % FRAMES
         half = whole // 2 - whole // 2 % FRAMES
