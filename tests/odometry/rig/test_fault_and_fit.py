@@ -1,0 +1,239 @@
+"""What exact tracks of a drive show of a turned right camera and of lenses that bend."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.core.geometry.projection import project
+from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoCalibration
+from recon.odometry.rig.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
+from recon.odometry.rig.fit import FittedFault, fit_fault
+from recon.odometry.rig.refine import compare_rigs
+from recon.odometry.rig.tracks import StereoTracks
+from recon.odometry.window import TrackWindow
+from recon.stereo.rectify.lens import project_raw
+from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
+
+CAMERA = RectifiedCamera(700.0, 600.0, 180.0, 610.0, 0.5, 1200, 370)
+FAULT = RigFault(CAMERA)
+ALL = np.ones(len(NAMES), np.bool_)
+NONE = np.zeros(len(NAMES))
+SETTINGS = RectificationSettings()
+NOISE_PX = 0.1
+FRAMES, POINTS, WINDOWS = 6, 150, 12
+
+
+def fault(**parameters: float) -> np.ndarray:
+    values = NONE.copy()
+    values[[NAMES.index(name) for name in parameters]] = list(parameters.values())
+    return values
+
+
+TURN = fault(pitch=1e-3, yaw=7e-4, roll=-2e-3, zoom=-1e-3)
+LENSES = fault(
+    left_k1=8e-3, left_k2=-3e-3, left_p1=-1e-3, left_s1=2e-3, left_s3=-1e-3,
+    right_k1=5e-3, right_k2=-2e-3, right_p2=1e-3, right_s1=-3e-3, right_s4=1e-4,
+)  # fmt: skip
+
+
+def in_opencv(terms: np.ndarray) -> np.ndarray:
+    k1, k2, k3, p1, p2, s1, s2, s3, s4 = terms
+    return np.array([k1, k2, p1, p2, k3, 0, 0, 0, s1, s2, s3, s4])
+
+
+def seen(xyz: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where points (N, 3) are in both images of a rig with a fault, as OpenCV projects them."""
+    turn, left, right = values[:4], values[4:13], values[13:]
+    K = CAMERA.right_matrix.copy()
+    K[[0, 1], [0, 1]] /= 1.0 + turn[3]
+    there = (xyz - [CAMERA.baseline_m, 0.0, 0.0]) @ exp_so3(-turn[:3]).T
+    none = np.zeros(3)
+    return (
+        cv2.projectPoints(xyz, none, none, CAMERA.matrix, in_opencv(left))[0][:, 0],
+        cv2.projectPoints(there, none, none, K, in_opencv(right))[0][:, 0],
+    )
+
+
+def tracks(values: np.ndarray, seed: int) -> StereoTracks:
+    """Points on a street, seen from six poses by a rig with a fault."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(6.0, 60.0, POINTS)
+    aside, up = rng.uniform([[-0.7], [-0.2]], [[0.7], [0.2]], (2, POINTS)) * depth
+    xyz = np.column_stack([aside, up, depth])
+    step = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 1.0]))
+    poses = np.stack([np.linalg.matrix_power(step, k) for k in range(FRAMES)])
+    uvd, right_uv = (np.full((FRAMES, POINTS, size), np.nan) for size in (3, 2))
+    for k, T in enumerate(poses):
+        near = apply(invert(T), xyz)
+        left, right = (at + rng.normal(0.0, NOISE_PX, at.shape) for at in seen(near, values))
+        inside = ((left > 0) & (left < [CAMERA.width_px, CAMERA.height_px])).all(axis=1)
+        uvd[k, inside] = np.column_stack([left, left[:, 0] - right[:, 0]])[inside]
+        right_uv[k, inside] = right[inside]
+    start = xyz + rng.normal(0.0, 0.02, xyz.shape) * depth[:, None] * [0, 0, 1]
+    return StereoTracks(TrackWindow(poses, uvd, start), right_uv)
+
+
+def fitted(values: np.ndarray, first: int = 0, shown: np.ndarray = ALL) -> FittedFault:
+    return fit_fault([tracks(values, first + k) for k in range(WINDOWS)], FAULT, shown)
+
+
+def off_px(values: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Rows and disparities (N, 2) that a rig is off by when a fault was found in it."""
+    v, u = np.mgrid[20:350:8j, 150:1050:12j]
+    rays = np.stack([(u - CAMERA.cx_px) / 700, (v - CAMERA.cy_px) / 700, np.ones(u.shape)], -1)
+    xyz = 25.0 * rays.reshape(-1, 3)
+    places = FAULT.correct(*seen(xyz, values), found)
+    off = places.left_uv - places.right_uv
+    return np.column_stack([off[:, 1], off[:, 0] - project(xyz, CAMERA)[2]])
+
+
+def rms(off: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(off**2, axis=0))
+
+
+@pytest.mark.parametrize("values", [fault(yaw=1e-4), TURN, LENSES, TURN + LENSES])
+def test_places_are_where_a_rig_without_the_fault_sees_them(values: np.ndarray) -> None:
+    assert rms(off_px(values, NONE)).max() > 0.05
+    assert np.abs(off_px(values, values)).max() < 0.01
+
+
+def test_places_follow_the_fault_as_its_derivatives_say() -> None:
+    rng, step = np.random.default_rng(0), 1e-6
+    left, right = rng.uniform(0, [CAMERA.width_px, CAMERA.height_px], (2, 50, 2))
+    at = FAULT.correct(left, right, NONE)
+    np.testing.assert_allclose(at.left_uv, left, atol=1e-9)
+    np.testing.assert_allclose(at.right_uv, right, atol=1e-9)
+    for k, one in enumerate(step * np.eye(len(NAMES))):
+        ahead, behind = FAULT.correct(left, right, one), FAULT.correct(left, right, -one)
+        for there, back, derivative in (
+            (ahead.left_uv, behind.left_uv, at.by_left),
+            (ahead.right_uv, behind.right_uv, at.by_right),
+        ):
+            # Of hundreds of pixels per radian.
+            np.testing.assert_allclose((there - back) / (2 * step), derivative[..., k], atol=1e-2)
+
+
+@cache
+def raw_rig() -> StereoCalibration:
+    """A rig as it comes from a calibration: lenses with distortion, cameras a little askew."""
+    K = np.array([[400.0, 0.0, 318.0], [0.0, 401.0, 242.0], [0.0, 0.0, 1.0]])
+    lenses = (
+        CameraIntrinsics(K, np.array([-0.1, 0.02, 1e-3, -5e-4, 1e-3]), 640, 480),
+        CameraIntrinsics(K + np.diag([3.0, 3.0, 0.0]), np.array([-0.11, 0.03, 0, 1e-3]), 640, 480),
+    )
+    R = exp_so3(np.array([0.01, -0.02, 0.015]))
+    return StereoCalibration(*lenses, make_transform(R, R @ np.array([-0.2, 0.004, -0.003])))
+
+
+@pytest.mark.parametrize("rig", [CAMERA, raw_rig()], ids=["rectified", "raw"])
+@pytest.mark.parametrize(
+    "values", [fault(yaw=2e-3), fault(pitch=2e-3, roll=-2e-3), LENSES, LENSES + TURN]
+)
+def test_the_calibration_without_a_fault_sees_what_is_left_of_it(
+    rig: Rig, values: np.ndarray
+) -> None:
+    turns, depth_m = turns_of(rig, SETTINGS), 10.0
+    camera = turns.camera
+    refined = without_fault(rig, turns, values)
+    assert refined.baseline_m == pytest.approx(camera.baseline_m, rel=1e-9)
+    change = compare_rigs(rig, refined, depth_m, SETTINGS)
+    rows, columns = change.off_px.shape
+    v, u = np.mgrid[0 : camera.height_px - 1 : rows * 1j, 0 : camera.width_px - 1 : columns * 1j]
+    uv = np.stack([u, v], axis=-1)
+    disparity_px = camera.focal_px * camera.baseline_m / depth_m
+    right_uv = uv - [disparity_px - camera.doffs_px, 0.0]
+    places = RigFault(camera).correct(uv, right_uv, values)
+    off = right_uv - uv + places.left_uv - places.right_uv
+    both = np.stack([off[..., 0], places.left_uv[..., 1] - places.right_uv[..., 1]])
+    found = np.stack([-change.off_px, change.rows_px])
+    shown = np.isfinite(found)
+    assert shown.mean() > 0.9
+    assert rms(both[shown]) > 0.2
+    # Both views turn by half of what the right camera does: second order, at the borders.
+    assert rms((found - both)[shown]) < 0.04 * rms(both[shown])
+
+
+def test_a_refined_rig_projects_points_to_where_they_were_seen() -> None:
+    refined = without_fault(CAMERA, turns_of(CAMERA, SETTINGS), TURN + LENSES)
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform([-0.8, -0.25, 1.0], [0.8, 0.25, 1.0], (100, 3)) * 20.0
+    left, right = seen(xyz, TURN + LENSES)
+    np.testing.assert_allclose(project_raw(refined.left, xyz), left, atol=0.02)
+    np.testing.assert_allclose(
+        project_raw(refined.right, apply(refined.T_right_left, xyz)), right, atol=0.02
+    )
+
+
+@pytest.mark.parametrize(
+    "values", [fault(pitch=2e-3), fault(yaw=1e-3), fault(zoom=2e-3), TURN],
+    ids=["pitch", "yaw", "zoom", "all"],
+)  # fmt: skip
+def test_a_turn_of_the_right_camera_is_recovered(values: np.ndarray) -> None:
+    found = fitted(values)
+    assert rms(off_px(values, found.values)).max() < 0.1 * rms(off_px(values, NONE)).max()
+    # Where lenses cannot bend, the turn is all there is: 5e-5 rad are 0.035 px.
+    turned = fitted(values, shown=np.arange(len(NAMES)) < 4)
+    np.testing.assert_allclose(turned.values, values, atol=5e-5)
+    assert not turned.covariance[4:].any()
+
+
+def test_rows_meet_and_disparities_fit_with_the_lenses_that_are_found() -> None:
+    found = fitted(LENSES)
+    before, after = rms(off_px(LENSES, NONE)), rms(off_px(LENSES, found.values))
+    assert (before > [0.35, 0.45]).all()
+    assert (after < [0.05, 0.15]).all()
+    assert found.windows == WINDOWS
+    assert 1.0 <= found.scatter < 2.0
+
+
+def test_nothing_is_invented_and_intervals_hold() -> None:
+    drives = [fitted(NONE, 100 * n) for n in range(6)]
+    assert max(rms(off_px(NONE, drive.values)).max() for drive in drives) < 0.05
+    assert all((np.linalg.eigvalsh(drive.covariance) > 0).all() for drive in drives)
+
+
+def test_directions_that_a_drive_shows_well_stay_and_others_become_zero() -> None:
+    sigmas = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
+    H = np.diag([1e6, 1e6, 1.0, 100.0, 0.0])
+    values = np.array([0.5, -1.0, 0.9, 0.3, 0.7])
+    found = shrink(values, H, sigmas)
+    np.testing.assert_allclose(found[:2], values[:2], rtol=1e-4)
+    # 1.8 of its standard deviations, 3.03 of them, and one of which the drive says nothing.
+    assert found[2] == found[4] == 0.0
+    assert found[3] == pytest.approx(0.3 * (1 - 4 / 3.03**2), rel=1e-6)
+    assert not shrink(np.zeros(5), H, sigmas).any()
+    # Two parameters of which only the sum is known share what is shown of it.
+    both = shrink(np.array([0.2, 0.2]), 1e6 * np.ones((2, 2)), np.ones(2))
+    np.testing.assert_allclose(both, 0.2, rtol=1e-4)
+
+
+def with_lens(**changes: object) -> StereoCalibration:
+    rig = raw_rig()
+    return replace(rig, right=replace(rig.right, **changes))
+
+
+@pytest.mark.parametrize(
+    ("rig", "bends"),
+    [
+        (CAMERA, True),
+        (raw_rig(), True),
+        (with_lens(distortion=in_opencv(1e-3 * np.ones(len(LENS)))), True),
+        (with_lens(distortion=np.array([-0.1, 0.02, 0, 0, 0, 0.1, 0, 0])), False),
+        (with_lens(distortion=np.array([-0.1, 0.02, 0, 0]), model="fisheye"), False),
+    ],
+    ids=["rectified", "plain", "prisms", "rational", "fisheye"],
+)
+def test_lenses_of_other_models_are_left_as_they_are(rig: Rig, *, bends: bool) -> None:
+    assert may_bend(rig) == bends
+    assert active(rig)[:4].all()
+    assert (active(rig)[4:] == bends).all()
+    if not bends:
+        refined = without_fault(rig, turns_of(rig, SETTINGS), TURN)
+        np.testing.assert_array_equal(refined.right.distortion, rig.right.distortion)
+        assert refined.left is rig.left
