@@ -7,6 +7,7 @@
 - `rig/`: the rig as the motion of a drive shows it, before the drive is mapped;
 - `checked.py`: poses that cannot be trusted are marked, by all patches of the image;
 - `health.py`: what that says of a drive, and how far its path may be off;
+- `rig/`: the rig as the motion of a drive shows it;
 - `kiss.py`: clouds registered over time, also in a finished map (`recon.map.localize`);
 - `prior.py`: what wheels or an inertial unit say; `prior_axes.py`: in which axes.
 """

@@ -4,4 +4,6 @@
 - `sample.py`: which frames are looked at, and the rows, swapped cameras and delays that they show;
   `measures.py`: what is measured in them;
 - `findings.py`: the problems found, with advice, and the verdict.
+
+What the motion shows of the rig is `recon.odometry.rig`.
 """
