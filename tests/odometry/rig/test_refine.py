@@ -1,0 +1,191 @@
+"""The rig of a rendered drive is refined where it is off, and only there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pytest
+
+from recon.commands.config import load_config
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import RectifiedCamera, Rig, StereoPair, Trajectory
+from recon.odometry.rig.refine import RefinedRig, RigChange, compare_rigs, refine_rig
+from recon.odometry.settings import RigSettings
+from recon.sources.live import LiveSource
+from recon.sources.source import SourcePart, StereoSource
+from recon.stereo.rectify.rectifier import turns_of
+from recon.stereo.rectify.row_alignment import correct_rig
+from recon.street.settings import StreetScene
+from tests.rig.audit import faults
+from tests.scenery.film import Film, film
+
+CONFIG = load_config()
+AUTO = RigSettings()
+FRAMES = 36  # as few as are refined
+
+
+@pytest.fixture(scope="module")
+def street() -> Film:
+    size = {"width_px": 400, "height_px": 136, "focal_px": 225.0, "smooth_edges": False}
+    return film(StreetScene(frames=FRAMES, seed=3, **size))
+
+
+def turned_rig(
+    camera: RectifiedCamera, yaw_deg: float = 0.0, enlarged: float = 1.0, pitch_deg: float = 0.0
+) -> Rig:
+    """The rig that takes the images of `faults.turned`."""
+    turn = np.array([*-np.radians([pitch_deg, yaw_deg, 0.0]), 1.0 / enlarged - 1.0])
+    return correct_rig(camera, turn, np.eye(3))
+
+
+def off(rig: Rig, other: Rig) -> RigChange:
+    return compare_rigs(rig, other, 10.0, CONFIG.rectification)
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "enlarged"),
+    [(0.25, 1.0), (-0.25, 1.005), (0.0, 0.995)],
+    ids=["yaw", "yaw and focal length", "focal length"],
+)
+def test_a_turned_right_camera_is_recovered_and_said(
+    street: Film, yaw_deg: float, enlarged: float
+) -> None:
+    source = faults.turned(street, yaw_deg=yaw_deg, enlarged=enlarged)
+    true = turned_rig(street.calibration, yaw_deg, enlarged)
+    planted = off(street.calibration, true)
+    rig = refine_rig(source, CONFIG, AUTO)
+    assert rig.refined
+    assert rig.calibration.baseline_m == pytest.approx(street.calibration.baseline_m, rel=1e-9)
+    left = off(true, rig.calibration)
+    # Noise, and what is shrunk of a turn that lenses may share: three standard deviations.
+    assert left.rms_px < 0.25 * planted.rms_px
+    assert abs(left.mean_px) < 3.0 * rig.sigma_px
+    assert rig.wrong_at(10.0)
+    assert not rig.wrong_at(0.5)
+    figures = json.loads(json.dumps(rig.figures(), allow_nan=False))
+    assert figures["yaw_deg"] == pytest.approx(-yaw_deg, abs=0.065)
+    assert figures["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.1)
+    (warning,) = rig.warnings()
+    assert "the rig is not as calibrated" in warning
+    assert "rig.refine=off" in warning
+    drive = rig.applied(source)
+    assert drive.calibration is rig.calibration
+    assert (len(drive), drive.name) == (len(source), source.name)
+
+
+def test_a_clean_street_keeps_its_calibration(street: Film) -> None:
+    rig = refine_rig(street, CONFIG, AUTO)
+    assert rig.fitted is not None
+    assert off(street.calibration, rig.calibration).rms_px <= 0.05
+    assert not rig.wrong_at(10.0)
+    assert rig.warnings() == []
+    assert rig.refined == (rig.calibration is not street.calibration)
+    if not rig.refined:
+        assert rig.applied(street) is street
+
+
+@pytest.mark.parametrize(
+    ("short", "live", "refine"),
+    [(True, False, "auto"), (False, True, "auto"), (False, False, "off")],
+    ids=["too short", "live", "off"],
+)
+def test_what_is_not_to_be_refined_is_not_read(
+    street: Film, *, short: bool, live: bool, refine: str
+) -> None:
+    def unread(_: int) -> StereoPair:
+        raise AssertionError
+
+    source: StereoSource = faults.Spoiled(street.calibration, FRAMES, unread)
+    source = SourcePart(source, 1, FRAMES) if short else source
+    source = LiveSource(source) if live else source
+    rig = refine_rig(source, CONFIG, RigSettings(refine=refine))
+    assert (rig.refined, rig.fitted, rig.figures()) == (False, None, {"refined": False})
+    assert (rig.warnings(), rig.wrong_at(10.0)) == ([], False)
+    assert rig.applied(source) is source
+
+
+def test_images_without_features_keep_the_calibration(street: Film) -> None:
+    rig = refine_rig(street.taken(slice(None), np.zeros_like), CONFIG, AUTO)
+    assert (rig.refined, rig.figures()) == (False, {"refined": False})
+
+
+def test_depth_behind_infinity_is_said_and_can_be_stored(street: Film) -> None:
+    camera = street.calibration
+    true = turned_rig(camera, yaw_deg=2.0)
+    changes = tuple(compare_rigs(camera, true, z, CONFIG.rectification) for z in (10.0, 30.0))
+    fitted = refine_rig(street, CONFIG, AUTO).fitted
+    rig = RefinedRig(camera, true, camera, fitted, changes=changes, sigma_px=0.1)
+    assert rig.depth_percent(changes[1]) == (np.inf, np.inf)
+    assert json.loads(json.dumps(rig.figures(), allow_nan=False))["depth_percent"]["30"] == {
+        "mean": None,
+        "sigma": None,
+    }
+    assert "behind infinity at 30 m" in rig.describe()
+    assert rig.wrong_at(10.0)
+    # Less than two standard deviations are no fault.
+    assert not replace(rig, sigma_px=10.0).wrong_at(10.0)
+
+
+def test_known_poses_are_those_of_the_refined_rig(street: Film) -> None:
+    camera = street.calibration
+    refined = turned_rig(camera, pitch_deg=1.0)
+    rig = RefinedRig(camera, refined, camera)
+    T = make_transform(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, 2.0, 3.0]))
+    given = Trajectory(np.stack([np.eye(4), T]), np.array([0.0, 0.1]))
+    found = rig.poses(given, CONFIG.rectification).T_world_camera
+    R = turns_of(refined, CONFIG.rectification).R_left
+    assert np.degrees(np.arccos((np.trace(R) - 1) / 2)) == pytest.approx(0.5, abs=0.01)
+    # The raw left camera is where it was.
+    np.testing.assert_allclose(found[:, :3, :3] @ R, given.T_world_camera[:, :3, :3], atol=1e-12)
+    np.testing.assert_array_equal(found[:, :3, 3], given.T_world_camera[:, :3, 3])
+
+
+class _Without(StereoSource):
+    def __len__(self) -> int:
+        return 0
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        return iter(())
+
+
+class Cached(_Without):
+    @cached_property
+    def calibration(self) -> Rig:
+        return GIVEN
+
+
+class Plain(_Without):
+    @property
+    def calibration(self) -> Rig:
+        return GIVEN
+
+
+@dataclass(frozen=True)
+class Frozen(_Without):
+    calibration: Rig
+
+
+class Own(_Without):
+    def __init__(self) -> None:
+        self.calibration = GIVEN
+
+
+GIVEN = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)
+
+
+@pytest.mark.parametrize("kind", [Cached, Plain, lambda: Frozen(GIVEN), Own])
+def test_a_source_of_any_kind_takes_another_calibration(kind) -> None:
+    source, other = kind(), replace(GIVEN, baseline_m=0.25)
+    assert source.calibration is GIVEN
+    changed = source.with_calibration(other)
+    assert changed.calibration is other
+    assert isinstance(changed, type(source))
+    assert changed.name == source.name
+    assert changed.with_calibration(GIVEN).calibration is GIVEN
+    assert changed.calibration is other
+    assert source.calibration is GIVEN
+    assert SourcePart(changed, 0, 0).calibration is other
