@@ -69,6 +69,10 @@ def test_a_turned_right_camera_is_recovered_and_said(
     figures = json.loads(json.dumps(rig.figures(), allow_nan=False))
     assert figures["yaw_deg"] == pytest.approx(-yaw_deg, abs=0.065)
     assert figures["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.1)
+    # Of all passes together: a rig that was far off is fitted twice.
+    yaw = figures["parameters"]["yaw"]
+    assert np.degrees(yaw["value"]) == pytest.approx(figures["yaw_deg"], abs=1e-9)
+    assert 0.0 < yaw["sigma"] < yaw["prior"]
     (warning,) = rig.warnings()
     assert "the rig is not as calibrated" in warning
     assert "rig.refine=off" in warning
