@@ -192,8 +192,8 @@ def test_rows_meet_and_disparities_fit_with_the_lenses_that_are_found() -> None:
     assert 1.0 <= found.scatter < 2.0
 
 
-def test_nothing_is_invented_and_intervals_hold() -> None:
-    drives = [fitted(NONE, 100 * n) for n in range(6)]
+def test_nothing_is_invented_by_noise() -> None:
+    drives = [fitted(NONE, 100 * n) for n in range(3)]
     assert max(rms(off_px(NONE, drive.values)).max() for drive in drives) < 0.05
     assert all((np.linalg.eigvalsh(drive.covariance) > 0).all() for drive in drives)
 

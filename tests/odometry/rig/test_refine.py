@@ -94,11 +94,11 @@ def test_a_clean_street_keeps_its_calibration(street: Film) -> None:
 
 @pytest.mark.parametrize(
     ("short", "live", "refine"),
-    [(True, False, "auto"), (False, True, "auto"), (False, False, "off")],
+    [(True, False, True), (False, True, True), (False, False, False)],
     ids=["too short", "live", "off"],
 )
 def test_what_is_not_to_be_refined_is_not_read(
-    street: Film, *, short: bool, live: bool, refine: str
+    street: Film, *, short: bool, live: bool, refine: bool
 ) -> None:
     def unread(_: int) -> StereoPair:
         raise AssertionError
@@ -112,8 +112,11 @@ def test_what_is_not_to_be_refined_is_not_read(
     assert rig.applied(source) is source
 
 
-def test_images_without_features_keep_the_calibration(street: Film) -> None:
-    rig = refine_rig(street.taken(slice(None), np.zeros_like), CONFIG, AUTO)
+@pytest.mark.parametrize("drive", ["black", "standing still"])
+def test_a_drive_that_shows_nothing_keeps_its_calibration(street: Film, drive: str) -> None:
+    black = street.taken(slice(None), np.zeros_like)
+    still = Film(FRAMES * street.pairs[:1], street.calibration, street.trajectory.T_world_camera)
+    rig = refine_rig({"black": black, "standing still": still}[drive], CONFIG, AUTO)
     assert (rig.refined, rig.figures()) == (False, {"refined": False})
 
 
