@@ -118,7 +118,7 @@ def ratios(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 def write_pair(folder: Path) -> list[str]:
     """Render a pair; returns the words of its command."""
-    pair = slanted_pair(CAMERA, 2.0, (0.1, -0.1), noise_dn=1.0).pair
+    pair = slanted_pair(CAMERA, 2.0, (0.1, -0.1)).pair
     for side in ("left", "right"):
         write_image(folder / f"{side}.png", getattr(pair, side))
     camera = ["--focal", str(CAMERA.focal_px), "--baseline", str(CAMERA.baseline_m)]

@@ -83,7 +83,8 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     camera = rectifier.camera
     sample = take_sample(source, rectifier, quick=quick)
     geometry = measure_geometry(sample, camera)
-    rig = None if quick else refine_rig(source, config, RigSettings())
+    readable = not quick and sample.broken is None
+    rig = refine_rig(source, config, RigSettings()) if readable else None
     measured = Measured(source, camera, sample, geometry, find_gaps(source), rig)
     findings = find_faults(measured, config, _reach_px(camera, config.matching))
     verdict, looks = verdict_of(findings), tuple(sample.looks)

@@ -131,7 +131,7 @@ def test_depth_behind_infinity_is_said_and_can_be_stored(street: Film) -> None:
         "mean": None,
         "sigma": None,
     }
-    assert "behind infinity at 30 m" in rig.describe()
+    assert "px rms over the image, depth by" in rig.describe(30.0)
     assert rig.wrong_at(10.0)
     # Less than two standard deviations are no fault.
     assert not replace(rig, sigma_px=10.0).wrong_at(10.0)
