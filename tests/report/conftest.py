@@ -113,7 +113,7 @@ def rig(pair: RectifiedPair) -> RefinedRig:
     off_px = np.linspace(-2.0, -1.0, 32).reshape(4, 8)
     off_px[0, 0] = np.nan
     changes = tuple(RigChange(z, off_px, np.full((4, 8), 0.25)) for z in DEPTHS_M)
-    return RefinedRig(camera, replace(camera), camera, fitted, values[:4], changes, 0.05)
+    return RefinedRig(camera, replace(camera), camera, fitted, changes, 0.05)
 
 
 @pytest.fixture

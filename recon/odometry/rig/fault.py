@@ -191,7 +191,7 @@ def shrink(values: Float64, H: Float64, sigmas: Float64) -> Float64:
     """Return parameters (P,) moved to 0 in directions that the drive does not show.
 
     Each direction, whitened by the prior, is shrunk by its own certainty: not at all where the
-    drive fixes it well, to 0 where it is within two of its standard deviations. ``H`` (P, P) is the
+    drive fixes it well, to 0 where it is within its standard deviation. ``H`` (P, P) is the
     information of the drive, ``sigmas`` (P,) those of the prior.
 
     Ref: Breiman, "Better subset regression using the nonnegative garrote", 1995.
@@ -199,16 +199,10 @@ def shrink(values: Float64, H: Float64, sigmas: Float64) -> Float64:
     D, V = np.linalg.eigh(sigmas[:, None] * H * sigmas)
     D = np.maximum(D, 0.0)
     z = V.T @ (values / sigmas)
-    # What the drive alone says is z (1 + D) / D, with a variance of 1 / D.
-    certain = z * (1.0 + D) * np.divide(1.0, np.sqrt(D), where=D > 0, out=np.zeros_like(D))
-    kept = np.maximum(
-        0.0,
-        1.0 - np.divide(_TELLING**2, certain**2, where=certain != 0.0, out=np.full_like(D, np.inf)),
-    )
-    return np.asarray(sigmas * (V @ (kept * z)))
-
-
-_TELLING: Final = 2.0  # standard deviations within which a direction counts as not shown
+    # What the drive alone says is z (1 + D) / D, with a variance of 1 / D: its share by chance.
+    shown = (D > 0.0) & (z != 0.0)
+    chance = np.divide(D, (z * (1.0 + D)) ** 2, where=shown, out=np.ones_like(D))
+    return np.asarray(sigmas * (V @ (np.maximum(0.0, 1.0 - chance) * z)))
 
 
 def active(rig: Rig) -> Bool:

@@ -201,12 +201,12 @@ def test_nothing_is_invented_by_noise() -> None:
 def test_directions_that_a_drive_shows_well_stay_and_others_become_zero() -> None:
     sigmas = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
     H = np.diag([1e6, 1e6, 1.0, 100.0, 0.0])
-    values = np.array([0.5, -1.0, 0.9, 0.3, 0.7])
+    values = np.array([0.5, -1.0, 0.4, 0.3, 0.7])
     found = shrink(values, H, sigmas)
     np.testing.assert_allclose(found[:2], values[:2], rtol=1e-4)
-    # 1.8 of its standard deviations, 3.03 of them, and one of which the drive says nothing.
+    # 0.8 of its standard deviations, 3.03 of them, and one of which the drive says nothing.
     assert found[2] == found[4] == 0.0
-    assert found[3] == pytest.approx(0.3 * (1 - 4 / 3.03**2), rel=1e-6)
+    assert found[3] == pytest.approx(0.3 * (1 - 1 / 3.03**2), rel=1e-6)
     assert not shrink(np.zeros(5), H, sigmas).any()
     # Two parameters of which only the sum is known share what is shown of it.
     both = shrink(np.array([0.2, 0.2]), 1e6 * np.ones((2, 2)), np.ones(2))

