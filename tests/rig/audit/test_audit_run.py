@@ -128,7 +128,7 @@ def test_a_turn_that_only_motion_shows_is_mended(
     assert "rig" in {finding.code for finding in before.findings}
     found = correct_calibration(spoiled, CONFIG, before, tmp_path / "mended.yaml")
     assert found["yaw_deg"] == pytest.approx(-yaw_deg, rel=0.25)
-    assert found["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.1)
+    assert found["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.15)
     mended = read_calibration(tmp_path / "mended.yaml", 400, 136)
     after = audit_source(replace(spoiled, camera=mended), CONFIG)
     assert after.findings == ()
