@@ -16,7 +16,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.kernels import bundle
 from recon.odometry.rig.fault import Places, RigFault, shrink
-from recon.odometry.rig.tracks import StereoTracks
+from recon.odometry.rig.tracks import THREADS, StereoTracks
 from recon.odometry.window import (
     CAUCHY_SIGMAS,
     SIGMA_D_PX,
@@ -26,6 +26,7 @@ from recon.odometry.window import (
     normal_equations,
     weighted,
 )
+from recon.run.threads import serial_algebra, side_by_side
 
 _ROUNDS: Final = 8  # times that all windows are adjusted, without the fault as known by then
 _ROUNDING: Final = 1e-9  # share of the best known direction below which one is not known at all
@@ -56,14 +57,19 @@ def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> 
     prior, scatter = np.diag(1.0 / sigmas**2), 1.0
     values, windows = np.zeros(len(active)), [part.window for part in tracks]
     tried, stepped = list[Float64](), list[Float64]()
+
+    def linearised(part: StereoTracks, window: TrackWindow) -> tuple[TrackWindow, _System]:
+        places = fault.correct(part.window.uvd[..., :2], part.right_uv, values)
+        window = adjust(_seen(window, part, places), fault.camera)
+        return window, _system(window, places, fault.camera)
+
     for _ in range(_ROUNDS):
-        systems: list[_System] = []
-        for k, part in enumerate(tracks):
-            places = fault.correct(part.window.uvd[..., :2], part.right_uv, values)
-            windows[k] = adjust(_seen(windows[k], part, places), fault.camera)
-            systems.append(_system(windows[k], places, fault.camera))
-        H = np.stack([system.H for system in systems])[:, active][:, :, active]
-        g = np.stack([system.g for system in systems])[:, active]
+        with serial_algebra():
+            each = zip(tracks, windows, strict=True)
+            found = list(side_by_side(lambda pair: linearised(*pair), each, threads=THREADS))
+        windows = [window for window, _ in found]
+        H = np.stack([system.H for _, system in found])[:, active][:, :, active]
+        g = np.stack([system.g for _, system in found])[:, active]
         total = _information(H.sum(axis=0), sigmas)
         step = np.linalg.solve(
             total / scatter + prior, g.sum(axis=0) / scatter - prior @ values[active]

@@ -20,6 +20,7 @@ from recon.run.threads import serial_algebra, side_by_side
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
+THREADS: Final = min(2, available_cores())  # that windows are worked on in; results are the same
 FRAMES: Final = 6  # frames in a window
 _MIN_FRAMES: Final = 4  # windows of fewer frames, after a loss, are left out
 _LEAST_MOTION: Final = 0.1  # in baselines; a window that moves less shows no depth by its motion
@@ -60,9 +61,8 @@ def track_stretches(
         matched = (reconstructor.match_roughly(pair) for pair in pairs)
         return list(stereo_tracks(OdometryFrame(*found) for found in matched))
 
-    threads = min(2, available_cores())
     with serial_algebra():
-        found = side_by_side(tracked, plan_stretches(len(source)), threads=threads)
+        found = side_by_side(tracked, plan_stretches(len(source)), threads=THREADS)
         return tuple(window for stretch in found for window in stretch)
 
 
