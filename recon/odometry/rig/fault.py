@@ -159,6 +159,13 @@ def without_fault(rig: Rig, turns: RectifyingTurns, values: Float64) -> StereoCa
     return replace(turned, left=left, right=right)
 
 
+def spread_pixels(camera: CameraIntrinsics | RectifiedCamera, counts: tuple[int, int]) -> Float64:
+    """Return places all over an image, so many across and down: float64 (down, across, 2)."""
+    sizes = (camera.width_px, camera.height_px)
+    places = (np.linspace(0, size - 1, count) for size, count in zip(sizes, counts, strict=True))
+    return np.stack(np.meshgrid(*places), axis=-1)
+
+
 def _relensed(
     before: CameraIntrinsics, after: CameraIntrinsics, R: Float64, terms: Float64
 ) -> CameraIntrinsics:
@@ -168,11 +175,7 @@ def _relensed(
     """
     if not terms.any():
         return after
-    columns, rows = (
-        np.linspace(0, size - 1, count)
-        for size, count in zip((before.width_px, before.height_px), _GRID, strict=True)
-    )
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    pixels = spread_pixels(before, _GRID).reshape(-1, 2)
     zoom = before.matrix[0, 0] / after.matrix[0, 0]
     level = rays_of(before, pixels) @ R.T
     known = level[:, 2] > 0

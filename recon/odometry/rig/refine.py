@@ -10,7 +10,6 @@ ECMR 2021.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
-from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, without_fault
+from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.tracks import FRAMES, plan_stretches, track_stretches
 from recon.odometry.settings import RigSettings
@@ -61,6 +60,15 @@ class RigChange:
     @property
     def rms_px(self) -> float:
         return float(np.sqrt(np.nanmean(self.off_px**2)))
+
+    @property
+    def rows_rms_px(self) -> float:
+        return float(np.sqrt(np.nanmean(self.rows_px**2)))
+
+    @property
+    def moved_px(self) -> float:
+        """By how far features of the right image move against the left one, root mean square."""
+        return float(np.hypot(self.rms_px, self.rows_rms_px))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +142,7 @@ class RefinedRig:
                 "sigma": self.sigma_px,
                 "rms": self.changes[-1].rms_px,
             },
-            "rows_px": float(np.sqrt(np.nanmean(self.changes[-1].rows_px ** 2))),
+            "rows_px": self.changes[-1].rows_rms_px,
             "depth_percent": {
                 f"{change.depth_m:g}": {"mean": mean, "sigma": sigma}
                 for change, (mean, sigma) in zip(self.changes, percent, strict=True)
@@ -185,18 +193,15 @@ def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -
         camera = reconstructor.camera
         fitted = fit_fault(tracks, RigFault(camera), active(refined))
         values += fitted.values
-        before, refined = (
-            refined,
-            without_fault(refined, turns_of(refined, config.rectification), fitted.values),
-        )
+        before, turns = refined, turns_of(refined, config.rectification)
+        refined = without_fault(before, turns, fitted.values)
         change = compare_rigs(before, refined, DEPTHS_M[-1], config.rectification)
-        if np.hypot(change.rms_px, np.sqrt(np.nanmean(change.rows_px**2))) < _FAR_OFF_PX:
+        if change.moved_px < _FAR_OFF_PX:
             break
     changes = tuple(compare_rigs(given, refined, z, config.rectification) for z in DEPTHS_M)
-    moved_px = np.hypot(changes[-1].rms_px, np.sqrt(np.nanmean(changes[-1].rows_px ** 2)))
     return RefinedRig(
         given,
-        refined if moved_px > _LEAST_PX else given,
+        refined if changes[-1].moved_px > _LEAST_PX else given,
         start.camera,
         replace(fitted, values=values),
         changes,
@@ -211,11 +216,7 @@ def compare_rigs(
     turns, now = turns_of(given, settings), turns_of(refined, settings)
     raw, raw_now = as_raw(given), as_raw(refined)
     camera, camera_now = turns.camera, now.camera
-    columns, rows = (
-        np.linspace(0, size - 1, count)
-        for size, count in zip((camera.width_px, camera.height_px), _FIELD, strict=True)
-    )
-    uv = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    uv = spread_pixels(camera, _FIELD).reshape(-1, 2)
     disparity_px = camera.focal_px * camera.baseline_m / depth_m
     right_uv = uv - [disparity_px - camera.doffs_px, 0.0]
     pixels = [
@@ -232,39 +233,28 @@ def compare_rigs(
     right = now.place(raw_now, pixels[1], right=True)
     scale = (camera.focal_px * camera.baseline_m) / (camera_now.focal_px * camera_now.baseline_m)
     seen_px = scale * (left[:, 0] - right[:, 0] + camera_now.doffs_px)
-    shape = (len(rows), len(columns))
-    return RigChange(
-        depth_m,
-        (disparity_px - seen_px).reshape(shape),
-        (left[:, 1] - right[:, 1]).reshape(shape),
-    )
+    fields = (disparity_px - seen_px, left[:, 1] - right[:, 1])
+    off_px, rows_px = (field.reshape(_FIELD[::-1]) for field in fields)
+    return RigChange(depth_m, off_px, rows_px)
 
 
 def _with_rows_aligned(
     source: StereoSource, given: Rig, rectifier: Rectifier
 ) -> tuple[Rig, Float64]:
     """Return a rig whose rows meet well enough to be matched, and what turned its right camera."""
-    none = np.zeros(len(TURN))
-    found = []
-    for start, _ in plan_stretches(len(source))[::2]:
-        for pair in islice(source.frames(start), 1):
-            level = rectifier.rectify(pair)
-            found.append(match_features(level.left, level.right, _FEATURES))
-    features = pool_features(found)
+    starts = [start for start, _ in plan_stretches(len(source))[::2]]
+    pairs = [rectifier.rectify(next(source.frames(start))) for start in starts]
+    features = pool_features(match_features(p.left, p.right, _FEATURES) for p in pairs)
     alignment = align_rows(features.left_uv, features.right_uv, rectifier.camera)
     if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
-        return given, none
+        return given, np.zeros(len(TURN))
     R_left = turns_of(given, rectifier.settings).R_left
     return correct_rig(given, alignment.turn, R_left), alignment.turn
 
 
 def _mean_sigma(camera: RectifiedCamera, fitted: FittedFault) -> float:
     """Return the standard deviation of the mean disparity that the fault explains."""
-    columns, rows = (
-        np.linspace(0, size - 1, count)
-        for size, count in zip((camera.width_px, camera.height_px), _FIELD, strict=True)
-    )
-    uv = np.stack(np.meshgrid(columns, rows), axis=-1)
+    uv = spread_pixels(camera, _FIELD)
     right_uv = uv + np.array([camera.doffs_px, 0.0])
     places = RigFault(camera).correct(uv, right_uv, np.zeros(len(fitted.values)))
     by = (places.by_left - places.by_right)[..., 0, :].reshape(-1, len(fitted.values)).mean(axis=0)
