@@ -1,9 +1,6 @@
 """Fixtures shared by all tests: the real data, if available."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -20,7 +17,7 @@ hypothesis.settings.load_profile("recon")
 
 
 @pytest.fixture(scope="session")
-def recon_data() -> Path:
+def recon_data():
     """Folder of real data; the test is skipped where ``RECON_DATA`` does not name one."""
     folder = os.environ.get("RECON_DATA")
     if not folder:
@@ -32,7 +29,7 @@ def recon_data() -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def commands_built_once() -> Iterator[None]:
+def commands_built_once():
     """Let Typer build the tree of commands once, not at each call, where it is most of the time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typer.testing, "_get_command", cache(typer.testing._get_command))
@@ -40,7 +37,7 @@ def commands_built_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def blank_figures() -> Iterator[None]:
+def blank_figures():
     """Leave the figures of reports blank where nobody looks at them: a page takes seconds."""
     from tests.scenery.figures import leave_figures_blank
 

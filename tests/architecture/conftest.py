@@ -1,11 +1,8 @@
 """Fixtures for tests of the project's own files."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,19 +13,19 @@ else:
 
 
 @pytest.fixture(scope="session")
-def root() -> Path:
+def root():
     """Folder of the project."""
     return Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="session")
-def pyproject(root: Path) -> dict[str, Any]:
+def pyproject(root):
     """Content of pyproject.toml."""
     return tomllib.loads((root / "pyproject.toml").read_text())
 
 
 @pytest.fixture(scope="session")
-def trees(root: Path) -> dict[Path, ast.Module]:
+def trees(root):
     """The modules of the library, parsed."""
     modules = sorted((root / "recon").rglob("*.py"))
     return {path: ast.parse(path.read_text()) for path in modules}

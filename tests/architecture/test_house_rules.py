@@ -1,7 +1,5 @@
 """House rules of library, pages and benchmarks, and the linters themselves."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -9,7 +7,6 @@ import statistics
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,14 +23,12 @@ def _text_files(root: Path) -> list[Path]:
     return [path for path in files if path.suffix in TEXT and "__pycache__" not in path.parts]
 
 
-def test_every_module_says_what_it_is_and_is_no_drawer(trees: dict[Path, ast.Module]) -> None:
+def test_every_module_says_what_it_is_and_is_no_drawer(trees):
     assert [str(path) for path, tree in trees.items() if not ast.get_docstring(tree)] == []
     assert {name for path in trees for name in (path.stem, path.parent.name)} & NO_NAMES == set()
 
 
-def test_a_name_is_imported_from_the_file_that_defines_it(
-    trees: dict[Path, ast.Module], root: Path
-) -> None:
+def test_a_name_is_imported_from_the_file_that_defines_it(trees, root):
     gathering = {
         path.parent.relative_to(root).as_posix()
         for path, tree in trees.items()
@@ -44,7 +39,7 @@ def test_a_name_is_imported_from_the_file_that_defines_it(
     assert gathering - {"recon", "recon/cli"} == {"recon/core/values"}
 
 
-def test_files_are_short(root: Path) -> None:
+def test_files_are_short(root):
     lengths = {
         path.relative_to(root): len(path.read_text().splitlines())
         for path in _text_files(root)
@@ -53,7 +48,7 @@ def test_files_are_short(root: Path) -> None:
     assert {path: n for path, n in lengths.items() if n > MAX_LINES[path.parts[0] == "tests"]} == {}
 
 
-def test_functions_are_short(trees: dict[Path, ast.Module]) -> None:
+def test_functions_are_short(trees):
     """House style: half of all functions within 8 lines, 90 % within 30 (kernels apart)."""
     modules = [tree for path, tree in trees.items() if "kernels" not in path.parts]
     nodes = [node for tree in modules for node in ast.walk(tree)]
@@ -67,7 +62,7 @@ def _body_lines(function: ast.FunctionDef) -> int:
     return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
 
 
-def test_no_file_names_a_path_of_one_machine(root: Path) -> None:
+def test_no_file_names_a_path_of_one_machine(root):
     found = [
         f"{path.relative_to(root)}:{number}: {line.strip()}"
         for path in _text_files(root)
@@ -78,7 +73,7 @@ def test_no_file_names_a_path_of_one_machine(root: Path) -> None:
 
 
 @pytest.mark.parametrize("script", [".ci/run", "scripts/setup.sh"])
-def test_script_can_be_executed(script: str, root: Path) -> None:
+def test_script_can_be_executed(script, root):
     assert (root / script).stat().st_mode & 0o111
 
 
@@ -88,7 +83,7 @@ segment byte row face triangle voxel tile gap coefficient
 """
 
 
-def test_numbers_of_things_are_written_by_one_function(root: Path) -> None:
+def test_numbers_of_things_are_written_by_one_function(root):
     """So that none reads "1 frames"; constants, which are in capitals, are more than one."""
     plural = re.compile(
         rf"(\{{[^{{}}:]*[a-z][^{{}}:]*\}}+|%d) ({'|'.join(THINGS.split())})s\b(?! the)"
@@ -100,8 +95,8 @@ def test_numbers_of_things_are_written_by_one_function(root: Path) -> None:
 
 
 def test_the_page_of_the_architecture_names_what_is_there_in_the_order_that_is_enforced(
-    root: Path, pyproject: dict[str, Any]
-) -> None:
+    root, pyproject
+):
     page = (root / "docs" / "architecture.md").read_text()
     named = re.findall(r"`(recon/[\w/]+(?:\.py|/))`", page)
     assert len(named) > 20
@@ -113,7 +108,7 @@ def test_the_page_of_the_architecture_names_what_is_there_in_the_order_that_is_e
     assert ["__main__", *rooms] == layers
 
 
-def test_every_file_that_a_room_names_is_in_it(root: Path) -> None:
+def test_every_file_that_a_room_names_is_in_it(root):
     """The docstring of a room leads a reader to the files to begin with."""
     files = list((root / "recon").glob("*/**/__init__.py"))
     named = {f.parent: re.findall(r"`([\w/]+(?:\.py|/))`", f.read_text()) for f in files}
@@ -129,9 +124,7 @@ def test_every_file_that_a_room_names_is_in_it(root: Path) -> None:
     assert sum(map(len, named.values())) > 150
 
 
-def test_the_story_of_a_command_fits_on_a_screen_or_two(
-    trees: dict[Path, ast.Module], root: Path
-) -> None:
+def test_the_story_of_a_command_fits_on_a_screen_or_two(trees, root):
     lengths = {
         node.name: (node.end_lineno or 0) - node.lineno
         for path in (root / "recon" / "commands").glob("*.py")
@@ -142,7 +135,7 @@ def test_the_story_of_a_command_fits_on_a_screen_or_two(
     assert {name: lines for name, lines in lengths.items() if lines > 100} == {}
 
 
-def test_benchmarks_import_what_is_there(trees: dict[Path, ast.Module], root: Path) -> None:
+def test_benchmarks_import_what_is_there(trees, root):
     defined = {path: _defined(tree) for path, tree in trees.items()}
     missing = [
         f"{path.name}:{node.lineno} {node.module}.{name.name}"
@@ -157,9 +150,7 @@ def test_benchmarks_import_what_is_there(trees: dict[Path, ast.Module], root: Pa
 
 
 @pytest.mark.parametrize("child", [False, True])
-def test_a_benchmark_measures_the_checkout_that_it_stands_in(
-    root: Path, tmp_path: Path, child: bool
-) -> None:
+def test_a_benchmark_measures_the_checkout_that_it_stands_in(root, tmp_path, child):
     other = tmp_path / "other" / "recon"
     other.mkdir(parents=True)
     (other / "__init__.py").write_text("raise SystemExit('another recon was imported')")
@@ -179,7 +170,7 @@ def test_a_benchmark_measures_the_checkout_that_it_stands_in(
     assert (str(root / "recon" / "__init__.py") if child else "usage: map_store.py") in done.stdout
 
 
-def test_every_benchmark_says_first_what_is_measured(root: Path) -> None:
+def test_every_benchmark_says_first_what_is_measured(root):
     """What stands before the first import from the library decides from where that comes."""
     late = []
     for path in (root / "benchmarks").glob("*.py"):
@@ -210,7 +201,7 @@ COMMANDS = ("ruff check --output-format concise", "ruff format --check", "mypy",
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_static_check_passes(command: str, root: Path) -> None:
+def test_static_check_passes(command, root):
     program, *arguments = command.split()
     words = [str(Path(sys.executable).with_name(program)), *arguments]
     done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=False)

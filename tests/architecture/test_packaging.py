@@ -1,7 +1,5 @@
 """The package declares, installs, loads and exports exactly what it should."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re
@@ -9,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import packages_distributions
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,7 +24,7 @@ def _normal(name: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def imported(trees: dict[Path, ast.Module]) -> dict[str, set[str]]:
+def imported(trees):
     """Names of the libraries that are imported, with the names that they could be declared by."""
     names = set()
     for tree in trees.values():
@@ -51,9 +48,7 @@ def _extras(pyproject: dict[str, Any]) -> dict[str, list[str]]:
     return pyproject["project"]["optional-dependencies"]
 
 
-def test_what_is_imported_is_declared_and_pinned_and_nothing_else(
-    imported: dict[str, set[str]], pyproject: dict[str, Any], root: Path
-) -> None:
+def test_what_is_imported_is_declared_and_pinned_and_nothing_else(imported, pyproject, root):
     declared = _declared(pyproject)
     assert {name for name, providers in imported.items() if not declared & providers} == set()
     assert declared - set().union(*imported.values()) == set()
@@ -62,9 +57,7 @@ def test_what_is_imported_is_declared_and_pinned_and_nothing_else(
     assert declared | set(map(_normal, _extras(pyproject)["dev"])) <= pinned
 
 
-def test_every_optional_library_is_declared_by_the_extra_that_its_error_names(
-    trees: dict[Path, ast.Module], pyproject: dict[str, Any]
-) -> None:
+def test_every_optional_library_is_declared_by_the_extra_that_its_error_names(trees, pyproject):
     extras = _extras(pyproject)
     asked = {pair for tree in trees.values() for pair in _required(tree)}
     providers = packages_distributions()
@@ -90,7 +83,7 @@ def _required(tree: ast.Module) -> Iterator[tuple[str, str]]:
                 yield node.args[0].value.split(".")[0], name
 
 
-def test_kernels_need_no_linear_algebra_of_scipy(trees: dict[Path, ast.Module]) -> None:
+def test_kernels_need_no_linear_algebra_of_scipy(trees):
     found = [
         f"{path.name}:{node.lineno}"
         for path, tree in trees.items()
@@ -109,15 +102,15 @@ def _is_compiled(function: ast.FunctionDef) -> bool:
     return "kernel" in names
 
 
-def test_version_is_the_same_everywhere(root: Path, pyproject: dict[str, Any]) -> None:
+def test_version_is_the_same_everywhere(root, pyproject):
     version = pyproject["project"]["version"]
     assert recon.__version__ == version
     assert f"## [{version}]" in (root / "CHANGELOG.md").read_text()
 
 
 def test_doctor_looks_for_what_is_installed_and_runs_kernels_of_each_room_that_has_some(
-    root: Path, pyproject: dict[str, Any]
-) -> None:
+    root, pyproject
+):
     entry = re.compile(r"^ +(lib\S+\.so\S*?):(\S+)", re.MULTILINE)
     installed = dict(entry.findall((root / "scripts" / "setup.sh").read_text()))
     assert dict(SYSTEM_LIBRARIES) == installed
@@ -127,7 +120,7 @@ def test_doctor_looks_for_what_is_installed_and_runs_kernels_of_each_room_that_h
     assert set(SAMPLES) == {folder.parent.name for folder in (root / "recon").glob("*/kernels")}
 
 
-def test_public_names_are_exactly_the_documented_ones_and_explain_themselves(root: Path) -> None:
+def test_public_names_are_exactly_the_documented_ones_and_explain_themselves(root):
     lines = (root / "docs" / "api.md").read_text().splitlines()
     documented = {line.split("`")[1].split("(")[0] for line in lines if line.startswith("- `")}
     assert set(recon.__all__) == documented
@@ -148,7 +141,7 @@ def loaded(probe: str) -> set[str]:
     return set(done.stdout.rpartition("LOADED")[2].split())
 
 
-def test_help_loads_the_shells_and_neither_libraries_nor_numbers_nor_settings() -> None:
+def test_help_loads_the_shells_and_neither_libraries_nor_numbers_nor_settings():
     """What it takes is measured by `benchmarks/two_checkouts.py`; this is what makes it little."""
     found = loaded(
         "import contextlib, sys; sys.argv = ['recon', '--help']; from recon.cli import main\n"
@@ -161,11 +154,11 @@ def test_help_loads_the_shells_and_neither_libraries_nor_numbers_nor_settings() 
 
 # The second meshes, in a process for each tile of a surface.
 @pytest.mark.parametrize("module", ["recon", "recon.export.pymeshlab"])
-def test_imports_load_no_heavy_library(module: str) -> None:
+def test_imports_load_no_heavy_library(module):
     assert loaded(f"import {module}").isdisjoint(HEAVY)
 
 
-def test_doctor_loads_nothing_whose_lack_it_reports() -> None:
+def test_doctor_loads_nothing_whose_lack_it_reports():
     shell = {"typer", "rich", "typing_extensions"}  # without these there is no command line
     found = loaded("import recon.cli.getting_started, recon.commands.doctor")
     assert found & set(PACKAGES.values()) <= shell

@@ -1,7 +1,5 @@
 """`recon audit` on the command line: table, JSON, corrected calibration, one line for bad input."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +21,12 @@ FRAMES = 6
 
 
 @pytest.fixture(scope="module")
-def drive() -> Drive:
+def drive():
     return drives.rendered(FRAMES, width_px=400, height_px=136, focal_px=225.0, seed=5)
 
 
 @pytest.fixture(scope="module")
-def good(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good(drive, tmp_path_factory):
     return drives.write_kitti(*drive, tmp_path_factory.mktemp("good"))
 
 
@@ -42,7 +40,7 @@ def spoiled(drive: Drive, **turn_deg: float) -> Drive:
     return list(faults.turned(source, **turn_deg)), camera
 
 
-def test_a_good_drive_is_announced_measured_and_found_good(good: Path, tmp_path: Path) -> None:
+def test_a_good_drive_is_announced_measured_and_found_good(good, tmp_path):
     done = recon("audit", good, "--source", "kitti", "--verbose", "--out", tmp_path / "audited")
     assert done.exit_code == 0
     assert '"description": "KITTI odometry drive' in done.stderr
@@ -57,7 +55,7 @@ def test_a_good_drive_is_announced_measured_and_found_good(good: Path, tmp_path:
     assert summary["verdict"] == "good"
 
 
-def test_a_report_is_made_of_a_camera_that_shows_nothing(drive: Drive, tmp_path: Path) -> None:
+def test_a_report_is_made_of_a_camera_that_shows_nothing(drive, tmp_path):
     pairs, camera = drive
     dark = [replace(pair, right=pair.right * 0) for pair in pairs]
     folder = drives.write_kitti(dark, camera, tmp_path / "dark")
@@ -66,13 +64,13 @@ def test_a_report_is_made_of_a_camera_that_shows_nothing(drive: Drive, tmp_path:
     assert "shows nothing" in (tmp_path / "audited" / "report.html").read_text()
 
 
-def test_a_layout_that_is_named_and_not_there_is_refused(good: Path) -> None:
+def test_a_layout_that_is_named_and_not_there_is_refused(good):
     done = recon("audit", good, "--source", "euroc")
     assert done.exit_code == 1
     assert "cam0: folder of a camera is missing" in done.stderr
 
 
-def test_json_has_the_verdict_and_nothing_else_is_printed(drive: Drive, tmp_path: Path) -> None:
+def test_json_has_the_verdict_and_nothing_else_is_printed(drive, tmp_path):
     path = drives.write_kitti(*spoiled(drive, roll_deg=1.0), tmp_path)
     done = recon("audit", path, "--json", "--quiet")
     summary = json.loads(done.stdout)
@@ -85,9 +83,7 @@ def test_json_has_the_verdict_and_nothing_else_is_printed(drive: Drive, tmp_path
     assert set(summary["depth_error_m"]) == {"2", "5", "10", "20", "50"}
 
 
-def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(
-    drive: Drive, tmp_path: Path
-) -> None:
+def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(drive, tmp_path):
     path = drives.write_kitti(*spoiled(drive, pitch_deg=0.3), tmp_path / "drive")
     mended = tmp_path / "mended.yaml"
     told = recon("audit", path, "--mend", mended, "--json", "--quiet")
@@ -101,9 +97,7 @@ def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(
 
 
 @pytest.mark.slow
-def test_mapping_warns_of_rows_first_and_takes_the_mended_file(
-    drive: Drive, tmp_path: Path
-) -> None:
+def test_mapping_warns_of_rows_first_and_takes_the_mended_file(drive, tmp_path):
     path = drives.write_kitti(*spoiled(drive, pitch_deg=0.6), tmp_path / "drive")
     common = ("--no-mesh", "--json", "--set", "matching.matcher=opencv-bm")
     done = recon("map", path, *common, "--verbose", "--out", tmp_path / "bad")
@@ -120,7 +114,7 @@ def test_mapping_warns_of_rows_first_and_takes_the_mended_file(
     assert summary["points"] > json.loads(done.stdout)["points"]
 
 
-def test_images_of_another_size_are_refused_in_one_line(drive: Drive, tmp_path: Path) -> None:
+def test_images_of_another_size_are_refused_in_one_line(drive, tmp_path):
     pairs, camera = drive
     half = [replace(p, left=p.left[::2, ::2].copy(), right=p.right[::2, ::2].copy()) for p in pairs]
     done = recon("audit", drives.write_euroc(half, camera, tmp_path))

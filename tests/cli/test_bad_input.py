@@ -1,7 +1,5 @@
 """Bad input gets one clear line, exit code 1, and leaves nothing behind."""
 
-from __future__ import annotations
-
 import io
 import shutil
 from collections.abc import Callable
@@ -21,7 +19,7 @@ from tests.scenery.kitti import write_kitti
 
 
 @pytest.fixture(scope="module")
-def good_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good_drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drive")
     size = {"width_px": 128, "height_px": 64, "focal_px": 72.0}
     write_kitti(SyntheticSource(StreetScene(frames=3, smooth_edges=False, **size)), folder)
@@ -29,7 +27,7 @@ def good_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def drive(good_drive: Path, tmp_path: Path) -> Path:
+def drive(good_drive, tmp_path):
     return Path(shutil.copytree(good_drive, tmp_path / "drive"))
 
 
@@ -71,20 +69,20 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_faulty_drive_is_refused(drive: Path, tmp_path: Path, fault: str) -> None:
+def test_a_faulty_drive_is_refused(drive, tmp_path, fault):
     spoil, word = FAULTS[fault]
     spoil(drive)
     assert_one_line(run("map", drive, "--out", tmp_path / "out", "--json"), word)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_process_that_refuses_a_drive_ends_with_one(drive: Path, tmp_path: Path) -> None:
+def test_a_process_that_refuses_a_drive_ends_with_one(drive, tmp_path):
     """The other tests run commands inside of this process."""
     lose_the_baseline(drive)
     assert_one_line(run_apart("map", drive, "--out", tmp_path / "out", "--json"), "baseline")
 
 
-def test_an_unwritable_output_folder_is_refused(drive: Path, tmp_path: Path) -> None:
+def test_an_unwritable_output_folder_is_refused(drive, tmp_path):
     (tmp_path / "file").write_text("no folder")
     done = run("map", drive, "--out", tmp_path / "file" / "out", "--json")
     assert_one_line(done, str(tmp_path / "file"))
@@ -105,16 +103,14 @@ def test_an_unwritable_output_folder_is_refused(drive: Path, tmp_path: Path) -> 
         ("--set=nonsense", "", "key=value"),
     ],
 )
-def test_wrong_poses_priors_and_settings_are_refused(
-    good_drive: Path, tmp_path: Path, option: str, content: str, word: str
-) -> None:
+def test_wrong_poses_priors_and_settings_are_refused(good_drive, tmp_path, option, content, word):
     (tmp_path / "given.txt").write_text(content)
     words = [option] if "=" in option else [option, tmp_path / "given.txt"]
     assert_one_line(run("map", good_drive, *words, "--out", tmp_path / "out", "--quiet"), word)
     assert not (tmp_path / "out").exists()
 
 
-def test_files_that_are_not_what_is_wanted_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_what_is_wanted_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "left.png"), np.zeros((40, 60), np.uint8))
     cv2.imwrite(str(tmp_path / "right.png"), np.zeros((40, 50), np.uint8))
     (tmp_path / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
@@ -138,13 +134,11 @@ def test_files_that_are_not_what_is_wanted_are_refused(tmp_path: Path) -> None:
         "board chess:9x6 --board chess:9x6", "batch", "batch map x --resume y", "piece plan 0",
     ],
 )  # fmt: skip
-def test_wrong_usage_exits_with_two(line: str) -> None:
+def test_wrong_usage_exits_with_two(line):
     assert run(*line.split()).code == 2
 
 
-def test_an_import_that_ctrl_c_stops_is_an_interruption_and_any_other_an_error(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_import_that_ctrl_c_stops_is_an_interruption_and_any_other_an_error(capsys):
     with pytest.raises(typer.Exit) as ended, one_line_errors():
         raise ImportError("initialization failed") from KeyboardInterrupt()
     assert (ended.value.exit_code, capsys.readouterr().err) == (130, "interrupted\n")
@@ -167,9 +161,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, stream: io.StringIO, *, quiet: bool) 
     return stream.getvalue().splitlines()
 
 
-def test_a_terminal_alone_is_told_once_that_kernels_are_compiled(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_terminal_alone_is_told_once_that_kernels_are_compiled(monkeypatch):
     (line,) = shown(monkeypatch, Terminal(), quiet=False)
     assert line.startswith("compiling kernels, once")
     assert shown(monkeypatch, Terminal(), quiet=True) == []

@@ -1,7 +1,5 @@
 """The command line: options name settings, help is whole, and settings are listed as they are."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re
@@ -59,7 +57,7 @@ def see(start: StartInMap = None, *, reading: DriveOptions, shared: Shared) -> N
         ("--memory-limit 1.5G", {"memory.limit_mb": 1500}),
     ],
 )
-def test_what_is_given_is_set(line: str, settings: dict[str, Any]) -> None:
+def test_what_is_given_is_set(line, settings):
     done = CliRunner().invoke(probe, line.split())
     assert done.exit_code == 0, done.output
     assert SEEN.pop() == load_config(None, [settings])
@@ -73,13 +71,13 @@ def test_what_is_given_is_set(line: str, settings: dict[str, Any]) -> None:
         ("--focal -1", "source.focal_px"),
     ],
 )
-def test_what_is_no_value_of_its_setting_is_refused(line: str, words: str) -> None:
+def test_what_is_no_value_of_its_setting_is_refused(line, words):
     done = CliRunner().invoke(probe, line.split())
     assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
     assert words in done.stderr
 
 
-def test_every_option_that_names_a_setting_names_one_that_there_is() -> None:
+def test_every_option_that_names_a_setting_names_one_that_there_is():
     commands = [one.callback for one in (*app.registered_commands, *evaluate.registered_commands)]
     options = [p for one in commands for p in inspect.signature(one or see).parameters.values()]
     marks = [mark for one in options for mark in getattr(one.annotation, "__metadata__", ())]
@@ -88,7 +86,7 @@ def test_every_option_that_names_a_setting_names_one_that_there_is() -> None:
     assert {*named} <= {*setting_names(ReconConfig)}
 
 
-def test_a_survey_is_positions_with_an_offset_and_a_system() -> None:
+def test_a_survey_is_positions_with_an_offset_and_a_system():
     positions = Path("gnss.txt")
     assert survey_of(None, None) is None
     assert survey_of(positions, None) == Survey(positions, (0.0, 0.0, 0.0), None)
@@ -102,7 +100,7 @@ def test_a_survey_is_positions_with_an_offset_and_a_system() -> None:
             survey_of(None, *half)
 
 
-def test_a_drive_begins_at_a_pose_or_a_frame() -> None:
+def test_a_drive_begins_at_a_pose_or_a_frame():
     assert read_start(None) == (None, None)
     assert read_start("7") == (None, 7)
     assert read_start("12.5,-3,90") == (StartPose(12.5, -3.0, 90.0), None)
@@ -128,7 +126,7 @@ every_command = pytest.mark.parametrize("words", sorted(command_names()), ids=" 
 
 
 @every_command
-def test_examples_are_of_that_command_and_use_options_that_it_has(words: tuple[str, ...]) -> None:
+def test_examples_are_of_that_command_and_use_options_that_it_has(words):
     examples = re.findall(r"^ {3}(recon .*\S) *$", help_of(*words), flags=re.MULTILINE)
     options = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", help_of(*words).split("Options")[-1]))
     assert examples
@@ -139,7 +137,7 @@ def test_examples_are_of_that_command_and_use_options_that_it_has(words: tuple[s
 
 
 @every_command
-def test_help_is_shown_whole_on_a_narrow_terminal(words: tuple[str, ...]) -> None:
+def test_help_is_shown_whole_on_a_narrow_terminal(words):
     """Square brackets are markup to rich, which drops what it does not know."""
     command: Any = typer.main.get_command(app)
     for word in words:
@@ -153,7 +151,7 @@ def test_help_is_shown_whole_on_a_narrow_terminal(words: tuple[str, ...]) -> Non
     assert {"--json", "--quiet"} <= {name for one in command.params for name in one.opts}
 
 
-def test_help_has_the_groups_of_commands_and_every_product() -> None:
+def test_help_has_the_groups_of_commands_and_every_product():
     for title in ("Getting started", "Reconstruction", "Cameras", "Evaluation"):
         assert title in help_of()
     assert all(name in help_of("export") for name in PRODUCTS)
@@ -167,7 +165,7 @@ def entries(name: str | None = None) -> dict[str, SettingEntry]:
     return {entry.name: entry for group in list_settings(name) for entry in group.settings}
 
 
-def test_every_setting_is_listed_once_with_what_it_does_and_a_default_that_can_be_set() -> None:
+def test_every_setting_is_listed_once_with_what_it_does_and_a_default_that_can_be_set():
     named, pair = {*setting_names(ReconConfig)}, load_config(defaults=PAIR_DEFAULTS)
     groups = {name for name in named if any(other.startswith(f"{name}.") for other in named)}
     assert {*entries()} == named - groups
@@ -179,13 +177,13 @@ def test_every_setting_is_listed_once_with_what_it_does_and_a_default_that_can_b
         assert load_config(None, [f"{name}={entry.default_pair}"], PAIR_DEFAULTS) == pair
 
 
-def test_the_page_of_the_documentation_is_up_to_date() -> None:
+def test_the_page_of_the_documentation_is_up_to_date():
     """If not: recon settings --markdown > docs/settings.md."""
     page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
     assert settings("--markdown").stdout == page == settings_page(list_settings())
 
 
-def test_a_group_a_setting_or_a_part_of_a_name_selects() -> None:
+def test_a_group_a_setting_or_a_part_of_a_name_selects():
     assert all(name.startswith("matching.sgm.") for name in entries("matching.sgm"))
     assert [*entries("grid.min_height_m")] == ["grid.min_height_m"]
     assert {"fusion.voxel_m", "filters.voxel_m"} <= {*entries("voxel")}
@@ -197,7 +195,7 @@ def test_a_group_a_setting_or_a_part_of_a_name_selects() -> None:
     assert "did you mean grid.min_height_m" in failed.stderr
 
 
-def test_unit_values_and_other_defaults_of_a_pair_are_shown() -> None:
+def test_unit_values_and_other_defaults_of_a_pair_are_shown():
     entry = entries("cloud.max_range_m")["cloud.max_range_m"]
     assert (entry.unit, entry.default_pair) == ("m", "none")
     assert entry.values.endswith("or none")

@@ -1,7 +1,5 @@
 """Command lines of jobs are those of the program, and stay in their folder."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,7 +32,7 @@ def line(folder: Path = ROOT, /, **changes: Any) -> list[str]:
     return job.command_line(Path("out"))
 
 
-def test_a_command_line_has_what_the_job_says_and_limits_are_needs_of_a_worker() -> None:
+def test_a_command_line_has_what_the_job_says_and_limits_are_needs_of_a_worker():
     changes = {"options": ["--no-mesh"], "set": ["matching.sad.window_px=9"]}
     limits = {"threads": 2, "memory": "4G", "timeout_s": 5.0, "retries": 0}
     (job,) = plan({**DRIVE, **changes, **limits})
@@ -62,9 +60,7 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_command_line_of_a_job_is_one_of_the_program_and_names_no_other_output(
-    command: str,
-) -> None:
+def test_the_command_line_of_a_job_is_one_of_the_program_and_names_no_other_output(command):
     options = ["--map", "run"] if command == "localize" else []
     words = line(command=command, source=["x"] * SOURCES.get(command, 1), options=options)
     name = command.split()
@@ -77,7 +73,7 @@ def test_the_command_line_of_a_job_is_one_of_the_program_and_names_no_other_outp
     assert paths - INPUTS <= _NOT_OPTIONS
 
 
-def test_the_folder_of_a_scene_is_a_pair_with_calibration_and_truth(tmp_path: Path) -> None:
+def test_the_folder_of_a_scene_is_a_pair_with_calibration_and_truth(tmp_path):
     for name in ("im0.png", "im1.png", "calib.txt", "disp0GT.pfm"):
         (tmp_path / name).touch()
     words = line(tmp_path, command="pair", source=[str(tmp_path)])
@@ -89,7 +85,7 @@ def test_the_folder_of_a_scene_is_a_pair_with_calibration_and_truth(tmp_path: Pa
     assert words[:3] == ["pair", f"{tmp_path}/nowhere/im0.png", f"{tmp_path}/nowhere/im1.png"]
 
 
-def test_what_was_begun_is_resumed_with_its_limits(tmp_path: Path) -> None:
+def test_what_was_begun_is_resumed_with_its_limits(tmp_path):
     (job,) = plan({**DRIVE, "threads": 3, "memory": "2G"})
     assert job.command_line(tmp_path, resume=True) == [
         "map", "--resume", str(tmp_path), "--threads", "3", "--memory-limit", "2G", "--json",
@@ -102,7 +98,7 @@ def test_what_was_begun_is_resumed_with_its_limits(tmp_path: Path) -> None:
     assert resumed == [*words, "--resume", str(tmp_path / "3")]
 
 
-def test_a_sweep_spreads_every_job_over_every_combination() -> None:
+def test_a_sweep_spreads_every_job_over_every_combination():
     sweep = {"matching__sad__window_px": [9, 11], "matching__matcher": ["sad", "sgm"]}
     jobs = plan(DRIVE, {**DRIVE, "name": "b"}, **sweep)
     assert len(jobs) == 8
@@ -115,7 +111,7 @@ def test_a_sweep_spreads_every_job_over_every_combination() -> None:
     assert jobs[7].swept == {"matching.sad.window_px": 11, "matching.matcher": "sgm"}
 
 
-def test_of_a_large_sweep_each_value_is_checked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_a_large_sweep_each_value_is_checked_once(monkeypatch):
     checked: list[Any] = []
     load = config.load_config
     monkeypatch.setattr(config, "load_config", lambda *words: checked.append(words) or load(*words))
@@ -125,7 +121,7 @@ def test_of_a_large_sweep_each_value_is_checked_once(monkeypatch: pytest.MonkeyP
     assert len(checked) == 5 + 600 - 1
 
 
-def test_a_wrong_value_of_a_sweep_is_refused() -> None:
+def test_a_wrong_value_of_a_sweep_is_refused():
     with pytest.raises(SettingsError, match=r"job a: .*matching\.sad\.window_px"):
         plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
 
@@ -167,13 +163,13 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "words"), REFUSED)
-def test_jobs_that_are_none_are_one_line(changes: dict[str, Any], words: str) -> None:
+def test_jobs_that_are_none_are_one_line(changes, words):
     with pytest.raises(SettingsError, match=words) as told:
         line(**changes)
     assert "\n" not in str(told.value)
 
 
-def test_no_help_loses_words_in_brackets_to_the_markup() -> None:
+def test_no_help_loses_words_in_brackets_to_the_markup():
     texts = [each.callback.__doc__ or "" for each in app.registered_commands if each.callback]
     assert "recon\\[cluster]" in "".join(texts)
     assert [text for text in texts if re.search(r"(?<!\\)\[[a-z]+\]", text)] == []
@@ -183,9 +179,7 @@ def job(name: str, state: str = "succeeded", **more: Any) -> dict[str, Any]:
     return {"name": name, "state": state, "tries": 1, "seconds": 12.34, "figures": {}, **more}
 
 
-def test_the_table_has_the_accuracy_of_each_command(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_table_has_the_accuracy_of_each_command(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     jobs = [
         job("drive_window=9", figures={"trajectory.t_rel_percent": 0.512345, "points": 7.0}),
@@ -202,7 +196,7 @@ def test_the_table_has_the_accuracy_of_each_command(
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_of_very_many_jobs_the_first_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_very_many_jobs_the_first_are_printed(capsys):
     print_batch({"jobs": [job(f"j{n}") for n in range(1000)], "out": "outputs/week"})
     out = capsys.readouterr().out
     assert "j199 " in out

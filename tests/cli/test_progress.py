@@ -1,7 +1,5 @@
 """What is shown of a run: a bar on a terminal, JSON lines for programs, a line per source."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -19,7 +17,7 @@ from recon.map.localize.sequence import LocalizedFrame
 from recon.odometry.protocol import OdometryHealth
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult
-from recon.run.progress import Progress, Silent, Step
+from recon.run.progress import Progress, Silent
 from recon.sources.datasets import _Megabyte
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
@@ -50,7 +48,7 @@ def lines(stream: io.StringIO) -> list[dict[str, Any]]:
     return [json.loads(line) for line in stream.getvalue().splitlines()]
 
 
-def test_every_event_is_one_json_line_with_null_for_nan() -> None:
+def test_every_event_is_one_json_line_with_null_for_nan():
     stream = io.StringIO()
     run(JsonLines(stream))
     JsonLines(stream).on_step(frame(1, ok=False, valid_share=float("nan")))
@@ -61,7 +59,7 @@ def test_every_event_is_one_json_line_with_null_for_nan() -> None:
     assert (last["position_m"], last["notes"]) == ([0.0, 0.0, 0.0], ["a [bold] note"])
 
 
-def test_bar_shows_frames_rate_and_lost_poses() -> None:
+def test_bar_shows_frames_rate_and_lost_poses():
     stream = Terminal()
     run(ProgressBar(Console(file=stream, force_terminal=True, width=140)))
     shown = stream.getvalue()
@@ -73,7 +71,7 @@ def test_bar_shows_frames_rate_and_lost_poses() -> None:
     assert "mesh" in shown
 
 
-def test_bar_may_be_finished_twice_and_asked_before_its_start() -> None:
+def test_bar_may_be_finished_twice_and_asked_before_its_start():
     viewer = ProgressBar(Console(file=io.StringIO()))
     viewer.on_step(frame(0))
     viewer.on_finish()
@@ -81,9 +79,7 @@ def test_bar_may_be_finished_twice_and_asked_before_its_start() -> None:
     viewer.on_finish()
 
 
-def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose(capsys):
     assert isinstance(choose_viewer(stream=Terminal()), ProgressBar)
     assert isinstance(choose_viewer(stream=io.StringIO(), verbose=True), JsonLines)
     assert isinstance(choose_viewer(stream=io.StringIO()), Silent)
@@ -95,7 +91,7 @@ def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose(
     assert err
 
 
-def test_lines_of_scenes_have_the_seconds_of_each_matcher() -> None:
+def test_lines_of_scenes_have_the_seconds_of_each_matcher():
     stream = io.StringIO()
     JsonLines(stream).on_step(SceneDone("Piano", {"sad": {"seconds": 0.25}}, 0.5))
     JsonLines(stream).on_step(SceneDone("Pipes", None, 0.5))
@@ -128,9 +124,7 @@ JOB = JobResult(job("night"), Outcome("failed", "no images", 0.25))
         pytest.param([JOB, JOB], "pieces", "2 failed", id="pieces"),
     ],
 )
-def test_the_bar_fits_the_terminal_and_what_counts_is_never_cut(
-    steps: list[Step], unit: str, bad: str, name: str, width: int
-) -> None:
+def test_the_bar_fits_the_terminal_and_what_counts_is_never_cut(steps, unit, bad, name, width):
     stream = Terminal()
     bar = ProgressBar(Console(file=stream, force_terminal=True, width=width, color_system=None))
     bar.on_start(name, 1200, unit)
@@ -147,7 +141,7 @@ def test_the_bar_fits_the_terminal_and_what_counts_is_never_cut(
     assert " 70 " not in last or width == 80  # what has no room is left out whole
 
 
-def test_frames_that_are_searched_are_not_called_untrusted() -> None:
+def test_frames_that_are_searched_are_not_called_untrusted():
     stream = Terminal()
     bar = ProgressBar(Console(file=stream, force_terminal=True, width=140))
     bar.on_start("drive", 3)
@@ -167,7 +161,7 @@ def said(stream: io.StringIO, **how: bool) -> list[str]:
     return stream.getvalue().splitlines()
 
 
-def test_a_source_is_a_line_on_a_terminal_and_json_elsewhere_if_verbose() -> None:
+def test_a_source_is_a_line_on_a_terminal_and_json_elsewhere_if_verbose():
     first, *rest = said(Terminal())
     assert first == f"{SOURCE.name}: {SOURCE.description}, 3 pairs"
     assert rest == ["warning: zu dunkel für alles", "warning: too late"]

@@ -1,7 +1,5 @@
 """Rigs and their recordings: calibrate, rectify and capture."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -9,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +48,7 @@ def noisy(image: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarr
 
 
 @pytest.fixture(scope="session")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drawn(tmp_path_factory):
     """Nine views of a board through a true rig; the right image of one is without the board."""
     folder, rig = tmp_path_factory.mktemp("board"), board_rig()
     pictures = render_views(rig, BOARD, place_boards(rig, BOARD, 9, seed=2))
@@ -72,7 +69,7 @@ def calibrate(
 
 
 @pytest.fixture(scope="module")
-def run(drawn: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrationRun:
+def run(drawn, tmp_path_factory):
     """A calibration whose figures, files and report several tests look at."""
     return calibrate(drawn, tmp_path_factory.mktemp("calibrated"))
 
@@ -97,9 +94,7 @@ def assert_read_back(file: Path, run: CalibrationRun) -> None:
     assert Rectifier(read).camera.focal_px == pytest.approx(focal_px, rel=1e-6)
 
 
-def test_images_give_the_true_rig_which_comes_back_from_every_format(
-    run: CalibrationRun, tmp_path: Path
-) -> None:
+def test_images_give_the_true_rig_which_comes_back_from_every_format(run, tmp_path):
     written = json.loads((Path(run.summary["out"]) / "summary.json").read_text())
     assert written == json.loads(json.dumps(run.summary))
     assert_true_rig(run)
@@ -108,15 +103,13 @@ def test_images_give_the_true_rig_which_comes_back_from_every_format(
         assert_read_back(write_calibration(tmp_path / f"{form}.yaml", run, form)[0], run)
 
 
-def test_images_give_the_true_rig_with_a_lens_that_kalibr_knows(
-    drawn: Path, tmp_path: Path
-) -> None:
+def test_images_give_the_true_rig_with_a_lens_that_kalibr_knows(drawn, tmp_path):
     run = calibrate(drawn, tmp_path, "kalibr")
     assert_true_rig(run)
     assert_read_back(Path(run.summary["files"][0]), run)
 
 
-def test_report_and_images_are_written(run: CalibrationRun) -> None:
+def test_report_and_images_are_written(run):
     out, summary = Path(run.summary["out"]), run.summary
     names = {path.name for path in out.rglob("*.png")}
     assert {"coverage.png", "epipolar_raw.png", "epipolar_rectified.png"} <= names
@@ -149,12 +142,8 @@ def blank(folder: Path) -> None:
     ],
 )
 def test_images_without_a_rig_are_refused_and_nothing_is_left(
-    drawn: Path,
-    tmp_path: Path,
-    spoil: Callable[[Path], None],
-    error: type[ReconError],
-    message: str,
-) -> None:
+    drawn, tmp_path, spoil, error, message
+):
     copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
     spoil(copy)
     with pytest.raises(error, match=message):
@@ -163,19 +152,19 @@ def test_images_without_a_rig_are_refused_and_nothing_is_left(
 
 
 @pytest.mark.slow
-def test_a_wrong_board_is_reported_with_the_true_size(drawn: Path, tmp_path: Path) -> None:
+def test_a_wrong_board_is_reported_with_the_true_size(drawn, tmp_path):
     with pytest.raises(CalibrationError, match=r"does not have 8x6 inner corners \(got 9x6"):
         calibrate(drawn, tmp_path / "out", board="chess:8x6:25mm")
 
 
-def test_a_board_without_a_size_gives_squares_and_says_so(drawn: Path, tmp_path: Path) -> None:
+def test_a_board_without_a_size_gives_squares_and_says_so(drawn, tmp_path):
     run = calibrate(drawn, tmp_path, board="chess:9x6")
     assert run.summary["baseline_squares"] == pytest.approx(0.12 / 0.025, rel=0.01)
     assert run.summary["baseline_m"] == pytest.approx(run.summary["baseline_squares"])
     assert any("in squares" in line for line in run.summary["warnings"])
 
 
-def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path: Path) -> None:
+def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path):
     rig, older = board_rig(), parse_board("charuco:8x6:30mm:22mm:5x5_100:legacy")
     views = place_boards(rig, older, 2, seed=3)
     for number, pair in enumerate(render_views(rig, older, views)):
@@ -189,16 +178,14 @@ def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path: Path) -> No
         np.testing.assert_allclose(left.pixels, placed.left_px[left.numbers], atol=0.5)
 
 
-def test_a_folder_for_a_calibration_file_is_refused(drawn: Path, tmp_path: Path) -> None:
+def test_a_folder_for_a_calibration_file_is_refused(drawn, tmp_path):
     (tmp_path / "rig.yaml").mkdir()
     with pytest.raises(OutputError, match="calibration file is a folder"):
         calibrate(drawn, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_still_board_on_video_gives_the_forecast_of_one_image_each(
-    drawn: Path, tmp_path: Path
-) -> None:
+def test_a_still_board_on_video_gives_the_forecast_of_one_image_each(drawn, tmp_path):
     often = tmp_path / "often"
     often.mkdir()
     rng = np.random.default_rng(3)
@@ -215,7 +202,7 @@ def test_a_still_board_on_video_gives_the_forecast_of_one_image_each(
     assert any(finding["code"] == "repeats" for finding in thrice["findings"])
 
 
-def test_an_image_without_a_partner_is_left_out_and_counted(drawn: Path, tmp_path: Path) -> None:
+def test_an_image_without_a_partner_is_left_out_and_counted(drawn, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(drawn, copy)
     (copy / "right02.png").unlink()
@@ -228,8 +215,8 @@ def test_an_image_without_a_partner_is_left_out_and_counted(drawn: Path, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["two videos", "side by side"])
 def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
-    drawn: Path, tmp_path: Path, layout: str
-) -> None:
+    drawn, tmp_path, layout
+):
     """A second of each view, with new noise in every image, and half a second of moving there."""
     rng, films = np.random.default_rng(2), []
     for number in range(9):
@@ -253,7 +240,7 @@ def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
     assert all(number % 15 <= 9 for number in numbers)
 
 
-def test_one_video_and_one_folder_are_refused(tmp_path: Path) -> None:
+def test_one_video_and_one_folder_are_refused(tmp_path):
     video = drives.write_video(tmp_path / "left.mkv", [np.zeros((32, 32), np.uint8)] * 3)
     for left, right in ((str(video), str(tmp_path)), (str(tmp_path), None)):
         with pytest.raises(SourceError, match="two videos, or one video with both views"):
@@ -261,9 +248,7 @@ def test_one_video_and_one_folder_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_the_published_chessboard_pairs_calibrate_as_they_should(
-    recon_data: Path, tmp_path: Path
-) -> None:
+def test_the_published_chessboard_pairs_calibrate_as_they_should(recon_data, tmp_path):
     folder = recon_data / "calibration" / "opencv_chessboard"
     sides = (str(folder / "left*.jpg"), str(folder / "right*.jpg"))
     summary = run_calibrate(*sides, BOARD, load_config(), out=tmp_path / "out").summary
@@ -278,7 +263,7 @@ WARP = np.array([[1.0, 0.04, -12], [-0.05, 1.02, 9], [4e-5, -3e-5, 1]])
 
 
 @pytest.fixture(scope="session")
-def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def street(tmp_path_factory):
     """Two pairs of the street; the right camera's are warped by one homography."""
     folder = tmp_path_factory.mktemp("street")
     source = SyntheticSource(SMALL)
@@ -290,9 +275,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_folder_is_rectified_by_its_features_and_says_up_to_scale(
-    street: Path, tmp_path: Path
-) -> None:
+def test_a_folder_is_rectified_by_its_features_and_says_up_to_scale(street, tmp_path):
     sides = (str(street / "left"), str(street / "right"))
     run_rectify(*sides, load_config(), out=tmp_path / "out", threads=1)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -312,9 +295,7 @@ def test_a_folder_is_rectified_by_its_features_and_says_up_to_scale(
     assert np.abs(left[1] / left[2] - right[1] / right[2]).mean() < 0.7
 
 
-def test_a_calibration_gives_metric_pictures_that_other_commands_take(
-    street: Path, tmp_path: Path
-) -> None:
+def test_a_calibration_gives_metric_pictures_that_other_commands_take(street, tmp_path):
     height, width = read_image(street / "left" / "0.png").shape[:2]
     rig = board_rig("fisheye", width, height)
     write_recon_calibration(tmp_path / "rig.yaml", rig)
@@ -328,7 +309,7 @@ def test_a_calibration_gives_metric_pictures_that_other_commands_take(
     assert read_image(tmp_path / "out" / "left" / "0.png").shape == (height, width, 3)
 
 
-def test_a_calibration_of_rectified_pictures_is_refused(street: Path, tmp_path: Path) -> None:
+def test_a_calibration_of_rectified_pictures_is_refused(street, tmp_path):
     camera = RectifiedCamera(270, 240, 120, 240, 0.5, 480, 240)
     write_recon_calibration(tmp_path / "c.yaml", camera)
     sides, file = (str(street / "left"), str(street / "right")), tmp_path / "c.yaml"
@@ -337,9 +318,7 @@ def test_a_calibration_of_rectified_pictures_is_refused(street: Path, tmp_path: 
     assert not (tmp_path / "out").exists()
 
 
-def test_one_pair_is_enough_with_features_and_keeps_its_file_type(
-    street: Path, tmp_path: Path
-) -> None:
+def test_one_pair_is_enough_with_features_and_keeps_its_file_type(street, tmp_path):
     for side in ("left", "right"):
         write_image(tmp_path / side / "0.jpg", read_image(street / side / "0.png"))
     sides = (str(tmp_path / "left" / "0.jpg"), str(tmp_path / "right" / "0.jpg"))
@@ -351,7 +330,7 @@ def test_one_pair_is_enough_with_features_and_keeps_its_file_type(
         assert np.abs(written - rectified).mean() < 3
 
 
-def test_blank_images_are_refused_with_what_would_help(tmp_path: Path) -> None:
+def test_blank_images_are_refused_with_what_would_help(tmp_path):
     for side in ("l", "r"):
         write_image(tmp_path / f"{side}.png", np.full((60, 80), 128, np.uint8))
     sides = (str(tmp_path / "l.png"), str(tmp_path / "r.png"))
@@ -366,7 +345,7 @@ SMALL_CAMERA = RectifiedCamera(10.0, 5.5, 3.5, 5.5, 0.5, 12, 8)
 
 
 @pytest.fixture(scope="module")
-def pairs() -> list[StereoPair]:
+def pairs():
     rng = np.random.default_rng(5)
     return [
         StereoPair(*rng.integers(0, 256, (2, 32, 64), dtype=np.uint8), 0.1 * index, index)
@@ -397,7 +376,7 @@ class FakeCamera:
 
 
 @pytest.fixture(autouse=True)
-def _no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_warm_up(monkeypatch):
     """Record from the first frame on."""
     monkeypatch.setattr(capture, "_WARM_UP_FRAMES", 0)
 
@@ -409,9 +388,7 @@ def recorded(folder: Path, left_s: list[float], right_s: list[float], frames: in
     return cameras, record(cameras, folder, settings, None, lambda: False)
 
 
-def test_two_videos_are_recorded_and_mapped_at_once(
-    pairs: list[StereoPair], tmp_path: Path
-) -> None:
+def test_two_videos_are_recorded_and_mapped_at_once(pairs, tmp_path):
     folder = drives.write_two_videos(pairs, CAMERA, tmp_path / "in")
     devices = [str(folder / "left.avi"), str(folder / "right.avi")]
     out = tmp_path / "out"
@@ -430,7 +407,7 @@ def test_two_videos_are_recorded_and_mapped_at_once(
         assert ours.timestamp_s == pytest.approx(truth.timestamp_s, abs=1e-6)
 
 
-def test_one_device_with_both_views_is_halved(pairs: list[StereoPair], tmp_path: Path) -> None:
+def test_one_device_with_both_views_is_halved(pairs, tmp_path):
     video = drives.write_side_by_side(pairs, CAMERA, tmp_path / "in")
     run_capture([str(video)], tmp_path / "out", RecordingSettings(frames=5))
     drives.write_calib(tmp_path / "out", CAMERA)
@@ -442,7 +419,7 @@ def test_one_device_with_both_views_is_halved(pairs: list[StereoPair], tmp_path:
 TIMES_S = [0.1 * k for k in range(10)]
 
 
-def test_skew_is_recorded(tmp_path: Path) -> None:
+def test_skew_is_recorded(tmp_path):
     _, summary = recorded(tmp_path, TIMES_S, [t + 0.003 for t in TIMES_S], 8)
     assert summary["skew_mean_ms"] == pytest.approx(3)
     assert summary["gaps"] == 0
@@ -450,7 +427,7 @@ def test_skew_is_recorded(tmp_path: Path) -> None:
     assert rows[3] == "left/000002.png,right/000002.png,0.200000,0.203000"
 
 
-def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path: Path) -> None:
+def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path):
     kept = [t for t in TIMES_S if round(10 * t) not in {3, 4}]
     _, summary = recorded(tmp_path, TIMES_S, [t + 0.002 for t in kept], 8)
     assert summary["skew_max_ms"] == pytest.approx(2)
@@ -460,9 +437,7 @@ def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path: Path) -> N
     np.testing.assert_allclose(stamps, kept)
 
 
-def test_the_exposure_of_the_left_camera_is_held_on_both_sides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_exposure_of_the_left_camera_is_held_on_both_sides(tmp_path, monkeypatch):
     monkeypatch.setattr(capture, "_WARM_UP_FRAMES", 4)
     (left, right), summary = recorded(tmp_path, TIMES_S, TIMES_S, 3)
     assert summary["exposure_locked"] is True
@@ -470,7 +445,7 @@ def test_the_exposure_of_the_left_camera_is_held_on_both_sides(
     assert "0.400000" in (tmp_path / FRAMES).read_text().splitlines()[1]
 
 
-def test_a_camera_that_goes_silent_is_reported_and_what_was_recorded_stays(tmp_path: Path) -> None:
+def test_a_camera_that_goes_silent_is_reported_and_what_was_recorded_stays(tmp_path):
     with pytest.raises(SourceError, match="/dev/video2: camera gives no more frames"):
         recorded(tmp_path, TIMES_S, TIMES_S[:4], 10)
     drives.write_calib(tmp_path, SMALL_CAMERA)
@@ -478,9 +453,7 @@ def test_a_camera_that_goes_silent_is_reported_and_what_was_recorded_stays(tmp_p
 
 
 @pytest.mark.parametrize("victim", ["left", "right", "list"])
-def test_a_full_disk_takes_the_pair_back_whole(
-    pairs: list[StereoPair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, victim: str
-) -> None:
+def test_a_full_disk_takes_the_pair_back_whole(pairs, tmp_path, monkeypatch, victim):
     """The sixth image of a side, or the sixth line, finds no room."""
     full = OSError(28, os.strerror(28))
     sync, write = atomic._sync, os.write
@@ -508,23 +481,21 @@ def test_a_full_disk_takes_the_pair_back_whole(
     assert written == sorted(2 * [f"{k:06d}.png" for k in range(5)])
 
 
-def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_holds_something_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("x")
     with pytest.raises(OutputError, match=r"folder is not empty.*--out"):
         CaptureFolder(tmp_path, "png")
 
 
 @pytest.mark.parametrize("device", ["no_such_camera", "97"])
-def test_a_camera_that_is_not_there_is_one_line_and_leaves_no_folder(
-    tmp_path: Path, device: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_camera_that_is_not_there_is_one_line_and_leaves_no_folder(tmp_path, device, capfd):
     with pytest.raises(ReconError, match=f"{device}: camera cannot be opened"):
         run_capture([device], tmp_path / "out", RecordingSettings())
     assert capfd.readouterr().err == ""
     assert not (tmp_path / "out").exists()
 
 
-def test_cameras_of_different_size_are_reported(pairs: list[StereoPair], tmp_path: Path) -> None:
+def test_cameras_of_different_size_are_reported(pairs, tmp_path):
     drives.write_video(tmp_path / "l.avi", [pair.left for pair in pairs])
     drives.write_video(tmp_path / "r.avi", [pair.right[:, :32] for pair in pairs])
     devices = [str(tmp_path / "l.avi"), str(tmp_path / "r.avi")]
@@ -533,7 +504,7 @@ def test_cameras_of_different_size_are_reported(pairs: list[StereoPair], tmp_pat
 
 
 @pytest.mark.slow
-def test_interrupting_the_command_leaves_a_drive_and_exit_code_0(tmp_path: Path) -> None:
+def test_interrupting_the_command_leaves_a_drive_and_exit_code_0(tmp_path):
     rng = np.random.default_rng(1)
     frame = rng.integers(0, 256, (240, 640), dtype=np.uint8)
     video = drives.write_video(tmp_path / "long.avi", [frame] * 400)

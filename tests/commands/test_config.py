@@ -1,7 +1,5 @@
 """What a run is asked for: settings from defaults, file and overrides; and what resuming keeps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,15 +28,13 @@ from recon.run.directory import STARTED, state_folder
         ("paper", PAIR_DEFAULTS, ["paper.as_printed=true"]),
     ],
 )
-def test_a_dumped_configuration_loads_back_equal(
-    tmp_path: Path, command: str, defaults: dict[str, Any], overrides: list[str]
-) -> None:
+def test_a_dumped_configuration_loads_back_equal(tmp_path, command, defaults, overrides):
     config = load_config(None, overrides, defaults)
     write_yaml(tmp_path / "config.yaml", config.recorded(command))
     assert load_config(tmp_path / "config.yaml", defaults=defaults) == config
 
 
-def test_a_command_writes_only_what_determines_its_result(tmp_path: Path) -> None:
+def test_a_command_writes_only_what_determines_its_result(tmp_path):
     write_yaml(tmp_path / "config.yaml", load_config().recorded("map"))
     drive = (tmp_path / "config.yaml").read_text()
     assert drive.count("\n") < 100
@@ -50,11 +46,11 @@ def test_a_command_writes_only_what_determines_its_result(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("command", GROUPS)
-def test_the_groups_of_every_command_are_settings(command: str) -> None:
+def test_the_groups_of_every_command_are_settings(command):
     assert {*GROUPS[command]} <= {*ReconConfig.model_fields}
 
 
-def test_what_comes_later_wins_and_only_for_its_key(tmp_path: Path) -> None:
+def test_what_comes_later_wins_and_only_for_its_key(tmp_path):
     (tmp_path / "c.yaml").write_text("mesh: {max_depth: 8}\nmatching: {sad: {window_px: 7}}\n")
     changes = ["matching.sad.window_px=9", "fusion.min_count=2", "fusion.min_count=5"]
     config = load_config(f"{tmp_path}/c.yaml", [*changes, "fusion.voxel_m=0.2"], PAIR_DEFAULTS)
@@ -75,7 +71,7 @@ def test_what_comes_later_wins_and_only_for_its_key(tmp_path: Path) -> None:
         ("- 1\n- 2", "not a mapping"),
     ],
 )
-def test_a_wrong_file_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+def test_a_wrong_file_is_refused_by_name(tmp_path, text, message):
     path = tmp_path / "c.yaml"
     path.write_text(text)
     with pytest.raises(SettingsError, match=message) as caught:
@@ -87,7 +83,7 @@ def test_a_wrong_file_is_refused_by_name(tmp_path: Path, text: str, message: str
         load_config(path)
 
 
-def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path: Path) -> None:
+def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path):
     (tmp_path / "good.yaml").write_text("matching:\n  matcher: sgm\n")
     with pytest.raises(SettingsError, match=r"^setting 'matching\.sad\.window_px': ") as refused:
         load_config(tmp_path / "good.yaml", ["matching.sad.window_px=8"])
@@ -95,12 +91,12 @@ def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["fusion.voxel_m", "=3", "fusion.voxel_m=[1"])
-def test_an_override_that_cannot_be_read_is_refused(text: str) -> None:
+def test_an_override_that_cannot_be_read_is_refused(text):
     with pytest.raises(SettingsError, match="--set"):
         load_config(overrides=[text])
 
 
-def test_a_map_is_made_and_opened_by_its_name(tmp_path: Path) -> None:
+def test_a_map_is_made_and_opened_by_its_name(tmp_path):
     with recon.Map.create(f"{tmp_path}/map/map.recon") as map_:
         map_.commit()
     for name in (f"{tmp_path}/map/map.recon", str(tmp_path)):
@@ -108,7 +104,7 @@ def test_a_map_is_made_and_opened_by_its_name(tmp_path: Path) -> None:
             assert map_.sessions == []
 
 
-def test_a_folder_that_is_no_run_is_named_whatever_the_type(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_run_is_named_whatever_the_type(tmp_path):
     for make in (recon.run_export, recon.run_occupancy):
         for folder in (tmp_path, str(tmp_path)):
             with pytest.raises(FormatError, match="does not contain a finished run"):
@@ -123,7 +119,7 @@ RAN = load_config(None, ["fusion.voxel_m=0.2", "memory.limit_mb=900"])
 
 
 @pytest.fixture
-def begin(tmp_path: Path) -> Begin:
+def begin(tmp_path):
     """Begin a run: its folder, with an unfinished map that keeps what it was asked for."""
 
     def begun(config: dict[str, Any] | None = None, **asked: Any) -> Path:
@@ -140,7 +136,7 @@ def begin(tmp_path: Path) -> Begin:
     return begun
 
 
-def test_what_is_left_open_is_as_the_run_was_asked_for(begin: Begin, tmp_path: Path) -> None:
+def test_what_is_left_open_is_as_the_run_was_asked_for(begin, tmp_path):
     (tmp_path / "prior.txt").touch()
     run = begin(poses_file=tmp_path / "p.txt", prior_from=str(tmp_path / "prior.txt"), mesh=False)
     options, settings = MapOptions(threads=2).resumed(run, None, [])
@@ -153,7 +149,7 @@ def test_what_is_left_open_is_as_the_run_was_asked_for(begin: Begin, tmp_path: P
     assert (other.source, other.kind, other.prior_from) == ("moved", "tum", "/odom")
 
 
-def test_settings_must_be_those_of_the_run_but_for_the_memory(begin: Begin) -> None:
+def test_settings_must_be_those_of_the_run_but_for_the_memory(begin):
     run = begin()
     for same in ([], ["fusion.voxel_m=0.2"], [{"fusion.voxel_m": 0.2}]):
         assert MapOptions().resumed(run, None, same)[1] == RAN
@@ -166,22 +162,20 @@ def test_settings_must_be_those_of_the_run_but_for_the_memory(begin: Begin) -> N
         MapOptions(mesh=False).resumed(run, None, [])
 
 
-def test_a_run_of_an_earlier_version_has_settings_that_are_fixed_now(begin: Begin) -> None:
+def test_a_run_of_an_earlier_version_has_settings_that_are_fixed_now(begin):
     run = begin({"grid": {"free_height_m": 0.8, "max_height_m": 3.0}, "audit": {"frames": 300}})
     _, settings = MapOptions().resumed(run, None, [])
     assert settings == load_config(None, ["grid.max_height_m=3"])
 
 
 @pytest.mark.parametrize("config", [{"grid": {"free_height_m": 0.5}}, {"no": 1}])
-def test_settings_that_there_are_not_are_refused_by_the_name_of_the_run(
-    begin: Begin, config: dict[str, Any]
-) -> None:
+def test_settings_that_there_are_not_are_refused_by_the_name_of_the_run(begin, config):
     run = begin(config)
     with pytest.raises(SettingsError, match=str(run)):
         MapOptions().resumed(run, None, [])
 
 
-def test_where_nothing_can_be_resumed_it_is_said_why(tmp_path: Path) -> None:
+def test_where_nothing_can_be_resumed_it_is_said_why(tmp_path):
     with pytest.raises(OutputError, match=r"no unfinished run.*start it without --resume"):
         MapOptions().resumed(tmp_path, None, [])
     (tmp_path / "run.json").touch()
@@ -194,7 +188,7 @@ def test_where_nothing_can_be_resumed_it_is_said_why(tmp_path: Path) -> None:
         MapOptions().resumed(tmp_path, None, [])
 
 
-def test_without_a_source_there_is_nothing_to_open_and_nothing_to_keep() -> None:
+def test_without_a_source_there_is_nothing_to_open_and_nothing_to_keep():
     assert MapOptions().arguments == {}
     with pytest.raises(SettingsError, match="name SOURCE"):
         MapOptions().open(ReconConfig())

@@ -1,14 +1,11 @@
 """Data sets arrive as recon reads them, whole or not at all."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
 import tarfile
 import zipfile
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 
 import pytest
 
@@ -25,12 +22,12 @@ SCENE = "middlebury-2014/Pipes"
 
 
 @pytest.fixture(autouse=True)
-def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_pause(monkeypatch):
     monkeypatch.setattr(download, "_PAUSE_S", 0.0)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def scene(tmp_path_factory):
     """The archive of a scene."""
     folder = tmp_path_factory.mktemp("scene") / "Pipes"
     write_scene(folder)
@@ -38,7 +35,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.fixture
-def mirror(scene: bytes) -> Iterator[Mirror]:
+def mirror(scene):
     with serving(Mirror({"/Pipes-perfect.zip": scene})) as served:
         yield served
 
@@ -60,7 +57,7 @@ def tarred(name: str, content: bytes) -> bytes:
     return out.getvalue()
 
 
-def test_every_address_is_that_of_a_file_and_says_how_it_is_checked() -> None:
+def test_every_address_is_that_of_a_file_and_says_how_it_is_checked():
     parts = [part for dataset in datasets().values() for part in parts_of(dataset)]
     assert len({part.name for part in parts}) == len(parts) > 100
     for part in parts:
@@ -75,7 +72,7 @@ def test_every_address_is_that_of_a_file_and_says_how_it_is_checked() -> None:
         assert set(dataset.files) <= files
 
 
-def test_a_scene_arrives_once_as_recon_reads_it(mirror: Mirror, tmp_path: Path) -> None:
+def test_a_scene_arrives_once_as_recon_reads_it(mirror, tmp_path):
     mirror.break_after = 1000
     (found,) = run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"]
     assert found["fetched"]
@@ -97,9 +94,7 @@ def test_a_scene_arrives_once_as_recon_reads_it(mirror: Mirror, tmp_path: Path) 
     assert [name for name, fetched in parts.items() if fetched] == [SCENE]
 
 
-def test_verification_names_the_file_that_is_not_what_was_unpacked(
-    mirror: Mirror, tmp_path: Path
-) -> None:
+def test_verification_names_the_file_that_is_not_what_was_unpacked(mirror, tmp_path):
     run_fetch([SCENE], tmp_path, address=mirror.address)
     image = tmp_path / SCENE / "im1.png"
     image.write_bytes(image.read_bytes()[:-1] + b"x")
@@ -110,9 +105,7 @@ def test_verification_names_the_file_that_is_not_what_was_unpacked(
         run_verify([SCENE], tmp_path)
 
 
-def test_a_part_of_which_one_archive_is_not_that_of_the_list_does_not_appear(
-    mirror: Mirror, tmp_path: Path
-) -> None:
+def test_a_part_of_which_one_archive_is_not_that_of_the_list_does_not_appear(mirror, tmp_path):
     drive = "2011_09_28_drive_0001"
     mirror.files["/2011_09_28_calib.zip"] = zipped({"2011_09_28/calib_cam_to_cam.txt": b"calib"})
     with pytest.raises(DownloadError, match="another file than the list"):
@@ -120,9 +113,7 @@ def test_a_part_of_which_one_archive_is_not_that_of_the_list_does_not_appear(
     assert not (tmp_path / "kitti-raw").exists()
 
 
-def test_flights_are_taken_out_of_their_archive(
-    mirror: Mirror, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_flights_are_taken_out_of_their_archive(mirror, tmp_path, monkeypatch):
     flight = zipped({"mav0/cam0/data.csv": b"#", "__MACOSX/._mav0": b"x"})
     content = zipped({"vicon_room1/V1_01/V1_01.zip": flight, "vicon_room1/V1_01/V1_01.bag": b"x"})
     mirror.files["/vicon_room1.zip"] = content
@@ -136,7 +127,7 @@ def test_flights_are_taken_out_of_their_archive(
     assert sorted(path.name for path in place.iterdir()) == ["V1_01", RECORD]
 
 
-def test_a_hash_beside_the_archive_is_compared(mirror: Mirror, tmp_path: Path) -> None:
+def test_a_hash_beside_the_archive_is_compared(mirror, tmp_path):
     name = "dataset-room1_512_16"
     content = tarred(f"{name}/mav0/cam0/data.csv", b"#")
     mirror.files[f"/{name}.tar"] = content
@@ -156,8 +147,8 @@ def test_a_hash_beside_the_archive_is_compared(mirror: Mirror, tmp_path: Path) -
 
 
 def test_a_hostile_archive_leaves_no_data_set_and_a_folder_of_others_is_left_alone(
-    mirror: Mirror, tmp_path: Path
-) -> None:
+    mirror, tmp_path
+):
     mirror.files["/Pipes-perfect.zip"] = zipped({"Pipes-perfect/a": b"1", "../../../b": b"2"})
     with pytest.raises(FormatError, match="path outside of itself"):
         run_fetch([SCENE], tmp_path / "data", address=mirror.address)
@@ -169,14 +160,14 @@ def test_a_hostile_archive_leaves_no_data_set_and_a_folder_of_others_is_left_alo
 
 
 @pytest.mark.parametrize("name", ["kiti-raw", "kitti-raw/2011_09_26_drive_9999", "../x", ""])
-def test_unknown_names_are_one_line(tmp_path: Path, name: str) -> None:
+def test_unknown_names_are_one_line(tmp_path, name):
     with pytest.raises(SettingsError, match="recon datasets list"):
         find_parts(name)
     assert_refused(run("datasets", "fetch", name, "--folder", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
-def test_the_commands_print_json(mirror: Mirror, tmp_path: Path) -> None:
+def test_the_commands_print_json(mirror, tmp_path):
     where = ("--folder", tmp_path, "--json")
     for words in (("list",), ("fetch", SCENE, "--address", mirror.address), ("verify", SCENE)):
         ended = run("datasets", *words, *where)

@@ -1,7 +1,5 @@
 """`recon doctor` finds what is missing, and compiles what a first run would."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
@@ -22,7 +20,7 @@ from recon.commands import doctor
 from recon.commands.doctor import Check, check_kernels, examine
 
 
-def test_this_machine_is_examined_and_ready(tmp_path: Path) -> None:
+def test_this_machine_is_examined_and_ready(tmp_path):
     checks = examine(tmp_path / "outputs")
     assert [check for check in checks if check.needed and not check.ok] == []
     names = {check.name for check in checks}
@@ -30,7 +28,7 @@ def test_this_machine_is_examined_and_ready(tmp_path: Path) -> None:
     assert not (tmp_path / "outputs").exists()
 
 
-def test_what_kernels_lack_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_kernels_lack_is_named(tmp_path, monkeypatch):
     (tmp_path / "llvmlite.py").write_text("raise ImportError('half of it is gone')")
     paths = os.pathsep.join([str(tmp_path), str(Path(recon.__file__).parents[1])])
     monkeypatch.setenv("PYTHONPATH", paths)
@@ -41,7 +39,7 @@ def test_what_kernels_lack_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert check.found == "ImportError: half of it is gone"
 
 
-def test_what_is_missing_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missing_says_what_to_do(monkeypatch):
     missing = doctor.check_package("no-such-package", "no_such_package")
     assert (missing.ok, missing.found) == (False, "not installed")
     assert missing.hint == "run: pip install no-such-package"
@@ -56,9 +54,7 @@ def test_what_is_missing_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> Non
     assert doctor.check_package("numpy", "numpy").hint == "run: apt-get install libgl1"
 
 
-def test_a_process_that_crashes_or_never_ends_is_reported(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_process_that_crashes_or_never_ends_is_reported(monkeypatch):
     done, found = doctor.run_python("import os; os.abort()")
     assert (done, found) == (False, "crashed with signal 6")
 
@@ -79,9 +75,7 @@ def test_a_process_that_crashes_or_never_ends_is_reported(
         ("NUMBA_DISABLE_JIT", "1", "unset NUMBA_DISABLE_JIT"),
     ],
 )
-def test_variables_that_change_results_or_lead_nowhere_are_reported(
-    monkeypatch: pytest.MonkeyPatch, name: str, value: str, hint: str
-) -> None:
+def test_variables_that_change_results_or_lead_nowhere_are_reported(monkeypatch, name, value, hint):
     def hints() -> str:
         quick = (check for check in check_kernels() if not check.needed)
         checks = [*doctor.check_environment(), *itertools.islice(quick, 2)]
@@ -93,7 +87,7 @@ def test_variables_that_change_results_or_lead_nowhere_are_reported(
     assert hint in hints()
 
 
-def test_a_folder_below_a_file_cannot_be_written(tmp_path: Path) -> None:
+def test_a_folder_below_a_file_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     below = tmp_path / "file" / "outputs"
     assert not doctor.check_folder("x", below, "use --out", needed=True).ok
@@ -101,7 +95,7 @@ def test_a_folder_below_a_file_cannot_be_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def test_table_names_what_is_missing_and_says_ready_where_only_niceties_lack() -> None:
+def test_table_names_what_is_missing_and_says_ready_where_only_niceties_lack():
     gone = Check("a [1]", ok=False, found="gone", hint="run: x")
     for check, line in ((gone, "missing"), (replace(gone, needed=False), "note")):
         stream = io.StringIO()
@@ -166,9 +160,7 @@ def printed(code: str, environment: dict[str, str], *arguments: str) -> list[str
 @pytest.mark.slow
 @pytest.mark.timeout(3600)  # two minutes of a core of its own; others may have most of it
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
-def test_every_kernel_is_compiled_and_no_command_of_a_first_run_compiles_more(
-    tmp_path: Path,
-) -> None:
+def test_every_kernel_is_compiled_and_no_command_of_a_first_run_compiles_more(tmp_path):
     root = str(Path(recon.__file__).parents[1])
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": root}
     command = [sys.executable, "-m", "recon", "doctor", "--compile", "--json"]

@@ -1,10 +1,7 @@
 """A run is compared in the axes given in its record."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ T_MAP_WORLD = make_transform(exp_so3(np.array([0.3, -1.2, 0.8])), np.zeros(3))
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     rng = np.random.default_rng(0)
     cloud = PointCloud(rng.uniform(-5, 5, (2000, 3)).astype(np.float32), frame="map")
     folder = tmp_path / "run"
@@ -43,7 +40,7 @@ def run(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("inside", ["", "map/cloud.ply"])
 @pytest.mark.parametrize("frame", ["camera", "map"])
-def test_a_run_equals_itself_in_either_frame(run: Path, inside: str, frame: str) -> None:
+def test_a_run_equals_itself_in_either_frame(run, inside, frame):
     reference = run.parent / f"in_{frame}.ply"
     figures = run_evaluate_map(run / inside, reference, frame=frame)
     assert figures["f_score"] == 1.0
@@ -53,16 +50,14 @@ def test_a_run_equals_itself_in_either_frame(run: Path, inside: str, frame: str)
 
 
 @pytest.mark.parametrize(("right", "wrong"), [("map", "camera"), ("camera", "map")])
-def test_the_wrong_frame_does_not_fit_and_the_right_one_is_named(
-    run: Path, right: str, wrong: str
-) -> None:
+def test_the_wrong_frame_does_not_fit_and_the_right_one_is_named(run, right, wrong):
     figures = run_evaluate_map(run, run.parent / f"in_{right}.ply", frame=wrong)
     assert figures["f_score"] < 0.5
     (doubt,) = figures["warnings"]
     assert f"--reference-frame {right}" in doubt
 
 
-def test_a_cloud_of_no_run_is_taken_as_it_is_and_clouds_apart_are_said_to_be(run: Path) -> None:
+def test_a_cloud_of_no_run_is_taken_as_it_is_and_clouds_apart_are_said_to_be(run):
     reference, far = run.parent / "in_camera.ply", run.parent / "far.ply"
     assert run_evaluate_map(reference, reference, frame="camera")["f_score"] == 1.0
     cloud = read_ply(reference)
@@ -72,14 +67,14 @@ def test_a_cloud_of_no_run_is_taken_as_it_is_and_clouds_apart_are_said_to_be(run
 
 
 @pytest.mark.parametrize("record", ["{}", "no json", '{"T_map_world": [[1]]}'])
-def test_a_broken_record_is_refused(run: Path, record: str) -> None:
+def test_a_broken_record_is_refused(run, record):
     (run / "run.json").write_text(record)
     with pytest.raises(FormatError, match=r"run\.json|T_map_world"):
         run_evaluate_map(run, run.parent / "in_map.ply", frame="camera")
 
 
 @pytest.fixture
-def drifted(tmp_path: Path) -> Path:
+def drifted(tmp_path):
     """A run that walks along two walls and the ground, its path and map turned and moved alike."""
     rng = np.random.default_rng(1)
     along = rng.uniform(0, 40, (9000, 1))
@@ -102,9 +97,7 @@ def drifted(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_their_errors(
-    drifted: Path,
-) -> None:
+def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_their_errors(drifted):
     files, out = (drifted / "drift", drifted / "reference.ply"), drifted / "out"
     assert run_evaluate_map(*files)["f_score"] < 0.7
     found = run_evaluate_map(*files, align_to=drifted / "poses.txt", out=out)
@@ -121,9 +114,7 @@ def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_th
         assert cloud.confidence.max() < 0.01
 
 
-def test_icp_lays_the_cloud_onto_the_reference_and_every_threshold_has_its_figures(
-    drifted: Path,
-) -> None:
+def test_icp_lays_the_cloud_onto_the_reference_and_every_threshold_has_its_figures(drifted):
     files = (drifted / "drift", drifted / "reference.ply")
     found = run_evaluate_map(*files, icp=True, thresholds_m=(0.1, 0.2))
     assert found["icp_share"] > 0.9
@@ -134,7 +125,7 @@ def test_icp_lays_the_cloud_onto_the_reference_and_every_threshold_has_its_figur
     assert (found["threshold_m"], found["f_score"]) == (0.1, first)
 
 
-def test_icp_finds_out_in_which_axes_the_reference_is(drifted: Path) -> None:
+def test_icp_finds_out_in_which_axes_the_reference_is(drifted):
     folder, reference = drifted / "drift", drifted / "reference.ply"
     assert run_evaluate_map(folder, reference, icp=True)["reference_frame"] == "camera"
     in_map = transform_cloud(read_ply(reference), T_MAP_WORLD, frame="map")
@@ -152,7 +143,7 @@ def test_icp_finds_out_in_which_axes_the_reference_is(drifted: Path) -> None:
         run_evaluate_map(folder, reference, icp=True)
 
 
-def test_what_stands_above_all_of_the_reference_is_not_judged(drifted: Path) -> None:
+def test_what_stands_above_all_of_the_reference_is_not_judged(drifted):
     cloud = read_ply(drifted / "drift" / "map" / "cloud.ply")
     up = T_MAP_WORLD[:3, :3] @ np.array([0.0, -6.0, 0.0])
     crowns = cloud.xyz[9000:18000] + up.astype(np.float32)
@@ -165,7 +156,7 @@ def test_what_stands_above_all_of_the_reference_is_not_judged(drifted: Path) -> 
     assert found["beyond_reach"] == pytest.approx(9000 / len(xyz), abs=1e-3)
 
 
-def test_what_cannot_be_aligned_is_reported(drifted: Path) -> None:
+def test_what_cannot_be_aligned_is_reported(drifted):
     reference, poses = drifted / "reference.ply", drifted / "poses.txt"
     with pytest.raises(EvaluationError, match="has no path to align"):
         run_evaluate_map(reference, reference, align_to=poses)
@@ -188,7 +179,7 @@ RULES = TrajectoryRules()
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """A bend of 120 poses as truth.txt (KITTI) and truth_tum.txt, every second one as half.txt."""
     step = make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.0, 0.0, 1.0]))
     poses = np.stack([np.linalg.matrix_power(step, n) for n in range(120)])
@@ -202,7 +193,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_paths_are_compared_by_time_where_both_have_times_else_in_order(folder: Path) -> None:
+def test_paths_are_compared_by_time_where_both_have_times_else_in_order(folder):
     found = run_evaluate_trajectory(folder / "half.txt", folder / "truth_tum.txt", RULES)
     assert found["associated"] == "by time"
     assert (found["frames"], found["estimate_poses"], found["true_poses"]) == (60, 60, 120)
@@ -217,9 +208,7 @@ def test_paths_are_compared_by_time_where_both_have_times_else_in_order(folder: 
         run_evaluate_trajectory(folder / "half_kitti.txt", folder / "truth.txt", RULES)
 
 
-def test_the_alignment_is_given_as_a_transform_with_the_offset_of_survey_coordinates(
-    folder: Path,
-) -> None:
+def test_the_alignment_is_given_as_a_transform_with_the_offset_of_survey_coordinates(folder):
     turn = exp_so3(np.array([0.3, -0.2, 1.1]))
     T_survey_world = make_transform(turn, np.array([567_890.123, 5_432_109.876, 210.5]))
     path = read_trajectory(folder / "truth_tum.txt")
@@ -234,7 +223,7 @@ def test_the_alignment_is_given_as_a_transform_with_the_offset_of_survey_coordin
     np.testing.assert_allclose(found["T_truth_estimate"], T_survey_world, rtol=0, atol=1e-6)
 
 
-def test_few_partners_are_warned_of(folder: Path) -> None:
+def test_few_partners_are_warned_of(folder):
     times = 5 + 0.2 * np.arange(60) + np.where(np.arange(60) < 20, 0.003, 0.05)
     poses = np.tile(np.eye(4), (60, 1, 1))
     poses[:, 2, 3] = np.arange(60)
@@ -244,7 +233,7 @@ def test_few_partners_are_warned_of(folder: Path) -> None:
     assert found["warnings"] == ["a partner in time for only 20 of 60 poses; see --tolerance"]
 
 
-def test_a_folder_gets_report_figures_and_aligned_paths(folder: Path) -> None:
+def test_a_folder_gets_report_figures_and_aligned_paths(folder):
     out = folder / "out"
     found = run_evaluate_trajectory(folder / "half.txt", folder / "truth_tum.txt", RULES, out=out)
     figures = {"path", "error_along_path", "translation_by_length", "rotation_by_length"}
@@ -260,7 +249,7 @@ def test_a_folder_gets_report_figures_and_aligned_paths(folder: Path) -> None:
     assert again["ate_m"] == pytest.approx(found["ate_m"], abs=1e-9)
 
 
-def test_what_cannot_be_compared_leaves_no_folder(folder: Path) -> None:
+def test_what_cannot_be_compared_leaves_no_folder(folder):
     for estimate, truth, times, kind in (
         ("half.txt", "none.txt", None, FormatError),
         ("truth.txt", "truth_tum.txt", folder / "times.txt", SourceError),
@@ -271,7 +260,7 @@ def test_what_cannot_be_compared_leaves_no_folder(folder: Path) -> None:
         assert not (folder / "out").exists()
 
 
-def test_a_path_is_drawn_in_the_axes_in_which_it_goes_farthest() -> None:
+def test_a_path_is_drawn_in_the_axes_in_which_it_goes_farthest():
     rng = np.random.default_rng(0)
     assert widest_axes(rng.normal(0, (9, 1, 30), (50, 3))) == [0, 2]
     assert widest_axes(rng.normal(0, (9, 12, 1), (50, 3))) == [0, 1]

@@ -1,7 +1,5 @@
 """A drive that is mapped in pieces becomes one drive: every frame once, and the same map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,7 +9,7 @@ from recon.commands.config import load_config
 from recon.commands.map_pieces import LEAD, Piece, cut_drive
 from recon.map.drive.drive import Workspace, session_info
 from recon.map.drive.drive_odometry import odometry_of
-from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.sequence import map_sequence
 from recon.map.map import Map
 from recon.map.sessions.copying import join_parts
 from recon.sources.source import SourcePart
@@ -26,7 +24,7 @@ PIECES = [Piece(0, 10), Piece(5, 18, 5), Piece(12, 26, 6)]
 
 @pytest.mark.parametrize("frames", [1, 79, 80, 144, 999, 2000, 36_000])
 @pytest.mark.parametrize("workers", [1, 2, 3, 64])
-def test_pieces_have_every_frame_once_behind_their_leads(frames: int, workers: int) -> None:
+def test_pieces_have_every_frame_once_behind_their_leads(frames, workers):
     pieces = cut_drive(frames, workers)
     own = [n for piece in pieces for n in range(piece.first + piece.lead, piece.last)]
     assert own == list(range(frames))
@@ -36,7 +34,7 @@ def test_pieces_have_every_frame_once_behind_their_leads(frames: int, workers: i
 
 
 @pytest.fixture(scope="module")
-def mapped() -> tuple[MappedSequence, MappedSequence]:
+def mapped():
     """The drive mapped whole, and in pieces that are joined."""
     source = film(STREET)
     config = load_config(None, ["submaps.length_m=4", "submaps.tile_m=12.8"])
@@ -56,9 +54,7 @@ def mapped() -> tuple[MappedSequence, MappedSequence]:
     return whole, map_sequence(source, config, workspace=work)
 
 
-def test_the_path_has_every_frame_once_and_is_that_of_one_run(
-    mapped: tuple[MappedSequence, MappedSequence],
-) -> None:
+def test_the_path_has_every_frame_once_and_is_that_of_one_run(mapped):
     whole, joined = mapped
     np.testing.assert_array_equal(joined.trajectory.timestamps_s, whole.trajectory.timestamps_s)
     assert joined.session.submaps.frames == len(joined.health) == STREET.frames
@@ -71,7 +67,7 @@ def test_the_path_has_every_frame_once_and_is_that_of_one_run(
     assert joined.loops.keyframes >= STREET.frames // 2
 
 
-def test_the_map_is_about_that_of_one_run(mapped: tuple[MappedSequence, MappedSequence]) -> None:
+def test_the_map_is_about_that_of_one_run(mapped):
     whole, joined = mapped
     # Voxels that are turned into others share some of these: fewer points for the same surface.
     assert 0.8 < len(joined.cloud) / len(whole.cloud) < 1.05

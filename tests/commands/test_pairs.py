@@ -1,9 +1,6 @@
 """Pairs from Python and from files: any matcher, any calibration, or none."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +22,7 @@ Noise = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def noise() -> Noise:
+def noise():
     """Noise, six pixels further left in the right image."""
     world = np.random.default_rng(8).integers(0, 256, (50, 130), dtype=np.uint8)
     world = cv2.GaussianBlur(world, (3, 3), 0)
@@ -33,7 +30,7 @@ def noise() -> Noise:
 
 
 @pytest.mark.parametrize("matcher", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
-def test_every_matcher_finds_the_shift(noise: Noise, matcher: str) -> None:
+def test_every_matcher_finds_the_shift(noise, matcher):
     disparity = recon.match(*noise, matcher=matcher, ndisp=16)
     # All fit parts of a pixel; a quarter is more than the bias of any of them.
     assert np.nanmedian(disparity.values) == pytest.approx(6, abs=0.25)
@@ -41,9 +38,7 @@ def test_every_matcher_finds_the_shift(noise: Noise, matcher: str) -> None:
     assert disparity.valid[4:-4, 20:-4].mean() > 0.8
 
 
-def test_settings_are_those_of_the_matcher_that_is_named(
-    noise: Noise,
-) -> None:
+def test_settings_are_those_of_the_matcher_that_is_named(noise):
     assert recon.match(*noise, matcher="opencv-bm", block_px=15).values.shape == (50, 120)
     with pytest.raises(SettingsError, match="block_px"):
         recon.match(*noise, block_px=15)
@@ -59,9 +54,7 @@ CALIBRATIONS = {
 
 
 @pytest.mark.parametrize("kind", CALIBRATIONS)
-def test_a_calibration_file_gives_metres_and_may_need_the_size_of_images(
-    noise: Noise, tmp_path: Path, kind: str
-) -> None:
+def test_a_calibration_file_gives_metres_and_may_need_the_size_of_images(noise, tmp_path, kind):
     path, size = tmp_path / "calib.txt", (120, 50)
     path.write_text(CALIBRATIONS[kind])
     frame = recon.reconstruct(*noise, path)
@@ -76,7 +69,7 @@ def test_a_calibration_file_gives_metres_and_may_need_the_size_of_images(
 
 
 @pytest.fixture
-def images(tmp_path: Path) -> tuple[Path, Path]:
+def images(tmp_path):
     """Blurred noise, 12 pixels further left in the right image."""
     world = np.random.default_rng(3).integers(0, 256, (120, 260)).astype(np.uint8)
     world = cv2.GaussianBlur(world, (0, 0), 1.5).astype(np.float64)
@@ -90,9 +83,7 @@ def read(images: tuple[Path, Path], known: SourceSettings) -> PairInput:
     return read_pair_input(*images, None, known=known)
 
 
-def test_focal_length_and_baseline_give_metres_and_a_principal_point_is_that_of_both_views(
-    images: tuple[Path, Path],
-) -> None:
+def test_focal_length_and_baseline_give_metres_and_a_principal_point_is_that_of_both_views(images):
     given = read(images, SourceSettings(focal_px=300, baseline_m=0.2))
     camera = given.calibration
     assert isinstance(camera, RectifiedCamera)
@@ -105,9 +96,7 @@ def test_focal_length_and_baseline_give_metres_and_a_principal_point_is_that_of_
     assert (camera.cx_px, camera.cy_px, camera.cx_right_px) == (100, 50, 100)
 
 
-def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
-    images: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(images, tmp_path):
     given = read(images, SourceSettings(focal_px=300))
     settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
     run = run_pair(given, settings, out=tmp_path / "out")
@@ -123,9 +112,7 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
         ({"focal_px": 4.5}, r"--focal: .*4\.5 px.*see 17\d deg.*in pixels"),
     ],
 )
-def test_an_unknown_focal_length_or_one_in_millimetres_is_refused(
-    images: tuple[Path, Path], known: dict[str, float], message: str
-) -> None:
+def test_an_unknown_focal_length_or_one_in_millimetres_is_refused(images, known, message):
     with pytest.raises(CalibrationError, match=message):
         read(images, SourceSettings(baseline_m=0.2, **known))
 
@@ -134,9 +121,7 @@ LAYOUTS = ("folders", "kitti", "kitti-raw", "euroc", "tum", "two videos", "mcap"
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_numbers_take_the_place_of_the_calibration_of_every_layout(
-    tmp_path: Path, layout: str
-) -> None:
+def test_numbers_take_the_place_of_the_calibration_of_every_layout(tmp_path, layout):
     grey = [np.full((32, 64), 10 * k, np.uint8) for k in range(4)]
     pairs = [StereoPair(image, image, 0.1 * k, k) for k, image in enumerate(grey)]
     path = ALL[layout](pairs, RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32), tmp_path)
@@ -155,8 +140,6 @@ def test_numbers_take_the_place_of_the_calibration_of_every_layout(
         ({"focal_px": 300, "baseline_m": 0.1, "calibration": "rig.yaml"}, r"--calib: .*replace"),
     ],
 )
-def test_half_a_camera_or_two_of_them_are_refused(
-    images: tuple[Path, Path], given: dict[str, Any], said: str
-) -> None:
+def test_half_a_camera_or_two_of_them_are_refused(images, given, said):
     with pytest.raises(ReconError, match=said):
         open_source(images[0].parent, settings=SourceSettings(**given))

@@ -1,7 +1,5 @@
 """Transforms, alignment, projection and ray casting: inverses, published numbers, bad input."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -48,14 +46,14 @@ EXACT = {"rtol": 0, "atol": 1e-12}
 
 
 @given(A=TRANSFORMS, B=TRANSFORMS)
-def test_inverses_undo_and_neighbouring_frames_cancel(A: np.ndarray, B: np.ndarray) -> None:
+def test_inverses_undo_and_neighbouring_frames_cancel(A, B):
     np.testing.assert_allclose(A @ invert(A), np.eye(4), **EXACT)
     np.testing.assert_array_equal(invert(np.stack([A, B])), np.stack([invert(A), invert(B)]))
     np.testing.assert_allclose(apply(A @ B, POINTS), apply(A, apply(B, POINTS)), **EXACT)
 
 
 @given(T=TRANSFORMS)
-def test_a_rigid_motion_keeps_distances_and_dtypes_and_turns_directions(T: np.ndarray) -> None:
+def test_a_rigid_motion_keeps_distances_and_dtypes_and_turns_directions(T):
     moved = apply(T, POINTS)
     steps_m = [np.linalg.norm(np.diff(xyz, axis=0), axis=1) for xyz in (moved, POINTS)]
     np.testing.assert_allclose(*steps_m, **EXACT)
@@ -67,7 +65,7 @@ def test_a_rigid_motion_keeps_distances_and_dtypes_and_turns_directions(T: np.nd
 
 
 @given(w=VECTORS)
-def test_exp_gives_a_rotation_about_w_by_its_length(w: np.ndarray) -> None:
+def test_exp_gives_a_rotation_about_w_by_its_length(w):
     R = exp_so3(w)
     np.testing.assert_allclose(R @ R.T, np.eye(3), **EXACT)
     np.testing.assert_allclose(R @ w, w, **EXACT)
@@ -79,21 +77,19 @@ def test_exp_gives_a_rotation_about_w_by_its_length(w: np.ndarray) -> None:
 
 
 @given(w=VECTORS, v=VECTORS, scale=st.floats(1e-12, 1e-6))
-def test_hat_is_cross_product_and_first_order_of_exp(
-    w: np.ndarray, v: np.ndarray, scale: float
-) -> None:
+def test_hat_is_cross_product_and_first_order_of_exp(w, v, scale):
     np.testing.assert_allclose(hat(w) @ v, np.cross(w, v), **EXACT)
     # The rest is of second order: |w·scale|² / 2 < 1.5e-11.
     np.testing.assert_allclose(exp_so3(w * scale), np.eye(3) + hat(w * scale), rtol=0, atol=2e-11)
 
 
 @given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
-def test_steps_and_transforms_are_inverse(step: list[float]) -> None:
+def test_steps_and_transforms_are_inverse(step):
     # sqrt(3)·1.5 < π, so the rotation vector is unique.
     np.testing.assert_allclose(as_step(as_transform(np.array(step))), step, atol=1e-9)
 
 
-def test_the_jacobian_of_a_step_is_the_derivative_of_moved_points() -> None:
+def test_the_jacobian_of_a_step_is_the_derivative_of_moved_points():
     xyz, h = np.random.default_rng(3).normal(0.0, 5.0, (7, 3)), 1e-6
     for axis, step in enumerate(h * np.eye(6)):
         moved = (apply(as_transform(step), xyz) - apply(as_transform(-step), xyz)) / (2 * h)
@@ -101,7 +97,7 @@ def test_the_jacobian_of_a_step_is_the_derivative_of_moved_points() -> None:
         np.testing.assert_allclose(step_jacobian(xyz)[:, :, axis], moved, rtol=0, atol=1e-7)
 
 
-def test_angles_keep_their_precision_where_acos_loses_it() -> None:
+def test_angles_keep_their_precision_where_acos_loses_it():
     for angle in (1e-9, 1e-5, 1.0, np.pi - 1e-9):
         T = make_transform(exp_so3(np.array([0, angle, 0])), np.zeros(3))
         # acos of the trace would be off by 1e-8.
@@ -109,7 +105,7 @@ def test_angles_keep_their_precision_where_acos_loses_it() -> None:
 
 
 @given(T=TRANSFORMS, noise=st.integers(0, 1000))
-def test_orthonormalising_mends_small_noise(T: np.ndarray, noise: int) -> None:
+def test_orthonormalising_mends_small_noise(T, noise):
     rough = T.copy()
     rough[:3, :3] += np.random.default_rng(noise).uniform(-1e-4, 1e-4, (3, 3))
     mended = orthonormalise(rough)
@@ -122,7 +118,7 @@ def test_orthonormalising_mends_small_noise(T: np.ndarray, noise: int) -> None:
 
 
 @given(R=ROTATIONS)
-def test_a_rotation_comes_back_from_its_quaternion_of_any_length_and_sign(R: np.ndarray) -> None:
+def test_a_rotation_comes_back_from_its_quaternion_of_any_length_and_sign(R):
     xyzw = quaternion_from_rotation(R)
     np.testing.assert_allclose(np.linalg.norm(xyzw), 1, **EXACT)
     assert xyzw[3] >= 0
@@ -131,14 +127,14 @@ def test_a_rotation_comes_back_from_its_quaternion_of_any_length_and_sign(R: np.
 
 
 @given(w=VECTORS.filter(lambda v: np.linalg.norm(v) > 0.1), angle=st.floats(0.0, math.pi - 1e-6))
-def test_log_is_the_inverse_of_exp(w: np.ndarray, angle: float) -> None:
+def test_log_is_the_inverse_of_exp(w, angle):
     w = angle * w / np.linalg.norm(w)
     # 1e-7: near π the rotation vector amplifies the matrix's rounding by its square root.
     np.testing.assert_allclose(log_so3(exp_so3(w)), w, atol=1e-7)
 
 
 @pytest.mark.parametrize("axis", np.eye(3))
-def test_half_a_turn_has_an_axis_and_a_quaternion(axis: np.ndarray) -> None:
+def test_half_a_turn_has_an_axis_and_a_quaternion(axis):
     R = 2.0 * np.outer(axis, axis) - np.eye(3)
     w = log_so3(R)
     assert np.linalg.norm(w) == pytest.approx(math.pi)
@@ -151,7 +147,7 @@ def points(seed: int, n: int = 40) -> np.ndarray:
 
 
 @given(T=TRANSFORMS, scale=st.floats(0.2, 5.0))
-def test_the_similarity_that_moved_points_is_found(T: np.ndarray, scale: float) -> None:
+def test_the_similarity_that_moved_points_is_found(T, scale):
     there = scale * points(1) @ T[:3, :3].T + T[:3, 3]
     found = fit_points(points(1), there, scaled=True)
     np.testing.assert_allclose(found.T_to_from, T, atol=1e-9)
@@ -159,9 +155,7 @@ def test_the_similarity_that_moved_points_is_found(T: np.ndarray, scale: float) 
     assert fit_points(points(1), there).scale == 1.0
 
 
-def test_points_in_one_place_are_not_scaled_and_a_straight_path_is_not_turned_about_itself() -> (
-    None
-):
+def test_points_in_one_place_are_not_scaled_and_a_straight_path_is_not_turned_about_itself():
     here, there = np.ones((5, 3)), np.full((5, 3), 3.0)
     found = fit_points(here, there, scaled=True)
     assert found.scale == 1.0
@@ -180,7 +174,7 @@ def test_points_in_one_place_are_not_scaled_and_a_straight_path_is_not_turned_ab
     np.testing.assert_allclose(moved.T_world_camera[1, :3, :3], T[:3, :3], atol=1e-12)
 
 
-def test_places_decide_more_the_wider_a_path_winds() -> None:
+def test_places_decide_more_the_wider_a_path_winds():
     turns = []
     for reach_m in (1.0, 30.0, 1000.0):
         poses = np.tile(np.eye(4), (60, 1, 1))
@@ -196,7 +190,7 @@ def test_places_decide_more_the_wider_a_path_winds() -> None:
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 17])
-def test_points_that_contradict_more_than_half_are_found(wrong: int) -> None:
+def test_points_that_contradict_more_than_half_are_found(wrong):
     random = np.random.default_rng(8)
     along = np.column_stack([np.arange(40.0), np.zeros((40, 2))])  # straight: the hardest case
     T = make_transform(exp_so3(np.array([0.0, 0.0, 2.0])), np.array([5e5, 5e6, 100.0]))
@@ -223,7 +217,7 @@ CAMERA = RectifiedCamera(721.5, 609.6, 172.9, 609.6, 0.537, 1242, 375)
 
 
 @given(camera=CAMERAS, depth_m=st.floats(0.5, 200))
-def test_depth_and_disparity_are_inverse(camera: RectifiedCamera, depth_m: float) -> None:
+def test_depth_and_disparity_are_inverse(camera, depth_m):
     fb = camera.focal_px * camera.baseline_m
     disparity = fb / depth_m - camera.doffs_px
     found = disparity_from_depth(np.array([depth_m]), camera)
@@ -234,7 +228,7 @@ def test_depth_and_disparity_are_inverse(camera: RectifiedCamera, depth_m: float
     assert back[0] == pytest.approx(depth_m, rel=1e-5)
 
 
-def test_a_published_pair_of_numbers_gives_the_published_depth() -> None:
+def test_a_published_pair_of_numbers_gives_the_published_depth():
     # Middlebury's own formula Z = baseline·f/(d + doffs), with the numbers of Motorcycle at Q.
     camera = RectifiedCamera(999.421, 294.182, 252.932, 326.96, 0.193001, 741, 497)
     depth = depth_from_disparity(np.array([50.0]), camera)
@@ -242,7 +236,7 @@ def test_a_published_pair_of_numbers_gives_the_published_depth() -> None:
 
 
 @pytest.mark.parametrize("doffs_px", [0.0, 20.0, -20.0])
-def test_what_is_unknown_or_not_in_front_has_no_depth_and_warns_of_nothing(doffs_px: float) -> None:
+def test_what_is_unknown_or_not_in_front_has_no_depth_and_warns_of_nothing(doffs_px):
     camera = replace(CAMERA, cx_right_px=CAMERA.cx_px + doffs_px)
     disparity = np.array([NAN, -doffs_px, -doffs_px - 5, np.inf * -1, -doffs_px + 5])
     with np.errstate(all="raise"):
@@ -254,7 +248,7 @@ def test_what_is_unknown_or_not_in_front_has_no_depth_and_warns_of_nothing(doffs
 
 @pytest.mark.parametrize("depth_m", [3.0, 10.0, 30.0])
 @pytest.mark.parametrize("sigma_px", [0.1, 0.3])
-def test_sigma_is_what_noise_of_disparity_does_to_depth(depth_m: float, sigma_px: float) -> None:
+def test_sigma_is_what_noise_of_disparity_does_to_depth(depth_m, sigma_px):
     rng = np.random.default_rng(0)
     true = disparity_from_depth(np.array([depth_m]), CAMERA).astype(np.float64)
     measured = depth_from_disparity(true + rng.normal(0, sigma_px, 200_000), CAMERA)
@@ -266,7 +260,7 @@ def test_sigma_is_what_noise_of_disparity_does_to_depth(depth_m: float, sigma_px
 
 
 @given(camera=CAMERAS, seed=st.integers(0, 1000))
-def test_a_pixel_with_depth_is_a_point_and_back(camera: RectifiedCamera, seed: int) -> None:
+def test_a_pixel_with_depth_is_a_point_and_back(camera, seed):
     rng = np.random.default_rng(seed)
     u, v, depth = rng.uniform(0, 1000, 30), rng.uniform(0, 1000, 30), rng.uniform(0.5, 100, 30)
     xyz = unproject(u, v, depth, camera)
@@ -280,7 +274,7 @@ def test_a_pixel_with_depth_is_a_point_and_back(camera: RectifiedCamera, seed: i
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_principal_point_looks_straight_ahead_right_is_x_and_down_is_y(dtype: type) -> None:
+def test_the_principal_point_looks_straight_ahead_right_is_x_and_down_is_y(dtype):
     u, v = CAMERA.cx_px + np.array([0, 10, 0]), CAMERA.cy_px + np.array([0, 0, 10])
     xyz = unproject(u, v, np.ones(3, dtype), CAMERA)
     assert xyz.dtype == dtype
@@ -296,7 +290,7 @@ def _square(z: float, half: float = 1.0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def scene() -> RayScene:
+def scene():
     return RayScene(np.concatenate([_square(2.0), _square(5.0, 3.0)]))
 
 

@@ -1,7 +1,5 @@
 """Numbers in text are ASCII decimals; errors and settings are one clear line; bounds are kept."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -38,7 +36,7 @@ READERS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("text", FOREIGN)
-def test_decimal_numbers_are_what_python_reads_and_other_notations_none(text: str) -> None:
+def test_decimal_numbers_are_what_python_reads_and_other_notations_none(text):
     for number in ("1", "-1.5", "+.5", "1e-05", "7."):
         assert parse_number(number) == float(number)
     assert not is_count(text)
@@ -48,7 +46,7 @@ def test_decimal_numbers_are_what_python_reads_and_other_notations_none(text: st
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_readers_take_decimals_alone(tmp_path: Path, reader: str) -> None:
+def test_readers_take_decimals_alone(tmp_path, reader):
     read, content = READERS[reader]
     (tmp_path / "file").write_text(content.format("10"), encoding="utf-8")
     read(tmp_path / "file")
@@ -59,7 +57,7 @@ def test_readers_take_decimals_alone(tmp_path: Path, reader: str) -> None:
 
 
 @pytest.mark.parametrize("text", [*FOREIGN, "0x10", "1:30"])
-def test_numbers_of_old_yaml_are_text(tmp_path: Path, text: str) -> None:
+def test_numbers_of_old_yaml_are_text(tmp_path, text):
     assert parse_yaml(f"value: {text}", "x.yaml") == {"value": text}
     (tmp_path / "rig.yml").write_text(f"%YAML:1.0\n---\nfx: {text}\n", encoding="utf-8")
     assert read_file_storage(tmp_path / "rig.yml") == {"fx": text}
@@ -68,7 +66,7 @@ def test_numbers_of_old_yaml_are_text(tmp_path: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("text", FOREIGN)
-def test_settings_and_options_refuse_other_notations(text: str) -> None:
+def test_settings_and_options_refuse_other_notations(text):
     for setting in (f"fusion.voxel_m={text}", f"audit.baseline_m=[0.1, {text}]"):
         with pytest.raises(ReconError, match="number"):
             load_config(None, [setting])
@@ -78,7 +76,7 @@ def test_settings_and_options_refuse_other_notations(text: str) -> None:
         parse_size_mb(f"{text}M")
 
 
-def test_things_are_counted_with_their_plural() -> None:
+def test_things_are_counted_with_their_plural():
     numbers = (0, 1, 2, -1, 1200)
     found = ["0 frames", "1 frame", "2 frames", "-1 frame", "1200 frames"]
     assert [counted(number, "frame") for number in numbers] == found
@@ -98,7 +96,7 @@ UNITS = {
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_a_figure_has_the_unit_that_its_name_tells(name: str) -> None:
+def test_a_figure_has_the_unit_that_its_name_tells(name):
     assert unit_of(name) == UNITS[name]
     assert with_unit("3", name) == f"3 {UNITS[name]}".strip()
 
@@ -113,11 +111,11 @@ def test_a_figure_has_the_unit_that_its_name_tells(name: str) -> None:
         ({"where": Path("a/b"), "got": 2, "expected": 3}, "a/b: wrong (got 2, expected 3)"),
     ],
 )
-def test_the_line_of_an_error_has_the_known_parts(parts: dict[str, object], line: str) -> None:
+def test_the_line_of_an_error_has_the_known_parts(parts, line):
     assert str(ReconError("wrong", **parts)) == line  # type: ignore[arg-type]
 
 
-def test_an_optional_package_is_imported_and_a_missing_one_gets_the_pip_line() -> None:
+def test_an_optional_package_is_imported_and_a_missing_one_gets_the_pip_line():
     assert require("json", extra="ros").dumps([1]) == "[1]"
     words = r"'no_such_thing'.*pip install 'recon\[ros\]'"
     with pytest.raises(MissingDependencyError, match=words):
@@ -140,7 +138,7 @@ class Outer(Settings):
     name: str = Field(default="a", description="Name.")
 
 
-def test_the_word_none_leaves_open_what_can_be_left_open() -> None:
+def test_the_word_none_leaves_open_what_can_be_left_open():
     class Open(Settings):
         limit_m: float | None = Field(default=1.0, description="Limit.")
         kind: Literal["none", "all"] = Field(default="all", description="Kind.")
@@ -150,7 +148,7 @@ def test_the_word_none_leaves_open_what_can_be_left_open() -> None:
         Outer.parse({"inner": "none"})
 
 
-def test_a_part_of_a_group_keeps_the_other_defaults_of_that_group() -> None:
+def test_a_part_of_a_group_keeps_the_other_defaults_of_that_group():
     class Filtered(Settings):
         outer: Outer = Outer(inner=Inner(window_px=5), name="b")
 
@@ -172,12 +170,12 @@ def test_a_part_of_a_group_keeps_the_other_defaults_of_that_group() -> None:
         ({"window_px": 3}, r"did you mean inner\.window_px\?"),
     ],
 )
-def test_a_bad_setting_is_named_with_its_path(values: dict[str, object], message: str) -> None:
+def test_a_bad_setting_is_named_with_its_path(values, message):
     with pytest.raises(SettingsError, match=message):
         Outer.parse(values, where="config.yaml")
 
 
-def test_settings_cannot_be_changed_and_defaults_keep_their_bounds() -> None:
+def test_settings_cannot_be_changed_and_defaults_keep_their_bounds():
     class Wrong(Settings):
         window_px: int = Field(default=0, ge=1, description="Window.")
 
@@ -199,14 +197,14 @@ FIXED: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", FIXED)
-def test_a_constant_of_now_is_read_from_files_of_before_with_its_value_alone(name: str) -> None:
+def test_a_constant_of_now_is_read_from_files_of_before_with_its_value_alone(name):
     assert load_config(None, [{name: FIXED[name]}]) == ReconConfig()
     group, _, last = name.rpartition(".")
     with pytest.raises(SettingsError, match=f"{group}.*{last} is fixed in this version"):
         load_config(None, [{name: 7}])
 
 
-def test_a_setting_that_a_group_has_again_is_not_fixed() -> None:
+def test_a_setting_that_a_group_has_again_is_not_fixed():
     class Old(Settings):
         fixed = {"size": 1}  # noqa: RUF012
 
@@ -217,7 +215,7 @@ def test_a_setting_that_a_group_has_again_is_not_fixed() -> None:
 
 
 @pytest.mark.parametrize("settings", [ReconConfig, TrajectoryRules, RecordingSettings, StreetScene])
-def test_every_number_has_two_bounds(settings: type[Settings]) -> None:
+def test_every_number_has_two_bounds(settings):
     open_ended = [one.name for one in numbers_of(settings) if None in (one.low, one.high)]
     assert open_ended == []
 
@@ -228,7 +226,7 @@ def _given(number: Number, value: object) -> list[str]:
 
 
 @pytest.mark.parametrize("number", [*numbers_of(ReconConfig)], ids=lambda number: number.name)
-def test_a_number_beyond_its_bounds_is_refused_in_one_line(number: Number) -> None:
+def test_a_number_beyond_its_bounds_is_refused_in_one_line(number):
     assert number.low is not None
     assert number.high is not None
     step = 1 if number.whole else 1e-9 * max(1.0, abs(number.low), abs(number.high))

@@ -1,9 +1,6 @@
 """Values are checked when they are made, cannot be changed, and show themselves in one line."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +62,7 @@ TRUTH = DisparityTruth(np.ones((2, 2), np.float32), np.ones((2, 2), bool))
     [LENS, RIG, StereoPair(GREY, GREY), PAIR, DISPARITY, TRUTH, CLOUD, PATH, VOXELS, GRID],
     ids=lambda value: type(value).__name__,
 )
-def test_a_value_and_its_arrays_cannot_be_changed_and_others_are_named(value: Any) -> None:
+def test_a_value_and_its_arrays_cannot_be_changed_and_others_are_named(value):
     for field in fields(value):
         content = getattr(value, field.name)
         with pytest.raises(FrozenInstanceError):
@@ -78,7 +75,7 @@ def test_a_value_and_its_arrays_cannot_be_changed_and_others_are_named(value: An
                     replace(value, **{field.name: wrong})
 
 
-def test_freezing_copies_nothing_and_leaves_the_callers_array_writeable() -> None:
+def test_freezing_copies_nothing_and_leaves_the_callers_array_writeable():
     mine = np.zeros(3)
     view = frozen_array("mine", mine, np.float64, (3,))
     mine[0] = 5
@@ -116,15 +113,13 @@ def test_freezing_copies_nothing_and_leaves_the_callers_array_writeable() -> Non
         (CAMERA, {"height_px": 2_000_000}, "image size is implausible"),
     ],
 )
-def test_fields_that_disagree_and_cameras_without_depth_are_refused(
-    value: Any, change: dict[str, Any], words: str
-) -> None:
+def test_fields_that_disagree_and_cameras_without_depth_are_refused(value, change, words):
     error = CalibrationError if value in (LENS, RIG, CAMERA) else ShapeError
     with pytest.raises(error, match=words):
         replace(value, **change)
 
 
-def test_a_resized_camera_sees_the_same_directions() -> None:
+def test_a_resized_camera_sees_the_same_directions():
     assert CAMERA.doffs_px == 2
     np.testing.assert_array_equal(CAMERA.matrix, [[700, 0, 3], [0, 700, 2], [0, 0, 1]])
     half = CAMERA.resized(3, 2)
@@ -136,13 +131,13 @@ def test_a_resized_camera_sees_the_same_directions() -> None:
     assert half.resized(6, 4).focal_px == CAMERA.focal_px
 
 
-def test_colours_of_a_grey_pair_are_its_grey_thrice() -> None:
+def test_colours_of_a_grey_pair_are_its_grey_thrice():
     grey, rgb = np.arange(24, dtype=np.uint8).reshape(4, 6), np.zeros((4, 6, 3), np.uint8)
     np.testing.assert_array_equal(replace(PAIR, left=grey).colours[:, :, 1], grey)
     np.testing.assert_array_equal(replace(PAIR, left_rgb=rgb).colours, rgb)
 
 
-def test_rejecting_pixels_gives_the_reason_to_those_alone_that_had_a_value() -> None:
+def test_rejecting_pixels_gives_the_reason_to_those_alone_that_had_a_value():
     rejected = DISPARITY.reject(np.array([[True, True], [False, False]]), Reason.EDGE)
     assert rejected.valid.tolist() == [[False, False], [True, True]]
     assert rejected.reason.tolist() == [[Reason.EDGE, Reason.BORDER], [0, 0]]
@@ -151,7 +146,7 @@ def test_rejecting_pixels_gives_the_reason_to_those_alone_that_had_a_value() -> 
     assert DISPARITY.valid.tolist() == [[True, False], [True, True]]
 
 
-def test_selecting_points_selects_every_field() -> None:
+def test_selecting_points_selects_every_field():
     chosen = replace(CLOUD, frame="world").select(np.array([False, True, False, True]))
     assert len(chosen) == 2
     assert chosen.xyz[:, 0].tolist() == [3, 9]
@@ -162,7 +157,7 @@ def test_selecting_points_selects_every_field() -> None:
     np.testing.assert_allclose(VOXELS.centres_m, [[0.1, -0.1, 0.5]], atol=1e-12)
 
 
-def test_path_length_adds_the_steps() -> None:
+def test_path_length_adds_the_steps():
     assert PATH.distances_m.tolist() == [0, 3, 7]
     assert PATH.path_length_m == 7
     empty = PATH.select(np.zeros(0, int))
@@ -172,7 +167,7 @@ def test_path_length_adds_the_steps() -> None:
 GIVEN = np.array([[5.0, np.nan, np.inf], [0.0, -3.0, 7.5]])
 
 
-def test_a_disparity_is_made_of_values_alone_of_any_real_numbers() -> None:
+def test_a_disparity_is_made_of_values_alone_of_any_real_numbers():
     made = Disparity.from_values(GIVEN)
     assert made.values.dtype == np.float32
     assert made.valid.tolist() == [[True, False, False], [False, False, True]]
@@ -209,14 +204,12 @@ def test_a_disparity_is_made_of_values_alone_of_any_real_numbers() -> None:
         (GIVEN, {"sigma_px": np.inf}, "sigma_px"),
     ],
 )
-def test_what_is_no_disparity_is_refused(
-    values: object, others: dict[str, object], words: str
-) -> None:
+def test_what_is_no_disparity_is_refused(values, others, words):
     with pytest.raises(ShapeError, match=words):
         Disparity.from_values(values, **others)  # type: ignore[arg-type]
 
 
-def test_a_truth_is_made_of_values_and_a_mask_of_middlebury() -> None:
+def test_a_truth_is_made_of_values_and_a_mask_of_middlebury():
     levels = np.array([[255, 255, 255], [255, 255, 128]], np.uint8)
     made = DisparityTruth.from_values(GIVEN, levels)
     assert np.isfinite(made.values).tolist() == [[True, False, False], [False, False, True]]
@@ -261,11 +254,11 @@ SHOWN = {
 
 
 @pytest.mark.parametrize("value", SHOWN, ids=lambda value: type(value).__name__)
-def test_a_value_is_shown_in_one_line(value: object) -> None:
+def test_a_value_is_shown_in_one_line(value):
     assert repr(value) == SHOWN[value]
 
 
-def test_settings_show_what_differs_from_the_defaults_and_results_their_parts() -> None:
+def test_settings_show_what_differs_from_the_defaults_and_results_their_parts():
     assert repr(recon.load_config()) == "ReconConfig()"
     config = recon.load_config(overrides=["matching.matcher=sgm", "matching.sad.window_px=7"])
     assert repr(config) == (
@@ -291,7 +284,7 @@ def test_settings_show_what_differs_from_the_defaults_and_results_their_parts() 
         ("charuco:8x6:40mm", CalibrationBoard("charuco", 8, 6, 0.04, 0.03, "5X5_100")),
     ],
 )
-def test_a_board_is_read_from_text(text: str, board: CalibrationBoard) -> None:
+def test_a_board_is_read_from_text(text, board):
     read = parse_board(text)
     assert read.square_m == pytest.approx(board.square_m, rel=1e-12)
     assert read.marker_m == pytest.approx(board.marker_m, rel=1e-12)
@@ -303,7 +296,7 @@ def test_a_board_is_read_from_text(text: str, board: CalibrationBoard) -> None:
     "text",
     ["chess:9x6:25mm", "charuco:8x6:30mm:22mm:4x4_50", "charuco:8x6:30mm:22mm:4x4_50:legacy"],
 )
-def test_a_board_tells_itself_as_it_is_read(text: str) -> None:
+def test_a_board_tells_itself_as_it_is_read(text):
     assert str(parse_board(text)) == text
 
 
@@ -323,13 +316,13 @@ NO_BOARDS = (
         ("chess:9x6:0mm", "implausible"),
     ],
 )
-def test_what_is_no_board_or_cannot_be_one_is_refused(text: str, message: str) -> None:
+def test_what_is_no_board_or_cannot_be_one_is_refused(text, message):
     with pytest.raises(SettingsError, match=message):
         parse_board(text)
 
 
 @pytest.mark.parametrize("text", ["chess:9x6:25mm", "charuco:8x6:30mm:22mm:4x4_50"])
-def test_every_inner_corner_is_one_of_two_dark_squares(text: str) -> None:
+def test_every_inner_corner_is_one_of_two_dark_squares(text):
     board = parse_board(text)
     dark = dark_rectangles(board)
     whole = dark[np.isclose(dark[:, 2] - dark[:, 0], board.square_m)]

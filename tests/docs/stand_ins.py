@@ -4,8 +4,6 @@ To make the blocks of a new page run, add to `STAND_INS` what they read: how a b
 and the function that writes it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace

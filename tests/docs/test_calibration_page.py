@@ -1,9 +1,6 @@
 """The calibration files that docs/calibration.md prints in full."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ FILES = [
 ]
 
 
-def test_a_rectified_rig_can_be_typed(tmp_path: Path) -> None:
+def test_a_rectified_rig_can_be_typed(tmp_path):
     (tmp_path / "rig.yaml").write_text(FILES[0])
     camera = read_calibration(tmp_path / "rig.yaml", 1280, 720)
     assert isinstance(camera, RectifiedCamera)
@@ -34,7 +31,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_the_file_of_each_lens_model_is_what_recon_writes(tmp_path: Path, model: str) -> None:
+def test_the_file_of_each_lens_model_is_what_recon_writes(tmp_path, model):
     assert f"{{{LENSES[model]}}}" in (ROOT / "docs" / "calibration.md").read_text()
     text = FILES[1].replace(LENSES["pinhole"], LENSES[model]).replace("pinhole", model)
     (tmp_path / "rig.yaml").write_text(text)
@@ -45,7 +42,7 @@ def test_the_file_of_each_lens_model_is_what_recon_writes(tmp_path: Path, model:
     assert (tmp_path / "again.yaml").read_text() == text
 
 
-def test_without_lens_distortion_the_coefficients_may_be_left_out(tmp_path: Path) -> None:
+def test_without_lens_distortion_the_coefficients_may_be_left_out(tmp_path):
     text = re.sub(r"^  distortion:.*$", "  distortion: {}", FILES[1], flags=re.MULTILINE)
     (tmp_path / "rig.yaml").write_text(text)
     rig = read_calibration(tmp_path / "rig.yaml", 1280, 720)

@@ -1,12 +1,9 @@
 """What README and docs show runs, from the pages themselves."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import typer.main
@@ -39,12 +36,12 @@ every_shell_block = pytest.mark.parametrize("block", SHELL, ids=str)
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=str)
-def test_a_block_says_whether_it_runs(block: Block) -> None:
+def test_a_block_says_whether_it_runs(block):
     assert block.language in {"sh", "python", *SHOWN}
 
 
 @every_shell_block
-def test_a_shell_block_is_shell(block: Block) -> None:
+def test_a_shell_block_is_shell(block):
     done = subprocess.run(
         ["bash", "-n"], input=block.text, capture_output=True, text=True, check=False
     )
@@ -52,7 +49,7 @@ def test_a_shell_block_is_shell(block: Block) -> None:
 
 
 @every_shell_block
-def test_its_commands_are_those_of_the_program(block: Block) -> None:
+def test_its_commands_are_those_of_the_program(block):
     for name, *arguments in commands_in(block.text):
         if name == "recon":
             command = typer.main.get_command(app)
@@ -62,7 +59,7 @@ def test_its_commands_are_those_of_the_program(block: Block) -> None:
             command.make_context("recon", words)  # fails where an option does not exist
 
 
-def test_nothing_is_left_out_without_need() -> None:
+def test_nothing_is_left_out_without_need():
     lines = [line for block in SHELL for line in block.text.splitlines()]
     unused = [start for start in NOT_RUN if not any(re.match(start, line) for line in lines)]
     assert unused == []
@@ -81,7 +78,7 @@ def as_command(block: Block) -> list[str]:
 
 
 @pytest.fixture
-def environment(tmp_path: Path) -> dict[str, str]:
+def environment(tmp_path):
     """A home of its own, and this `recon` among the programs."""
     program = tmp_path / "bin" / "recon"
     program.parent.mkdir()
@@ -98,9 +95,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)  # README alone runs some twenty commands
 @pytest.mark.parametrize("page", RUNNING)
-def test_the_blocks_of_a_page_run_in_order(
-    page: str, tmp_path: Path, environment: dict[str, str]
-) -> None:
+def test_the_blocks_of_a_page_run_in_order(page, tmp_path, environment):
     """In a folder with small stand-ins for the files that they name."""
     blocks = [block for block in BLOCKS if block.page == page and block.language not in SHOWN]
     folder = tmp_path / "work"

@@ -1,11 +1,8 @@
 """The tables of README and docs/results.md, and `make results`, which makes them."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -26,7 +23,7 @@ RECORD = {
 
 
 @pytest.fixture
-def results(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def results(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     return importlib.import_module("results")
 
@@ -39,7 +36,7 @@ def measure(results: ModuleType, *names: str) -> Any:
 
 
 @pytest.fixture
-def elsewhere(results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def elsewhere(results, tmp_path, monkeypatch):
     """A page and the file of results in a folder of their own."""
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- table: movers -->\nold\n<!-- end -->\nafter\n")
@@ -50,11 +47,11 @@ def elsewhere(results: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     return page
 
 
-def test_the_tables_of_the_pages_are_those_that_were_measured(results: ModuleType) -> None:
+def test_the_tables_of_the_pages_are_those_that_were_measured(results):
     assert results.outdated() == []
 
 
-def test_every_table_has_one_place_and_no_figures_are_typed_elsewhere(results: ModuleType) -> None:
+def test_every_table_has_one_place_and_no_figures_are_typed_elsewhere(results):
     """Figures stand behind the first column: `| 12.3 % |`."""
     pages = [page.read_text() for page in results.PAGES]
     places = [place[2] for text in pages for place in results.PLACE.finditer(text)]
@@ -65,7 +62,7 @@ def test_every_table_has_one_place_and_no_figures_are_typed_elsewhere(results: M
         assert re.findall(r"^\|[^|\n]*\|.*?\d[.\d]* (?:%|m|ms|MB)\b.*$", typed, re.MULTILINE) == []
 
 
-def test_what_was_measured_says_of_which_commit_and_machine_it_is(results: ModuleType) -> None:
+def test_what_was_measured_says_of_which_commit_and_machine_it_is(results):
     for name, record in results.read().items():
         assert re.fullmatch(r"[0-9a-f]{7,}", record["commit"]), name
         assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"]), name
@@ -75,9 +72,7 @@ def test_what_was_measured_says_of_which_commit_and_machine_it_is(results: Modul
         assert "kiss-icp" in record["machine"] or "states" in record["note"], name
 
 
-def test_a_table_says_of_which_commit_and_machine_it_is(
-    results: ModuleType, elsewhere: Path
-) -> None:
+def test_a_table_says_of_which_commit_and_machine_it_is(results, elsewhere):
     assert measure(results, "movers") == 0
     origin = "commit 0123abc, 2026-01-02, a processor, 2 cores, load 3.5 at the start"
     assert elsewhere.read_text().splitlines() == [
@@ -96,19 +91,14 @@ def test_a_table_says_of_which_commit_and_machine_it_is(
     assert results.outdated() == ["page.md"]
 
 
-def test_what_is_not_measured_again_stays(results: ModuleType, elsewhere: Path) -> None:
+def test_what_is_not_measured_again_stays(results, elsewhere):
     earlier = {"movers": {**RECORD, "commit": "fedcba9"}}
     results.FILE.write_text(json.dumps(earlier))
     measure(results, "occupancy")
     assert json.loads(results.FILE.read_text()) == {**earlier, "occupancy": RECORD}
 
 
-def test_a_table_without_its_data_is_skipped_and_says_why(
-    results: ModuleType,
-    elsewhere: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_table_without_its_data_is_skipped_and_says_why(results, elsewhere, monkeypatch, capsys):
     monkeypatch.delenv("RECON_DATA", raising=False)
     assert measure(results, "kitti-d", "middlebury") == 0
     assert capsys.readouterr().out.splitlines() == [
@@ -118,9 +108,7 @@ def test_a_table_without_its_data_is_skipped_and_says_why(
     assert not results.FILE.exists()
 
 
-def test_a_table_that_fails_keeps_what_it_has(
-    results: ModuleType, elsewhere: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_table_that_fails_keeps_what_it_has(results, elsewhere, monkeypatch):
     def fail(name: str) -> None:
         raise LookupError(name)
 

@@ -1,7 +1,5 @@
 """Errors of disparities, depths and confidences, counted by hand and against definitions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -30,7 +28,7 @@ def estimate(values: list[float]) -> np.ndarray:
     return np.array([values], dtype=np.float32)
 
 
-def test_a_case_counted_by_hand() -> None:
+def test_a_case_counted_by_hand():
     # Errors 0, 0.5, 1, 3, none; the sixth truth is unknown, the seventh occluded.
     given = (
         estimate([10, 10.5, 9, 13, N, 4, 90]),
@@ -50,7 +48,7 @@ def test_a_case_counted_by_hand() -> None:
     assert evaluate_disparity(found, true).d1 == pytest.approx(40.0)
 
 
-def test_maps_without_values_or_truth_or_of_another_size_have_no_errors() -> None:
+def test_maps_without_values_or_truth_or_of_another_size_have_no_errors():
     result = evaluate_disparity(estimate([N, N]), truth([1, 2]))
     assert (result.invalid, set(result.bad.values())) == (100, {0.0})
     assert np.isnan([result.avgerr_px, result.rms_px, *result.quantiles_px.values()]).all()
@@ -63,7 +61,7 @@ def test_maps_without_values_or_truth_or_of_another_size_have_no_errors() -> Non
         share_within_sigma(Disparity.from_values(estimate([N, 1])), truth([1, N]))
 
 
-def test_plain_arrays_are_evaluated_like_values() -> None:
+def test_plain_arrays_are_evaluated_like_values():
     true = np.array([[8.0, np.inf, 0.0, 6.0], [4.0, 5.0, np.nan, 7.0]])
     found = np.array([[8.5, 3.0, 3.0, np.inf], [9.0, 5.0, 1.0, np.nan]])
     known = DisparityTruth.from_values(true.astype(np.float32))
@@ -75,7 +73,7 @@ def test_plain_arrays_are_evaluated_like_values() -> None:
         assert evaluate_middlebury(one, true.tolist()) == expected
 
 
-def test_depth_errors_of_a_case_counted_by_hand() -> None:
+def test_depth_errors_of_a_case_counted_by_hand():
     # f·b = 10, doffs 1: disparities 1, 4, 9 are 5 m, 2 m, 1 m.
     camera = RectifiedCamera(100.0, 1.0, 0.0, 2.0, 0.1, 4, 1)
     found = evaluate_depth(estimate([4, 4, -1, N]), truth([1, 4, 9, 9]), camera)
@@ -99,12 +97,12 @@ def made(
     return estimate, DisparityTruth(values, np.ones(values.shape, bool))
 
 
-def test_share_within_sigma_counts_what_is_less_than_it() -> None:
+def test_share_within_sigma_counts_what_is_less_than_it():
     pair = made(np.array([[0.2, 0.7, 1.2, 5.0]]))
     assert [share_within_sigma(*pair, n) for n in (1, 2, 3)] == [0.25, 0.5, 0.75]
 
 
-def test_honest_confidence_has_no_calibration_error() -> None:
+def test_honest_confidence_has_no_calibration_error():
     """Pixels are right just as often as their confidence says."""
     rng, shape = np.random.default_rng(0), (200, 500)
     confidence = rng.uniform(0, 1, shape)
@@ -120,9 +118,7 @@ def test_honest_confidence_has_no_calibration_error() -> None:
     ("claimed", "error_px", "gap", "place"),
     [(0.9, 5.0, 0.9, 8), (0.25, 0.0, 0.75, 2), (1.0, 1.0, 0.0, 9)],
 )
-def test_calibration_error_is_the_gap(
-    claimed: float, error_px: float, gap: float, place: int
-) -> None:
+def test_calibration_error_is_the_gap(claimed, error_px, gap, place):
     """A pixel off by the limit is right; what is certain falls into the last bin."""
     reliability = measure_reliability(*made(np.full((4, 5), error_px), claimed))
     # 1e-6: confidence is float32, in which 0.9 is a little less.
@@ -131,7 +127,7 @@ def test_calibration_error_is_the_gap(
     assert np.flatnonzero(~np.isnan(reliability.right)).tolist() == [place]
 
 
-def test_confidence_that_sorts_better_leaves_less_area() -> None:
+def test_confidence_that_sorts_better_leaves_less_area():
     error_px = np.where(np.arange(1000).reshape(10, 100) < 300, 5.0, 0.0)
     best, flat, worst = (
         measure_sparsification(*made(error_px, np.where(error_px > 1, wrong, right)))

@@ -1,7 +1,5 @@
 """Metrics of clouds and of occupancy maps, on truth that can be counted by hand, and ICP."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +31,7 @@ def cloud(xyz: np.ndarray) -> PointCloud:
     return PointCloud(xyz.astype(np.float32))
 
 
-def test_an_offset_is_the_median_and_decides_at_the_threshold() -> None:
+def test_an_offset_is_the_median_and_decides_at_the_threshold():
     same = evaluate_map(cloud(grid()), cloud(grid()), 0.2)
     assert (same.precision, same.recall, same.f_score) == (1, 1, 1)
     # The distance of a point to itself, squared and rooted in single precision.
@@ -46,7 +44,7 @@ def test_an_offset_is_the_median_and_decides_at_the_threshold() -> None:
     assert (far.precision, far.recall, far.f_score) == (0, 0, 0)
 
 
-def test_precision_counts_wrong_points_and_recall_missing_ones() -> None:
+def test_precision_counts_wrong_points_and_recall_missing_ones():
     clouds = cloud(np.concatenate([grid()[:240], grid(5.0)[:80]])), cloud(grid())
     there, back = evaluate_map(*clouds, 0.2), evaluate_map(*clouds[::-1], 0.2)
     assert (there.precision, there.recall) == pytest.approx((0.75, 0.6))
@@ -54,14 +52,14 @@ def test_precision_counts_wrong_points_and_recall_missing_ones() -> None:
     assert there.f_score == back.f_score == pytest.approx(2 * 0.75 * 0.6 / 1.35)
 
 
-def test_density_does_not_weigh() -> None:
+def test_density_does_not_weigh():
     rng = np.random.default_rng(0)
     dense_wrong = rng.uniform([0, 0, 4], [0.05, 0.05, 4.05], (5000, 3))
     result = evaluate_map(cloud(np.concatenate([grid(), dense_wrong])), cloud(grid()), 0.2)
     assert result.precision >= 400 / 408  # the heap fills at most eight voxels
 
 
-def test_distances_hold_far_from_the_origin() -> None:
+def test_distances_hold_far_from_the_origin():
     far = np.array([4000.0, 0, 9000.0])
     here, there = ((grid(z) + far).astype(np.float32) for z in (0.125, 0.0))
     # float32 places points at 9 km to half a millimetre.
@@ -79,9 +77,7 @@ def test_distances_hold_far_from_the_origin() -> None:
         (cloud(grid()), cloud(grid()), float("nan"), "threshold is not positive"),
     ],
 )
-def test_clouds_that_cannot_be_compared_are_refused(
-    estimate: PointCloud, reference: PointCloud, threshold_m: float, complaint: str
-) -> None:
+def test_clouds_that_cannot_be_compared_are_refused(estimate, reference, threshold_m, complaint):
     with pytest.raises(EvaluationError, match=complaint):
         evaluate_map(estimate, reference, threshold_m)
 
@@ -95,7 +91,7 @@ def corner(seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("away_m", [0.0, 5000.0])
-def test_icp_finds_the_motion_between_two_samples_of_a_corner(away_m: float) -> None:
+def test_icp_finds_the_motion_between_two_samples_of_a_corner(away_m):
     here = np.eye(4)
     here[:3, 3] = away_m
     small = make_transform(exp_so3(np.array([0.01, -0.02, 0.015])), np.array([0.3, -0.2, 0.1]))
@@ -108,7 +104,7 @@ def test_icp_finds_the_motion_between_two_samples_of_a_corner(away_m: float) -> 
     assert share > 0.9
 
 
-def test_clouds_that_are_too_far_apart_for_icp_are_reported() -> None:
+def test_clouds_that_are_too_far_apart_for_icp_are_reported():
     with pytest.raises(RegistrationError, match="no corresponding points"):
         icp(corner(0), corner(1) + 100, (2.0, 0.5))
     xyz = corner(2)
@@ -149,7 +145,7 @@ def voxels(*occupied: np.ndarray, free: np.ndarray = WALL[:0]) -> OccupancyVoxel
     return OccupancyVoxels(keys, log_odds, EDGE_M)
 
 
-def test_the_true_occupancy_itself_is_perfect() -> None:
+def test_the_true_occupancy_itself_is_perfect():
     found = evaluate_occupancy(voxels(WALL, free=WALL - np.array([5, 0, 0])), TRUTH.grid, TRUTH)
     for one in (found.voxels, found.voxels_exact):
         assert (one.precision, one.recall, one.voxels, one.true_voxels) == (1.0, 1.0, 72, 72)
@@ -159,7 +155,7 @@ def test_the_true_occupancy_itself_is_perfect() -> None:
 
 
 @pytest.mark.parametrize(("shift", "exact", "tolerant"), [(1, 0.0, 1.0), (2, 0.0, 0.0)])
-def test_the_tolerance_is_one_cell(shift: int, exact: float, tolerant: float) -> None:
+def test_the_tolerance_is_one_cell(shift, exact, tolerant):
     moved = OccupancyGrid(np.roll(CELLS, shift, axis=1), EDGE_M, (0.0, -2.0))
     found = evaluate_occupancy(voxels(WALL + np.array([shift, 0, 0])), moved, TRUTH)
     assert (found.voxels_exact.precision, found.voxels_exact.recall) == (exact, exact)
@@ -167,7 +163,7 @@ def test_the_tolerance_is_one_cell(shift: int, exact: float, tolerant: float) ->
     assert (found.grid_exact.iou_occupied, found.grid.iou_occupied) == (exact, tolerant)
 
 
-def test_voxels_that_no_image_held_do_not_count() -> None:
+def test_voxels_that_no_image_held_do_not_count():
     beside, behind, far = (WALL + np.array(by) for by in ([0, 80, 0], [-100, 0, 0], [60, 0, 0]))
     found = evaluate_occupancy(voxels(WALL, beside, behind, far), TRUTH.grid, TRUTH)
     assert (found.voxels.precision, found.voxels.voxels) == (1.0, 72)
@@ -176,7 +172,7 @@ def test_voxels_that_no_image_held_do_not_count() -> None:
     assert (found.voxels.precision, found.voxels.recall) == (0.5, 1.0)
 
 
-def test_true_voxels_must_have_been_seen_often_enough() -> None:
+def test_true_voxels_must_have_been_seen_often_enough():
     frames = np.where(WALL[:, 1] < 0, 3, 2).astype(np.int32)
     seldom = replace(TRUTH, frames=frames)
     half = evaluate_occupancy(voxels(WALL[WALL[:, 1] < 0]), TRUTH.grid, seldom)
@@ -185,7 +181,7 @@ def test_true_voxels_must_have_been_seen_often_enough() -> None:
     assert evaluate_occupancy(voxels(WALL), TRUTH.grid, seldom).voxels.precision == 1.0
 
 
-def test_intersection_over_union_on_paper() -> None:
+def test_intersection_over_union_on_paper():
     cells = np.full((20, 60), FREE, np.int8)
     cells[4:10, 50] = OCCUPIED  # 6 of 12 found
     cells[10:12, 50] = UNKNOWN  # 2 not known, so 4 are called free
@@ -200,7 +196,7 @@ def test_intersection_over_union_on_paper() -> None:
     assert found.grid.iou_occupied == pytest.approx(7 / 18)
 
 
-def test_only_seen_cells_of_the_grid_count_wherever_it_lies() -> None:
+def test_only_seen_cells_of_the_grid_count_wherever_it_lies():
     ahead = np.zeros_like(TRUTH.seen)
     ahead[:, 40:60] = True
     part = OccupancyGrid(CELLS[:, 45:], EDGE_M, (9.0, -2.0))
@@ -208,7 +204,7 @@ def test_only_seen_cells_of_the_grid_count_wherever_it_lies() -> None:
     assert (found.iou_occupied, found.unknown, found.cells) == pytest.approx((1.0, 5 / 20, 400))
 
 
-def test_occupancies_that_cannot_be_compared_are_refused() -> None:
+def test_occupancies_that_cannot_be_compared_are_refused():
     coarse = OccupancyGrid(np.zeros((2, 2), np.int8), 0.4, (0.0, 0.0))
     with pytest.raises(EvaluationError, match="different resolutions"):
         evaluate_occupancy(voxels(WALL), coarse, TRUTH)

@@ -1,9 +1,6 @@
 """Middlebury's metrics against plain implementations, and against published values."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,9 +75,7 @@ def plain_figures(
     rounded=st.booleans(),
     masked=st.booleans(),
 )
-def test_figures_are_those_of_the_plain_definitions(
-    seed: int, scale: int, full: int, rounded: bool, masked: bool
-) -> None:
+def test_figures_are_those_of_the_plain_definitions(seed, scale, full, rounded, masked):
     rng = np.random.default_rng(seed)
     # Multiples of 1/4 are exact, so errors of exactly a limit occur and must not be bad.
     gt = (rng.integers(0, 80 * scale, (12, 16)) / 4).astype(np.float32)
@@ -106,7 +101,7 @@ def test_figures_are_those_of_the_plain_definitions(
     assert named == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
-def test_a_result_is_taken_to_the_size_of_the_truth_up_to_the_rest_of_a_division() -> None:
+def test_a_result_is_taken_to_the_size_of_the_truth_up_to_the_rest_of_a_division():
     values = np.arange(24, dtype=np.float32).reshape(4, 6)
     assert at_truth_size(values, (2, 3)).tolist() == [[0, 1, 2], [6, 7, 8]]
     smaller = at_truth_size(np.array([[1, N]], dtype=np.float32), (2, 4))
@@ -117,7 +112,7 @@ def test_a_result_is_taken_to_the_size_of_the_truth_up_to_the_rest_of_a_division
         at_truth_size(np.ones((10, 10), np.float32), (10, 15))
 
 
-def test_five_scenes_count_half() -> None:
+def test_five_scenes_count_half():
     halved = {"PianoL", "Playroom", "Playtable", "Shelves", "Vintage", "trainingQ/Playroom"}
     assert {scene_weight(name) for name in halved} == {4}
     assert {scene_weight(name) for name in ("PlaytableP", "Piano", "Teddy")} == {8}
@@ -136,7 +131,7 @@ def plainly_filled(row: list[float]) -> list[float]:
 
 
 @given(st.integers(0, 2**16), st.integers(1, 12))
-def test_known_values_stay_and_holes_follow_the_rule(seed: int, width: int) -> None:
+def test_known_values_stay_and_holes_follow_the_rule(seed, width):
     rng = np.random.default_rng(seed)
     values = rng.integers(0, 50, (5, width)).astype(np.float32)
     values[rng.random(values.shape) < 0.6] = np.nan
@@ -145,7 +140,7 @@ def test_known_values_stay_and_holes_follow_the_rule(seed: int, width: int) -> N
     assert fill_holes(values).tolist() == expected
 
 
-def test_rows_without_values_are_filled_from_the_nearest_the_upper_one_first() -> None:
+def test_rows_without_values_are_filled_from_the_nearest_the_upper_one_first():
     rows = [[N, N], [1, N], [N, N], [N, 2], [N, N], [N, N]]
     filled = fill_holes(np.array(rows, np.float32))
     assert filled[:, 0].tolist() == [1, 1, 1, 2, 2, 2]
@@ -154,7 +149,7 @@ def test_rows_without_values_are_filled_from_the_nearest_the_upper_one_first() -
         fill_holes(np.zeros((2, 2)))
 
 
-def test_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
+def test_confidence_that_is_right_as_often_as_it_says_has_no_error():
     fifth_wrong = np.where(np.arange(np.prod(SHAPE)).reshape(SHAPE) % 5 == 0, 3.0, 0.25)
     figures = confidence_figures(*made(fifth_wrong))
     assert figures is not None
@@ -168,9 +163,7 @@ def test_confidence_that_is_right_as_often_as_it_says_has_no_error() -> None:
 @pytest.mark.parametrize(
     ("factor", "error_px", "right", "within"), [(2, 0.75, 1, 0), (4, 0.25, 1, 1), (4, 1.25, 0, 0)]
 )
-def test_a_map_larger_than_the_truth_is_judged_in_its_own_pixels(
-    factor: int, error_px: float, right: int, within: int
-) -> None:
+def test_a_map_larger_than_the_truth_is_judged_in_its_own_pixels(factor, error_px, right, within):
     """Off by 0.75 of its own pixels is right; at half the size that is 0.375 px of the truth."""
     small = tuple(n // factor for n in SHAPE)
     truth = DisparityTruth(np.full(small, 20 / factor, np.float32), np.ones(small, bool))
@@ -179,7 +172,7 @@ def test_a_map_larger_than_the_truth_is_judged_in_its_own_pixels(
     assert (figures["reliability"]["right"][8], figures["within_1_sigma"]) == (right, within)
 
 
-def test_the_mean_counts_scenes_by_weight_and_leaves_out_those_without() -> None:
+def test_the_mean_counts_scenes_by_weight_and_leaves_out_those_without():
     """PianoL counts half: two thirds and one third."""
     estimate, truth = made(np.zeros(SHAPE))
     nothing = confidence_figures(estimate.reject(np.ones(SHAPE, bool), Reason.AMBIGUOUS), truth)
@@ -207,7 +200,7 @@ class Shifted:
         return Disparity.from_values(self.values[: pair.left.shape[0]])
 
 
-def test_scenes_and_results_of_a_folder_become_figures(tmp_path: Path) -> None:
+def test_scenes_and_results_of_a_folder_become_figures(tmp_path):
     for name in ("Teddy", "Vintage"):
         write_scene(tmp_path / "trainingQ" / name, square())
     paths = find_scenes(tmp_path / "trainingQ")
@@ -241,7 +234,7 @@ def test_scenes_and_results_of_a_folder_become_figures(tmp_path: Path) -> None:
     assert error_map(teddy, own.values)[np.isfinite(true)] == pytest.approx(4.0)
 
 
-def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path: Path) -> None:
+def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path):
     write_scene(tmp_path / "Teddy", square())
     paths = find_scenes(tmp_path)
     for folder, names, message in (
@@ -264,7 +257,7 @@ ANCHORS = {"opencv-bm": (42.4, 28.6, 21.1, 12.2), "opencv-sgbm": (40.3, 23.0, 15
 
 
 @pytest.mark.real
-def test_opencv_scores_as_it_was_measured_elsewhere(recon_data: Path, tmp_path: Path) -> None:
+def test_opencv_scores_as_it_was_measured_elsewhere(recon_data, tmp_path):
     folder = recon_data / "middlebury" / "MiddEval3" / "trainingQ"
     found = run_middlebury(folder, matchers=tuple(ANCHORS), out=tmp_path / "run")["matchers"]
     for matcher, anchors in ANCHORS.items():

@@ -1,9 +1,5 @@
 """The geometry that Table 1 describes, and block matching as printed."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -34,7 +30,7 @@ def camera_for(width_px: int, height_px: int, ndisp: int | None = None) -> Recti
     return RectifiedCamera(60.0, *middle, 0.5, width_px, height_px, ndisp)
 
 
-def test_true_depths_have_no_error_and_those_of_table_1_a_large_one() -> None:
+def test_true_depths_have_no_error_and_those_of_table_1_a_large_one():
     values = np.linspace(16, 58, 200, dtype=np.float32).reshape(10, 20)
     truth = DisparityTruth(values, np.isfinite(values))
     believed_m = depth_from_disparity(values, camera_of_table_1(CAMERA))
@@ -52,13 +48,13 @@ def test_true_depths_have_no_error_and_those_of_table_1_a_large_one() -> None:
 
 
 @pytest.mark.parametrize("values", [{"patch_px": 4}, {"patches_px": [3, 6]}, {"patches_px": []}])
-def test_even_patches_and_none_are_refused(values: dict[str, object]) -> None:
+def test_even_patches_and_none_are_refused(values):
     with pytest.raises(SettingsError, match="patch"):
         PaperSettings.parse(values)
 
 
 @pytest.mark.real
-def test_the_real_scenes_have_the_numbers_that_identify_table_1(recon_data: Path) -> None:
+def test_the_real_scenes_have_the_numbers_that_identify_table_1(recon_data):
     rows = [*map(table_1_row, read_experiments(recon_data / "middlebury/MiddEval3/trainingQ"))]
     assert {row["experiment"]: row["scene"] for row in rows} == EXPERIMENTS
     # Ref: doffs, baseline, ndisp as the paper's Table 1 prints them.
@@ -67,7 +63,7 @@ def test_the_real_scenes_have_the_numbers_that_identify_table_1(recon_data: Path
     assert [row["corrected"]["focal_px"] for row in rows] == [935.0, 1823.297, 989.886]
 
 
-def test_only_absolute_differences_find_a_wall_to_the_whole_pixel() -> None:
+def test_only_absolute_differences_find_a_wall_to_the_whole_pixel():
     # 60 px · 0.5 m / 5 m = 6 px exactly.
     scene = fronto_parallel_pair(camera_for(64, 40, 16), 5.0)
     found = PrintedMatcher(7, signed=False).match(scene.pair)
@@ -78,7 +74,7 @@ def test_only_absolute_differences_find_a_wall_to_the_whole_pixel() -> None:
     assert np.mean(signed.values[:, 9:-3] == 6) < 0.3
 
 
-def test_only_pixels_whose_patch_leaves_the_image_have_no_value() -> None:
+def test_only_pixels_whose_patch_leaves_the_image_have_no_value():
     left = np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8)
     pair = RectifiedPair(left, left, camera_for(30, 20))
     found = PrintedMatcher(5, signed=True).match(pair)
@@ -100,9 +96,7 @@ def test_only_pixels_whose_patch_leaves_the_image_have_no_value() -> None:
     patch_px=st.sampled_from([1, 3]),
     signed=st.booleans(),
 )
-def test_it_equals_the_sums_written_out(
-    data: st.DataObject, shape: tuple[int, int], patch_px: int, signed: bool
-) -> None:
+def test_it_equals_the_sums_written_out(data, shape, patch_px, signed):
     left, right = (data.draw(hnp.arrays(np.uint8, shape)) for _ in range(2))
     pair = RectifiedPair(left, right, camera_for(shape[1], shape[0], 6))
     found = PrintedMatcher(patch_px, signed).match(pair).values

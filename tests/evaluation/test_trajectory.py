@@ -1,9 +1,6 @@
 """Errors of paths: counted by hand, as evo counts them (GPL-3, in development only)."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,7 +48,7 @@ def bend(frames: int, yaw_rad: float, step_m: float = 1.0) -> np.ndarray:
     return np.stack([np.linalg.matrix_power(step, n) for n in range(frames)])
 
 
-def test_upright_keeps_a_map_upright_where_gnss_leaves_its_roll_open() -> None:
+def test_upright_keeps_a_map_upright_where_gnss_leaves_its_roll_open():
     along = np.arange(60)[:, None] * np.array([0.8, 0.6, 0.02])
     noise = np.random.default_rng(4).normal(0, 0.3, along.shape)
     found, loose = (fit(along, along + noise + 5e6).T_to_from for fit in (fit_upright, fit_points))
@@ -66,7 +63,7 @@ def test_upright_keeps_a_map_upright_where_gnss_leaves_its_roll_open() -> None:
 
 
 @given(scale=st.floats(0.5, 1.5))
-def test_a_constant_scale_error_is_the_relative_error(scale: float) -> None:
+def test_a_constant_scale_error_is_the_relative_error(scale):
     truth = straight(201)
     estimate = truth.copy()
     estimate[:, :3, 3] *= scale
@@ -79,7 +76,7 @@ def test_a_constant_scale_error_is_the_relative_error(scale: float) -> None:
     assert metrics.rpe_m == pytest.approx(abs(scale - 1), abs=1e-9)
 
 
-def test_a_yaw_drift_is_the_relative_rotation_error() -> None:
+def test_a_yaw_drift_is_the_relative_rotation_error():
     drift_rad = math.radians(0.01)
     truth = trajectory(straight(201))
     metrics = evaluate_trajectory(trajectory(bend(201, drift_rad)), truth)
@@ -92,7 +89,7 @@ def test_a_yaw_drift_is_the_relative_rotation_error() -> None:
     ("alignment", "ate_m", "scale"),
     [("none", 3.0, 1.0), ("origin", 1.0, 1.0), ("se3", 1.0, 1.0), ("sim3", 0.0, 1 / 1.1)],
 )
-def test_an_alignment_takes_away_what_it_may(alignment: str, ate_m: float, scale: float) -> None:
+def test_an_alignment_takes_away_what_it_may(alignment, ate_m, scale):
     """An estimate of another scale that begins elsewhere; what remains is at least ``ate_m``."""
     poses = bend(201, 0.01)
     moved = make_transform(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([5.0, -3.0, 2.0])) @ poses
@@ -120,9 +117,7 @@ def test_an_alignment_takes_away_what_it_may(alignment: str, ate_m: float, scale
         (31, {15.0: 15}),
     ],
 )
-def test_segments_are_those_for_which_a_drive_has_room(
-    frames: int, by_length: dict[float, int]
-) -> None:
+def test_segments_are_those_for_which_a_drive_has_room(frames, by_length):
     truth = trajectory(straight(frames))
     metrics = evaluate_trajectory(trajectory(bend(frames, 0.0101)), truth)
     assert {one.length_m: one.segments for one in metrics.by_length} == by_length
@@ -134,7 +129,7 @@ def test_segments_are_those_for_which_a_drive_has_room(
         assert getattr(metrics, name) == pytest.approx(mean, rel=1e-12)
 
 
-def test_lengths_and_steps_can_be_asked_for() -> None:
+def test_lengths_and_steps_can_be_asked_for():
     rules = TrajectoryRules(lengths_m=(20.0, 5.0), step_frames=7)
     metrics = evaluate_trajectory(trajectory(straight(50)), trajectory(straight(50)), rules)
     assert [(one.length_m, one.segments) for one in metrics.by_length] == [(5.0, 7), (20.0, 5)]
@@ -142,7 +137,7 @@ def test_lengths_and_steps_can_be_asked_for() -> None:
         compare_paths(*[trajectory(straight(50))] * 2, TrajectoryRules(lengths_m=(60.0,)))
 
 
-def test_a_path_is_taken_from_a_file_and_from_the_truth_of_a_source(tmp_path: Path) -> None:
+def test_a_path_is_taken_from_a_file_and_from_the_truth_of_a_source(tmp_path):
     path = trajectory(bend(100, 0.01))
     write_tum(tmp_path / "path.txt", path)
     assert evaluate_trajectory(path, SequenceTruth(path)) == evaluate_trajectory(path, path)
@@ -157,7 +152,7 @@ def test_a_path_is_taken_from_a_file_and_from_the_truth_of_a_source(tmp_path: Pa
 
 
 @pytest.mark.parametrize("unit", [1e-3, 0.3048, 1e3, 1e6])
-def test_a_truth_in_another_unit_is_refused_unless_scales_are_aligned(unit: float) -> None:
+def test_a_truth_in_another_unit_is_refused_unless_scales_are_aligned(unit):
     estimate = bend(2000, 0.01)
     truth = estimate.copy()
     truth[:, :3, 3] *= unit
@@ -169,7 +164,7 @@ def test_a_truth_in_another_unit_is_refused_unless_scales_are_aligned(unit: floa
 
 
 @given(steps=st.lists(st.floats(0.0, 3.0), min_size=2, max_size=60).filter(lambda s: sum(s) >= 1.0))
-def test_every_path_of_a_metre_or_more_has_a_finite_error(steps: list[float]) -> None:
+def test_every_path_of_a_metre_or_more_has_a_finite_error(steps):
     poses = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
     poses[1:, 2, 3] = np.cumsum(steps)
     estimate = poses.copy()
@@ -187,15 +182,13 @@ def test_every_path_of_a_metre_or_more_has_a_finite_error(steps: list[float]) ->
         (straight(9), straight(9, 0.0), "too short"),
     ],
 )
-def test_what_cannot_be_compared_is_reported(
-    estimate: np.ndarray, truth: np.ndarray, told: str
-) -> None:
+def test_what_cannot_be_compared_is_reported(estimate, truth, told):
     with pytest.raises(EvaluationError, match=told):
         evaluate_trajectory(trajectory(estimate), trajectory(truth))
 
 
 @pytest.mark.real
-def test_the_two_truths_of_a_real_drive_differ_by_about_one_per_cent(recon_data: Path) -> None:
+def test_the_two_truths_of_a_real_drive_differ_by_about_one_per_cent(recon_data):
     folder = recon_data / "driven" / "kitti_raw_0013"
     metrics = evaluate_trajectory(folder / "poses_oxts.txt", folder / "poses.txt")
     # The data's README states "about 1 %".
@@ -210,7 +203,7 @@ def jittered(poses: np.ndarray, sigma_m: float, seed: int = 1) -> np.ndarray:
     return moved
 
 
-def test_the_roll_that_a_straight_path_does_not_fix_is_no_rotation_error() -> None:
+def test_the_roll_that_a_straight_path_does_not_fix_is_no_rotation_error():
     truth = jittered(straight(60), 0.05, seed=2)
     estimate = make_transform(exp_so3(np.array([0.1, 0.2, 0.8])), np.ones(3)) @ truth
     found = compare_paths(trajectory(jittered(estimate, 0.05)), trajectory(truth))
@@ -221,7 +214,7 @@ def test_the_roll_that_a_straight_path_does_not_fix_is_no_rotation_error() -> No
     assert found.metrics.ate_m == pytest.approx(0.05 * math.sqrt(3), rel=0.3)
 
 
-def test_a_roll_that_changes_along_a_straight_path_stays_a_rotation_error() -> None:
+def test_a_roll_that_changes_along_a_straight_path_stays_a_rotation_error():
     truth = jittered(straight(60), 0.02, seed=2)
     estimate = jittered(truth, 0.02)
     rolls = [exp_so3(np.array([0.0, 0.0, roll])) for roll in np.linspace(-0.1, 0.1, 60)]
@@ -233,7 +226,7 @@ def test_a_roll_that_changes_along_a_straight_path_stays_a_rotation_error() -> N
 
 
 @pytest.mark.parametrize("alignment", ["se3", "none"])
-def test_a_bend_fixes_every_rotation_and_so_does_no_alignment(alignment: str) -> None:
+def test_a_bend_fixes_every_rotation_and_so_does_no_alignment(alignment):
     poses = bend(100, 0.02) if alignment == "se3" else straight(100)
     rules = TrajectoryRules(alignment=alignment)  # type: ignore[arg-type]
     found = compare_paths(trajectory(jittered(poses, 0.02)), trajectory(poses), rules)
@@ -250,9 +243,7 @@ def path(times_s: np.ndarray) -> Trajectory:
 
 
 @given(times=TIMES, others=TIMES, tolerance=st.floats(0, 5))
-def test_partners_are_near_in_order_and_belong_to_one_only(
-    times: np.ndarray, others: np.ndarray, tolerance: float
-) -> None:
+def test_partners_are_near_in_order_and_belong_to_one_only(times, others, tolerance):
     times, others = np.unique(times), np.unique(others)
     try:
         first, second = associate(path(times), path(others), tolerance)
@@ -265,7 +256,7 @@ def test_partners_are_near_in_order_and_belong_to_one_only(
         np.testing.assert_array_equal(found.positions_m[:, 0], found.timestamps_s)
 
 
-def test_clocks_that_never_meet_are_reported() -> None:
+def test_clocks_that_never_meet_are_reported():
     with pytest.raises(EvaluationError, match=r"times 0\.000 to 4\.000 s and 1000\.000"):
         associate(path(np.arange(5.0)), path(1000 + np.arange(5.0)), 0.01)
 
@@ -285,7 +276,7 @@ def measured(frames: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(0.0, 0.03, (frames, 3))
 
 
-def test_an_interpolated_stretch_is_found_and_the_segments_that_rest_on_it_counted() -> None:
+def test_an_interpolated_stretch_is_found_and_the_segments_that_rest_on_it_counted():
     turns = measured(50)
     turns[:11] = [0.01, -0.04, -0.04]
     truth = turning_path(turns)
@@ -310,7 +301,7 @@ SHORT_STRETCH[10:14] = SHORT_STRETCH[10]
         *(measured(steps) for steps in (0, 1, 5)),
     ],
 )
-def test_no_other_path_has_interpolated_poses(turns: np.ndarray) -> None:
+def test_no_other_path_has_interpolated_poses(turns):
     assert not interpolated_poses(turning_path(turns)).any()
     assert interpolation_warnings(turning_path(turns), segments_of(np.arange(9.0), (3.0,), 1)) == []
 
@@ -329,7 +320,7 @@ def drive(frames: int, seed: int) -> tuple[Trajectory, Trajectory]:
 
 
 @pytest.fixture
-def evo() -> Any:
+def evo():
     """The metrics of evo, whose relations and units are in the same module."""
     return pytest.importorskip("evo.core.metrics", reason="evo needs Python 3.11")
 
@@ -349,7 +340,7 @@ def evo_statistics(pair: Any, metric: Any) -> dict[str, float]:
 
 @pytest.mark.parametrize("alignment", ["none", "origin", "se3", "sim3"])
 @pytest.mark.parametrize("rpe_frames", [1, 7])
-def test_ate_and_rpe_agree_with_evo(alignment: str, rpe_frames: int, evo: Any) -> None:
+def test_ate_and_rpe_agree_with_evo(alignment, rpe_frames, evo):
     estimate, truth = drive(300, seed=3)
     rules = TrajectoryRules(alignment=alignment, rpe_frames=rpe_frames)
     found = compare_paths(estimate, truth, rules)
@@ -376,7 +367,7 @@ def test_ate_and_rpe_agree_with_evo(alignment: str, rpe_frames: int, evo: Any) -
         assert value == pytest.approx(evo_statistics(pair, steps)["rmse"], rel=rel)
 
 
-def test_association_agrees_with_evo() -> None:
+def test_association_agrees_with_evo():
     sync = pytest.importorskip("evo.core.sync", reason="evo needs Python 3.11")
     estimate, truth = drive(300, seed=7)
     rng = np.random.default_rng(0)

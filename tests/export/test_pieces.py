@@ -1,7 +1,5 @@
 """Cut meshes meet without a gap, and the surface of a drive is built of such tiles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +54,7 @@ def area_m2(mesh: TriangleMesh) -> float:
 
 
 @given(axis=st.integers(0, 1), at=st.floats(-0.9, 0.9), seed=st.integers(0, 5))
-def test_the_halves_are_the_whole(axis: int, at: float, seed: int) -> None:
+def test_the_halves_are_the_whole(axis, at, seed):
     mesh, plane = sheet(seed), Plane(axis, at)
     halves = [cut_mesh(mesh, plane, keep_above=above) for above in (False, True)]
     # float32 places new vertices to 1e-7 m.
@@ -70,7 +68,7 @@ def test_the_halves_are_the_whole(axis: int, at: float, seed: int) -> None:
     np.testing.assert_array_equal(borders[0], borders[1])
 
 
-def test_new_vertices_have_normals_and_colours_between() -> None:
+def test_new_vertices_have_normals_and_colours_between():
     half = cut_mesh(sheet(0), Plane(0, 0.0), keep_above=True)
     on_plane = half.vertices[:, 0] == 0
     assert half.rgb is not None
@@ -80,7 +78,7 @@ def test_new_vertices_have_normals_and_colours_between() -> None:
 
 
 @pytest.mark.parametrize("above", [True, False])
-def test_a_mesh_on_one_side_is_kept_or_dropped_whole(above: bool) -> None:
+def test_a_mesh_on_one_side_is_kept_or_dropped_whole(above):
     mesh = sheet(1)
     kept = cut_mesh(mesh, Plane(0, -5.0 if above else 5.0), keep_above=above)
     assert len(kept.faces) == len(mesh.faces)
@@ -98,7 +96,7 @@ def gaps_m(one: TriangleMesh, other: TriangleMesh, plane: Plane) -> np.ndarray:
 
 
 @pytest.mark.parametrize("n", [12, 24, 57])
-def test_a_seam_between_two_versions_of_a_surface_is_closed(n: int) -> None:
+def test_a_seam_between_two_versions_of_a_surface_is_closed(n):
     plane = Plane(0, 0.1)
     left = cut_mesh(sheet(2), plane, keep_above=False)
     right = cut_mesh(sheet(3, n, shift_m=0.02, noise_m=0.005), plane, keep_above=True)
@@ -116,7 +114,7 @@ def _within(mesh: TriangleMesh, y_m: float) -> TriangleMesh:
     return cut_mesh(below, Plane(1, -y_m), keep_above=True)
 
 
-def test_a_seam_whose_neighbour_is_far_stays_as_it_is() -> None:
+def test_a_seam_whose_neighbour_is_far_stays_as_it_is():
     plane = Plane(0, 0.0)
     left = cut_mesh(sheet(2), plane, keep_above=False)
     right = cut_mesh(sheet(3, shift_m=1.0), plane, keep_above=True)
@@ -129,7 +127,7 @@ SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32
 HALVES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
 
 
-def test_a_face_stays_only_with_all_its_vertices_and_in_a_large_component() -> None:
+def test_a_face_stays_only_with_all_its_vertices_and_in_a_large_component():
     vertices, faces = keep_vertices(SQUARE, HALVES, np.array([True, False, True, True]))
     np.testing.assert_array_equal(vertices, SQUARE[[0, 2, 3]])
     np.testing.assert_array_equal(faces, [[0, 1, 2]])
@@ -141,7 +139,7 @@ def test_a_face_stays_only_with_all_its_vertices_and_in_a_large_component() -> N
         drop_small_components(SQUARE, HALVES, 3)
 
 
-def test_normals_of_a_flat_square_are_its_normal_and_large_faces_weigh_more() -> None:
+def test_normals_of_a_flat_square_are_its_normal_and_large_faces_weigh_more():
     np.testing.assert_allclose(vertex_normals(SQUARE, HALVES), [[0, 0, 1]] * 4)
     np.testing.assert_allclose(vertex_normals(SQUARE, HALVES[:, ::-1]), [[0, 0, -1]] * 4)
     vertices = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, -1]], dtype=np.float32)
@@ -171,7 +169,7 @@ def street() -> PointCloud:
 
 
 @pytest.fixture
-def store(monkeypatch: pytest.MonkeyPatch) -> Tiles:
+def store(monkeypatch):
     """The street in tiles, which overlap as little as the pieces of 8 m, which are small, do."""
     monkeypatch.setattr("recon.export.mesh.pieces.OVERLAP_M", 1.5)
     store = Tiles(CONFIG, np.eye(4))
@@ -195,9 +193,7 @@ def written(
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)
 
 
-def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(
-    store: Tiles, tmp_path: Path
-) -> None:
+def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(store, tmp_path):
     whole, tiles, warnings = written(store, tmp_path / "alone", threads=1)
     assert (warnings, len(tiles)) == ([], 2)
     assert sum(len(tile.faces) for tile in tiles) == len(whole.faces)
@@ -218,13 +214,13 @@ def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(
     np.testing.assert_array_equal(together.faces, whole.faces)
 
 
-def test_a_target_is_that_of_all_tiles(store: Tiles, tmp_path: Path) -> None:
+def test_a_target_is_that_of_all_tiles(store, tmp_path):
     settings = SETTINGS.model_copy(update={"target_faces": 4000})
     whole, _, _ = written(store, tmp_path / "out", settings)
     assert 3000 < len(whole.faces) < 5000
 
 
-def test_what_hangs_where_cameras_looked_is_cut_off(store: Tiles, tmp_path: Path) -> None:
+def test_what_hangs_where_cameras_looked_is_cut_off(store, tmp_path):
     ball = np.random.default_rng(5).normal(0, 1, (3000, 3)).astype(np.float32)
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     xyz, rgb = 0.5 * ball + np.float32([1.0, 0.0, 1.6]), np.full((3000, 3), 255, np.uint8)
@@ -239,7 +235,7 @@ def test_what_hangs_where_cameras_looked_is_cut_off(store: Tiles, tmp_path: Path
     assert len(above) == 0
 
 
-def test_tiles_with_too_few_points_are_reported_in_one_line(store: Tiles, tmp_path: Path) -> None:
+def test_tiles_with_too_few_points_are_reported_in_one_line(store, tmp_path):
     stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
     cloud = street().select(np.arange(3))
     store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
@@ -249,7 +245,7 @@ def test_tiles_with_too_few_points_are_reported_in_one_line(store: Tiles, tmp_pa
     assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")
 
 
-def test_a_store_without_a_surface_or_a_folder_is_an_error(store: Tiles, tmp_path: Path) -> None:
+def test_a_store_without_a_surface_or_a_folder_is_an_error(store, tmp_path):
     with pytest.raises(MeshingError, match="no part of the map gives a surface"):
         written(Tiles(CONFIG, np.eye(4)), tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -1,11 +1,8 @@
 """The products of a map, made tile by tile, are those of the whole map."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +31,7 @@ SETTINGS = ["submaps.length_m=4", "submaps.tile_m=12.8", "fusion.min_count=1"]
 
 
 @pytest.fixture(scope="module")
-def mapped() -> MappedSequence:
+def mapped():
     return map_sequence(SyntheticSource(STREET), load_config(None, SETTINGS))
 
 
@@ -44,14 +41,12 @@ def write_products(mapped: MappedSequence, run: Run) -> Products:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Run]:
+def folder(tmp_path):
     with Run("map", tmp_path / "run") as run:
         yield run
 
 
-def test_cloud_and_octomap_of_tiles_are_those_of_the_whole(
-    mapped: MappedSequence, folder: Run
-) -> None:
+def test_cloud_and_octomap_of_tiles_are_those_of_the_whole(mapped, folder):
     written = write_products(mapped, folder)
     whole = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     back = read_ply(folder.path("map/cloud.ply"))
@@ -65,7 +60,7 @@ def test_cloud_and_octomap_of_tiles_are_those_of_the_whole(
         assert folder.path(f"map/octomap.{end}").read_bytes() == theirs.read_bytes()
 
 
-def test_the_grid_of_tiles_is_that_of_the_whole(mapped: MappedSequence, folder: Run) -> None:
+def test_the_grid_of_tiles_is_that_of_the_whole(mapped, folder):
     config = mapped.config
     cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
@@ -92,7 +87,7 @@ def test_the_grid_of_tiles_is_that_of_the_whole(mapped: MappedSequence, folder: 
         assert (ours & theirs).sum() >= 0.995 * (ours | theirs).sum() > 100
 
 
-def test_the_vehicle_frees_its_own_track_alone(mapped: MappedSequence, folder: Run) -> None:
+def test_the_vehicle_frees_its_own_track_alone(mapped, folder):
     narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
     seen = write_products(replace(mapped, config=narrow), folder).grid
     grid = write_products(mapped, folder).grid
@@ -110,9 +105,7 @@ def test_the_vehicle_frees_its_own_track_alone(mapped: MappedSequence, folder: R
     assert away.max() < np.hypot(0.3, 0.55)
 
 
-def test_a_map_too_large_for_an_octomap_has_all_else(
-    mapped: MappedSequence, folder: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_too_large_for_an_octomap_has_all_else(mapped, folder, monkeypatch):
     whole = write_products(mapped, folder)
     monkeypatch.setattr("recon.io.models.octomap.KEY_LIMIT", 20)
     folder.path("map/octomap.bt").unlink()
@@ -133,9 +126,7 @@ def test_a_map_too_large_for_an_octomap_has_all_else(
         (0.3, 2, None),
     ],
 )
-def test_a_band_that_the_ground_or_nothing_falls_into_is_warned_of(
-    mapped: MappedSequence, folder: Run, low: float, high: float, said: str | None
-) -> None:
+def test_a_band_that_the_ground_or_nothing_falls_into_is_warned_of(mapped, folder, low, high, said):
     config = load_config(None, [*SETTINGS, f"grid.min_height_m={low}", f"grid.max_height_m={high}"])
     written = write_products(replace(mapped, config=config), folder)
     warnings = [text for text in written.warnings if "height" in text]
@@ -144,8 +135,8 @@ def test_a_band_that_the_ground_or_nothing_falls_into_is_warned_of(
 
 
 def test_an_empty_height_band_and_a_grid_that_a_far_pose_makes_too_large_are_refused(
-    mapped: MappedSequence, folder: Run, tmp_path: Path
-) -> None:
+    mapped, folder, tmp_path
+):
     config = load_config(None, [*SETTINGS, "grid.min_height_m=2", "grid.max_height_m=1"])
     with pytest.raises(MappingError, match="height band"):
         write_products(replace(mapped, config=config), folder)
@@ -161,7 +152,7 @@ def _random_cloud(seed: int, points: int) -> PointCloud:
     return PointCloud(rng.uniform(-20, 20, (points, 3)).astype(np.float32), frame="map")
 
 
-def test_a_sample_is_small_and_even_and_all_of_a_small_cloud() -> None:
+def test_a_sample_is_small_and_even_and_all_of_a_small_cloud():
     sample, cloud = CloudSample(1000, 0.1), _random_cloud(0, 900)
     assert len(sample.cloud()) == 0
     sample.add(cloud)
@@ -176,7 +167,7 @@ def test_a_sample_is_small_and_even_and_all_of_a_small_cloud() -> None:
     assert np.abs(octants / len(kept) - 1 / 8).max() < 3 * np.sqrt(7 / 64 / len(kept))
 
 
-def test_tiles_in_one_file_are_read_as_one_cloud_and_an_error_leaves_none(tmp_path: Path) -> None:
+def test_tiles_in_one_file_are_read_as_one_cloud_and_an_error_leaves_none(tmp_path):
     tiles = [_random_cloud(seed, 7 + 100 * seed) for seed in range(4)]
     assert write_ply_tiles(tmp_path / "a.ply", iter(tiles), frame="map") == 628
     back = read_ply(tmp_path / "a.ply")

@@ -1,11 +1,8 @@
 """Surfaces lie on what was sampled, stay open where there is no data, and face outwards."""
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,7 +39,7 @@ def boundary_edges(mesh: TriangleMesh) -> int:
 WHOLE = MeshSettings(depth=5, trim_density_quantile=0)
 
 
-def test_the_mesh_of_a_sphere_lies_on_it_is_closed_faces_out_and_has_its_colours() -> None:
+def test_the_mesh_of_a_sphere_lies_on_it_is_closed_faces_out_and_has_its_colours():
     mesh = reconstruct_mesh(sphere(), WHOLE)
     # Cells of 2.2 m / 2^5 = 69 mm; the surface is placed far better than a cell.
     assert np.abs(radii(mesh) - 1).max() < 0.005
@@ -58,7 +55,7 @@ def test_the_mesh_of_a_sphere_lies_on_it_is_closed_faces_out_and_has_its_colours
     assert (mesh.rgb[outwards[:, 0] < -0.05] == [0, 0, 200]).all()
 
 
-def test_a_hole_in_the_data_stays_a_hole() -> None:
+def test_a_hole_in_the_data_stays_a_hole():
     cloud = sphere()
     cap = cloud.xyz[:, 2] > 5.6
     mesh = reconstruct_mesh(cloud.select(~cap), MeshSettings(depth=5))
@@ -71,7 +68,7 @@ def test_a_hole_in_the_data_stays_a_hole() -> None:
     assert balloon.vertices[:, 2].max() > 5.6 + 0.22
 
 
-def test_small_pieces_are_dropped() -> None:
+def test_small_pieces_are_dropped():
     cloud, far = sphere(), sphere(300, radius_m=0.05)
     both = PointCloud(
         xyz=np.concatenate([cloud.xyz, far.xyz + np.float32([3, 0, 0])]),
@@ -81,15 +78,13 @@ def test_small_pieces_are_dropped() -> None:
     assert mesh.vertices[:, 0].max() < 4.2
 
 
-def test_decimation_reaches_its_target_and_stays_on_the_sphere() -> None:
+def test_decimation_reaches_its_target_and_stays_on_the_sphere():
     mesh = reconstruct_mesh(sphere(), WHOLE.model_copy(update={"target_faces": 1000}))
     assert 900 <= len(mesh.faces) <= 1000
     assert np.abs(radii(mesh) - 1).max() < 0.02
 
 
-def test_the_same_cloud_gives_the_same_mesh_and_nothing_else_is_touched(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_the_same_cloud_gives_the_same_mesh_and_nothing_else_is_touched(capfd):
     before = os.getcwd()  # noqa: PTH109 - the very thing that MeshLab can break
     first, second = (reconstruct_mesh(sphere(1000), MeshSettings(depth=4)) for _ in range(2))
     np.testing.assert_array_equal(first.vertices, second.vertices)
@@ -99,7 +94,7 @@ def test_the_same_cloud_gives_the_same_mesh_and_nothing_else_is_touched(
 
 
 @pytest.mark.parametrize("viewpoint_m", [None, (3.0, 0.0, 5.0)])
-def test_a_cloud_without_normals_gets_them(viewpoint_m: tuple[float, float, float] | None) -> None:
+def test_a_cloud_without_normals_gets_them(viewpoint_m):
     cloud = PointCloud(sphere(1000).xyz)
     mesh = reconstruct_mesh(cloud, MeshSettings(depth=4, trim_density_quantile=0), viewpoint_m)
     assert np.abs(radii(mesh) - 1).max() < 0.02
@@ -111,7 +106,7 @@ def test_a_cloud_without_normals_gets_them(viewpoint_m: tuple[float, float, floa
         assert (along < 0).all()  # seen from inside
 
 
-def test_points_and_normals_that_are_not_finite_are_left_out() -> None:
+def test_points_and_normals_that_are_not_finite_are_left_out():
     cloud = sphere()
     xyz, normals = cloud.xyz.copy(), cloud.normals.copy()
     xyz[::50] = np.nan
@@ -134,12 +129,12 @@ def test_points_and_normals_that_are_not_finite_are_left_out() -> None:
         (np.random.default_rng(0).normal(size=(500, 3)) + 4e6, "subtract an offset"),
     ],
 )
-def test_clouds_without_a_surface_are_refused(xyz: np.ndarray, complaint: str) -> None:
+def test_clouds_without_a_surface_are_refused(xyz, complaint):
     with pytest.raises(MeshingError, match=complaint):
         reconstruct_mesh(PointCloud(xyz.astype(np.float32)), MeshSettings())
 
 
-def test_the_depth_follows_the_spacing_of_the_points() -> None:
+def test_the_depth_follows_the_spacing_of_the_points():
     coarse, fine = sphere(1000), sphere(16000)  # spacings differ by four: two levels
     chosen = [_fitting_depth(cloud.xyz, MeshSettings()) for cloud in (coarse, fine)]
     assert chosen[1] - chosen[0] == 2
@@ -147,7 +142,7 @@ def test_the_depth_follows_the_spacing_of_the_points() -> None:
     assert _fitting_depth((100 * fine.xyz).astype(np.float32), MeshSettings()) == chosen[1]
 
 
-def test_points_of_one_plane_give_that_plane() -> None:
+def test_points_of_one_plane_give_that_plane():
     xyz = np.random.default_rng(0).uniform(0, 1, (3000, 3)).astype(np.float32)
     xyz[:, 2] = 2
     mesh = reconstruct_mesh(PointCloud(xyz), MeshSettings())
@@ -160,7 +155,7 @@ def poisson(xyz: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, ...]:
     return screened_poisson(xyz, normals, depth=5, scale=1.1, point_weight=4.0)
 
 
-def test_arrays_come_back_typed_and_matching_and_pymeshlab_is_not_loaded_here() -> None:
+def test_arrays_come_back_typed_and_matching_and_pymeshlab_is_not_loaded_here():
     loaded, cloud = "pymeshlab" in sys.modules, sphere(600)
     vertices, faces, density = poisson(cloud.xyz, cloud.normals)
     assert ("pymeshlab" in sys.modules) == loaded
@@ -169,9 +164,7 @@ def test_arrays_come_back_typed_and_matching_and_pymeshlab_is_not_loaded_here() 
     assert 0 <= faces.min() <= faces.max() < len(vertices)
 
 
-def test_a_poisoned_cloud_and_a_child_that_dies_are_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_poisoned_cloud_and_a_child_that_dies_are_one_line(tmp_path, monkeypatch):
     cloud = sphere(600)
     xyz = cloud.xyz.copy()
     xyz[3] = np.nan
@@ -204,11 +197,11 @@ def hall() -> PointCloud:
 
 
 @pytest.fixture(scope="module")
-def mesh() -> TriangleMesh:
+def mesh():
     return reconstruct_view(hall(), CAMERA, SETTINGS)
 
 
-def test_vertices_lie_on_the_surfaces(mesh: TriangleMesh) -> None:
+def test_vertices_lie_on_the_surfaces(mesh):
     x, y, z = mesh.vertices.T.astype(np.float64)
     column = CAMERA.focal_px * x / z + CAMERA.cx_px
     row = CAMERA.focal_px * y / z + CAMERA.cy_px
@@ -224,7 +217,7 @@ def test_vertices_lie_on_the_surfaces(mesh: TriangleMesh) -> None:
     assert mesh_coverage(mesh, hall()) > 0.95
 
 
-def test_no_sheet_joins_the_board_and_the_wall(mesh: TriangleMesh) -> None:
+def test_no_sheet_joins_the_board_and_the_wall(mesh):
     z = mesh.vertices[mesh.faces][:, :, 2]
     # A disparity step of 27.5 pixels; what is left of a sheet reaches 1.4 pixels from either side.
     # In between are disparities of 4 to 28.5 pixels; the ground, which passes there, lies at y = 1.
@@ -234,7 +227,7 @@ def test_no_sheet_joins_the_board_and_the_wall(mesh: TriangleMesh) -> None:
     assert not between.any()
 
 
-def test_faces_and_normals_point_to_the_camera_and_have_colours(mesh: TriangleMesh) -> None:
+def test_faces_and_normals_point_to_the_camera_and_have_colours(mesh):
     assert mesh.normals is not None
     towards = -np.einsum("ij,ij->i", mesh.normals, mesh.vertices)
     assert np.mean(towards > 0) > 0.99
@@ -244,9 +237,7 @@ def test_faces_and_normals_point_to_the_camera_and_have_colours(mesh: TriangleMe
     assert (mesh.rgb == 90).all()
 
 
-def test_a_scene_ten_times_as_large_has_the_same_triangles_one_behind_none(
-    mesh: TriangleMesh,
-) -> None:
+def test_a_scene_ten_times_as_large_has_the_same_triangles_one_behind_none(mesh):
     cloud, larger = hall(), replace(CAMERA, baseline_m=2.0)
     scaled = reconstruct_view(replace(cloud, xyz=10 * cloud.xyz), larger, SETTINGS)
     # Rounding of coordinates may move a vertex over a limit.
@@ -255,7 +246,7 @@ def test_a_scene_ten_times_as_large_has_the_same_triangles_one_behind_none(
         reconstruct_view(PointCloud(-cloud.xyz), CAMERA, SETTINGS)
 
 
-def test_coverage_is_the_share_of_points_on_the_mesh() -> None:
+def test_coverage_is_the_share_of_points_on_the_mesh():
     corners = np.array([[0, 0, 2], [1, 0, 2], [0, 1, 2]], np.float32)
     triangle = TriangleMesh(corners, np.array([[0, 1, 2]], np.int32))
     # 0.5 % of 2 m is 1 cm.

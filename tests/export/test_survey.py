@@ -1,7 +1,5 @@
 """A map is placed where positions measured along its drive say it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -60,7 +58,7 @@ Place = Callable[..., Georeference]
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Place:
+def place(tmp_path):
     """Places a map by rows of positions."""
 
     def placed(
@@ -86,7 +84,7 @@ def noisy(sigma_m: float, seed: int = 5) -> Float64:
     return rows
 
 
-def test_antenna_and_times_between_frames_count(place: Place) -> None:
+def test_antenna_and_times_between_frames_count(place):
     # Once a second and off the times of the frames; some before and after the drive.
     placed = place(positions(FROM_S + 0.037 + np.arange(-3, 25)))
     off = invert(T_SURVEY_MAP) @ placed.T_survey_map
@@ -100,7 +98,7 @@ def test_antenna_and_times_between_frames_count(place: Place) -> None:
     assert without[2, 3] == pytest.approx(ANTENNA[2], abs=0.05)
 
 
-def test_frames_that_are_not_trusted_and_the_order_of_positions_do_not_count(place: Place) -> None:
+def test_frames_that_are_not_trusted_and_the_order_of_positions_do_not_count(place):
     rows = positions(FROM_S + 0.05 + np.arange(0, 19.8, 0.1))
     assert place(rows, mapped(untrusted=(50, 51, 52))).rms_m < 0.01
     # A TUM file; and a merged map, of which the first drive counts.
@@ -110,7 +108,7 @@ def test_frames_that_are_not_trusted_and_the_order_of_positions_do_not_count(pla
     np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
 
 
-def test_positions_that_contradict_most_are_left_out_and_named(place: Place) -> None:
+def test_positions_that_contradict_most_are_left_out_and_named(place):
     rows = each_second()
     rows[[3, 11], 1:3] += [[30.0, -12.0], [-8.0, 5.0]]
     rows[17, 1:] = 0.0  # no fix
@@ -123,7 +121,7 @@ def test_positions_that_contradict_most_are_left_out_and_named(place: Place) -> 
     assert f"{FROM_S + 3:.3f} s" in warning
 
 
-def test_what_may_be_wrong_with_the_positions_is_warned_of(place: Place) -> None:
+def test_what_may_be_wrong_with_the_positions_is_warned_of(place):
     rows = each_second()
     rows[:, 0] += 1.5 * np.sin(np.arange(20))
     placed = place(rows)
@@ -145,16 +143,14 @@ NONSENSE = {
 
 
 @pytest.mark.parametrize("nonsense", NONSENSE)
-def test_positions_that_nothing_explains_are_refused(place: Place, nonsense: str) -> None:
+def test_positions_that_nothing_explains_are_refused(place, nonsense):
     rows = often()
     rows[:, 1:] = NONSENSE[nonsense](rows[:, 1:])
     with pytest.raises(ReconError, match=r"gnss\.txt"):
         place(rows)
 
 
-def test_positions_of_another_day_or_at_one_place_or_none_are_refused(
-    place: Place, tmp_path: Path
-) -> None:
+def test_positions_of_another_day_or_at_one_place_or_none_are_refused(place, tmp_path):
     rows = each_second()
     with pytest.raises(EvaluationError, match="no position was measured during the drive"):
         place(rows + np.array([86400, 0, 0, 0]))
@@ -167,7 +163,7 @@ def test_positions_of_another_day_or_at_one_place_or_none_are_refused(
 
 
 @pytest.mark.parametrize("columns", [1, 3])
-def test_a_file_may_state_how_well_positions_were_measured(place: Place, columns: int) -> None:
+def test_a_file_may_state_how_well_positions_were_measured(place, columns):
     def stated(sigma_m: float) -> Float64:
         rows = noisy(10.0)
         return np.column_stack([rows, np.full((len(rows), columns), sigma_m)])
@@ -181,7 +177,7 @@ def test_a_file_may_state_how_well_positions_were_measured(place: Place, columns
         place(stated(0.0))
 
 
-def test_a_drift_that_the_run_states_explains_a_scale(place: Place) -> None:
+def test_a_drift_that_the_run_states_explains_a_scale(place):
     rows = np.column_stack([each_second() * [1, 1.2, 1.2, 1.2], np.full(20, 0.02)])
     with pytest.raises(EvaluationError, match=r"1\.2 times as far"):
         place(rows)
@@ -190,13 +186,13 @@ def test_a_drift_that_the_run_states_explains_a_scale(place: Place) -> None:
     assert place(rows, far).scale == pytest.approx(1.2, abs=0.01)
 
 
-def test_an_antenna_that_is_on_no_vehicle_is_refused() -> None:
+def test_an_antenna_that_is_on_no_vehicle_is_refused():
     for far_m in (101.0, 1e300, float("nan")):
         with pytest.raises(SettingsError, match="--antenna"):
             Survey(Path("gnss.txt"), (far_m, 0.0, 0.0))
 
 
-def test_coordinate_systems_of_ones_own_are_taken_if_their_metres_are_metres(place: Place) -> None:
+def test_coordinate_systems_of_ones_own_are_taken_if_their_metres_are_metres(place):
     pytest.importorskip("pyproj")
     for crs in ("+proj=noop", "+proj=pipeline +step +proj=noop"):
         with pytest.raises(EvaluationError, match="a metre of the coordinate system"):
@@ -214,7 +210,7 @@ OUTSIDE = {
 
 
 @pytest.mark.parametrize("change", OUTSIDE)
-def test_positions_outside_the_coordinate_system_are_refused(place: Place, change: str) -> None:
+def test_positions_outside_the_coordinate_system_are_refused(place, change):
     pytest.importorskip("pyproj")
     with pytest.raises(EvaluationError, match=r"outside the area|not degrees"):
         place(OUTSIDE[change](each_second()), crs="EPSG:25832")

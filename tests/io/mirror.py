@@ -1,7 +1,5 @@
 """A local HTTP server that behaves as badly as it is told to."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -21,7 +19,7 @@ def write_half_and_raise(target: Path, error: BaseException) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
-def test_text_appears_whole_under_its_name_and_nothing_else_stays(tmp_path: Path) -> None:
+def test_text_appears_whole_under_its_name_and_nothing_else_stays(tmp_path):
     before = os.umask(0o022)
     try:
         write_text(tmp_path / "run" / "a.txt", "größe\n")
@@ -32,7 +30,7 @@ def test_text_appears_whole_under_its_name_and_nothing_else_stays(tmp_path: Path
     assert names(tmp_path / "run") == ["a.txt"]
 
 
-def test_the_temporary_shares_folder_and_suffixes_with_the_target(tmp_path: Path) -> None:
+def test_the_temporary_shares_folder_and_suffixes_with_the_target(tmp_path):
     with atomic_path(tmp_path / "map.tar.gz") as temporary:
         assert temporary.parent == tmp_path
         assert temporary.suffixes == [".tar", ".gz"]
@@ -41,9 +39,7 @@ def test_the_temporary_shares_folder_and_suffixes_with_the_target(tmp_path: Path
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, FormatError])
-def test_a_failing_block_keeps_the_old_file_and_leaves_no_temporary(
-    tmp_path: Path, error: type[BaseException]
-) -> None:
+def test_a_failing_block_keeps_the_old_file_and_leaves_no_temporary(tmp_path, error):
     target = tmp_path / "a.txt"
     write_text(target, "old")
     with pytest.raises(error):
@@ -52,7 +48,7 @@ def test_a_failing_block_keeps_the_old_file_and_leaves_no_temporary(
     assert names(tmp_path) == ["a.txt"]
 
 
-def test_what_the_system_refuses_names_the_target_not_the_temporary(tmp_path: Path) -> None:
+def test_what_the_system_refuses_names_the_target_not_the_temporary(tmp_path):
     target = tmp_path / "a.bin"
     with pytest.raises(OutputError, match=r"a\.bin: cannot write.*No space left") as caught:
         write_half_and_raise(target, OSError(28, "No space left on device", ".x-a.bin"))
@@ -65,7 +61,7 @@ def test_what_the_system_refuses_names_the_target_not_the_temporary(tmp_path: Pa
         write_bytes(target / "a.txt", b"")
 
 
-def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path) -> None:
+def test_what_is_no_regular_file_is_not_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "null").symlink_to(os.devnull)
     (tmp_path / "folder").mkdir()
@@ -76,7 +72,7 @@ def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path) -> None:
     assert {path.name: path.lstat().st_mode for path in tmp_path.iterdir()} == before
 
 
-def test_an_input_is_not_written_under_any_name(tmp_path: Path) -> None:
+def test_an_input_is_not_written_under_any_name(tmp_path):
     source, other = tmp_path / "calib.txt", tmp_path / "other"
     for path in (source, other):
         path.write_text("same content")
@@ -90,9 +86,7 @@ def test_an_input_is_not_written_under_any_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("system", ["linux", "another"])
-def test_two_folders_are_exchanged_or_the_old_one_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
-) -> None:
+def test_two_folders_are_exchanged_or_the_old_one_stays(tmp_path, monkeypatch, system):
     new, old = tmp_path / "new", tmp_path / "old"
     for folder in (new, old):
         folder.mkdir()

@@ -1,7 +1,5 @@
 """Damaged files of every format: one clear line that names the file, and the row if any."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import partial
@@ -207,15 +205,13 @@ def refusal(read: Callable[[Path], object], path: Path) -> str:
 
 
 @pytest.mark.parametrize(("name", "content", "message"), ROWS)
-def test_a_damaged_file_is_one_clear_line(
-    tmp_path: Path, name: str, content: bytes, message: str
-) -> None:
+def test_a_damaged_file_is_one_clear_line(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     assert re.search(rf"{re.escape(name)}.*{message}", refusal(CORPUS[name][0], tmp_path / name))
 
 
 @pytest.mark.parametrize("name", CORPUS)
-def test_what_is_no_file_is_named(tmp_path: Path, name: str) -> None:
+def test_what_is_no_file_is_named(tmp_path, name):
     for path in (tmp_path / name, tmp_path):
         words = r"file does not exist|cannot read the file|no such file|not an|unknown kind"
         assert re.search(rf"{path.name}: ({words})", refusal(CORPUS[name][0], path))
@@ -278,9 +274,7 @@ VALID: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         ("grid.yaml", "negate", "negative", "no 'negate'"),
     ],
 )
-def test_a_spoiled_file_is_one_clear_line(
-    tmp_path: Path, name: str, old: str, new: str, message: str
-) -> None:
+def test_a_spoiled_file_is_one_clear_line(tmp_path, name, old, new, message):
     write, read = VALID[name]
     path = tmp_path / name
     write(path)

@@ -1,12 +1,10 @@
 """Downloads end with the right bytes or with one line, whatever the server does."""
 
-from __future__ import annotations
-
 import io
 import stat
 import tarfile
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,14 +24,14 @@ Fetch = Callable[..., Path]
 
 
 @pytest.fixture
-def mirror(monkeypatch: pytest.MonkeyPatch) -> Iterator[Mirror]:
+def mirror(monkeypatch):
     monkeypatch.setattr(module, "_PAUSE_S", 0.0)
     with serving(Mirror({"/a.zip": CONTENT})) as served:
         yield served
 
 
 @pytest.fixture
-def fetch(mirror: Mirror, tmp_path: Path) -> Fetch:
+def fetch(mirror, tmp_path):
     """Download ``a.zip``, or what has that name, into a folder of its own."""
 
     def fetch(
@@ -49,7 +47,7 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_a_download_is_what_the_server_has(mirror: Mirror, fetch: Fetch) -> None:
+def test_a_download_is_what_the_server_has(mirror, fetch):
     told: list[tuple[int, int | None]] = []
     mirror.redirect, mirror.busy = f"{mirror.address}/moved", 3
     path = fetch(None, lambda *now: told.append(now))
@@ -58,7 +56,7 @@ def test_a_download_is_what_the_server_has(mirror: Mirror, fetch: Fetch) -> None
     assert told[-1] == (SIZE, SIZE)
 
 
-def test_a_connection_that_breaks_off_goes_on_where_it_was(mirror: Mirror, fetch: Fetch) -> None:
+def test_a_connection_that_breaks_off_goes_on_where_it_was(mirror, fetch):
     mirror.break_after = 1_200_000
     assert fetch().read_bytes() == CONTENT
     assert mirror.asked == ["", "bytes=1199999-", "bytes=2399998-"]
@@ -66,9 +64,7 @@ def test_a_connection_that_breaks_off_goes_on_where_it_was(mirror: Mirror, fetch
 
 # A file that is complete is not received again.
 @pytest.mark.parametrize(("size", "asked"), [(1_500_000, 1_999_999), (SIZE, SIZE - 1)])
-def test_a_later_call_goes_on_where_an_earlier_one_broke_off(
-    mirror: Mirror, tmp_path: Path, fetch: Fetch, size: int, asked: int
-) -> None:
+def test_a_later_call_goes_on_where_an_earlier_one_broke_off(mirror, tmp_path, fetch, size, asked):
     def interrupt(done: int, total: int | None) -> None:
         if done >= size:
             raise KeyboardInterrupt
@@ -81,9 +77,7 @@ def test_a_later_call_goes_on_where_an_earlier_one_broke_off(
 
 
 @pytest.mark.parametrize("change", ["no ranges", "another file"])
-def test_a_download_begins_anew_where_it_cannot_go_on(
-    mirror: Mirror, tmp_path: Path, fetch: Fetch, change: str
-) -> None:
+def test_a_download_begins_anew_where_it_cannot_go_on(mirror, tmp_path, fetch, change):
     (tmp_path / "a.zip.part").write_bytes(b"x" * 1000)
     (tmp_path / "a.zip.part.version").write_text('"old"')
     mirror.ranges = change == "another file"
@@ -102,18 +96,14 @@ def test_a_download_begins_anew_where_it_cannot_go_on(
         ({}, "b.zip", r"refuses the file .*404", 1),
     ],
 )
-def test_a_server_that_does_not_give_the_file_is_one_line(
-    mirror: Mirror, fetch: Fetch, how: dict[str, object], name: str, message: str, asked: int
-) -> None:
+def test_a_server_that_does_not_give_the_file_is_one_line(mirror, fetch, how, name, message, asked):
     vars(mirror).update(how)
     with pytest.raises(DownloadError, match=message):
         fetch(name=name)
     assert len(mirror.asked) == asked
 
 
-def test_a_size_that_is_not_said_is_no_lie_but_more_than_promised_is(
-    mirror: Mirror, tmp_path: Path, fetch: Fetch
-) -> None:
+def test_a_size_that_is_not_said_is_no_lie_but_more_than_promised_is(mirror, tmp_path, fetch):
     mirror.claimed = None
     with pytest.raises(DownloadError, match="sends more than it said"):
         fetch(1_000_000)
@@ -122,12 +112,12 @@ def test_a_size_that_is_not_said_is_no_lie_but_more_than_promised_is(
 
 
 @pytest.mark.parametrize("address", ["file:///etc/hostname", "a.zip", "ftp://127.0.0.1/a"])
-def test_other_addresses_are_refused(tmp_path: Path, address: str) -> None:
+def test_other_addresses_are_refused(tmp_path, address):
     with pytest.raises(DownloadError, match="not an address"):
         download(address, tmp_path / "a")
 
 
-def test_a_full_disk_is_one_line(fetch: Fetch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_one_line(fetch, monkeypatch):
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
     with pytest.raises(OutputError, match="no room for the download"):
         fetch()
@@ -161,7 +151,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar", "tar.gz"])
-def test_everything_is_unpacked_over_what_was_there(tmp_path: Path, kind: str) -> None:
+def test_everything_is_unpacked_over_what_was_there(tmp_path, kind):
     path = tmp_path / f"a.{kind}"
     write_zip(path) if kind == "zip" else write_tar(path, mode="w:gz" if "gz" in kind else "w")
     unpack(write_zip(tmp_path / "before.zip", {"README": b"four"}), tmp_path / "out")
@@ -169,7 +159,7 @@ def test_everything_is_unpacked_over_what_was_there(tmp_path: Path, kind: str) -
     assert content(tmp_path / "out") == FILES
 
 
-def test_only_what_is_chosen_is_unpacked(tmp_path: Path) -> None:
+def test_only_what_is_chosen_is_unpacked(tmp_path):
     path = write_zip(tmp_path / "a.zip", {**FILES, "__MACOSX/data/._a": b"x", "data/d.bag": b"y"})
     unpack(path, tmp_path / "out", below="data", without=[".bag"])
     assert content(tmp_path / "out") == {"a.txt": b"one", "b/c.png": b"two"}
@@ -177,7 +167,7 @@ def test_only_what_is_chosen_is_unpacked(tmp_path: Path) -> None:
         unpack(path, tmp_path / "out", below="nowhere")
 
 
-def test_archives_in_an_archive_are_unpacked_beside_themselves(tmp_path: Path) -> None:
+def test_archives_in_an_archive_are_unpacked_beside_themselves(tmp_path):
     inner = write_zip(tmp_path / "inner.zip", {"mav0/a": b"one"}).read_bytes()
     path = write_zip(tmp_path / "a.zip", {"hall/MH/MH.zip": inner, "hall/MH/MH.bag": b"x"})
     unpack(path, tmp_path / "out", below="hall", without=[".bag"], zips=True)
@@ -189,7 +179,7 @@ def test_archives_in_an_archive_are_unpacked_beside_themselves(tmp_path: Path) -
     ["../a", "/etc/a", "b/../../a", "b/../a", "..", "c:/a", "c:a", "b\\a", "\\\\host\\a", "a\x07b"],
 )
 @pytest.mark.parametrize("write", WRITERS)
-def test_paths_outside_are_refused(tmp_path: Path, write: Fetch, name: str) -> None:
+def test_paths_outside_are_refused(tmp_path, write, name):
     path = write(tmp_path / "a", {"good": b"1", name: b"2"})
     with pytest.raises(FormatError, match="path outside of itself"):
         unpack(path, tmp_path / "deep" / "out")
@@ -208,7 +198,7 @@ def special_tar(path: Path, kind: bytes, name: str, target: str = "") -> Path:
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE])
 @pytest.mark.parametrize("target", ["/etc", "../..", "../../../etc/passwd"])
-def test_links_that_lead_out_are_refused(tmp_path: Path, kind: bytes, target: str) -> None:
+def test_links_that_lead_out_are_refused(tmp_path, kind, target):
     path = special_tar(tmp_path / "a.tar", kind, "dso/images", target)
     with pytest.raises(FormatError, match="path outside of itself"):
         unpack(path, tmp_path / "out")
@@ -218,7 +208,7 @@ def test_links_that_lead_out_are_refused(tmp_path: Path, kind: bytes, target: st
 @pytest.mark.parametrize(
     ("kind", "target"), [(tarfile.SYMTYPE, "../mav0"), (tarfile.LNKTYPE, "mav0/x")]
 )
-def test_links_that_stay_are_left_out(tmp_path: Path, kind: bytes, target: str) -> None:
+def test_links_that_stay_are_left_out(tmp_path, kind, target):
     unpack(special_tar(tmp_path / "a.tar", kind, "dso/images", target), tmp_path / "out")
     assert content(tmp_path / "out") == {"dso/images/x": b"x"}
     assert not (tmp_path / "out" / "dso" / "images").is_symlink()
@@ -248,13 +238,13 @@ def link_zip(path: Path) -> Path:
     ],
     ids=["hidden end", "link", "device", "twice"],
 )
-def test_other_hostile_entries_are_refused(tmp_path: Path, write: Fetch, message: str) -> None:
+def test_other_hostile_entries_are_refused(tmp_path, write, message):
     with pytest.raises(FormatError, match=message):
         unpack(write(tmp_path / "a"), tmp_path / "out")
 
 
 @pytest.mark.parametrize("kind", ["in one", "in another", "empty files"])
-def test_a_bomb_is_refused_before_it_fills_the_disk(tmp_path: Path, kind: str) -> None:
+def test_a_bomb_is_refused_before_it_fills_the_disk(tmp_path, kind):
     path, bomb = tmp_path / "a.zip", {f"{number}": bytes(55_000_000) for number in range(2)}
     if kind == "empty files":
         write_tar(path, {f"{number}": b"" for number in range(30_000)}, "w:gz")
@@ -269,7 +259,7 @@ def test_a_bomb_is_refused_before_it_fills_the_disk(tmp_path: Path, kind: str) -
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty", "text"])
 @pytest.mark.parametrize("write", WRITERS)
-def test_damaged_archives_are_one_line(tmp_path: Path, write: Fetch, damage: str) -> None:
+def test_damaged_archives_are_one_line(tmp_path, write, damage):
     path = write(tmp_path / "a", {"a.bin": bytes(range(256)) * 40})
     good = bytearray(path.read_bytes())
     good[50] ^= 0xFF

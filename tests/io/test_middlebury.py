@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +42,7 @@ def make_2014(folder: Path) -> Path:
     return folder
 
 
-def test_calib_txt_gives_metres_and_doffs(tmp_path: Path) -> None:
+def test_calib_txt_gives_metres_and_doffs(tmp_path):
     calib = read_middlebury_calib(make_2014(tmp_path) / "calib.txt")
     assert calib.camera.baseline_m == pytest.approx(0.193001)
     assert calib.camera.doffs_px == pytest.approx(32.778)
@@ -65,14 +63,12 @@ def test_calib_txt_gives_metres_and_doffs(tmp_path: Path) -> None:
         ("mine", (640, 480), 1),
     ],
 )  # fmt: skip
-def test_full_size_factor_follows_the_collection_or_the_name_of_the_scene(
-    name: str, size: tuple[int, int], factor: float
-) -> None:
+def test_full_size_factor_follows_the_collection_or_the_name_of_the_scene(name, size, factor):
     layout = Layout("im0", "im1", "disp0", "disp1", calibrated=True)
     assert units_of(layout, *size, Path("anywhere") / name).factor == factor
 
 
-def test_truth_in_pfm_makes_a_scene_without_its_calibration(tmp_path: Path) -> None:
+def test_truth_in_pfm_makes_a_scene_without_its_calibration(tmp_path):
     folder = make_2014(tmp_path / "Adirondack-perfect")
     (folder / "calib.txt").unlink()
     write_pfm(folder / "disp0.pfm", np.full((12, 24), 4.0, np.float32))
@@ -82,9 +78,7 @@ def test_truth_in_pfm_makes_a_scene_without_its_calibration(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("inside", ["", "Illum1/Exp2"])
-def test_truth_and_dmin_of_2005_may_lie_above_folders_of_light_and_exposure(
-    tmp_path: Path, inside: str
-) -> None:
+def test_truth_and_dmin_of_2005_may_lie_above_folders_of_light_and_exposure(tmp_path, inside):
     root, name = tmp_path / "Aloe", f"Aloe/{inside}".rstrip("/")
     for view in ("view1.png", "view5.png"):
         write_image(root / inside / view, image(370, 463))
@@ -100,7 +94,7 @@ def test_truth_and_dmin_of_2005_may_lie_above_folders_of_light_and_exposure(
     assert read_scored_scene(name, root / inside, None) is not None
 
 
-def test_eval3_truth_has_nan_for_inf_and_the_mask_of_its_file(tmp_path: Path) -> None:
+def test_eval3_truth_has_nan_for_inf_and_the_mask_of_its_file(tmp_path):
     folder = make_2014(tmp_path)
     values = np.full((12, 24), 5.0, dtype=np.float32)
     values[0, 0] = NAN
@@ -114,7 +108,7 @@ def test_eval3_truth_has_nan_for_inf_and_the_mask_of_its_file(tmp_path: Path) ->
     assert {tuple(at) for at in np.argwhere(~truth.nonocc)} == {(0, 0), (1, 1), (2, 2)}
 
 
-def test_truth_of_2014_without_a_mask_is_cross_checked(tmp_path: Path) -> None:
+def test_truth_of_2014_without_a_mask_is_cross_checked(tmp_path):
     folder = make_2014(tmp_path)
     left = np.full((12, 24), 4.0, dtype=np.float32)
     right = left.copy()
@@ -127,7 +121,7 @@ def test_truth_of_2014_without_a_mask_is_cross_checked(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.flatnonzero(~truth.nonocc[5]), hidden)
 
 
-def test_cross_check_asks_the_right_view_at_x_minus_d() -> None:
+def test_cross_check_asks_the_right_view_at_x_minus_d():
     left = np.array([[2.0, 2.0, 2.0, 1.0, NAN]], dtype=np.float32)
     right = np.array([[2.5, NAN, 1.0, 1.0, 1.0]], dtype=np.float32)
     assert cross_check(left, right, 1.0).tolist() == [[False, False, True, True, False]]
@@ -148,8 +142,8 @@ def test_cross_check_asks_the_right_view_at_x_minus_d() -> None:
     ],
 )
 def test_older_scenes_are_distinguished_and_their_truth_scaled(
-    tmp_path: Path, names: str, size: tuple[int, int], scale: int, generation: str
-) -> None:
+    tmp_path, names, size, scale, generation
+):
     left, right, truth = names.split()
     for name in (left, right):
         write_image(tmp_path / name, image(*size))
@@ -161,7 +155,7 @@ def test_older_scenes_are_distinguished_and_their_truth_scaled(
     np.testing.assert_allclose(scene.truth.values[0, :3], [NAN, 1 / scale, 2 / scale], rtol=1e-6)
 
 
-def test_images_that_are_missing_or_of_another_size_are_named(tmp_path: Path) -> None:
+def test_images_that_are_missing_or_of_another_size_are_named(tmp_path):
     folder = make_2014(tmp_path)
     write_pfm(folder / "disp0.pfm", np.ones((12, 23), dtype=np.float32))
     with pytest.raises(FormatError, match=r"disp0\.pfm: size.*got 23x12, expected 24x12"):
@@ -186,9 +180,7 @@ def test_images_that_are_missing_or_of_another_size_are_named(tmp_path: Path) ->
         ("MiddEval3/trainingQ/Pipes", "2014", (485, 735), 75),
     ],
 )
-def test_real_truth_lies_within_what_is_promised(
-    recon_data: Path, scene: str, generation: str, shape: tuple[int, int], highest_px: float
-) -> None:
+def test_real_truth_lies_within_what_is_promised(recon_data, scene, generation, shape, highest_px):
     read = read_middlebury_scene(recon_data / "middlebury" / scene)
     assert (read.generation, read.pair.left.shape[:2]) == (generation, shape)
     assert read.truth is not None
@@ -201,7 +193,7 @@ def test_real_truth_lies_within_what_is_promised(
 
 
 @pytest.mark.real
-def test_real_half_size_scenes_have_twice_the_doffs_and_no_truth(recon_data: Path) -> None:
+def test_real_half_size_scenes_have_twice_the_doffs_and_no_truth(recon_data):
     folder = recon_data / "middlebury" / "MiddEval3"
     half, quarter = (
         read_middlebury_scene(folder / f"training{size}" / "Motorcycle") for size in "HQ"

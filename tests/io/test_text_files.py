@@ -1,9 +1,5 @@
 """Text, tables, YAML, trajectories: what is read is what was written, or meant."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -24,7 +20,7 @@ from recon.io.trajectory import (
 )
 
 
-def test_a_table_skips_comments_empty_lines_and_the_mark_of_byte_order(tmp_path: Path) -> None:
+def test_a_table_skips_comments_empty_lines_and_the_mark_of_byte_order(tmp_path):
     path = tmp_path / "t.txt"
     path.write_bytes(b"\xef\xbb\xbf# t x\n1 2\n\n3, 4  # late\n")
     assert read_text(path)[0] == "#"
@@ -33,7 +29,7 @@ def test_a_table_skips_comments_empty_lines_and_the_mark_of_byte_order(tmp_path:
     assert lines == [2, 4]
 
 
-def test_yaml_comes_back_as_it_was_written_and_in_order(tmp_path: Path) -> None:
+def test_yaml_comes_back_as_it_was_written_and_in_order(tmp_path):
     values = {"b": {"window_px": 9, "alpha": None}, "a": [1, 2.5, "größe"]}
     write_yaml(tmp_path / "c.yaml", values)
     assert read_yaml(tmp_path / "c.yaml") == values
@@ -53,9 +49,7 @@ def random_trajectory(seed: int, length: int) -> Trajectory:
 @pytest.mark.parametrize("form", ["kitti", "tum"])
 @settings(max_examples=30)
 @given(trajectory=st.builds(random_trajectory, st.integers(0, 2**31), st.integers(1, 8)))
-def test_poses_lose_nothing_that_matters(
-    trajectory: Trajectory, form: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_poses_lose_nothing_that_matters(trajectory, form, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / f"poses_{form}.txt"
     (write_tum if form == "tum" else write_kitti_poses)(path, trajectory)
     read = read_trajectory(path, trajectory.timestamps_s if form == "kitti" else None)
@@ -66,7 +60,7 @@ def test_poses_lose_nothing_that_matters(
     np.testing.assert_allclose(read.timestamps_s, trajectory.timestamps_s, rtol=0, atol=1e-6)
 
 
-def test_tum_line_is_time_position_and_quaternion_xyzw_with_positive_w(tmp_path: Path) -> None:
+def test_tum_line_is_time_position_and_quaternion_xyzw_with_positive_w(tmp_path):
     quarter_turn = make_transform(exp_so3(np.array([0, np.pi / 2, 0])), np.array([1.0, 2.0, 3.0]))
     path, half = tmp_path / "t.txt", np.sqrt(0.5)
     write_tum(path, Trajectory(quarter_turn[None], np.array([0.5])))
@@ -77,7 +71,7 @@ def test_tum_line_is_time_position_and_quaternion_xyzw_with_positive_w(tmp_path:
     np.testing.assert_allclose(first, second, rtol=0, atol=1e-12)
 
 
-def test_rotations_of_few_digits_become_orthonormal(tmp_path: Path) -> None:
+def test_rotations_of_few_digits_become_orthonormal(tmp_path):
     path = tmp_path / "p.txt"
     path.write_text("0.9998 -0.02 0 1 0.02 0.9998 0 2 0 0 1 3\n")
     kitti = read_kitti_poses(path).T_world_camera[0]
@@ -87,7 +81,7 @@ def test_rotations_of_few_digits_become_orthonormal(tmp_path: Path) -> None:
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
 
 
-def test_kitti_poses_get_a_second_each_or_as_many_times_as_they_are(tmp_path: Path) -> None:
+def test_kitti_poses_get_a_second_each_or_as_many_times_as_they_are(tmp_path):
     (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
     assert read_kitti_poses(tmp_path / "p.txt").timestamps_s.tolist() == [0, 1]
     with pytest.raises(FormatError, match=r"p\.txt: numbers of poses .*\(got 2 poses, expected 3"):
@@ -98,9 +92,7 @@ def test_kitti_poses_get_a_second_each_or_as_many_times_as_they_are(tmp_path: Pa
 @pytest.mark.parametrize(
     ("drive", "frames", "length_m"), [("kitti_raw_0013", 144, 173), ("kitti_06_51", 51, 60)]
 )
-def test_real_drives_have_their_published_length(
-    recon_data: Path, drive: str, frames: int, length_m: float
-) -> None:
+def test_real_drives_have_their_published_length(recon_data, drive, frames, length_m):
     trajectory = read_trajectory(recon_data / "driven" / drive / "poses.txt")
     assert len(trajectory) == frames
     assert abs(trajectory.path_length_m - length_m) < 1

@@ -1,7 +1,5 @@
 """A street of textured planes: images and disparity from any pose, exact."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -88,12 +86,12 @@ def make_frame(grey: np.ndarray, values: np.ndarray, index: int = 0) -> Odometry
 
 
 @pytest.fixture(scope="session")
-def camera() -> RectifiedCamera:
+def camera():
     return CAMERA
 
 
 @pytest.fixture(scope="session")
-def see() -> See:
+def see():
     """See the street from a pose: a frame with exact disparity."""
 
     def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
@@ -104,7 +102,7 @@ def see() -> See:
 
 
 @pytest.fixture(scope="session")
-def see_both(see: See) -> See:
+def see_both(see):
     """See the street from a pose with both cameras."""
 
     def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
@@ -117,7 +115,7 @@ def see_both(see: See) -> See:
 
 
 @pytest.fixture(scope="session")
-def blind() -> See:
+def blind():
     """A frame that shows nothing: one grey level, no disparity."""
 
     def blind_frame(level: int = 0, index: int = 0) -> OdometryFrame:
@@ -128,11 +126,11 @@ def blind() -> See:
 
 
 @pytest.fixture(scope="session")
-def street_poses() -> np.ndarray:
+def street_poses():
     """float64 (12, 4, 4); the first is the identity."""
     return steps(12)
 
 
 @pytest.fixture(scope="session")
-def street(see: See, street_poses: np.ndarray) -> tuple[OdometryFrame, ...]:
+def street(see, street_poses):
     return tuple(see(T, index) for index, T in enumerate(street_poses))

@@ -1,7 +1,5 @@
 """A pose is not trusted if it is uncertain or if the patches of the images contradict it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +20,7 @@ from recon.odometry.registry import make_odometry
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.match.registry import make_matcher
 from recon.street.settings import StreetScene
-from tests.odometry.conftest import STEP, See
+from tests.odometry.conftest import STEP
 
 
 class Says:
@@ -49,7 +47,7 @@ def forward(*places_m: float) -> np.ndarray:
 
 
 @pytest.fixture
-def half_a_metre(see: See) -> list[OdometryFrame]:
+def half_a_metre(see):
     return [see(T, index) for index, T in enumerate(forward(0.0, 0.5))]
 
 
@@ -67,8 +65,8 @@ LOST = OdometryHealth(ok=False, notes=("lost",))
     ],
 )
 def test_a_motion_is_trusted_that_is_known_and_that_the_image_bears_out(
-    half_a_metre: list[OdometryFrame], said_m: float, stated: OdometryHealth, note: str | None
-) -> None:
+    half_a_metre, said_m, stated, note
+):
     health = last_health(half_a_metre, forward(0.0, said_m), stated)
     if note is None:
         assert health == stated
@@ -77,7 +75,7 @@ def test_a_motion_is_trusted_that_is_known_and_that_the_image_bears_out(
         assert note in health.notes[-1]
 
 
-def test_a_motion_without_a_deviation_needs_an_image_that_decides(blind: See) -> None:
+def test_a_motion_without_a_deviation_needs_an_image_that_decides(blind):
     frames = [blind(100, index) for index in range(2)]
     health = last_health(frames, forward(0.0, 0.5), OdometryHealth())
     assert not health.ok
@@ -86,7 +84,7 @@ def test_a_motion_without_a_deviation_needs_an_image_that_decides(blind: See) ->
     assert last_health(frames[:1], forward(0.0), OdometryHealth()).ok
 
 
-def test_a_small_image_is_trusted_from_its_first_motion() -> None:
+def test_a_small_image_is_trusted_from_its_first_motion():
     """With 27 features that fit to a twentieth of a pixel; its error is 6 mm."""
     street = StreetScene(frames=2, width_px=256, height_px=96, focal_px=150.0)
     odometry, matcher = make_odometry("visual"), make_matcher("sad")
@@ -107,27 +105,27 @@ TURNED = STEP @ make_transform(exp_so3(np.array([0.0, 0.05, 0.0])), np.zeros(3))
 FAST = make_transform(STEP[:3, :3], 2.0 * STEP[:3, 3])
 
 
-def test_the_true_motion_explains_nearly_every_patch(see: See) -> None:
+def test_the_true_motion_explains_nearly_every_patch(see):
     found = ask(see(np.eye(4)), see(STEP), STEP)
     assert found.informative >= 20
     assert found.share > 0.9
 
 
 @pytest.mark.parametrize("wrong", [np.eye(4), FAST, invert(STEP), TURNED])
-def test_a_wrong_motion_does_not(wrong: np.ndarray, see: See) -> None:
+def test_a_wrong_motion_does_not(wrong, see):
     found = ask(see(np.eye(4)), see(STEP), wrong)
     assert found.informative >= 8
     assert found.share < MIN_SHARE
 
 
-def test_another_exposure_changes_nothing(see: See) -> None:
+def test_another_exposure_changes_nothing(see):
     before, now = see(np.eye(4)), see(STEP)
     dim = np.rint(0.5 * now.pair.left + 20).astype(np.uint8)
     dimmed = replace(now, pair=replace(now.pair, left=dim))
     assert ask(before, dimmed, STEP).share == pytest.approx(ask(before, now, STEP).share, abs=0.05)
 
 
-def test_an_image_without_texture_or_dark_now_gives_no_answer(see: See, blind: See) -> None:
+def test_an_image_without_texture_or_dark_now_gives_no_answer(see, blind):
     found = ask(blind(100), blind(100), np.eye(4))
     assert found.informative == 0
     assert np.isnan(found.share)
@@ -135,7 +133,7 @@ def test_an_image_without_texture_or_dark_now_gives_no_answer(see: See, blind: S
 
 
 @pytest.mark.parametrize("direction", [(0, 1), (1, 0), (1, 1), (1, -1)])
-def test_edges_of_one_direction_give_no_answer(direction: tuple[int, int], see: See) -> None:
+def test_edges_of_one_direction_give_no_answer(direction, see):
     """Stripes look alike however far the camera went along them."""
     frame = see(np.eye(4))
     rows, columns = np.mgrid[0:160, 0:400]
@@ -145,7 +143,7 @@ def test_edges_of_one_direction_give_no_answer(direction: tuple[int, int], see: 
     assert ask(striped, striped, np.eye(4)).informative == 0
 
 
-def test_patches_are_counted_one_by_one(see: See) -> None:
+def test_patches_are_counted_one_by_one(see):
     """Where half of the image is another one, half of the patches disagree."""
     before, now = see(np.eye(4)), see(STEP)
     mixed = now.pair.left.copy()
@@ -156,7 +154,7 @@ def test_patches_are_counted_one_by_one(see: See) -> None:
 
 
 @pytest.mark.parametrize("sigma", [1.0, 3.0, 8.0])
-def test_the_noise_of_an_image_is_found(sigma: float) -> None:
+def test_the_noise_of_an_image_is_found(sigma):
     ramp = np.tile(np.linspace(60, 190, 300), (200, 1))
     noisy = ramp + np.random.default_rng(3).normal(0.0, sigma, ramp.shape)
     grey = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

@@ -1,7 +1,5 @@
 """Features of an image, and where they are in the next one."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ from recon.odometry.features import (
     warp_of,
 )
 from recon.odometry.protocol import OdometryFrame
-from tests.odometry.conftest import See
 
 NONE = np.zeros((0, 2), np.float32)
 
@@ -31,7 +28,7 @@ def per_cell(uv: np.ndarray) -> np.ndarray:
     return np.unique(cells, return_counts=True)[1]
 
 
-def test_no_cell_holds_more_than_its_share_also_with_features_already_followed(see: See) -> None:
+def test_no_cell_holds_more_than_its_share_also_with_features_already_followed(see):
     grey = see(np.eye(4)).pair.left
     first = find_corners(grey, NONE)
     assert len(first) > 50
@@ -42,14 +39,14 @@ def test_no_cell_holds_more_than_its_share_also_with_features_already_followed(s
     assert distance.size == 0 or distance.min() >= features._DISTANCE_PX
 
 
-def test_of_a_crowd_those_that_come_first_stay() -> None:
+def test_of_a_crowd_those_that_come_first_stay():
     gathered = np.array([[50.0, 50.0], [np.nan, np.nan], [200.0, 10.0]] + 4 * [[45.0, 60.0]])
     expected = [False, False, False, False, False, True, True]
     assert in_crowd(gathered, (100, 300)).tolist() == expected
     assert in_crowd(np.zeros((0, 2)), (100, 300)).shape == (0,)
 
 
-def test_the_corners_of_a_square_are_found() -> None:
+def test_the_corners_of_a_square_are_found():
     grey = np.full((100, 100), 50, np.uint8)
     grey[30:60, 30:60] = 200
     uv = find_corners(grey, NONE, cell_px=20)
@@ -62,7 +59,7 @@ def test_the_corners_of_a_square_are_found() -> None:
         assert find_corners(nothing, NONE).shape == (0, 2)
 
 
-def test_fewer_corners_are_corners_too(see: See) -> None:
+def test_fewer_corners_are_corners_too(see):
     grey = see(np.eye(4)).pair.left
     many, few = find_corners(grey, NONE), find_fewer_corners(grey, NONE)
     assert 0.15 < len(few) / len(many) < 0.6
@@ -73,7 +70,7 @@ def test_fewer_corners_are_corners_too(see: See) -> None:
     assert len(more) < 0.2 * len(few)
 
 
-def test_what_leaves_the_image_is_not_followed(see: See) -> None:
+def test_what_leaves_the_image_is_not_followed(see):
     grey = see(np.eye(4)).pair.left
     uv = find_corners(grey, NONE)
     shift = np.array([30, 12])
@@ -109,7 +106,7 @@ def seen_features(
     return uv[inside], xyz[inside], there[inside]
 
 
-def test_slopes_of_the_road_are_those_of_its_plane(see: See, camera: RectifiedCamera) -> None:
+def test_slopes_of_the_road_are_those_of_its_plane(see, camera):
     frame = see(np.eye(4))
     uv = np.array([[150.0, 130.0], [200.0, 140.0], [250.0, 120.0]])
     # A plane 1.6 m below the camera: d = f·b/Z and v - cy = f·1.6/Z, so d = (v - cy)·b/1.6.
@@ -118,7 +115,7 @@ def test_slopes_of_the_road_are_those_of_its_plane(see: See, camera: RectifiedCa
     )
 
 
-def test_the_warp_is_the_derivative_of_the_motion(camera: RectifiedCamera) -> None:
+def test_the_warp_is_the_derivative_of_the_motion(camera):
     T = make_transform(TURN, np.array([0.1, -0.05, -1.5]))
     uv, slope = np.array([[150.0, 130.0]]), np.array([[0.02, 0.3]])
 
@@ -136,9 +133,7 @@ def test_the_warp_is_the_derivative_of_the_motion(camera: RectifiedCamera) -> No
 
 
 @pytest.mark.parametrize(("step_m", "off_px"), [(0.5, 0.1), (2.0, 0.2)])
-def test_features_are_found_however_long_the_step(
-    step_m: float, off_px: float, see: See, camera: RectifiedCamera
-) -> None:
+def test_features_are_found_however_long_the_step(step_m, off_px, see, camera):
     T_then_now = make_transform(TURN, np.array([0.05, 0.0, step_m]))
     then, now = see(np.eye(4)), see(T_then_now)
     uv, xyz, there = seen_features(then, invert(T_then_now), camera)
@@ -157,7 +152,7 @@ def test_features_are_found_however_long_the_step(
         assert (off < 0.5)[near].mean() > 0.7
 
 
-def test_a_darker_image_changes_no_place(see: See, camera: RectifiedCamera) -> None:
+def test_a_darker_image_changes_no_place(see, camera):
     frame = see(np.eye(4))
     uv, _, _ = seen_features(frame, np.eye(4), camera)
     darker = np.rint(0.6 * frame.pair.left + 20).astype(np.uint8)
@@ -167,7 +162,7 @@ def test_a_darker_image_changes_no_place(see: See, camera: RectifiedCamera) -> N
     assert np.isfinite(found).mean() > 0.9
 
 
-def test_disparities_are_measured_near_rough_ones(see_both: See) -> None:
+def test_disparities_are_measured_near_rough_ones(see_both):
     frame = see_both(np.eye(4))
     uv = corners(frame)
     uv = uv[uv[:, 0] > 80]  # seen in the right image, too

@@ -1,7 +1,5 @@
 """Registration of points by KISS-ICP, and the selection of those points."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +17,10 @@ from recon.odometry.kiss import (
     select_points,
     textured,
 )
-from recon.odometry.protocol import OdometryFrame
-from tests.odometry.conftest import PLANES, See, off_m
+from tests.odometry.conftest import PLANES, off_m
 
 
-def test_a_still_camera_stays(see: See) -> None:
+def test_a_still_camera_stays(see):
     odometry = KissOdometry(30.0)
     results = [odometry.register(see(np.eye(4))) for _ in range(3)]
     # ICP against its own points: centimetres, from voxels of 0.5 m.
@@ -31,7 +28,7 @@ def test_a_still_camera_stays(see: See) -> None:
     assert results[-1].health.icp_points > 100
 
 
-def test_a_motion_towards_a_wall_is_found(see: See) -> None:
+def test_a_motion_towards_a_wall_is_found(see):
     odometry = KissOdometry(30.0)
     poses = [make_transform(np.eye(3), np.array([0.06 * n, 0.0, 0.0])) for n in range(7)]
     found = [odometry.register(see(T)).T_world_camera for T in poses][-1]
@@ -39,15 +36,13 @@ def test_a_motion_towards_a_wall_is_found(see: See) -> None:
     assert abs(found[0, 3] - poses[-1][0, 3]) < 0.04
 
 
-def test_smooth_walls_do_not_tell_the_motion_along_them(
-    street: tuple[OdometryFrame, ...], street_poses: np.ndarray
-) -> None:
+def test_smooth_walls_do_not_tell_the_motion_along_them(street, street_poses):
     """What no registration of surfaces can do, and why visual odometry is the default."""
     odometry = KissOdometry(30.0)
     assert off_m([odometry.register(frame) for frame in street][-1], street_poses[-1]) > 0.5
 
 
-def test_an_empty_frame_extrapolates_and_says_so(blind: See, see: See) -> None:
+def test_an_empty_frame_extrapolates_and_says_so(blind, see):
     odometry = KissOdometry(30.0)
     before = [odometry.register(see(np.eye(4))) for _ in range(2)]
     result = odometry.register(blind())
@@ -57,14 +52,14 @@ def test_an_empty_frame_extrapolates_and_says_so(blind: See, see: See) -> None:
     assert "too few" in result.health.notes[0]
 
 
-def test_an_empty_drive_stays_at_the_identity(blind: See) -> None:
+def test_an_empty_drive_stays_at_the_identity(blind):
     odometry = KissOdometry(30.0)
     results = [odometry.register(blind()) for _ in range(3)]
     assert all(np.array_equal(result.T_world_camera, np.eye(4)) for result in results)
     assert [result.health.ok for result in results] == [True, False, False]
 
 
-def test_selected_points_lie_on_the_street(see: See) -> None:
+def test_selected_points_lie_on_the_street(see):
     xyz = select_points(see(np.eye(4)), 30.0).xyz
     walls = [np.abs(xyz @ np.array(normal) - offset) for normal, offset, _ in PLANES]
     assert len(xyz) > 1000
@@ -72,7 +67,7 @@ def test_selected_points_lie_on_the_street(see: See) -> None:
     assert np.min(walls, axis=0).max() < 1e-4
 
 
-def test_range_and_accuracy_bound_the_selection(see: See, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_range_and_accuracy_bound_the_selection(see, monkeypatch):
     frame = see(np.eye(4))
     every = select_points(frame, 30.0)
     monkeypatch.setattr(kiss, "_MIN_RANGE_M", 6.0)
@@ -84,16 +79,14 @@ def test_range_and_accuracy_bound_the_selection(see: See, monkeypatch: pytest.Mo
     assert 0 < len(cloud) < len(every)
 
 
-def test_only_change_along_the_row_is_texture() -> None:
+def test_only_change_along_the_row_is_texture():
     rows = np.zeros((20, 20), np.uint8)
     rows[10:] = 200
     assert not textured(rows, 100.0).any()
     assert textured(np.ascontiguousarray(rows.T), 100.0).any()
 
 
-def test_a_lone_disparity_and_the_rim_of_the_unknown_are_not_consistent(
-    see: See, blind: See
-) -> None:
+def test_a_lone_disparity_and_the_rim_of_the_unknown_are_not_consistent(see, blind):
     disparity = see(np.eye(4)).disparity
     values = np.full_like(disparity.values, 10.0)
     values[50, 50] = 20.0
@@ -133,13 +126,13 @@ def aligned_to_room(prior: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.001])
-def test_points_in_camera_axes_give_the_pose_of_the_camera(scale: float) -> None:
+def test_points_in_camera_axes_give_the_pose_of_the_camera(scale):
     """Also from a prior that is not quite rigid, which must not end the process."""
     # The same surface points are seen again; 5 mm is far below the 300 mm voxel.
     assert error_m(aligned_to_room(np.diag([scale, scale, scale, 1.0]))) < 0.005
 
 
-def test_register_follows_the_camera_like_kiss_icp() -> None:
+def test_register_follows_the_camera_like_kiss_icp():
     icp = KissIcp(OPTIONS)
     first = icp.register(seen_from(np.eye(4))).T_world_camera
     second = icp.register(seen_from(T_MOVED)).T_world_camera
@@ -148,7 +141,7 @@ def test_register_follows_the_camera_like_kiss_icp() -> None:
     assert error_m(second) < 0.02
 
 
-def test_align_takes_read_only_arrays_and_leaves_them_and_the_map_alone() -> None:
+def test_align_takes_read_only_arrays_and_leaves_them_and_the_map_alone():
     xyz, pose = seen_from(np.eye(4)).astype(np.float32), np.eye(4)
     copy = xyz.copy()
     xyz.flags.writeable = pose.flags.writeable = False
@@ -160,19 +153,19 @@ def test_align_takes_read_only_arrays_and_leaves_them_and_the_map_alone() -> Non
     np.testing.assert_array_equal(icp.state()["points"], before)
 
 
-def test_without_a_map_the_guess_stays() -> None:
+def test_without_a_map_the_guess_stays():
     alignment = KissIcp(OPTIONS).align(seen_from(np.eye(4)), T_MOVED, 0.5)
     np.testing.assert_allclose(alignment.T_world_camera, T_MOVED, atol=1e-12)
 
 
 @pytest.mark.parametrize("value", ['{"max_range": 1.0}', "not json"])
-def test_environment_variables_change_nothing(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_variables_change_nothing(value, monkeypatch):
     expected = aligned_to_room(np.eye(4))
     monkeypatch.setenv("kiss_icp_data", value)
     np.testing.assert_array_equal(aligned_to_room(np.eye(4)), expected)
 
 
-def test_points_and_poses_that_kiss_icp_would_take_silently_are_refused() -> None:
+def test_points_and_poses_that_kiss_icp_would_take_silently_are_refused():
     icp = KissIcp(OPTIONS)
     for xyz in (np.zeros((0, 3)), np.zeros((5, 2)), np.full((5, 3), np.nan), np.zeros(3)):
         for call in (icp.register, lambda p: icp.align(p, np.eye(4), 0.5)):
@@ -183,7 +176,7 @@ def test_points_and_poses_that_kiss_icp_would_take_silently_are_refused() -> Non
             icp.align(room(), pose, 0.5)
 
 
-def test_no_foreign_exception_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_foreign_exception_leaks(monkeypatch):
     icp = KissIcp(OPTIONS)
 
     def fail(*_: object) -> None:
@@ -194,7 +187,7 @@ def test_no_foreign_exception_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
         icp.register(room())
 
 
-def test_the_threshold_is_that_of_kiss_icp() -> None:
+def test_the_threshold_is_that_of_kiss_icp():
     """Our threshold, unlike that of kiss-icp, can be saved; it gives the same values."""
     theirs = kiss_icp_pybind._AdaptiveThreshold(
         initial_threshold=kiss._INITIAL_THRESHOLD_M,
@@ -209,7 +202,7 @@ def test_the_threshold_is_that_of_kiss_icp() -> None:
         assert ours.get_threshold() == pytest.approx(theirs._compute_threshold(), rel=1e-9)
 
 
-def test_a_saved_state_goes_on_to_the_bit() -> None:
+def test_a_saved_state_goes_on_to_the_bit():
     rng = np.random.default_rng(5)
     world = rng.uniform([-10, -2, 0], [10, 2, 40], (6000, 3))
     options = KissIcpOptions(max_range_m=30.0, voxel_m=0.5)

@@ -1,7 +1,5 @@
 """Odometries by name, what they say of their poses, and how far they are off on real drives."""
 
-from __future__ import annotations
-
 import typing
 from dataclasses import replace
 from itertools import islice
@@ -12,7 +10,7 @@ import pytest
 
 from recon.core.errors import RegistrationError, SettingsError
 from recon.core.geometry.se3 import as_transform, invert
-from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory, TrajectoryMetrics
+from recon.core.values import RectifiedPair, Trajectory, TrajectoryMetrics
 from recon.evaluation.trajectory import evaluate_trajectory
 from recon.map.store.records import Store
 from recon.odometry.health import (
@@ -27,13 +25,10 @@ from recon.odometry.registry import ODOMETRIES, KnownPoses, make_odometry
 from recon.odometry.settings import OdometryName, OdometrySettings
 from recon.sources.registry import open_source
 from recon.stereo.match.registry import make_matcher
-from tests.odometry.conftest import See
 
 
 @pytest.mark.parametrize("name", ODOMETRIES)
-def test_a_saved_odometry_goes_on_to_the_bit(
-    name: str, street: tuple[OdometryFrame, ...], tmp_path: Path
-) -> None:
+def test_a_saved_odometry_goes_on_to_the_bit(name, street, tmp_path):
     unbroken = make_odometry(name)
     assert isinstance(unbroken, Odometry)
     for frame in street[:6]:
@@ -48,7 +43,7 @@ def test_a_saved_odometry_goes_on_to_the_bit(
         assert repr(ours.health) == repr(theirs.health)
 
 
-def test_the_settings_offer_what_there_is_and_runs_of_older_versions_were_visual_too() -> None:
+def test_the_settings_offer_what_there_is_and_runs_of_older_versions_were_visual_too():
     with pytest.raises(SettingsError, match="one of: kiss, visual"):
         make_odometry("lidar")
     assert set(typing.get_args(OdometryName)) == set(ODOMETRIES)
@@ -65,14 +60,14 @@ def test_the_settings_offer_what_there_is_and_runs_of_older_versions_were_visual
         {"max_range_m": 0},
     ],
 )
-def test_what_is_no_setting_is_refused(values: dict[str, object]) -> None:
+def test_what_is_no_setting_is_refused(values):
     with pytest.raises(SettingsError):
         OdometrySettings.parse(values)
 
 
 def test_known_poses_begin_at_the_identity_and_are_picked_by_the_number_of_the_frame(
-    blind: See, street_poses: np.ndarray
-) -> None:
+    blind, street_poses
+):
     odometry = KnownPoses(Trajectory(street_poses, np.arange(12.0)))
     assert isinstance(odometry, Odometry)
     for index in (3, 4, 5, 9):
@@ -94,9 +89,7 @@ def path(frames: int = 101, step_m: float = 1.0) -> Trajectory:
     return Trajectory(poses, np.arange(frames, dtype=np.float64))
 
 
-def test_an_error_of_all_disparities_is_as_much_of_the_length_and_warned_of_if_large(
-    camera: RectifiedCamera,
-) -> None:
+def test_an_error_of_all_disparities_is_as_much_of_the_length_and_warned_of_if_large(camera):
     near = expected_drift(path(), [GOOD] * 101, camera)
     far = expected_drift(path(), [replace(GOOD, scale_px=3.0)] * 101, camera)
     # 0.1 px, and 0.02° at 260 px: 0.135 px together, beside 0.2 % of the baseline.
@@ -109,7 +102,7 @@ def test_an_error_of_all_disparities_is_as_much_of_the_length_and_warned_of_if_l
     ]
 
 
-def test_random_errors_scatter_as_stated(camera: RectifiedCamera) -> None:
+def test_random_errors_scatter_as_stated(camera):
     """Paths with errors of the stated size in each step, against the stated drift."""
     rng = np.random.default_rng(4)
     sigmas = np.repeat([GOOD.sigma_m, np.deg2rad(GOOD.sigma_deg)], 3) / np.sqrt(3)
@@ -127,7 +120,7 @@ def test_random_errors_scatter_as_stated(camera: RectifiedCamera) -> None:
     assert 0.8 * random < scattered < 1.1 * random
 
 
-def test_poses_that_were_not_measured_say_nothing(camera: RectifiedCamera) -> None:
+def test_poses_that_were_not_measured_say_nothing(camera):
     assert expected_drift(path(), [OdometryHealth()] * 101, camera) is None
     assert expected_drift(path(1), [GOOD], camera) is None
     lost = replace(GOOD, ok=False, scale_px=1.0)
@@ -140,7 +133,7 @@ SKIPPED = replace(LOST, skipped=True)
 FINE = OdometryHealth()
 
 
-def test_lost_frames_are_named_by_stretches() -> None:
+def test_lost_frames_are_named_by_stretches():
     assert health_warnings([FINE] * 3) == []
     lines = health_warnings([FINE, LOST, LOST, FINE, LOST, *[FINE] * 30])
     assert [line.split(":")[0] for line in lines] == ["frames 1-2", "frame 4"]
@@ -153,13 +146,13 @@ def test_lost_frames_are_named_by_stretches() -> None:
     assert health_warnings([warned, FINE, warned, FINE]) == ["frames 0-2: rows are off"]
 
 
-def test_what_follows_a_lost_pose_is_another_stretch_unless_that_was_skipped() -> None:
+def test_what_follows_a_lost_pose_is_another_stretch_unless_that_was_skipped():
     assert stretches([FINE, SKIPPED, FINE, LOST, FINE, FINE]).tolist() == [0, -1, 0, -1, 1, 1]
     assert stretches([FINE, LOST, SKIPPED, FINE]).tolist() == [0, -1, -1, 1]
     assert stretches([]).tolist() == []
 
 
-def test_one_line_says_what_is_doubted_of_a_drive() -> None:
+def test_one_line_says_what_is_doubted_of_a_drive():
     assert doubt_about([FINE] * 3) == []
     (line,) = doubt_about([*[FINE] * 20, SKIPPED, *[FINE] * 20])
     assert line == "1 of 41 poses are not to be trusted (frame 20): nothing of them is in the map"
@@ -169,7 +162,7 @@ def test_one_line_says_what_is_doubted_of_a_drive() -> None:
     assert line.startswith("PATH AND MAP ARE NOT TO BE TRUSTED: the poses of 1 of 3 frames")
 
 
-def test_frames_are_named_by_their_first_three_stretches() -> None:
+def test_frames_are_named_by_their_first_three_stretches():
     assert name_frames([4]) == "frame 4"
     assert name_frames([1, 2, 5, 7, 8, 9]) == "frames 1-2, frame 5, frames 7-9"
     assert name_frames([1, 3, 5, 7]) == "frame 1, frame 3, frame 5, …"
@@ -203,8 +196,8 @@ def drive(folder: Path, stride: int) -> tuple[TrajectoryMetrics, list[OdometryHe
     ],
 )
 def test_real_drives_drift_as_little_as_promised_and_raise_no_alarm(
-    name: str, stride: int, t_bound: float, r_bound: float, recon_data: Path
-) -> None:
+    name, stride, t_bound, r_bound, recon_data
+):
     found, health = drive(recon_data / "driven" / name, stride)
     assert 0.0 < found.t_rel_percent < t_bound
     assert 0.0 < found.r_rel_deg_per_100m < r_bound

@@ -1,7 +1,5 @@
 """Visual odometry, alone and with an external trajectory as prior: any rate, world and axes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -34,7 +32,7 @@ def path_of(results: list[OdometryResult]) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def results(street: Street) -> list[OdometryResult]:
+def results(street):
     return register(street)
 
 
@@ -46,14 +44,14 @@ def forward(distance_m: float) -> np.ndarray:
     return make_transform(np.eye(3), np.array([0.0, 0.0, distance_m]))
 
 
-def test_a_camera_that_stands_still_stays(see: See) -> None:
+def test_a_camera_that_stands_still_stays(see):
     poses = path_of(register([see(np.eye(4))] * 4))
     # Equal images: what is left is the optimiser's rounding.
     np.testing.assert_allclose(poses, np.tile(np.eye(4), (4, 1, 1)), atol=1e-4)
 
 
 @pytest.mark.parametrize("step", [forward(0.5), yaw(0.02), forward(-0.3), forward(0.4) @ yaw(0.01)])
-def test_a_motion_is_found(step: np.ndarray, see: See) -> None:
+def test_a_motion_is_found(step, see):
     truth = [np.linalg.matrix_power(step, n) for n in range(5)]
     last = register([see(T) for T in truth])[-1]
     # 1 % of a 2 m path; a quarter of a pixel (1/260 rad) in four frames, as patches that grow
@@ -62,9 +60,7 @@ def test_a_motion_is_found(step: np.ndarray, see: See) -> None:
     assert angle_rad(invert(last.T_world_camera) @ truth[-1]) < 0.25 / 260
 
 
-def test_features_stay_spread_over_the_image_where_a_drive_backwards_gathers_them(
-    street: Street,
-) -> None:
+def test_features_stay_spread_over_the_image_where_a_drive_backwards_gathers_them(street):
     odometry = VisualOdometry()
     for frame in reversed(street):
         odometry.register(frame)
@@ -73,9 +69,7 @@ def test_features_stay_spread_over_the_image_where_a_drive_backwards_gathers_the
     assert not in_crowd(newest, street[0].pair.left.shape).any()
 
 
-def test_motion_begins_at_the_identity_wherever_the_drive_begins(
-    street: Street, results: list[OdometryResult]
-) -> None:
+def test_motion_begins_at_the_identity_wherever_the_drive_begins(street, results):
     late, whole = path_of(register(street[4:8])), path_of(results)
     np.testing.assert_array_equal(late[0], np.eye(4))
     relative = invert(whole[4]) @ whole[7]
@@ -83,17 +77,17 @@ def test_motion_begins_at_the_identity_wherever_the_drive_begins(
     assert np.linalg.norm(relative[:3, 3] - late[3][:3, 3]) < 0.03
 
 
-def test_two_runs_are_equal_to_the_bit(street: Street, results: list[OdometryResult]) -> None:
+def test_two_runs_are_equal_to_the_bit(street, results):
     np.testing.assert_array_equal(path_of(register(street)), path_of(results))
 
 
-def test_a_blank_wall_gives_no_motion_and_no_exception(blind: See) -> None:
+def test_a_blank_wall_gives_no_motion_and_no_exception(blind):
     results = register([blind(128, n) for n in range(3)])
     assert [result.health.ok for result in results[:2]] == [True, False]
     np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
 
 
-def test_an_object_that_moves_does_not_move_the_camera(see: See) -> None:
+def test_an_object_that_moves_does_not_move_the_camera(see):
     """A third of the image shows the street from elsewhere, as on the side of a passing bus."""
     frames, third = [], np.s_[:, :133]
     for n in range(5):
@@ -143,24 +137,22 @@ def _exposed(gain: float) -> Callable[[Street, See], list[OdometryFrame]]:
     ids=["black", "black for long", "no disparity", "frames missing", "dark", "bright"],
 )
 def test_what_is_lost_is_said_and_the_camera_found_again(
-    spoil, lost: list[int], most_m: float, street: Street, street_poses: np.ndarray, blind: See
-) -> None:
+    spoil, lost, most_m, street, street_poses, blind
+):
     results = register(spoil(street, blind))
     assert [n for n, result in enumerate(results) if not result.health.ok] == lost
     assert all("lost" in results[n].health.notes[0] for n in lost)
     assert off_m(results[-1], street_poses[-1]) < most_m
 
 
-def test_a_drive_that_begins_blind_begins_where_it_sees(blind: See, street: Street) -> None:
+def test_a_drive_that_begins_blind_begins_where_it_sees(blind, street):
     results = register([blind(), blind(), *street[:4]])
     np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
     assert [result.health.ok for result in results[:2]] == [True, False]
     assert results[-1].health.ok
 
 
-def test_the_stated_error_of_a_motion_is_about_its_error(
-    results: list[OdometryResult], street_poses: np.ndarray
-) -> None:
+def test_the_stated_error_of_a_motion_is_about_its_error(results, street_poses):
     steps, truth = (invert(T[:-1]) @ T[1:] for T in (path_of(results), street_poses))
     off = np.linalg.norm((steps - truth)[:, :3, 3], axis=1)
     stated_m = np.array([result.health.sigma_m for result in results[1:]])
@@ -171,9 +163,7 @@ def test_the_stated_error_of_a_motion_is_about_its_error(
 
 
 @pytest.mark.parametrize("error_px", [-0.3, 0.3])
-def test_what_all_disparities_are_off_is_in_the_length_as_health_says(
-    error_px: float, street: Street, results: list[OdometryResult]
-) -> None:
+def test_what_all_disparities_are_off_is_in_the_length_as_health_says(error_px, street, results):
     off = [Disparity.from_values(frame.disparity.values + error_px) for frame in street]
     wrong = register([replace(f, disparity=d) for f, d in zip(street, off, strict=True)])
     scale_px = np.mean([result.health.scale_px for result in results[1:]])
@@ -184,9 +174,7 @@ def test_what_all_disparities_are_off_is_in_the_length_as_health_says(
     assert lengths_m[0] / lengths_m[1] - 1.0 == pytest.approx(-error_px / scale_px, rel=0.1)
 
 
-def test_rough_disparities_give_nearly_the_same_path(
-    see_both: See, street_poses: np.ndarray
-) -> None:
+def test_rough_disparities_give_nearly_the_same_path(see_both, street_poses):
     matcher = HalfSizeMatcher(SadSettings(), threads=1)
     pairs = [see_both(T, index).pair for index, T in enumerate(street_poses)]
     found = register([OdometryFrame(pair, matcher.match(pair), rough=True) for pair in pairs])
@@ -211,35 +199,33 @@ def led_by(frames: list[OdometryFrame], prior: Trajectory | None) -> list[Odomet
     return [odometry.register(frame) for frame in frames]
 
 
-def test_motions_do_not_depend_on_the_world_of_the_path() -> None:
+def test_motions_do_not_depend_on_the_world_of_the_path():
     prior = MotionPrior(path(steps(5)), PriorSettings())
     # Positions of 500 m have 1e-13 of them as rounding.
     np.testing.assert_allclose(prior.motion(0.1, 0.2), STEP, atol=1e-9)
 
 
-def test_between_poses_the_path_is_interpolated() -> None:
+def test_between_poses_the_path_is_interpolated():
     coarse = MotionPrior(path(steps(9)[::4], interval_s=0.4), PriorSettings())
     found = coarse.motion(0.1, 0.2)
     # A chord of an arc of 0.04 rad and 2 m: 2 m · 0.04 / 8 to the side at most.
     np.testing.assert_allclose(found, STEP, atol=0.01)
 
 
-def test_body_axes_are_turned_into_those_of_the_camera() -> None:
+def test_body_axes_are_turned_into_those_of_the_camera():
     body = np.stack([T @ CAMERA_FROM_BODY for T in steps(4)])
     prior = MotionPrior(path(body), PriorSettings(axes="body"))
     np.testing.assert_allclose(prior.motion(0.0, 0.1), STEP, atol=1e-9)
 
 
 @pytest.mark.parametrize(("from_s", "to_s"), [(-0.1, 0.1), (0.3, 0.6), (0.2, 0.2), (0.2, 0.1)])
-def test_outside_of_the_path_and_across_a_gap_nothing_is_reported(
-    from_s: float, to_s: float
-) -> None:
+def test_outside_of_the_path_and_across_a_gap_nothing_is_reported(from_s, to_s):
     assert MotionPrior(path(steps(5)), PriorSettings()).motion(from_s, to_s) is None
     gappy = MotionPrior(path(steps(3), interval_s=2.0), PriorSettings())
     assert gappy.motion(0.5, 0.6) is None
 
 
-def test_what_is_no_path_of_the_drive_is_refused() -> None:
+def test_what_is_no_path_of_the_drive_is_refused():
     prior = MotionPrior(path(steps(5), start_s=1.7e9), PriorSettings())
     with pytest.raises(RegistrationError, match=r"does not cover the drive.*same clock"):
         prior.check_covers(0.1 * np.arange(10))
@@ -251,7 +237,7 @@ def test_what_is_no_path_of_the_drive_is_refused() -> None:
         make_odometry("kiss", OdometrySettings(), path(steps(3)))
 
 
-def test_frames_without_sight_are_carried_by_the_prior(see: See, blind: See) -> None:
+def test_frames_without_sight_are_carried_by_the_prior(see, blind):
     """The camera turns sharply while it is blind: the last motion going on would be far off."""
     turn = make_transform(exp_so3(np.array([0.0, 0.08, 0.0])), np.array([0.0, 0.0, 0.3]))
     truth = list(steps(4))
@@ -269,9 +255,7 @@ def test_frames_without_sight_are_carried_by_the_prior(see: See, blind: See) -> 
     assert off_m(carried[-1], truth[-1]) < 0.06
 
 
-def test_a_prior_that_is_a_little_off_hardly_moves_what_is_seen(
-    street: tuple[OdometryFrame, ...], street_poses: np.ndarray
-) -> None:
+def test_a_prior_that_is_a_little_off_hardly_moves_what_is_seen(street, street_poses):
     """Wheels that are 3 % too large: features know better."""
     poses = street_poses.copy()
     poses[:, :3, 3] *= 1.03
@@ -280,7 +264,7 @@ def test_a_prior_that_is_a_little_off_hardly_moves_what_is_seen(
     assert off_m(led[-1], street_poses[-1]) < off_m(alone[-1], street_poses[-1]) + 0.02
 
 
-def test_features_that_stand_still_do_not_outvote_the_wheels(see: See) -> None:
+def test_features_that_stand_still_do_not_outvote_the_wheels(see):
     """An image that stays the same while the wheels turn, as behind a lorry or a dirty lens."""
     still = [see(np.eye(4), 0)] * 3
     frames = [replace(f, pair=replace(f.pair, timestamp_s=0.1 * n)) for n, f in enumerate(still)]
@@ -295,7 +279,7 @@ AXES = {"camera": np.eye(4), "body": CAMERA_FROM_BODY}
 
 
 @pytest.fixture(scope="module")
-def frames(see: See) -> list[OdometryFrame]:
+def frames(see):
     return [see(T, n) for n, T in enumerate(steps(7))]
 
 
@@ -305,7 +289,7 @@ def prior(T_camera_body: np.ndarray, step: np.ndarray = STEP, count: int = 8) ->
 
 
 @pytest.mark.parametrize("axes", AXES)
-def test_the_axes_of_a_path_are_found(frames: list[OdometryFrame], axes: str) -> None:
+def test_the_axes_of_a_path_are_found(frames, axes):
     found = find_axes(prior(AXES[axes]), iter(frames), PriorSettings())
     assert found.axes == axes
     # The path is exact, so its own standard deviation of 3 % is never used up.
@@ -313,9 +297,7 @@ def test_the_axes_of_a_path_are_found(frames: list[OdometryFrame], axes: str) ->
     assert max(found.sigmas.values()) > 5
 
 
-def test_a_body_near_the_camera_and_a_scale_two_per_cent_off_are_recognised(
-    frames: list[OdometryFrame],
-) -> None:
+def test_a_body_near_the_camera_and_a_scale_two_per_cent_off_are_recognised(frames):
     lever = make_transform(exp_so3(np.array([0.02, 0.0, 0.03])), np.array([0.3, 0.5, -0.2]))
     step = STEP.copy()
     step[:3, 3] *= 1.02
@@ -323,18 +305,18 @@ def test_a_body_near_the_camera_and_a_scale_two_per_cent_off_are_recognised(
     assert found.axes == "body"
 
 
-def test_a_path_of_other_axes_is_refused(frames: list[OdometryFrame]) -> None:
+def test_a_path_of_other_axes_is_refused(frames):
     backwards = make_transform(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     with pytest.raises(RegistrationError, match=r"does not fit what the cameras see.*body"):
         find_axes(prior(backwards), iter(frames), PriorSettings())
 
 
-def test_without_motion_the_axes_stay_open(see: See) -> None:
+def test_without_motion_the_axes_stay_open(see):
     still = [see(np.eye(4), n) for n in range(4)]
     assert find_axes(prior(np.eye(4), np.eye(4)), iter(still), PriorSettings()) is None
 
 
-def test_the_first_moving_frame_is_found_from_the_path_alone() -> None:
+def test_the_first_moving_frame_is_found_from_the_path_alone():
     moved = np.concatenate([np.zeros(20), 0.05 * np.arange(40)])
     poses = np.stack([make_transform(np.eye(3), np.array([x, 0.0, 0.0])) for x in moved])
     path = Trajectory(poses, 0.1 * np.arange(60))

@@ -1,7 +1,5 @@
 """Poses: one camera localised from the inliers of its points, and a window adjusted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -24,7 +22,7 @@ from recon.odometry.window import (
 
 
 @pytest.fixture(autouse=True)
-def _to_the_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
+def _to_the_minimum(monkeypatch):
     """Adjust until nothing changes any more, not only as far as a drive needs."""
     monkeypatch.setattr(bundle_window, "_ITERATIONS", 30)
     monkeypatch.setattr(bundle_window, "_MIN_GAIN", 1e-9)
@@ -58,7 +56,7 @@ def newest_error(window: TrackWindow, right: TrackWindow) -> tuple[float, float]
     return float(np.linalg.norm(off[:3, 3])), float(angle_rad(off))
 
 
-def test_exact_observations_give_exact_poses_and_points(camera: RectifiedCamera) -> None:
+def test_exact_observations_give_exact_poses_and_points(camera):
     right = truth(camera)
     start = disturbed(right)
     found = adjust(start, camera)
@@ -71,7 +69,7 @@ def test_exact_observations_give_exact_poses_and_points(camera: RectifiedCamera)
     np.testing.assert_array_equal(found.T_world_camera[0], start.T_world_camera[0])
 
 
-def test_some_wrong_tracks_hardly_matter(camera: RectifiedCamera) -> None:
+def test_some_wrong_tracks_hardly_matter(camera):
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[-1, :20, 0] += 15.0
@@ -82,7 +80,7 @@ def test_some_wrong_tracks_hardly_matter(camera: RectifiedCamera) -> None:
     assert not wrong[20:].any()
 
 
-def test_a_track_without_disparity_still_counts(camera: RectifiedCamera) -> None:
+def test_a_track_without_disparity_still_counts(camera):
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[1:, :, 2] = np.nan
@@ -91,7 +89,7 @@ def test_a_track_without_disparity_still_counts(camera: RectifiedCamera) -> None
     assert np.isnan(reprojection(found, camera)[-1, :, 2]).all()
 
 
-def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
+def test_information_predicts_the_scatter(camera):
     """Noise of the stated size in the newest frame alone: scatter against the covariance."""
     right = truth(camera, frames=2)
     rng = np.random.default_rng(13)
@@ -108,9 +106,7 @@ def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
     assert (ratio < 1.5).all()
 
 
-def test_health_states_the_certainty_that_the_misfit_of_the_features_gives(
-    camera: RectifiedCamera,
-) -> None:
+def test_health_states_the_certainty_that_the_misfit_of_the_features_gives(camera):
     right, sigma_px = truth(camera), 0.4
     uvd = right.uvd.copy()
     uvd[-1, :, :2] += np.random.default_rng(14).normal(0.0, sigma_px, uvd[-1, :, :2].shape)
@@ -126,7 +122,7 @@ def test_health_states_the_certainty_that_the_misfit_of_the_features_gives(
     assert found.scale_px == pytest.approx(np.average(d, weights=d))
 
 
-def test_trimming_keeps_what_is_followed_and_what_was_seen_twice(camera: RectifiedCamera) -> None:
+def test_trimming_keeps_what_is_followed_and_what_was_seen_twice(camera):
     window = truth(camera, frames=4, points=4)
     uvd = window.uvd.copy()
     uvd[3, 0] = uvd[3, 1] = np.nan
@@ -139,7 +135,7 @@ def test_trimming_keeps_what_is_followed_and_what_was_seen_twice(camera: Rectifi
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_a_window_without_points_stays_as_it_is(frames: int, camera: RectifiedCamera) -> None:
+def test_a_window_without_points_stays_as_it_is(frames, camera):
     poses = truth(camera).T_world_camera[:frames]
     window = TrackWindow(poses, np.zeros((frames, 0, 3)), np.zeros((0, 3)))
     np.testing.assert_array_equal(adjust(window, camera).T_world_camera, poses)
@@ -170,7 +166,7 @@ def street(seed: int, wrong: int = 12) -> tuple[Float64, Float64]:
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_noisy_depths_do_not_throw_the_camera(seed: int) -> None:
+def test_noisy_depths_do_not_throw_the_camera(seed):
     # Regression: a point on the horizon throws RANSAC's own pose, a closed form, by kilometres.
     xyz, uv = street(seed)
     found = locate_camera(xyz, uv, CAMERA, np.eye(4))
@@ -184,14 +180,14 @@ def test_noisy_depths_do_not_throw_the_camera(seed: int) -> None:
     np.testing.assert_array_equal(found.agree, error_px <= REPROJECTION_PX)
 
 
-def test_a_guess_that_is_far_off_does_no_harm() -> None:
+def test_a_guess_that_is_far_off_does_no_harm():
     xyz, uv = street(1)
     far = make_transform(exp_so3(np.array([0.0, 0.3, 0.0])), np.array([3.0, 0.0, -4.0]))
     found = locate_camera(xyz, uv, CAMERA, far)
     assert np.linalg.norm((invert(T_TRUE) @ found.T_world_camera)[:3, 3]) < 0.12
 
 
-def test_points_that_agree_on_nothing_and_too_few_give_no_pose() -> None:
+def test_points_that_agree_on_nothing_and_too_few_give_no_pose():
     xyz, uv = street(2)
     wrong = np.random.default_rng(2).permutation(uv)
     assert locate_camera(xyz, wrong, CAMERA, np.eye(4)) is None
@@ -201,7 +197,7 @@ def test_points_that_agree_on_nothing_and_too_few_give_no_pose() -> None:
 STEP = make_transform(exp_so3(np.array([0.0, 0.03, 0.01])), np.array([0.1, 0.0, 1.2]))
 
 
-def test_with_known_times_the_velocity_goes_on() -> None:
+def test_with_known_times_the_velocity_goes_on():
     motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1)
     np.testing.assert_allclose(motion.predict(0.2), STEP @ STEP, atol=1e-12)
     np.testing.assert_allclose(motion.predict(0.4), STEP @ part_of(STEP, 3.0), atol=1e-12)
@@ -212,12 +208,12 @@ def test_with_known_times_the_velocity_goes_on() -> None:
 @pytest.mark.parametrize(
     ("after_s", "time_s"), [(0.1, 0.0), (0.1, 0.1), (0.1, 1000.0), (0.1, -5.0), (0.0, 0.0)]
 )
-def test_times_that_give_no_answer_repeat_the_last_motion(after_s: float, time_s: float) -> None:
+def test_times_that_give_no_answer_repeat_the_last_motion(after_s, time_s):
     motion = Motion(np.eye(4), 0.0).moved(STEP, after_s)
     np.testing.assert_allclose(motion.predict(time_s), STEP @ STEP, atol=1e-12)
 
 
-def test_frames_that_are_not_seen_keep_the_velocity() -> None:
+def test_frames_that_are_not_seen_keep_the_velocity():
     motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1).drifted(0.2).drifted(0.3)
     np.testing.assert_allclose(motion.T_world_camera, np.linalg.matrix_power(STEP, 3), atol=1e-12)
     np.testing.assert_allclose(motion.predict(0.4), np.linalg.matrix_power(STEP, 4), atol=1e-12)

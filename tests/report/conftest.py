@@ -1,7 +1,5 @@
 """Small values shared by the tests of all reports."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,7 +19,6 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
-from recon.core.values.arrays import Float64
 from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 from recon.odometry.rig.fault import NAMES, RigFault
@@ -34,14 +31,14 @@ METRICS = TrajectoryMetrics(0.62, 0.7, 0.41, 0.01, 0.03, 10.0, 11, (5.0,), 3)
 
 
 @pytest.fixture
-def pair() -> RectifiedPair:
+def pair():
     left = np.random.default_rng(0).integers(0, 256, (HEIGHT_PX, WIDTH_PX), dtype=np.uint8)
     camera = RectifiedCamera(50.0, 30.0, 12.0, 30.0, 0.5, WIDTH_PX, HEIGHT_PX)
     return RectifiedPair(left, left, camera, index=7)
 
 
 @pytest.fixture
-def disparity() -> Disparity:
+def disparity():
     values = np.tile(np.linspace(1, 10, WIDTH_PX, dtype=np.float32), (HEIGHT_PX, 1))
     everything = np.ones_like(values)
     full = Disparity(values, everything, everything, np.zeros(values.shape, dtype=np.uint8))
@@ -51,13 +48,13 @@ def disparity() -> Disparity:
 
 
 @pytest.fixture
-def nothing_found(disparity: Disparity) -> Disparity:
+def nothing_found(disparity):
     """A disparity map without any value."""
     return disparity.reject(np.ones(disparity.values.shape, bool), Reason.LOW_TEXTURE)
 
 
 @pytest.fixture
-def trajectory() -> Trajectory:
+def trajectory():
     """Eleven frames, one metre each, straight ahead."""
     T = np.tile(np.eye(4), (11, 1, 1))
     T[:, 2, 3] = np.arange(11)
@@ -65,13 +62,13 @@ def trajectory() -> Trajectory:
 
 
 @pytest.fixture
-def T_map_world() -> Float64:
+def T_map_world():
     """Camera axes turned so that x is forward and z up."""
     return T_UPRIGHT_CAMERA
 
 
 @pytest.fixture
-def health() -> list[OdometryHealth]:
+def health():
     """One record per frame of `trajectory`; frame 5 has no measurement."""
     good = OdometryHealth(tracks=200, inliers=150, reprojection_px=0.2, sigma_m=0.01)
     bad = OdometryHealth(ok=False, notes=("too few <tracks>",))
@@ -79,7 +76,7 @@ def health() -> list[OdometryHealth]:
 
 
 @pytest.fixture
-def grid() -> OccupancyGrid:
+def grid():
     cells = np.full((20, 30), -1, dtype=np.int8)
     cells[5:15, 5:25] = 0
     cells[5, 5:25] = 100
@@ -87,14 +84,14 @@ def grid() -> OccupancyGrid:
 
 
 @pytest.fixture
-def cloud() -> PointCloud:
+def cloud():
     generator = np.random.default_rng(1)
     xyz = generator.uniform(0, 10, (2000, 3)).astype(np.float32)
     return PointCloud(xyz, rgb=generator.integers(0, 256, (2000, 3), dtype=np.uint8), frame="map")
 
 
 @pytest.fixture
-def mesh() -> TriangleMesh:
+def mesh():
     """A flat sheet of 2 × 19 × 19 triangles."""
     vertices = np.stack(np.mgrid[:20.0, :20.0, :1.0], axis=-1).reshape(-1, 3).astype(np.float32)
     number = np.arange(400, dtype=np.int32).reshape(20, 20)
@@ -104,7 +101,7 @@ def mesh() -> TriangleMesh:
 
 
 @pytest.fixture
-def rig(pair: RectifiedPair) -> RefinedRig:
+def rig(pair):
     """A right camera that is turned by half a degree: what is 30 m away seems behind infinity."""
     camera, values = pair.camera, np.zeros(len(NAMES))
     values[:4] = np.radians(0.1), np.radians(-0.5), 0.0, 0.01
@@ -117,7 +114,7 @@ def rig(pair: RectifiedPair) -> RefinedRig:
 
 
 @pytest.fixture
-def drive(request: pytest.FixtureRequest) -> SimpleNamespace:
+def drive(request):
     """What the page of a drive is made from, with everything but loops."""
     names = ("pair", "disparity", "trajectory", "T_map_world", "health", "grid", "cloud", "mesh")
     given = SimpleNamespace(**{name: request.getfixturevalue(name) for name in names})
@@ -143,7 +140,7 @@ def drive(request: pytest.FixtureRequest) -> SimpleNamespace:
 
 
 @pytest.fixture
-def view(pair: RectifiedPair, disparity: Disparity, cloud: PointCloud) -> SimpleNamespace:
+def view(pair, disparity, cloud):
     """A `PairRun`."""
     return SimpleNamespace(
         name="scenes/bike/im0.png",

@@ -1,7 +1,5 @@
 """What figures show: their colours, lines, bars, limits and words."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -18,15 +16,13 @@ from recon.core.values import (
     FREE,
     OCCUPIED,
     UNKNOWN,
-    Disparity,
     OccupancyGrid,
     OccupancyTruth,
     Reason,
     RectifiedCamera,
-    RectifiedPair,
     Trajectory,
 )
-from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.arrays import UInt8
 from recon.evaluation.paper import ABSOLUTE, AS_PRINTED, CORRECTED, TITLES
 from recon.odometry.protocol import OdometryHealth
 from recon.odometry.rig.refine import RigChange
@@ -57,7 +53,7 @@ def colour(scale: str, place: int) -> np.ndarray:
     return colormaps[scale](place, bytes=True)[:3]
 
 
-def test_colours_of_disparities_are_those_of_the_scale_and_near_is_red() -> None:
+def test_colours_of_disparities_are_those_of_the_scale_and_near_is_red():
     values = np.array([[0.0, 10.0, np.nan, -5.0, 99.0]], dtype=np.float32)
     far, near, missing, below, above = style.colour_disparity(values, (0.0, 10.0))[0]
     assert (far == below).all()
@@ -69,13 +65,13 @@ def test_colours_of_disparities_are_those_of_the_scale_and_near_is_red() -> None
     assert near[0] > near[2]
 
 
-def test_range_ignores_what_is_not_finite_and_is_never_empty() -> None:
+def test_range_ignores_what_is_not_finite_and_is_never_empty():
     assert style.value_range(np.array([np.nan, np.inf])) == (0.0, 1.0)
     assert style.value_range(np.array([4.0, 4.0, np.nan])) == (4.0, 5.0)
     assert style.value_range(np.arange(101.0)) == pytest.approx((1.0, 99.0))
 
 
-def test_errors_are_coloured_by_size_up_to_the_limit_and_no_confidence_as_missing() -> None:
+def test_errors_are_coloured_by_size_up_to_the_limit_and_no_confidence_as_missing():
     wrong, other, missing, far = style.colour_error(np.array([[2.0, -2.0, np.nan, 9.0]]), 4.0)[0]
     nothing, sure = style.colour_confidence(np.array([[0.0, 1.0]], dtype=np.float32))[0]
     np.testing.assert_array_equal(wrong, other)
@@ -83,7 +79,7 @@ def test_errors_are_coloured_by_size_up_to_the_limit_and_no_confidence_as_missin
     np.testing.assert_array_equal([far, sure], [colour("RdYlBu_r", 255), colour("viridis", 255)])
 
 
-def test_each_reason_has_a_colour_and_a_label_of_its_own() -> None:
+def test_each_reason_has_a_colour_and_a_label_of_its_own():
     assert set(style.REASON_COLOURS) == set(style.REASON_LABELS) == set(Reason)
     assert len(set(style.REASON_COLOURS.values())) == len(Reason)
     assert len(set(style.REASON_LABELS.values())) == len(Reason)
@@ -93,14 +89,14 @@ def test_each_reason_has_a_colour_and_a_label_of_its_own() -> None:
         style.colour_reasons(np.array([[len(Reason)]], dtype=np.uint8))
 
 
-def test_grid_is_drawn_with_its_largest_y_on_top() -> None:
+def test_grid_is_drawn_with_its_largest_y_on_top():
     grid = OccupancyGrid(np.array([[0, 100], [-1, -1]], dtype=np.int8), 1.0, (0.0, 0.0))
     picture = style.colour_grid(grid)
     np.testing.assert_array_equal(picture[0], [style.GRID_UNKNOWN] * 2)
     np.testing.assert_array_equal(picture[1], [style.GRID_FREE, style.GRID_OCCUPIED])
 
 
-def test_each_cell_of_a_small_grid_is_large_enough_to_be_seen() -> None:
+def test_each_cell_of_a_small_grid_is_large_enough_to_be_seen():
     cells = np.array([[FREE, OCCUPIED], [OCCUPIED, FREE]], dtype=np.int8)
     grid, seen = OccupancyGrid(cells, 0.2, (0.0, 0.0)), np.array([[True, True], [True, False]])
     camera = RectifiedCamera(100.0, 49.5, 49.5, 49.5, 0.5, 100, 100)
@@ -115,9 +111,7 @@ def test_each_cell_of_a_small_grid_is_large_enough_to_be_seen() -> None:
 
 
 @pytest.mark.parametrize("which", ["disparity", "nothing_found", "below zero"])
-def test_every_figure_of_a_pair_is_a_png(
-    which: str, pair: RectifiedPair, disparity: Disparity, nothing_found: Disparity
-) -> None:
+def test_every_figure_of_a_pair_is_a_png(which, pair, disparity, nothing_found):
     """With doffs, disparities may be negative; they have no depth here, where doffs is 0."""
     below = replace(disparity, values=disparity.values - 20)
     shown = {"disparity": disparity, "nothing_found": nothing_found}.get(which, below)
@@ -128,7 +122,7 @@ def test_every_figure_of_a_pair_is_a_png(
         picture(png)
 
 
-def test_a_figure_shows_its_picture(pair: RectifiedPair, disparity: Disparity) -> None:
+def test_a_figure_shows_its_picture(pair, disparity):
     image = picture(pair_page.disparity_figure(disparity, pair.camera)).astype(int)
     left, right = image[100, 20], image[100, -20]
     assert left.max() < 40  # no match: almost black
@@ -137,7 +131,7 @@ def test_a_figure_shows_its_picture(pair: RectifiedPair, disparity: Disparity) -
     assert [*disparity.reason_shares.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
 
 
-def test_depth_marks_are_round_inside_the_range_and_apart() -> None:
+def test_depth_marks_are_round_inside_the_range_and_apart():
     limits = (math.log(3.3), math.log(80.0))
     marks = pair_page.depth_marks(3.3, 80.0, math.log, limits)
     assert {5.0, 10.0, 20.0, 50.0} <= set(marks)
@@ -148,7 +142,7 @@ def test_depth_marks_are_round_inside_the_range_and_apart() -> None:
 
 
 @pytest.mark.parametrize("frames", [0, 1, 3])
-def test_path_of_any_length_is_drawn(frames: int, T_map_world: Float64) -> None:
+def test_path_of_any_length_is_drawn(frames, T_map_world):
     path, longer = (
         Trajectory(np.tile(np.eye(4), (n, 1, 1)), np.arange(float(n))) for n in (frames, frames + 1)
     )
@@ -158,8 +152,8 @@ def test_path_of_any_length_is_drawn(frames: int, T_map_world: Float64) -> None:
 
 
 def test_grid_is_drawn_with_and_without_path_and_without_any_known_cell(
-    grid: OccupancyGrid, trajectory: Trajectory, T_map_world: Float64
-) -> None:
+    grid, trajectory, T_map_world
+):
     path = figures.seen_from_above(trajectory, T_map_world)
     np.testing.assert_array_equal(path, np.column_stack([np.arange(11), np.zeros(11)]))
     unknown = OccupancyGrid(np.full((4, 5), -1, dtype=np.int8), 0.1, (0.0, 0.0))
@@ -167,7 +161,7 @@ def test_grid_is_drawn_with_and_without_path_and_without_any_known_cell(
         picture(figures.grid_figure(one, paths))
 
 
-def test_health_and_times_are_drawn_whatever_was_measured() -> None:
+def test_health_and_times_are_drawn_whatever_was_measured():
     measured = [OdometryHealth(9, 8, 0.2, 0.1)] * 5
     for health in ([], [OdometryHealth()] * 3, [OdometryHealth(ok=False)], measured):
         picture(figures.health_figure(health))
@@ -178,11 +172,11 @@ def test_health_and_times_are_drawn_whatever_was_measured() -> None:
 @pytest.mark.parametrize(
     ("target", "length"), [(34.0, 20.0), (0.7, 0.5), (1.0, 1.0), (99.9, 50.0), (5.0, 5.0)]
 )
-def test_scale_bar_has_a_round_length_that_fits(target: float, length: float) -> None:
+def test_scale_bar_has_a_round_length_that_fits(target, length):
     assert figures.nice_length(target) == pytest.approx(length)
 
 
-def test_a_thinned_grid_keeps_its_obstacles_and_its_place() -> None:
+def test_a_thinned_grid_keeps_its_obstacles_and_its_place():
     cells = np.full((7, 10), UNKNOWN, np.int8)
     cells[:3] = FREE
     cells[1, 9] = cells[6, 0] = OCCUPIED
@@ -194,7 +188,7 @@ def test_a_thinned_grid_keeps_its_obstacles_and_its_place() -> None:
     assert figures.thin_grid(small, 4) is small
 
 
-def test_a_grid_is_cropped_to_its_known_cells_and_a_margin() -> None:
+def test_a_grid_is_cropped_to_its_known_cells_and_a_margin():
     cells = np.full((60, 50), UNKNOWN, np.int8)
     cells[20, 30] = cells[25, 33] = FREE
     cropped = figures._crop_to_known(OccupancyGrid(cells, 0.5, (1.0, 2.0)))
@@ -203,7 +197,7 @@ def test_a_grid_is_cropped_to_its_known_cells_and_a_margin() -> None:
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+def drawn(monkeypatch):
     """The figures that are drawn; none becomes a PNG."""
     found: list[Figure] = []
     monkeypatch.setattr(style, "to_png", lambda figure: found.append(figure) or b"")
@@ -211,8 +205,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 
 def test_path_is_drawn_with_truth_drift_and_frames_that_are_not_trusted_or_without(
-    trajectory: Trajectory, T_map_world: Float64, health: list[OdometryHealth], drawn: list[Figure]
-) -> None:
+    trajectory, T_map_world, health, drawn
+):
     figures.path_figure(trajectory, trajectory, T_map_world, health, 0.1)
     figures.path_figure(trajectory, None, T_map_world)
     names = [[str(line.get_label()) for line in figure.axes[0].lines] for figure in drawn]
@@ -225,7 +219,7 @@ def legend(figure: Figure) -> list[str]:
     return [text.get_text() for text in found.get_texts()]
 
 
-def test_the_effect_of_the_patch_size_has_a_line_per_method(drawn: list[Figure]) -> None:
+def test_the_effect_of_the_patch_size_has_a_line_per_method(drawn):
     tried = [{"patch_px": px, "bad_percent": None, "valid_percent": 90.0} for px in (5, 9)]
     tried = [{**one, "avgerr_px": one["patch_px"] / 10} for one in tried]
     paper_page.patches_figure({CORRECTED: tried, AS_PRINTED: tried, ABSOLUTE: tried})
@@ -238,9 +232,7 @@ def test_the_effect_of_the_patch_size_has_a_line_per_method(drawn: list[Figure])
 
 
 @pytest.mark.parametrize(("doffs_px", "curves"), [(0.0, 1), (20.0, 2)])
-def test_depth_falls_with_disparity_as_the_camera_says(
-    doffs_px: float, curves: int, drawn: list[Figure]
-) -> None:
+def test_depth_falls_with_disparity_as_the_camera_says(doffs_px, curves, drawn):
     camera = RectifiedCamera(500.0, 30.0, 20.0, 30.0 + doffs_px, 0.2, 60, 40, ndisp=80)
     paper_page.depth_curve_figure(camera, np.linspace(10, 20, 101, dtype=np.float32))
     (axes,) = drawn[0].axes
@@ -252,7 +244,7 @@ def test_depth_falls_with_disparity_as_the_camera_says(
     assert (span.get_x(), span.get_width()) == pytest.approx((10.1, 9.8))
 
 
-def test_confidence_is_drawn_bin_by_bin_and_thin_bins_are_left_out(drawn: list[Figure]) -> None:
+def test_confidence_is_drawn_bin_by_bin_and_thin_bins_are_left_out(drawn):
     bins = {"confidence": [0.25, 0.75], "right": [None, 0.5], "share": [0.0005, 0.9995]}
     steps = {"removed": [0, 0.5], "wrong": [0.2, 0.1], "best": [0.2, 0.0]}
     curves = {"reliability": bins, "ece": 0.125, "sparsification": steps, "ause": 0.5}
@@ -268,9 +260,7 @@ def test_confidence_is_drawn_bin_by_bin_and_thin_bins_are_left_out(drawn: list[F
     assert left.get_label() == "sad: AUSE 0.500"
 
 
-def test_points_lie_on_lines_of_their_colour_and_level_ones_are_rows_of_the_left(
-    drawn: list[Figure],
-) -> None:
+def test_points_lie_on_lines_of_their_colour_and_level_ones_are_rows_of_the_left(drawn):
     images, pixels = [np.zeros((40, 60), np.uint8)] * 2, [np.array([[5.0, 7.0], [50.0, 30.0]])] * 2
     lines = [[np.array([[0.0, 7.0], [59.0, 9.0]])] * 2] * 2
     calibration_page.epipolar_pictures((images, pixels, lines), (images, pixels), ": view 3")
@@ -286,7 +276,7 @@ def test_points_lie_on_lines_of_their_colour_and_level_ones_are_rows_of_the_left
     assert spread.tolist() == [1, 2, 0]
 
 
-def test_each_view_of_a_calibration_has_its_error_and_corners(drawn: list[Figure]) -> None:
+def test_each_view_of_a_calibration_has_its_error_and_corners(drawn):
     corners = SimpleNamespace(pixels=np.array([[1.0, 2.0], [3.0, 4.0]]))
     views = [SimpleNamespace(name=name, seen=(corners, corners)) for name in ("a", "b")]
     fit = SimpleNamespace(
@@ -317,7 +307,7 @@ class Points(SimpleNamespace):
         return len(self.left_uv)
 
 
-def test_pairs_of_an_audit_are_drawn_by_frame(pair: RectifiedPair, drawn: list[Figure]) -> None:
+def test_pairs_of_an_audit_are_drawn_by_frame(pair, drawn):
     def look(index: int, rows_px: list[float]) -> Any:
         features = Points(left_uv=np.arange(2.0 * len(rows_px)).reshape(-1, 2))
         return SimpleNamespace(
@@ -338,9 +328,7 @@ def test_pairs_of_an_audit_are_drawn_by_frame(pair: RectifiedPair, drawn: list[F
     assert (view.get_xlim(), view.get_ylim()) == ((-0.5, 59.5), (23.5, -0.5))
 
 
-def test_frames_that_are_not_trusted_are_shaded(
-    trajectory: Trajectory, health: list[OdometryHealth], drawn: list[Figure]
-) -> None:
+def test_frames_that_are_not_trusted_are_shaded(trajectory, health, drawn):
     T = np.array(trajectory.T_world_camera)
     T[:, 0, 3] = 0.1 * np.arange(11)
     figures.health_figure(health)
@@ -353,7 +341,7 @@ def test_frames_that_are_not_trusted_are_shaded(
     assert rotation.lines[0].get_ydata().max() < 1e-6
 
 
-def test_lines_of_an_audit_say_what_is_not_known() -> None:
+def test_lines_of_an_audit_say_what_is_not_known():
     summary: dict[str, Any] = {
         "frames": 40, "frames_read": 10, "repeated_frames": 2, "frozen_left_frames": 0,
         "frozen_right_frames": 3, "usual_step_s": 0.1, "gaps": 1, "swapped_share": 0.25,
@@ -390,9 +378,7 @@ def test_lines_of_an_audit_say_what_is_not_known() -> None:
 
 
 @pytest.mark.parametrize(("off_px", "limit"), [(-2.0, 2.0), (0.01, 0.1), (math.nan, 0.1)])
-def test_the_field_of_a_rig_is_drawn_around_no_change(
-    off_px: float, limit: float, drawn: list[Figure]
-) -> None:
+def test_the_field_of_a_rig_is_drawn_around_no_change(off_px, limit, drawn):
     field = np.full((4, 8), off_px)
     field[0, :] = np.nan
     rig_part.field_figure(RigChange(30.0, field, np.zeros((4, 8))), (60, 24))

@@ -1,7 +1,5 @@
 """A page is one file that loads nothing, shows text as text, and says all that a run has to say."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import io
@@ -11,7 +9,6 @@ import sys
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -22,7 +19,7 @@ from jinja2 import UndefinedError
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from recon.core.values import Disparity, DisparityTruth, PointCloud, Reason, Trajectory
+from recon.core.values import DisparityTruth, PointCloud, Reason, Trajectory
 from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 from recon.report.map_page import map_content, write_joined_page
@@ -146,7 +143,7 @@ def embedded(image: np.ndarray) -> tuple[str, np.ndarray]:
         return kind, np.asarray(found.convert("RGB"))
 
 
-def test_an_image_is_packed_where_that_makes_it_smaller() -> None:
+def test_an_image_is_packed_where_that_makes_it_smaller():
     noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     kind, pixels = embedded(noise)
     assert (kind, pixels.shape) == ("webp", noise.shape)
@@ -155,7 +152,7 @@ def test_an_image_is_packed_where_that_makes_it_smaller() -> None:
     assert kind in {"png", "webp"}
 
 
-def test_report_loads_nothing_from_outside_and_the_browser_would_refuse_it() -> None:
+def test_report_loads_nothing_from_outside_and_the_browser_would_refuse_it():
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', audit_page())
     assert policy is not None
     assert "default-src 'none'" in policy[1]
@@ -166,7 +163,7 @@ def test_report_loads_nothing_from_outside_and_the_browser_would_refuse_it() -> 
         assert not re.search(r"https?://", page)
 
 
-def test_all_text_is_escaped_and_every_element_closed() -> None:
+def test_all_text_is_escaped_and_every_element_closed():
     page, plain = Loads(audit_page(NASTY)), Loads(audit_page())
     assert page.open == []
     assert page.tags == plain.tags
@@ -176,7 +173,7 @@ def test_all_text_is_escaped_and_every_element_closed() -> None:
         assert f"{part} plain" in plain.text
 
 
-def test_warnings_come_before_all_figures() -> None:
+def test_warnings_come_before_all_figures():
     page = audit_page()
     assert 0 < page.index("Warning plain") < page.index("<dt>Baseline") < page.index("<img")
     assert "No warnings" in audit_page(warnings=(), verdict="")
@@ -192,13 +189,13 @@ def test_warnings_come_before_all_figures() -> None:
         ({"warnings": ("w",), "verdict": "good", "sound": True}, "good"),
     ],
 )
-def test_only_what_is_wrong_is_alarming(content: dict[str, Any], kind: str) -> None:
+def test_only_what_is_wrong_is_alarming(content, kind):
     page = audit_page(**content)
     assert f'class="notice {kind}"' in page
     assert ('role="alert"' in page) == (kind == "warn")
 
 
-def test_text_in_a_scene_cannot_end_its_script() -> None:
+def test_text_in_a_scene_cannot_end_its_script():
     plot = {"data": [{"name": "</script><b>"}], "layout": {}}
     page = scene_page(plot)
     assert "</script><b>" not in page
@@ -207,7 +204,7 @@ def test_text_in_a_scene_cannot_end_its_script() -> None:
     assert json.loads(packed) == plot
 
 
-def test_plotly_travels_once_compressed_and_only_with_a_scene() -> None:
+def test_plotly_travels_once_compressed_and_only_with_a_scene():
     page = scene_page(view(), times=2)
     assert page.count('<div class="scene">') == 2
     packed = re.findall(r'<script type="text/plain" id="plotly">([^<]*)</script>', page)
@@ -218,7 +215,7 @@ def test_plotly_travels_once_compressed_and_only_with_a_scene() -> None:
     assert len(without) < 20_000
 
 
-def test_colourings_of_a_scene_get_a_button_each_where_there_is_a_choice() -> None:
+def test_colourings_of_a_scene_get_a_button_each_where_there_is_a_choice():
     page = scene_page(view(coloured=True))
     assert re.findall(r"<button[^>]*>(\w+)</button>", page) == ["image", "height"]
     assert "</button>" not in scene_page(view())
@@ -226,7 +223,7 @@ def test_colourings_of_a_scene_get_a_button_each_where_there_is_a_choice() -> No
     assert not re.search("In 3-D|#section-", scene_page(None))
 
 
-def test_contents_name_the_sections_and_long_names_are_broken_between_words() -> None:
+def test_contents_name_the_sections_and_long_names_are_broken_between_words():
     page = audit_page(lines={"frames": "1", "trajectory.ate_max_m": "0.05"})
     sections = [("1", "Measured"), ("2", "Pair 3")]
     assert re.findall(r'<a href="#section-(\d)">([^<]+)</a>', page) == sections
@@ -236,7 +233,7 @@ def test_contents_name_the_sections_and_long_names_are_broken_between_words() ->
         render_page("audit")
 
 
-def test_figures_of_each_part_are_rows_of_their_own() -> None:
+def test_figures_of_each_part_are_rows_of_their_own():
     found: dict[str, Any] = {"by_length": [{"length_m": 50.0, "segments": 15}]}
     found |= {"views_dropped": [], "stages": {"match": 1.0}, "nested": {"a": [1, None]}}
     assert summary_rows(found) == [
@@ -255,14 +252,12 @@ def test_figures_of_each_part_are_rows_of_their_own() -> None:
         ("other.py", ""),
     ],
 )
-def test_report_names_the_command_that_made_it_and_no_other_program(
-    program: str, line: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_report_names_the_command_that_made_it_and_no_other_program(program, line, monkeypatch):
     monkeypatch.setattr(sys, "argv", [program, "map", "a b"])
     assert command_line() == line
 
 
-def test_page_of_a_drive_shows_all_that_the_run_has(drive: SimpleNamespace) -> None:
+def test_page_of_a_drive_shows_all_that_the_run_has(drive):
     page = map_html(drive)
     assert {title for title, inside in blocks(page).items() if "<img" in inside} == {
         "Occupancy grid", "Path from above", "Error along the path", "Health of the odometry",
@@ -282,7 +277,7 @@ def test_page_of_a_drive_shows_all_that_the_run_has(drive: SimpleNamespace) -> N
     assert 1e5 < len(page.encode()) < MAX_BYTES
 
 
-def test_page_of_a_pair_shows_all_that_the_run_has(view: SimpleNamespace) -> None:
+def test_page_of_a_pair_shows_all_that_the_run_has(view):
     page = pair_html(view)
     shown = blocks(page)
     assert {"Input pair", "Disparity", "Disparity error", "In 3-D"} <= shown.keys()
@@ -297,7 +292,7 @@ def test_page_of_a_pair_shows_all_that_the_run_has(view: SimpleNamespace) -> Non
     assert "every m in this report is one baseline" in pair_html(view)
 
 
-def test_the_rig_is_tabulated_where_it_was_fitted(drive: SimpleNamespace) -> None:
+def test_the_rig_is_tabulated_where_it_was_fitted(drive):
     page = map_html(drive)
     shown = blocks(page)
     assert "The motion shows another rig" in page
@@ -316,7 +311,7 @@ def test_the_rig_is_tabulated_where_it_was_fitted(drive: SimpleNamespace) -> Non
     assert "Right camera" not in map_html(drive)
 
 
-def test_loops_that_were_closed_and_that_were_not_are_in_the_report(drive: SimpleNamespace) -> None:
+def test_loops_that_were_closed_and_that_were_not_are_in_the_report(drive):
     session, figures = drive.map_.first, {"found": 3, "keyframes": 11, "largest_correction_m": 2.5}
     session.loops = {"closed": [{"first": 0, "last": 9}]}
     drive.summary["loops"] = {**figures, "closed": 1}
@@ -330,7 +325,7 @@ def test_loops_that_were_closed_and_that_were_not_are_in_the_report(drive: Simpl
     assert "Loops" not in blocks(page)
 
 
-def test_notes_of_the_odometry_are_listed_by_frame(drive: SimpleNamespace) -> None:
+def test_notes_of_the_odometry_are_listed_by_frame(drive):
     assert rows(blocks(map_html(drive))["Notes of the odometry"]) == [("5", "too few <tracks>")]
     poses = np.tile(np.eye(4), (23, 1, 1))
     drive.map_.first.trajectory = Trajectory(poses, np.arange(23.0))
@@ -340,7 +335,7 @@ def test_notes_of_the_odometry_are_listed_by_frame(drive: SimpleNamespace) -> No
     assert "The first 20 of 23." in notes
 
 
-def test_a_map_compared_with_the_truth_is_tabulated(drive: SimpleNamespace) -> None:
+def test_a_map_compared_with_the_truth_is_tabulated(drive):
     cells = {"precision": 0.75, "recall": 0.5, "iou_occupied": None, "iou_free": 0.25}
     part = cells | {"occupied_called_free": 0.125}
     kinds = ("voxels", "grid", "voxels_exact", "grid_exact")
@@ -352,7 +347,7 @@ def test_a_map_compared_with_the_truth_is_tabulated(drive: SimpleNamespace) -> N
     assert rows(table)[2][1:] == ("–", "–")
 
 
-def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> None:
+def test_paths_and_cloud_are_drawn_in_the_same_axes(drive):
     plot: dict[str, Any] = drive_content(drive)["view"]
     assert [trace["name"] for trace in plot["data"]][-2:] == ["path", "true path"]
     low, high = plot["layout"]["scene"]["xaxis"]["range"]
@@ -361,7 +356,7 @@ def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> N
     assert high == pytest.approx(10.0, abs=0.3)
 
 
-def test_page_of_a_drive_with_nothing_but_path_and_grid_is_made(drive: SimpleNamespace) -> None:
+def test_page_of_a_drive_with_nothing_but_path_and_grid_is_made(drive):
     drive.errors, drive.made.cloud, drive.made.mesh = DriveErrors(None, None, None), None, None
     drive.summary, drive.map_.first.health = {"source": "drive", "warnings": []}, ()
     page = map_html(drive)
@@ -370,8 +365,8 @@ def test_page_of_a_drive_with_nothing_but_path_and_grid_is_made(drive: SimpleNam
 
 
 def test_page_of_a_pair_with_truth_of_another_size_or_without_any_disparity_is_made(
-    view: SimpleNamespace, nothing_found: Disparity
-) -> None:
+    view, nothing_found
+):
     half = view.disparity.values[::2, ::2].copy()
     view.truth = DisparityTruth(half, np.isfinite(half))
     assert "Disparity error" not in blocks(pair_html(view))
@@ -383,9 +378,7 @@ def test_page_of_a_pair_with_truth_of_another_size_or_without_any_disparity_is_m
     assert "In 3-D" not in page
 
 
-def test_runs_leave_their_pages_and_images(
-    drive: SimpleNamespace, view: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_runs_leave_their_pages_and_images(drive, view, tmp_path):
     for name, write in (
         ("drive", lambda run: write_page("map", run, drive.summary, **drive_content(drive))),
         ("pair", lambda run: write_pair_page(view, run)),
@@ -406,9 +399,7 @@ def test_runs_leave_their_pages_and_images(
     np.testing.assert_array_equal(reasons[0, 0], REASON_COLOURS[Reason.BORDER])
 
 
-def test_drives_of_a_merged_map_are_named_in_its_page(
-    drive: SimpleNamespace, trajectory: Trajectory, tmp_path: Path
-) -> None:
+def test_drives_of_a_merged_map_are_named_in_its_page(drive, trajectory, tmp_path):
     drive.map_.paths = {0: trajectory, 2: trajectory}
     sessions = [
         {"number": n, "name": f"drive {n}", "frames": 11, "frames_placed": 10, "length_m": 10.0,

@@ -1,7 +1,5 @@
 """The 3-D view: what is drawn, from where, and how it is thinned and packed."""
 
-from __future__ import annotations
-
 import base64
 import json
 from typing import Any
@@ -34,14 +32,14 @@ def plot(scene: Scene) -> Json:
     return found
 
 
-def test_points_are_turned_upright() -> None:
+def test_points_are_turned_upright():
     """Camera axes: forward is z and up is -y; in the view forward is x and up is z."""
     ahead_and_up = PointCloud(np.array([[0, -2, 5], [0, -2, 5]], dtype=np.float32))
     trace = plot(Scene(T_UPRIGHT_CAMERA, ahead_and_up))["data"][0]
     assert [unpack(trace[axis])[0] for axis in "xyz"] == [5.0, 0.0, 2.0]
 
 
-def test_colours_of_points_come_back_from_their_scale() -> None:
+def test_colours_of_points_come_back_from_their_scale():
     rgb = np.array([[10, 20, 30], [200, 100, 0]], dtype=np.uint8)
     cloud = PointCloud(np.array([[0, 0, 0], [1, 1, 1]], dtype=np.float32), rgb=rgb)
     marker = plot(Scene(np.eye(4), cloud))["data"][0]["marker"]
@@ -51,7 +49,7 @@ def test_colours_of_points_come_back_from_their_scale() -> None:
     assert [marker["colorscale"][n][0] for n in (0, -1)] == [0.0, 1.0]
 
 
-def test_coloured_cloud_can_also_be_shown_by_height(cloud: PointCloud) -> None:
+def test_coloured_cloud_can_also_be_shown_by_height(cloud):
     both = plot(Scene(np.eye(4), cloud))
     colourings = both["layout"]["meta"]
     assert [colouring["label"] for colouring in colourings] == ["image", "height"]
@@ -65,9 +63,7 @@ def test_coloured_cloud_can_also_be_shown_by_height(cloud: PointCloud) -> None:
     assert len(plot(Scene(np.eye(4), plain))["layout"]["meta"]) == 1
 
 
-def test_coordinates_are_packed_as_the_types_that_take_least(
-    cloud: PointCloud, mesh: TriangleMesh
-) -> None:
+def test_coordinates_are_packed_as_the_types_that_take_least(cloud, mesh):
     points, faces = plot(Scene(np.eye(4), cloud, mesh))["data"]
     assert {points[axis]["dtype"] for axis in "xyz"} == {"f4"}
     assert points["marker"]["color"]["dtype"] == "u1"
@@ -76,9 +72,7 @@ def test_coordinates_are_packed_as_the_types_that_take_least(
     np.testing.assert_array_equal(corners, mesh.faces)
 
 
-def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(
-    cloud: PointCloud, mesh: TriangleMesh
-) -> None:
+def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(cloud, mesh):
     both = plot(Scene(np.eye(4), cloud, mesh))["data"]
     grey = TriangleMesh(mesh.vertices, mesh.faces)
     (alone,) = plot(Scene(np.eye(4), None, grey))["data"]
@@ -87,7 +81,7 @@ def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(
     assert alone["color"] == "#b8c4ce"
 
 
-def test_axes_have_true_proportion_and_the_longest_is_two(cloud: PointCloud) -> None:
+def test_axes_have_true_proportion_and_the_longest_is_two(cloud):
     flat = PointCloud(cloud.xyz * np.array([1.0, 0.5, 0.1], dtype=np.float32))
     layout = plot(Scene(np.eye(4), flat))["layout"]["scene"]
     sides = {axis: np.ptp(layout[f"{axis}axis"]["range"]) for axis in "xyz"}
@@ -105,22 +99,20 @@ def test_axes_have_true_proportion_and_the_longest_is_two(cloud: PointCloud) -> 
         (1.0, (-9.5, 0.5, 10.5), (-2.2 / 2**0.5, 0.0, 2.2 / 2**0.5)),
     ],
 )
-def test_eye_in_metres_is_where_the_layout_looks_from(
-    far_m: float, eye_m: tuple[float, float, float], expected: tuple[float, ...]
-) -> None:
+def test_eye_in_metres_is_where_the_layout_looks_from(far_m, eye_m, expected):
     corners = np.array([[0, 0, 0], [far_m] * 3], dtype=np.float32)
     eye = plot(Scene(np.eye(4), PointCloud(corners), eye_m=eye_m))["layout"]["scene"]["camera"]
     assert tuple(eye["eye"].values()) == pytest.approx(expected)
 
 
-def test_a_point_far_from_all_others_does_not_make_the_rest_small(cloud: PointCloud) -> None:
+def test_a_point_far_from_all_others_does_not_make_the_rest_small(cloud):
     far = np.concatenate([cloud.xyz, [[1e4, 0, 0]]]).astype(np.float32)
     layout = plot(Scene(np.eye(4), PointCloud(far)))["layout"]["scene"]
     assert np.ptp(layout["xaxis"]["range"]) < 20.0
 
 
 @pytest.mark.parametrize("paths", [(), (("path", np.zeros((3, 3))),), (("p", np.zeros((0, 3))),)])
-def test_scene_of_one_place_is_valid_json_and_of_none_is_not_drawn(paths: Any) -> None:
+def test_scene_of_one_place_is_valid_json_and_of_none_is_not_drawn(paths):
     one, empty = (PointCloud(np.zeros((n, 3), dtype=np.float32)) for n in (1, 0))
     json.dumps(plot(Scene(np.eye(4), one, None, paths)), allow_nan=False)
     assert plot_scene(Scene(np.eye(4), empty, None, paths)) is None
@@ -150,7 +142,7 @@ def seen_places(cloud: PointCloud) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle_deg", [0, 45, 90, -60, 135])
-def test_a_long_drive_fills_the_first_view_whatever_its_direction(angle_deg: float) -> None:
+def test_a_long_drive_fills_the_first_view_whatever_its_direction(angle_deg):
     places = seen_places(drive(angle_deg))
     assert np.abs(places).max() <= 1
     # From one border almost to the other, in one direction at least, and not as a thin strip:
@@ -161,16 +153,14 @@ def test_a_long_drive_fills_the_first_view_whatever_its_direction(angle_deg: flo
 
 
 @given(count=st.integers(0, 400), limit=st.integers(1, 100), seed=st.integers(0, 99))
-def test_thinned_cloud_is_a_part_of_the_cloud_within_the_limit(
-    count: int, limit: int, seed: int
-) -> None:
+def test_thinned_cloud_is_a_part_of_the_cloud_within_the_limit(count, limit, seed):
     xyz = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
     thinned = thin_cloud(PointCloud(xyz), limit).xyz
     assert len(thinned) == count if count <= limit else 0 < len(thinned) <= limit
     assert {tuple(p) for p in thinned.tolist()} <= {tuple(p) for p in xyz.tolist()}
 
 
-def test_thinned_cloud_keeps_its_extent_and_most_of_what_it_may(cloud: PointCloud) -> None:
+def test_thinned_cloud_keeps_its_extent_and_most_of_what_it_may(cloud):
     thinned = thin_cloud(cloud, 500)
     (trace,) = plot_scene(Scene(np.eye(4), cloud), 500)["data"]  # type: ignore[index]
     assert len(unpack(trace["x"])) == len(thinned)
@@ -182,7 +172,7 @@ def test_thinned_cloud_keeps_its_extent_and_most_of_what_it_may(cloud: PointClou
     assert len(thin_cloud(PointCloud(np.ones((50, 3), dtype=np.float32)), 10)) == 1
 
 
-def test_thinned_mesh_covers_the_same_place_with_fewer_triangles(mesh: TriangleMesh) -> None:
+def test_thinned_mesh_covers_the_same_place_with_fewer_triangles(mesh):
     assert thin_mesh(mesh, 10_000) is mesh
     thinned = thin_mesh(mesh, 200)
     assert 20 < len(thinned.faces) <= 200
@@ -195,7 +185,7 @@ def test_thinned_mesh_covers_the_same_place_with_fewer_triangles(mesh: TriangleM
 
 
 @given(count=st.integers(0, 300), seed=st.integers(0, 99))
-def test_palette_is_small_and_every_colour_is_near_its_entry(count: int, seed: int) -> None:
+def test_palette_is_small_and_every_colour_is_near_its_entry(count, seed):
     rgb = np.random.default_rng(seed).integers(0, 256, (count, 3), dtype=np.uint8)
     palette, index = quantise_colours(rgb)
     assert 1 <= len(palette) <= 256
@@ -212,6 +202,6 @@ def test_palette_is_small_and_every_colour_is_near_its_entry(count: int, seed: i
         (np.array([[0, 0, 0]] * 3 + [[200, 10, 10]] * 97), 0),
     ],
 )
-def test_greys_and_two_colours_of_unequal_number_stay(rgb: np.ndarray, off: int) -> None:
+def test_greys_and_two_colours_of_unequal_number_stay(rgb, off):
     palette, index = quantise_colours(rgb.astype(np.uint8))
     assert np.abs(palette[index].astype(int) - rgb).max() <= off

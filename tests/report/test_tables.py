@@ -1,13 +1,10 @@
 """Tables of evaluations and batches agree with their figures; a batch's plot and report."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -58,7 +55,7 @@ def csv_rows(found: dict[str, Any]) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(csv_table(found))))
 
 
-def test_a_table_has_a_row_per_matcher_and_a_column_per_figure() -> None:
+def test_a_table_has_a_row_per_matcher_and_a_column_per_figure():
     first = tables(summary())["Weighted mean, nonocc, dense"]
     assert " ".join(first[1].split()[:8]) == "sad 40.00 30.00 20.00 10.00 12.50 3.25 3.25"
     assert (first[0].split()[-1], first[1].split()[-1]) == ("seconds", "0.500")
@@ -67,7 +64,7 @@ def test_a_table_has_a_row_per_matcher_and_a_column_per_figure() -> None:
         assert len({line.count("|") for line in lines}) == 1
 
 
-def test_csv_has_every_scene_mask_and_filling_and_the_confidence_where_it_is_counted() -> None:
+def test_csv_has_every_scene_mask_and_filling_and_the_confidence_where_it_is_counted():
     rows = csv_rows(summary())
     assert len(rows) == 2 * 3 * 4
     first = [rows[0][name] for name in ("scene", "depth_median_m", "bad0.5")]
@@ -76,7 +73,7 @@ def test_csv_has_every_scene_mask_and_filling_and_the_confidence_where_it_is_cou
     assert counted == 3 * [("sad", "all", "sparse")]
 
 
-def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell() -> None:
+def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell():
     found = tables(summary())
     rows = found["Confidence, weighted mean, all, sparse"]
     assert rows[1].split() == ["sad", "0.125", "0.125", "0.125", "0.125"]
@@ -87,7 +84,7 @@ def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell() -> None:
     assert csv_rows(given)[0]["avgerr"] == csv_rows(given)[0]["depth_mean_m"] == ""
 
 
-def test_the_best_of_several_is_bold_in_latex() -> None:
+def test_the_best_of_several_is_bold_in_latex():
     given = summary()
     given["matchers"]["sad"]["weighted"]["seconds"] = 0.25
     better = masked(2.5, depth=True)
@@ -104,13 +101,13 @@ def test_the_best_of_several_is_bold_in_latex() -> None:
     assert "textbf" not in "".join(found["Confidence, weighted mean, all, sparse"])
 
 
-def test_signs_of_latex_are_escaped() -> None:
+def test_signs_of_latex_are_escaped():
     table = Table("t", ("my_method", "50 %"), [("a&b–c", "{x}~^#$\\")]).latex()
     assert r"my\_method & 50 \% \\" in table
     assert r"a\&b--c & \{x\}\textasciitilde{}\textasciicircum{}\#\$\textbackslash{} \\" in table
 
 
-def test_means_over_some_of_the_scenes_say_so() -> None:
+def test_means_over_some_of_the_scenes_say_so():
     given = summary() | {"mean_over": ["Piano"]}
     del given["matchers"]["opencv-bm"]["scenes"]["Teddy"]
     found = tables(given)
@@ -135,7 +132,7 @@ def results() -> list[JobResult]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("batch") / "out"
     summary = {
         "jobs": [{}] * 12, "succeeded": 10, "failed": 1, "seconds": 60.0, "workers": 2,
@@ -148,7 +145,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_report_shows_outliers_first_and_links_to_the_runs(folder: Path) -> None:
+def test_the_report_shows_outliers_first_and_links_to_the_runs(folder):
     page = (folder / "report.html").read_text()
     rows = re.findall(r'<tr><th scope="row">(.*?)</th>', page)
     names = [re.sub("<[^>]+>", "", row) for row in rows][:3]
@@ -162,7 +159,7 @@ def test_the_report_shows_outliers_first_and_links_to_the_runs(folder: Path) -> 
     assert "drive0_w=9: the lens is dirty" in page
 
 
-def test_the_csv_has_every_figure_and_the_table_for_people_what_any_job_has(folder: Path) -> None:
+def test_the_csv_has_every_figure_and_the_table_for_people_what_any_job_has(folder):
     rows = list(csv.DictReader((folder / "table.csv").open()))
     assert (len(rows), rows[0]["window"]) == (12, "9")
     assert float(rows[6]["trajectory.t_rel_percent"]) == 99.0
@@ -174,9 +171,7 @@ def test_the_csv_has_every_figure_and_the_table_for_people_what_any_job_has(fold
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines if line[0] == "|"}) == 1
 
 
-def test_a_sweep_is_drawn_with_a_point_per_job_and_medians(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_is_drawn_with_a_point_per_job_and_medians(folder, monkeypatch):
     assert (folder / "sweep.png").read_bytes().startswith(b"\x89PNG")
     assert sweep_figure([JobResult(job("later", swept={"window": 9}))]) == b""
     figures: list[Figure] = []
@@ -190,9 +185,7 @@ def test_a_sweep_is_drawn_with_a_point_per_job_and_medians(
     assert [label.get_text() for label in axes.get_xticklabels()] == ["9", "11"]
 
 
-def test_jobs_of_each_command_have_a_table_and_panels_of_their_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_jobs_of_each_command_have_a_table_and_panels_of_their_own(monkeypatch):
     drawn: list[tuple[str, list[float]]] = []
     monkeypatch.setattr(
         "recon.report.batch_page._draw",

@@ -1,9 +1,5 @@
 """Cameras are opened together, and their frames paired by time."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -42,9 +38,7 @@ class FakeCamera:
         self.closed = True
 
 
-def test_a_camera_that_does_not_open_is_named_and_the_other_one_closed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_camera_that_does_not_open_is_named_and_the_other_one_closed(monkeypatch):
     with (
         pytest.raises(SourceError, match="no-such-camera"),
         open_cameras(["/dev/no-such-camera"], CaptureSettings()),
@@ -69,7 +63,7 @@ def test_a_camera_that_does_not_open_is_named_and_the_other_one_closed(
     assert asked[-1] == (None, None)
 
 
-def test_pairs_are_nearest_in_time_and_end_when_asked(tmp_path: Path) -> None:
+def test_pairs_are_nearest_in_time_and_end_when_asked(tmp_path):
     times = [0.1 * k for k in range(10)]
     late = [t + 0.003 for t in times if t != times[3]]  # the right camera loses a frame
 

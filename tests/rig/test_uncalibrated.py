@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -71,9 +68,7 @@ RIGS = [
 
 @pytest.mark.parametrize(("turn", "shift", "exact_px"), RIGS)
 @pytest.mark.parametrize("sigma_px", [0.0, 0.3])
-def test_rows_are_off_by_no_more_than_noise(
-    turn: Three, shift: Three, exact_px: float, sigma_px: float
-) -> None:
+def test_rows_are_off_by_no_more_than_noise(turn, shift, exact_px, sigma_px):
     found, truth = rectify_features([scene(shift, turn, sigma_px)], SIZE), scene(shift, turn)
     uv = map_pixels(found.H_left, truth.left_uv), map_pixels(found.H_right, truth.right_uv)
     assert np.abs(uv[0][:, 1] - uv[1][:, 1]).mean() < exact_px + 0.3 * sigma_px
@@ -84,7 +79,7 @@ def test_rows_are_off_by_no_more_than_noise(
     assert np.ptp(uv[1][:, 1]) == pytest.approx(np.ptp(truth.right_uv[:, 1]), rel=0.25)
 
 
-def test_distances_are_those_to_the_nearest_matching_pixels() -> None:
+def test_distances_are_those_to_the_nearest_matching_pixels():
     """Shift partners across their epipolar lines: half of a shift is mended on either side."""
     left, right = matches((0, 0, 0), (-0.1, 0, 0))
     inverse = np.linalg.inv(K)
@@ -93,7 +88,7 @@ def test_distances_are_those_to_the_nearest_matching_pixels() -> None:
     np.testing.assert_allclose(np.abs(apart), 0.6 / np.sqrt(2), rtol=1e-9)
 
 
-def test_wrong_matches_do_no_harm() -> None:
+def test_wrong_matches_do_no_harm():
     good, truth = scene(sigma_px=0.2), scene()
     rng = np.random.default_rng(1)
     wrong = rng.permutation(len(good))[: len(good) // 4]
@@ -104,7 +99,7 @@ def test_wrong_matches_do_no_harm() -> None:
     assert np.abs(uv[0][:, 1] - uv[1][:, 1]).mean() < 0.15
 
 
-def test_images_stay_upright_in_size_and_disparities_positive() -> None:
+def test_images_stay_upright_in_size_and_disparities_positive():
     found = rectify_features([scene()], SIZE)
     for H in (found.H_left, found.H_right):
         corners = map_pixels(H, np.array([[0.0, 0], [639, 0], [639, 479], [0, 479]]))
@@ -116,7 +111,7 @@ def test_images_stay_upright_in_size_and_disparities_positive() -> None:
     assert found.disparity_range_px[1] > 20
 
 
-def test_near_points_have_the_larger_disparity() -> None:
+def test_near_points_have_the_larger_disparity():
     """Cameras that are only shifted: disparity orders points as depth does, to a slant."""
     xyz = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 8), (400, 3))
     left, right = (q @ K.T for q in (xyz, xyz + np.array([-0.2, 0.02, 0.0])))
@@ -126,7 +121,7 @@ def test_near_points_have_the_larger_disparity() -> None:
     assert np.corrcoef(disparity, 1 / xyz[:, 2])[0, 1] > 0.99
 
 
-def test_epipolar_lines_pass_through_the_partners() -> None:
+def test_epipolar_lines_pass_through_the_partners():
     features = scene()
     found = rectify_features([features], SIZE)
     left, right = (uv[:5].astype(float) for uv in (features.left_uv, features.right_uv))
@@ -153,7 +148,7 @@ ANYTHING = PairFeatures(*np.random.default_rng(2).uniform(0, SIZE, (2, 100, 2)).
         (ANYTHING, ""),
     ],
 )
-def test_matches_without_a_geometry_are_refused(features: PairFeatures, message: str) -> None:
+def test_matches_without_a_geometry_are_refused(features, message):
     with pytest.raises(CalibrationError, match=message):
         rectify_features([features], SIZE)
 
@@ -167,7 +162,7 @@ def image_of(seed: int, size: tuple[int, int]) -> np.ndarray:
     return np.clip(128 + 30 * total, 0, 255).astype(np.uint8)
 
 
-def test_exact_features_know_places_to_a_third_of_a_pixel_under_a_homography() -> None:
+def test_exact_features_know_places_to_a_third_of_a_pixel_under_a_homography():
     image = image_of(5, (320, 240))
     H = np.array([[1.05, 0.08, -9], [-0.05, 0.97, 6], [1e-4, -5e-5, 1]])
     warped = cv2.warpPerspective(image, H, (320, 240), flags=cv2.INTER_CUBIC)
@@ -209,7 +204,7 @@ def shaken(size: tuple[int, int], reach: float, rng: np.random.Generator) -> np.
 
 
 @pytest.mark.parametrize("warp", ["none", "turned", "shifted", "weak", "strong"])
-def test_a_pair_under_known_homographies_comes_back_onto_rows(warp: str) -> None:
+def test_a_pair_under_known_homographies_comes_back_onto_rows(warp):
     size, rng = (400, 300), np.random.default_rng(7)
     left, right, disparity = planes_pair(size)
     turn = np.vstack([cv2.getRotationMatrix2D((200, 150), 2.0, 1.0), [0, 0, 1]])
@@ -237,7 +232,7 @@ def pitched_folder(pitch_deg: float) -> tuple[list[tuple[np.ndarray, np.ndarray]
 
 
 @pytest.mark.parametrize("first", ["like the others", "blank", "misleading"])
-def test_a_pitched_right_camera_is_turned_back_and_nothing_else(first: str) -> None:
+def test_a_pitched_right_camera_is_turned_back_and_nothing_else(first):
     pairs, B = pitched_folder(0.44)
     if first == "blank":
         pairs[0] = (np.full_like(pairs[0][0], 90),) * 2
@@ -254,7 +249,7 @@ def test_a_pitched_right_camera_is_turned_back_and_nothing_else(first: str) -> N
         assert abs(np.degrees(np.arctan2(across[1], across[0]))) < 0.1
 
 
-def test_pairs_on_equal_rows_stay_as_they_are() -> None:
+def test_pairs_on_equal_rows_stay_as_they_are():
     found = rectify_images(pitched_folder(0.0)[0], count=600)
     assert found.model == "raw"
     assert np.array_equal(found.H_left, np.eye(3))
@@ -262,7 +257,7 @@ def test_pairs_on_equal_rows_stay_as_they_are() -> None:
     assert found.row_error_after_px == found.row_error_before_px
 
 
-def test_matches_of_images_made_alike_are_places_in_those_recorded() -> None:
+def test_matches_of_images_made_alike_are_places_in_those_recorded():
     size, rng = (320, 240), np.random.default_rng(7)
     image = image_of(1, size)
     A, B = shaken(size, 0.08, rng), shaken(size, 0.08, rng)
@@ -278,9 +273,7 @@ def test_matches_of_images_made_alike_are_places_in_those_recorded() -> None:
 @pytest.mark.parametrize(
     "name", ["Motorcycle", *(pytest.param(k, marks=SLOW) for k in ("Jadeplant", "Pipes", "Teddy"))]
 )
-def test_warped_middlebury_pairs_come_back_onto_rows_by_their_truth(
-    recon_data: Path, name: str, reach: float
-) -> None:
+def test_warped_middlebury_pairs_come_back_onto_rows_by_their_truth(recon_data, name, reach):
     found = read_middlebury_scene(recon_data / "middlebury" / "MiddEval3" / "trainingQ" / name)
     left, right = to_grey(found.pair.left), to_grey(found.pair.right)
     size, rng = left.shape[::-1], np.random.default_rng(3)

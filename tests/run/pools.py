@@ -1,7 +1,5 @@
 """Thread pools that say when they have dropped the jobs that have not begun."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 

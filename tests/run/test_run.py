@@ -1,7 +1,5 @@
 """A run's folder appears complete, or not at all, with configuration, summary and record."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -34,9 +32,7 @@ class _Notes(Silent):
         self.stages.append(name)
 
 
-def test_a_run_writes_configuration_summary_and_record(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_writes_configuration_summary_and_record(tmp_path, monkeypatch):
     photo, out, peak_mb = tmp_path / "im0.png", tmp_path / "out", itertools.count(100.0)
     photo.write_bytes(b"pixels")
     monkeypatch.setattr("recon.run.run.peak_memory_mb", lambda: next(peak_mb))
@@ -77,8 +73,8 @@ def test_a_run_writes_configuration_summary_and_record(
 
 
 def test_a_run_in_the_default_folder_gets_a_link_and_writes_no_configuration_that_there_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
         with Run("map") as run:
@@ -90,7 +86,7 @@ def test_a_run_in_the_default_folder_gets_a_link_and_writes_no_configuration_tha
     assert files_in(runs / "latest") == {"run.json", "summary.json"}
 
 
-def test_a_hash_of_inputs_knows_their_names_bytes_and_order(tmp_path: Path) -> None:
+def test_a_hash_of_inputs_knows_their_names_bytes_and_order(tmp_path):
     one, other = tmp_path / "one", tmp_path / "other"
     one.write_bytes(b"a" * 3_000_000)
     other.write_bytes(b"b")
@@ -113,7 +109,7 @@ class _Figures:
     lengths: tuple[float, ...]
 
 
-def test_plain_values_survive_json_and_nan_becomes_null() -> None:
+def test_plain_values_survive_json_and_nan_becomes_null():
     figures = _Figures(error=math.nan, bad={0.5: 1.25, 2.0: math.inf}, lengths=(50.0, 100.0))
     expected = {"error": None, "bad": {"0.5": 1.25, "2.0": None}, "lengths": [50.0, 100.0]}
     assert json.loads(json.dumps(plain(figures), allow_nan=False)) == expected
@@ -143,7 +139,7 @@ def files_in(folder: Path) -> set[str]:
     return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_a_failed_run_leaves_an_earlier_run_as_it_was_or_no_folder(tmp_path: Path) -> None:
+def test_a_failed_run_leaves_an_earlier_run_as_it_was_or_no_folder(tmp_path):
     fail_halfway(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
     write_run(tmp_path / "run", "map/cloud.ply")
@@ -156,9 +152,7 @@ def test_a_failed_run_leaves_an_earlier_run_as_it_was_or_no_folder(tmp_path: Pat
     ("error", "begun", "stays"),
     [(OSError, True, True), (OSError, False, False), (KeyError, True, False)],
 )
-def test_what_the_input_did_not_cause_leaves_what_a_run_resumes_from(
-    tmp_path: Path, error: type[BaseException], begun: bool, stays: bool
-) -> None:
+def test_what_the_input_did_not_cause_leaves_what_a_run_resumes_from(tmp_path, error, begun, stays):
     fail_halfway(tmp_path / "run", error, begun)
     assert (state_folder(tmp_path / "run") / "map.recon").is_file() == stays
     if stays:
@@ -170,8 +164,8 @@ def test_what_the_input_did_not_cause_leaves_what_a_run_resumes_from(
 
 @pytest.mark.parametrize(("exchanges", "left"), [(False, "old"), (True, "new")])
 def test_a_run_that_is_interrupted_as_it_takes_the_place_of_another_leaves_one_of_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: bool, left: str
-) -> None:
+    tmp_path, monkeypatch, exchanges, left
+):
     def interrupted(new: Path, old: Path) -> None:
         if exchanges:
             exchange(new, old)
@@ -186,9 +180,7 @@ def test_a_run_that_is_interrupted_as_it_takes_the_place_of_another_leaves_one_o
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_an_address_is_not_taken_for_a_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resume: bool
-) -> None:
+def test_an_address_is_not_taken_for_a_folder(tmp_path, monkeypatch, resume):
     monkeypatch.chdir(tmp_path)
     address = Path("s3://bucket/week")
     for out in (address, address.resolve()):
@@ -200,9 +192,7 @@ def test_an_address_is_not_taken_for_a_folder(
 
 
 @pytest.mark.parametrize("whole", [False, True])
-def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(
-    tmp_path: Path, whole: bool
-) -> None:
+def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(tmp_path, whole):
     write_run(tmp_path / "run", "mesh/mesh.ply")
     (tmp_path / "run" / "notes.txt").write_text("mine")
     (tmp_path / "precious").write_text("stay")
@@ -218,15 +208,9 @@ def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(
 
 @pytest.mark.parametrize(
     ("inside", "said"),
-    [
-        ("", "are not of a run"),
-        ("thesis", "is a file"),
-        ("thesis/deeper", "cannot be written"),
-    ],
+    [("", "are not of a run"), ("thesis", "is a file"), ("thesis/deeper", "cannot be written")],
 )
-def test_a_folder_of_other_files_and_a_file_are_refused(
-    tmp_path: Path, inside: str, said: str
-) -> None:
+def test_a_folder_of_other_files_and_a_file_are_refused(tmp_path, inside, said):
     (tmp_path / "thesis").write_text("years of work")
     with pytest.raises(OutputError, match=said) as told, RunDirectory(tmp_path / inside):
         pass
@@ -235,7 +219,7 @@ def test_a_folder_of_other_files_and_a_file_are_refused(
     assert files_in(tmp_path) == {"thesis"}
 
 
-def test_links_below_a_folder_are_refused_and_the_folder_may_be_one(tmp_path: Path) -> None:
+def test_links_below_a_folder_are_refused_and_the_folder_may_be_one(tmp_path):
     (tmp_path / "run" / "map").mkdir(parents=True)
     (tmp_path / "latest").symlink_to("run")
     refuse_links(tmp_path / "latest" / "map")

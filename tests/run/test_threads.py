@@ -1,16 +1,13 @@
 """What overlaps gives the same results in the same order; a memory limit is kept."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -45,13 +42,13 @@ from tests.scenery.patience import LONG_S
 
 
 @given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
-def test_results_come_in_order(items: list[int], count: int) -> None:
+def test_results_come_in_order(items, count):
     after = [x + 1 for x in items]
     assert list(look_ahead(lambda x: x + 1, items, depth=count)) == after
     assert list(side_by_side(lambda x: x + 1, items, threads=count)) == after
 
 
-def test_as_many_items_are_worked_on_as_there_are_threads() -> None:
+def test_as_many_items_are_worked_on_as_there_are_threads():
     # Each waits for the other: one thread alone would wait for ever.
     both = threading.Barrier(2, timeout=LONG_S)
 
@@ -65,9 +62,7 @@ def test_as_many_items_are_worked_on_as_there_are_threads() -> None:
 @pytest.mark.parametrize(
     ("ahead", "most"), [(partial(look_ahead, depth=3), 5), (partial(side_by_side, threads=2), 3)]
 )
-def test_no_more_items_are_begun_than_can_be_held(
-    ahead: Callable[..., Iterator[int]], most: int
-) -> None:
+def test_no_more_items_are_begun_than_can_be_held(ahead, most):
     begun: list[int] = []
 
     def items() -> Iterator[int]:
@@ -81,7 +76,7 @@ def test_no_more_items_are_begun_than_can_be_held(
     assert 1 < len(begun) <= most
 
 
-def test_nothing_is_begun_after_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_begun_after_an_interruption(monkeypatch):
     begun, first, (pool, dropped) = list[int](), threading.Event(), observed_pool()
 
     def work(item: int) -> None:
@@ -100,7 +95,7 @@ def test_nothing_is_begun_after_an_interruption(monkeypatch: pytest.MonkeyPatch)
     assert begun == [0]
 
 
-def test_an_error_of_an_item_or_of_the_source_is_raised_at_its_turn() -> None:
+def test_an_error_of_an_item_or_of_the_source_is_raised_at_its_turn():
     def items() -> Iterator[str]:
         yield from ("0", "1")
         raise OSError("disk gone")
@@ -116,7 +111,7 @@ def test_an_error_of_an_item_or_of_the_source_is_raised_at_its_turn() -> None:
         next(results)
 
 
-def test_jobs_behind_are_done_in_order_one_at_a_time() -> None:
+def test_jobs_behind_are_done_in_order_one_at_a_time():
     behind, gate, done = OneBehind(), threading.Event(), list[int]()
 
     def first() -> None:
@@ -140,7 +135,7 @@ def test_jobs_behind_are_done_in_order_one_at_a_time() -> None:
     behind.abandon()
 
 
-def test_no_more_threads_are_used_than_there_are_cores() -> None:
+def test_no_more_threads_are_used_than_there_are_cores():
     cores, before = available_cores(), cv2.getNumThreads()
     assert [use_threads(1), use_threads(None), use_threads(cores + 3)] == [1, cores, cores]
     cv2.setNumThreads(before)
@@ -170,7 +165,7 @@ def printed_by(code: str) -> float:
     return float(done.stdout)
 
 
-def test_the_peak_is_that_of_the_process_alone_and_stays() -> None:
+def test_the_peak_is_that_of_the_process_alone_and_stays():
     ballast = np.ones(100_000_000)  # 800 MB
     peak_mb, below_mb = peak_memory_mb(), printed_by(PRINT_PEAK)
     assert peak_mb > ballast.nbytes / 1e6
@@ -181,11 +176,11 @@ def test_the_peak_is_that_of_the_process_alone_and_stays() -> None:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="malloc_trim is glibc's")
-def test_what_was_freed_before_something_that_stays_is_returned() -> None:
+def test_what_was_freed_before_something_that_stays_is_returned():
     assert printed_by(FREE_AND_RETURN) > 100_000_000
 
 
-def test_a_size_is_read_in_its_unit() -> None:
+def test_a_size_is_read_in_its_unit():
     sizes_mb = {"2G": 2000, "1.5 GB": 1500, "1500M": 1500, "800mb": 800, "640": 640}
     assert {text: parse_size_mb(text) for text in sizes_mb} == sizes_mb
     for text in ("", "2T", "-1G", "G", "0", "1e3M", "two"):
@@ -193,7 +188,7 @@ def test_a_size_is_read_in_its_unit() -> None:
             parse_size_mb(text)
 
 
-def test_what_takes_more_than_the_limit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_takes_more_than_the_limit_is_one_line(monkeypatch):
     free, limited = MemorySettings(), MemorySettings(limit_mb=500)
     assert (free.submap_bytes, free.tile_bytes) == (None, None)
     assert 0 < (limited.submap_bytes or 0) < (limited.tile_bytes or 0) < limited.cache_bytes < 1e8
@@ -222,9 +217,7 @@ def _along_a_wall(config: ReconConfig) -> Submaps:
     return store
 
 
-def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(monkeypatch):
     free, limited = load_config(None, []), load_config(None, ["memory.limit_mb=4"])
     stores = [_along_a_wall(config) for config in (free, limited)]
     assert len(stores[0]) == 1
@@ -252,9 +245,7 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(tmp_path, monkeypatch):
     peaks = iter([400.0] * 6)
     monkeypatch.setattr(threads, "peak_memory_mb", lambda: next(peaks, 600.0))
     drive, out = street_drive(tmp_path / "drive", 12, speed_m_per_frame=0.5), tmp_path / "run"

@@ -1,7 +1,5 @@
 """Calibration boards seen through lenses of known distortion: ground truth for calibration."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +37,7 @@ class BoardView:
     left_px: Float64
     right_px: Float64
 
-    def noisy(self, sigma_px: float, rng: np.random.Generator) -> BoardView:
+    def noisy(self, sigma_px: float, rng: np.random.Generator) -> "BoardView":
         """The view with Gaussian noise added to every pixel coordinate."""
         left, right = (p + rng.normal(0, sigma_px, p.shape) for p in (self.left_px, self.right_px))
         return BoardView(self.T_left_board, left, right)

@@ -1,7 +1,5 @@
 """The numbers that a user can set, and their bounds, taken from the settings themselves."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, get_args

@@ -1,7 +1,5 @@
 """Figures that nobody looks at: put together, but not drawn."""
 
-from __future__ import annotations
-
 import base64
 
 import pytest

@@ -1,7 +1,5 @@
 """A rendered drive that is kept: rendering takes far longer than what most tests do with it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -35,7 +33,9 @@ class Film(StereoSource):
         times = enumerate(self.pairs[start:], start)
         return (replace(pair, timestamp_s=0.1 * n, index=n) for n, pair in times)
 
-    def taken(self, which: slice, change: Callable[[np.ndarray], np.ndarray] | None = None) -> Film:
+    def taken(
+        self, which: slice, change: Callable[[np.ndarray], np.ndarray] | None = None
+    ) -> "Film":
         """Return some of its frames, each image changed."""
         chosen = self.pairs[which]
         if change is not None:

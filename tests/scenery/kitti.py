@@ -1,7 +1,5 @@
 """A rendered drive as files in the layout of KITTI."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Folders that are made by one of the processes of a test run, and read by all."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 from collections.abc import Callable

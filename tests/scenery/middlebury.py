@@ -1,7 +1,5 @@
 """Small scenes in the layout of MiddEval3."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

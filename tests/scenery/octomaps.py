@@ -1,7 +1,5 @@
 """OctoMaps of maps that are small enough to be one tile."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from recon.core.values import OccupancyVoxels

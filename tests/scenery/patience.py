@@ -1,7 +1,5 @@
 """Tests on a machine that is slow, or busy: nothing is left out, and nothing comes too late."""
 
-from __future__ import annotations
-
 import pytest
 
 from recon.core.values import RectifiedPair

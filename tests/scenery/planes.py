@@ -1,7 +1,5 @@
 """Textured planes with exact disparity: the simplest scenes to test a stage on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,18 +1,16 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import apply
 from recon.core.values.board import parse_board
 from recon.stereo.rectify.lens import project_raw
-from tests.scenery.boards import BoardRenderer, Lens, board_rig, place_boards
+from tests.scenery.boards import BoardRenderer, board_rig, place_boards
 
 BOARD = parse_board("chess:6x4:30mm")
 
 
 @pytest.mark.parametrize("lens", ["radtan", "rational", "fisheye"])
-def test_squares_between_true_corners_are_dark_and_light_by_turns(lens: Lens) -> None:
+def test_squares_between_true_corners_are_dark_and_light_by_turns(lens):
     rig = board_rig(lens)
     for view in place_boards(rig, BOARD, 2):
         for px in (view.left_px, view.right_px):
@@ -27,7 +25,7 @@ def test_squares_between_true_corners_are_dark_and_light_by_turns(lens: Lens) ->
             assert (grey[~dark] > 190).all()
 
 
-def test_positions_fill_the_image_and_tilt_both_ways() -> None:
+def test_positions_fill_the_image_and_tilt_both_ways():
     views = place_boards(board_rig(), BOARD, 30)
     pixels = np.concatenate([view.left_px for view in views])
     assert np.ptp(pixels, axis=0).min() > 0.7 * 480

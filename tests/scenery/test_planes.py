@@ -1,7 +1,5 @@
 """Planes have the disparity of the formula, and both images show the same surface."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import RectifiedCamera
-from tests.scenery.planes import PlanePair, fronto_parallel_pair, slanted_pair, step_pair
+from tests.scenery.planes import fronto_parallel_pair, slanted_pair, step_pair
 
 CAMERA = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)
 
@@ -23,7 +21,7 @@ CAMERA = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)
     ],
     ids=["doffs", "slanted", "step"],
 )
-def test_warping_by_the_truth_reproduces_the_left_view(scene: PlanePair) -> None:
+def test_warping_by_the_truth_reproduces_the_left_view(scene):
     d, mask = scene.truth.values.astype(np.float64), scene.truth.nonocc.copy()
     v, u = np.mgrid[0:100, 0:200].astype(np.float32)
     x = (u - np.nan_to_num(d)).astype(np.float32)
@@ -37,7 +35,7 @@ def test_warping_by_the_truth_reproduces_the_left_view(scene: PlanePair) -> None
     assert np.abs(np.diff(scene.pair.left.astype(int), axis=1)).mean() > 6.0
 
 
-def test_the_occluded_strip_is_as_wide_as_the_step_in_disparity() -> None:
+def test_the_occluded_strip_is_as_wide_as_the_step_in_disparity():
     scene = step_pair(CAMERA, 5.0, 10.0, 30.0)
     # d = 20 and 10 px: the ten columns left of the square, and the ten that leave the image.
     expected = np.ones(200, dtype=bool)

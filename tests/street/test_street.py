@@ -1,7 +1,5 @@
 """A street depends on its settings alone; its images and truth agree with analytic geometry."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -15,7 +13,7 @@ from recon.core.errors import SettingsError
 from recon.core.geometry import se3
 from recon.core.geometry.projection import project, unproject
 from recon.core.geometry.se3 import check_rigid
-from recon.core.values import OCCUPIED, PointCloud
+from recon.core.values import OCCUPIED
 from recon.street.materials import ROAD_HALF_M, both, stripe, stripes, tile_joints, tile_tone
 from recon.street.path import LANE_M, R_STREET_LEVEL, camera_poses, centre_line
 from recon.street.render import StreetCamera
@@ -41,12 +39,12 @@ SMALL = StreetScene(seed=3, frames=4, width_px=320, height_px=120, focal_px=180.
 
 
 @pytest.fixture(scope="module")
-def street() -> StreetCamera:
+def street():
     return StreetCamera(build_street(SMALL))
 
 
 @pytest.fixture(scope="module")
-def box_world() -> StreetWorld:
+def box_world():
     """A level road, a wall 20 m ahead, a box of 2 × 2 × 1.8 m whose front is 8 m ahead."""
     size = {"width_px": 200, "height_px": 100, "focal_px": 100.0, "baseline_m": 0.5}
     settings = StreetScene(frames=1, noise_dn=0.0, **size)
@@ -61,7 +59,7 @@ def box_world() -> StreetWorld:
 
 
 @pytest.fixture(scope="module")
-def frame(street: StreetCamera):
+def frame(street):
     return street.render(1)
 
 
@@ -107,7 +105,7 @@ def test_images_are_well_exposed_and_depth_is_that_of_the_road_the_sky_and_the_d
     assert not sky[80:].any()
 
 
-def test_depth_and_occlusion_of_the_box_world_are_those_on_paper(box_world: StreetWorld):
+def test_depth_and_occlusion_of_the_box_world_are_those_on_paper(box_world):
     depth = StreetCamera(box_world).depth(0)
     v, u = np.mgrid[0:100, 0:200]
     # Camera 1.5 m above the road, f = 100 px, principal point (99.5, 49.5).
@@ -199,7 +197,7 @@ def test_noise_and_gain_change_images_but_not_truth(street):
 
 
 @pytest.fixture(scope="module")
-def surface(street) -> PointCloud:
+def surface(street):
     return true_surface(street, range_m=25.0, voxel_m=0.1)
 
 
@@ -299,7 +297,7 @@ def test_on_rails_the_camera_moves_straight_ahead(street):
 
 
 @pytest.mark.parametrize(("angle", "axis"), [("yaw_deg", 1), ("pitch_deg", 2)])
-def test_the_mounting_turns_the_view_by_its_angles(angle: str, axis: int):
+def test_the_mounting_turns_the_view_by_its_angles(angle, axis):
     ahead = _poses(frames=1, **{**RAILS, angle: 10.0})[0, :3, 2]
     expected = np.cos(np.radians(10)) * np.eye(3)[0] - np.sin(np.radians(10)) * np.eye(3)[axis]
     assert np.allclose(ahead, expected)
@@ -342,7 +340,7 @@ LAP_M = 2 * sum(BLOCK_M) - 8 * CORNER_M + 2 * math.pi * CORNER_M
 
 
 @pytest.fixture(scope="module")
-def block() -> StreetCamera:
+def block():
     """A drive whose frame 100 stands where frame 0 stood, one lap later."""
     settings = StreetScene(
         path="block", block_m=BLOCK_M, frames=111, speed_m_per_frame=LAP_M / 100, **TINY, **ON_RAILS
@@ -397,7 +395,7 @@ def test_a_repeated_street_looks_and_is_the_same_each_period():
         ({"path": "curve", "repeat_m": 40.0}, "repeat_m"),
     ],
 )
-def test_an_impossible_street_is_refused(values, words: str):
+def test_an_impossible_street_is_refused(values, words):
     with pytest.raises(SettingsError, match=words):
         StreetScene.parse(values)
 
@@ -468,7 +466,7 @@ def test_a_quad_has_its_area_and_metric_surface_coordinates():
     ],
     ids=["box", "cylinder", "disc", "extrusion", "frustum"],
 )
-def test_shapes_have_their_area_and_are_closed(soup, area: float, closed: bool):
+def test_shapes_have_their_area_and_are_closed(soup, area, closed):
     assert _area(soup) == pytest.approx(area, rel=2e-3)
     assert (_open_edges(soup.vertices) == 0) == closed
     assert np.allclose(np.linalg.norm(soup.normals, axis=2), 1.0)

@@ -1,7 +1,5 @@
 """Machine code is never older than its sources; the voxel hash agrees with a dictionary."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -27,7 +25,7 @@ compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels ar
 
 
 @pytest.fixture
-def sources(tmp_path: Path) -> Path:
+def sources(tmp_path):
     folder = tmp_path / "sources" / "room" / "kernels"
     (folder / "simd").mkdir(parents=True)
     for name in ("outer.py", "inner.py", "simd/vectors.py"):
@@ -36,16 +34,14 @@ def sources(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["inner.py", "simd/vectors.py"])
-def test_a_change_in_a_source_gives_another_folder(
-    tmp_path: Path, sources: Path, name: str
-) -> None:
+def test_a_change_in_a_source_gives_another_folder(tmp_path, sources, name):
     before = cache_folder(tmp_path, sources.parents[1])
     assert cache_folder(tmp_path, sources.parents[1]) == before
     (sources / name).write_text("LANES = 16\n")
     assert cache_folder(tmp_path, sources.parents[1]) != before
 
 
-def test_folders_of_earlier_sources_are_removed(tmp_path: Path, sources: Path) -> None:
+def test_folders_of_earlier_sources_are_removed(tmp_path, sources):
     current = cache_folder(tmp_path, sources.parents[1])
     current.mkdir()
     earlier, other = tmp_path / "kernels-0123", tmp_path / "notes"
@@ -61,16 +57,14 @@ def test_folders_of_earlier_sources_are_removed(tmp_path: Path, sources: Path) -
 
 
 @pytest.fixture
-def foreign(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def foreign(monkeypatch, tmp_path):
     """The folder of a user who may write nothing but what lies in it."""
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(os, "access", lambda path, _: tmp_path in (path, *path.parents))
     return tmp_path
 
 
-def test_the_cache_is_the_users_where_the_installation_cannot_be_written(
-    monkeypatch: pytest.MonkeyPatch, foreign: Path
-) -> None:
+def test_the_cache_is_the_users_where_the_installation_cannot_be_written(monkeypatch, foreign):
     monkeypatch.setenv("XDG_CACHE_HOME", str(foreign / "caches"))
     assert cache_parent() == foreign / "caches" / "recon"
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(foreign / "numba"))
@@ -79,8 +73,8 @@ def test_the_cache_is_the_users_where_the_installation_cannot_be_written(
 
 @pytest.mark.parametrize("home", ["/", "~"])
 def test_a_user_without_a_home_gets_a_temporary_folder_that_nobody_else_can_write(
-    monkeypatch: pytest.MonkeyPatch, foreign: Path, home: str
-) -> None:
+    monkeypatch, foreign, home
+):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", home)
     monkeypatch.setattr(tempfile, "tempdir", str(foreign))
@@ -141,7 +135,7 @@ with when_compiling(compiling.append):
 
 @compiled
 @pytest.mark.slow
-def test_processes_that_compile_different_types_do_not_mix_up_code(tmp_path: Path) -> None:
+def test_processes_that_compile_different_types_do_not_mix_up_code(tmp_path):
     """The second writes the index last and the first the code: what numba alone would mix up."""
     (tmp_path / "race_kernel.py").write_text(
         "from recon.core.kernels.compiled import kernel\n\n"
@@ -168,7 +162,7 @@ def test_processes_that_compile_different_types_do_not_mix_up_code(tmp_path: Pat
 
 
 @compiled
-def test_what_is_compiled_is_announced_unless_it_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_compiled_is_announced_unless_it_is_cached(monkeypatch):
     assert Path(voxels.pack_key.stats.cache_path).parent == cache_folder(cache_parent())
     # Other users of numba keep their cache.
     monkeypatch.setattr(numba.config, "CACHE_DIR", "elsewhere")
@@ -236,14 +230,14 @@ def _sum(frames: list[tuple[np.ndarray, ...]], edge: float) -> voxels.VoxelSums:
 
 
 @given(st.lists(st.tuples(*[CELLS] * 3), min_size=1, max_size=20))
-def test_unpacking_inverts_packing(cells: list[tuple[int, int, int]]) -> None:
+def test_unpacking_inverts_packing(cells):
     keys = voxels.pack_keys(np.array(cells))
     assert (keys >= 0).all()
     assert keys.tolist() == [voxels.pack_key(*cell) for cell in cells]
     assert voxels.unpack_keys(keys).tolist() == [list(cell) for cell in cells]
 
 
-def test_growing_keeps_every_row_and_a_row_is_found_where_it_was_entered() -> None:
+def test_growing_keeps_every_row_and_a_row_is_found_where_it_was_entered():
     keys = voxels.pack_keys(np.stack(np.unravel_index(np.arange(8000), (20, 20, 20)), axis=1))
     sums = voxels.make_sums(len(keys), 0)
     assert voxels.reserve_sums(sums, len(keys)) is sums
@@ -260,7 +254,7 @@ def test_growing_keeps_every_row_and_a_row_is_found_where_it_was_entered() -> No
     assert voxels.find(table, voxels.pack_key(1, 2, 4)) == voxels.EMPTY
 
 
-def test_neighbouring_cells_spread_over_the_table() -> None:
+def test_neighbouring_cells_spread_over_the_table():
     # A street is a sheet of neighbouring cells: probing stays short if they do not cluster.
     cells = np.stack(np.unravel_index(np.arange(90_000), (300, 300, 1)), axis=1)
     table = voxels.make_table(len(cells))
@@ -276,9 +270,7 @@ def test_neighbouring_cells_spread_over_the_table() -> None:
     sizes=st.lists(st.integers(0, 60), min_size=1, max_size=4),
     edge=st.sampled_from([0.1, 0.5, 1.0, 7.0]),
 )
-def test_sums_of_frames_and_parts_equal_the_reference(
-    seed: int, sizes: list[int], edge: float
-) -> None:
+def test_sums_of_frames_and_parts_equal_the_reference(seed, sizes, edge):
     rng = np.random.default_rng(seed)
     frames = [_random_frame(rng, size) for size in sizes]
     expected = sum_points_reference(frames, edge)
@@ -298,7 +290,7 @@ def test_sums_of_frames_and_parts_equal_the_reference(
 
 
 @given(KEYS, KEYS)
-def test_keys_are_found_and_distinct_ones_sorted(wanted: np.ndarray, keys: np.ndarray) -> None:
+def test_keys_are_found_and_distinct_ones_sorted(wanted, keys):
     place, known = find_keys(wanted, np.sort(keys))
     np.testing.assert_array_equal(known, np.isin(wanted, keys))
     np.testing.assert_array_equal(np.sort(keys)[place[known]], wanted[known])

@@ -1,7 +1,5 @@
 """Calibration files: what each format keeps, what its consumers make of it, and of which images."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,7 +23,7 @@ from recon.sources.one_pair import read_pair_input
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
-from tests.scenery.boards import Lens, board_rig
+from tests.scenery.boards import board_rig
 from tests.sources import drives
 
 Write = Callable[[Path, StereoCalibration], object]
@@ -67,9 +65,7 @@ HELD = [(w, n) for w in WRITERS for n in LENSES if w != "kalibr" or n not in {"b
 
 
 @pytest.mark.parametrize(("form", "lens"), HELD)
-def test_every_format_gives_the_rig_back_whatever_its_name(
-    tmp_path: Path, form: str, lens: str
-) -> None:
+def test_every_format_gives_the_rig_back_whatever_its_name(tmp_path, form, lens):
     want = rig(lens)
     WRITERS[form](tmp_path / "left_rig.yaml", want)
     have = read_calibration(tmp_path / "left_rig.yaml", 640, 480)
@@ -84,7 +80,7 @@ def test_every_format_gives_the_rig_back_whatever_its_name(
         assert (got.model, got.width_px, got.height_px) == (camera.model, 640, 480)
 
 
-def test_our_file_is_exact_names_every_unit_and_keeps_figures_aside(tmp_path: Path) -> None:
+def test_our_file_is_exact_names_every_unit_and_keeps_figures_aside(tmp_path):
     camera = RectifiedCamera(1 / 3 + 700, 600.1, 180.7, 610.3, 0.54, 1242, 375, ndisp=96)
     write_recon_calibration(tmp_path / "c.yaml", camera)
     assert read_calibration(tmp_path / "c.yaml", camera.width_px, camera.height_px) == camera
@@ -95,13 +91,13 @@ def test_our_file_is_exact_names_every_unit_and_keeps_figures_aside(tmp_path: Pa
 
 
 @pytest.mark.parametrize("lens", ["brown", "rational"])
-def test_kalibr_refuses_a_lens_that_it_has_no_name_for(tmp_path: Path, lens: str) -> None:
+def test_kalibr_refuses_a_lens_that_it_has_no_name_for(tmp_path, lens):
     with pytest.raises(CalibrationError, match=r"kalibr.*pinhole with \d coeff.*radial_terms"):
         write_kalibr(tmp_path / "chain.yaml", rig(lens))
     assert not list(tmp_path.iterdir())
 
 
-def test_an_opencv_file_says_that_it_is_of_a_fisheye_and_refuses_two_models(tmp_path: Path) -> None:
+def test_an_opencv_file_says_that_it_is_of_a_fisheye_and_refuses_two_models(tmp_path):
     write_opencv_calibration(tmp_path / "f.yml", rig("fisheye"))
     assert read_opencv_calibration(tmp_path / "f.yml").right.model == "fisheye"
     mixed = StereoCalibration(rig("fisheye").left, rig("radtan").right, T_RIGHT_LEFT)
@@ -111,7 +107,7 @@ def test_an_opencv_file_says_that_it_is_of_a_fisheye_and_refuses_two_models(tmp_
     assert read_recon_calibration(tmp_path / "mixed.yaml").left.model == "fisheye"
 
 
-def test_a_kalibr_chain_as_its_wiki_prints_it_is_read(tmp_path: Path) -> None:
+def test_a_kalibr_chain_as_its_wiki_prints_it_is_read(tmp_path):
     """The example of kalibr's wiki page "Yaml formats", with a rigid T_cn_cnm1."""
     (tmp_path / "chain.yaml").write_text(
         """cam0:
@@ -146,7 +142,7 @@ cam1:
         ("my_right_cam.yaml", ["my_left_cam.yaml", "my_right_cam.yaml"]),
     ],
 )
-def test_camera_info_files_are_those_of_left_and_right(given: str, names: list[str]) -> None:
+def test_camera_info_files_are_those_of_left_and_right(given, names):
     assert [path.name for path in camera_info_paths(given)] == names
 
 
@@ -171,9 +167,7 @@ def swap(left: Path, right: Path) -> None:
         (swap, "to the left of the left.*swap left and right"),
     ],
 )
-def test_camera_infos_that_are_no_rig_are_refused(
-    tmp_path: Path, spoil: Callable[[Path, Path], None], message: str
-) -> None:
+def test_camera_infos_that_are_no_rig_are_refused(tmp_path, spoil, message):
     left, right = write_ros(tmp_path / "rig.yaml", rig("brown"))
     spoil(left, right)
     with pytest.raises(ReconError, match=rf"rig_right\.yaml: .*{message}"):
@@ -181,7 +175,7 @@ def test_camera_infos_that_are_no_rig_are_refused(
 
 
 @pytest.mark.parametrize("write", [write_kalibr, write_ros])
-def test_a_header_of_opencv_does_not_hide_the_format(tmp_path: Path, write: Write) -> None:
+def test_a_header_of_opencv_does_not_hide_the_format(tmp_path, write):
     write(tmp_path / "rig.yaml", rig("radtan"))
     for path in tmp_path.iterdir():
         path.write_text("%YAML:1.0\n---\n" + path.read_text())
@@ -189,7 +183,7 @@ def test_a_header_of_opencv_does_not_hide_the_format(tmp_path: Path, write: Writ
     assert isinstance(read_calibration(path, 640, 480), StereoCalibration)
 
 
-def test_what_is_no_calibration_gets_a_list_of_what_is_understood(tmp_path: Path) -> None:
+def test_what_is_no_calibration_gets_a_list_of_what_is_understood(tmp_path):
     (tmp_path / "notes.txt").write_text("f = 700\n")
     with pytest.raises(FormatError, match=r"notes\.txt: not.*KITTI.*Middlebury.*OpenCV"):
         read_calibration(tmp_path / "notes.txt", 640, 480)
@@ -214,7 +208,7 @@ def seen_by(rig: StereoCalibration) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("lens", ["radtan", "rational"])
-def test_opencv_rectifies_by_what_file_storage_reads(tmp_path: Path, lens: Lens) -> None:
+def test_opencv_rectifies_by_what_file_storage_reads(tmp_path, lens):
     rig = board_rig(lens)
     write_opencv_calibration(tmp_path / "rig.yml", rig)
     storage = cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
@@ -234,9 +228,7 @@ def test_opencv_rectifies_by_what_file_storage_reads(tmp_path: Path, lens: Lens)
     [("radtan", "plumb_bob", 5), ("rational", "rational_polynomial", 8),
      ("fisheye", "equidistant", 4)],
 )  # fmt: skip
-def test_camera_info_rectifies_by_the_equations_of_its_message(
-    tmp_path: Path, lens: Lens, name: str, count: int
-) -> None:
+def test_camera_info_rectifies_by_the_equations_of_its_message(tmp_path, lens, name, count):
     """sensor_msgs/CameraInfo: P = K' [I | t], disparity of a point is -P[0, 3] of the right / Z."""
     rig, placed = board_rig(lens), []
     undistort = cv2.fisheye.undistortPoints if lens == "fisheye" else cv2.undistortPoints
@@ -260,9 +252,7 @@ def test_camera_info_rectifies_by_the_equations_of_its_message(
 
 
 @pytest.mark.parametrize(("lens", "name"), [("radtan", "radtan"), ("fisheye", "equidistant")])
-def test_a_kalibr_chain_projects_by_the_equations_of_its_wiki(
-    tmp_path: Path, lens: Lens, name: str
-) -> None:
+def test_a_kalibr_chain_projects_by_the_equations_of_its_wiki(tmp_path, lens, name):
     rig, xyz = board_rig(lens), XYZ
     write_kalibr(tmp_path / "chain.yaml", rig)
     chain = yaml.safe_load((tmp_path / "chain.yaml").read_text())
@@ -307,9 +297,7 @@ def write_nodes(path: Path, **nodes: object) -> Path:
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
 @pytest.mark.parametrize("names", [tuple(NODES), OTHER_NAMES])
-def test_files_of_opencv_are_read_under_all_usual_names(
-    tmp_path: Path, suffix: str, names: tuple[str, ...]
-) -> None:
+def test_files_of_opencv_are_read_under_all_usual_names(tmp_path, suffix, names):
     nodes = dict(zip(names, NODES.values(), strict=True))
     path = write_nodes(tmp_path / f"stereo.{suffix}", **nodes, **POSE)
     read = read_opencv_calibration(path, size_px=(640, 480))
@@ -318,7 +306,7 @@ def test_files_of_opencv_are_read_under_all_usual_names(
     np.testing.assert_array_equal(read.T_right_left, T_RIGHT_LEFT)
 
 
-def test_millimetres_become_metres_and_taken_for_metres_are_noticed(tmp_path: Path) -> None:
+def test_millimetres_become_metres_and_taken_for_metres_are_noticed(tmp_path):
     path = write_nodes(tmp_path / "stereo.yml", **NODES, **{**POSE, "T": T_MM})
     read = read_opencv_calibration(path, size_px=(640, 480), metres_per_unit=0.001)
     np.testing.assert_allclose(read.T_right_left, T_RIGHT_LEFT, rtol=1e-14)
@@ -326,7 +314,7 @@ def test_millimetres_become_metres_and_taken_for_metres_are_noticed(tmp_path: Pa
         read_opencv_calibration(path, size_px=(640, 480))
 
 
-def test_extrinsics_beside_the_intrinsics_are_found_and_are_no_kitti_file(tmp_path: Path) -> None:
+def test_extrinsics_beside_the_intrinsics_are_found_and_are_no_kitti_file(tmp_path):
     path = write_nodes(tmp_path / "intrinsics.yml", **NODES)
     beside = tmp_path / "extrinsics.yml"
     write_nodes(beside, **POSE, P1=np.eye(3, 4), P2=np.eye(3, 4))
@@ -351,9 +339,7 @@ def test_extrinsics_beside_the_intrinsics_are_found_and_are_no_kitti_file(tmp_pa
         ({"image_width": None}, FormatError, "does not contain the image size"),
     ],
 )
-def test_a_bad_calibration_is_one_clear_line_with_the_file(
-    tmp_path: Path, change: dict[str, object], error: type[Exception], message: str
-) -> None:
+def test_a_bad_calibration_is_one_clear_line_with_the_file(tmp_path, change, error, message):
     nodes = {**NODES, **POSE, "image_width": 640, "image_height": 480, **change}
     path = write_nodes(tmp_path / "stereo.yml", **nodes)
     with pytest.raises(error, match=rf"stereo\.yml: .*{message}"):
@@ -361,7 +347,7 @@ def test_a_bad_calibration_is_one_clear_line_with_the_file(
 
 
 @pytest.mark.real
-def test_the_published_chessboard_calibration_is_read_from_its_two_files(recon_data: Path) -> None:
+def test_the_published_chessboard_calibration_is_read_from_its_two_files(recon_data):
     folder = recon_data / "calibration" / "opencv_chessboard"
     read = read_calibration(folder / "intrinsics.yml", 640, 480)
     assert isinstance(read, StereoCalibration)
@@ -382,13 +368,13 @@ MIDDLEBURY = (
 
 
 @pytest.mark.parametrize("text", [KITTI, MIDDLEBURY, KITTI.replace("P0", "P2").replace("P1", "P3")])
-def test_kitti_and_middlebury_files_of_one_rig_give_one_camera(tmp_path: Path, text: str) -> None:
+def test_kitti_and_middlebury_files_of_one_rig_give_one_camera(tmp_path, text):
     (tmp_path / "calib.txt").write_text(text)
     want = RectifiedCamera(700, 600, 180, 600, 0.5, *SIZE)
     assert read_calibration(tmp_path / "calib.txt", *SIZE) == want
 
 
-def test_each_pair_of_a_kitti_rig_has_its_own_baseline_offset_and_doffs(tmp_path: Path) -> None:
+def test_each_pair_of_a_kitti_rig_has_its_own_baseline_offset_and_doffs(tmp_path):
     path = tmp_path / "calib.txt"
     path.write_text(KITTI + COLOUR)
     assert read_kitti_calib(path, *SIZE).baseline_m == 0.5
@@ -405,7 +391,7 @@ def test_each_pair_of_a_kitti_rig_has_its_own_baseline_offset_and_doffs(tmp_path
 
 
 @pytest.mark.real
-def test_real_grey_and_colour_baselines_are_those_of_the_rig(recon_data: Path) -> None:
+def test_real_grey_and_colour_baselines_are_those_of_the_rig(recon_data):
     path = recon_data / "driven" / "kitti_raw_0013" / "calib.txt"
     # 0.5327 m of the colour pair: neither the 0.47 m of P3 alone nor the grey pair's.
     for cameras, baseline_m, near in (((0, 1), 0.5372, 1e-4), ((2, 3), 0.533, 1e-3)):
@@ -422,7 +408,7 @@ CAMERA = RectifiedCamera(72.0, 70.5, 21.5, 70.5, 0.5, *RECTIFIED)
 
 
 @pytest.fixture
-def kitti_raw(tmp_path: Path) -> Path:
+def kitti_raw(tmp_path):
     """``calib_cam_to_cam.txt`` of four cameras."""
     lines = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.950000e-02"]
     for number, focal in enumerate(FOCAL):
@@ -447,7 +433,7 @@ def write_pair(folder: Path, size: tuple[int, int], names: tuple[str, str]) -> l
     return paths
 
 
-def test_images_get_the_cameras_of_a_kitti_file_that_have_their_size(kitti_raw: Path) -> None:
+def test_images_get_the_cameras_of_a_kitti_file_that_have_their_size(kitti_raw):
     rig = read_calibration(kitti_raw, *RAW)
     assert isinstance(rig, StereoCalibration)
     assert (rig.left.matrix[0, 0], rig.right.matrix[0, 0]) == FOCAL[:2]
@@ -473,9 +459,7 @@ def test_images_get_the_cameras_of_a_kitti_file_that_have_their_size(kitti_raw: 
     ],
     ids=str,
 )
-def test_every_way_in_rectifies_raw_kitti_images_with_their_cameras(
-    kitti_raw: Path, kind: str, views: tuple[str, str], focal: tuple[float, float]
-) -> None:
+def test_every_way_in_rectifies_raw_kitti_images_with_their_cameras(kitti_raw, kind, views, focal):
     folder = kitti_raw.parent / "drive"
     paths = write_pair(folder, RAW, views)
     (folder / "times.txt").write_text("0\n")
@@ -504,9 +488,7 @@ def write_middlebury(path: Path, _: StereoCalibration) -> None:
 
 
 @pytest.mark.parametrize("write", [write_middlebury, *WRITERS.values()])
-def test_every_format_with_a_size_refuses_other_images_when_a_drive_is_opened(
-    tmp_path: Path, write: Write
-) -> None:
+def test_every_format_with_a_size_refuses_other_images_when_a_drive_is_opened(tmp_path, write):
     path = tmp_path / "left.yaml"
     write(path, raw_rig())
     pair = write_pair(tmp_path / "drive", (71, 22), ("left", "right"))
@@ -519,8 +501,8 @@ def test_every_format_with_a_size_refuses_other_images_when_a_drive_is_opened(
 
 @pytest.mark.parametrize("form", ["kitti", "opencv"])
 def test_a_file_without_a_size_is_refused_if_its_centre_cannot_be_that_of_the_images(
-    tmp_path: Path, form: str
-) -> None:
+    tmp_path, form
+):
     path = drives.write_calib(tmp_path, CAMERA)
     if form == "opencv":
         write_opencv_calibration(path, raw_rig())
@@ -531,7 +513,7 @@ def test_a_file_without_a_size_is_refused_if_its_centre_cannot_be_that_of_the_im
         read_calibration(path, 71, 22)
 
 
-def test_a_stated_size_is_believed_however_far_off_the_centre_is(tmp_path: Path) -> None:
+def test_a_stated_size_is_believed_however_far_off_the_centre_is(tmp_path):
     cropped = replace(CAMERA, cy_px=1.0)
     write_recon_calibration(tmp_path / "crop.yaml", cropped)
     assert read_calibration(tmp_path / "crop.yaml", *RECTIFIED) == cropped

@@ -1,9 +1,6 @@
 """Images, disparity maps, videos and images of ROS: what is read back, and what is refused."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -49,16 +46,14 @@ def random_image(*shape: int, dtype: str = "u1") -> np.ndarray:
     image=st.sampled_from(["u1", "u2"]).flatmap(lambda t: arrays(t, SHAPES)),
     suffix=st.sampled_from([".png", ".tif", ".tiff", "pnm"]),
 )
-def test_lossless_formats_give_back_every_level(
-    image: np.ndarray, suffix: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_lossless_formats_give_back_every_level(image, suffix, tmp_path_factory):
     netpbm = ".pgm" if image.ndim == 2 else ".ppm"
     path = tmp_path_factory.getbasetemp() / f"levels{netpbm if suffix == 'pnm' else suffix}"
     write_image(path, image)
     np.testing.assert_array_equal(read_levels(path), image)
 
 
-def test_colours_are_red_green_blue_in_the_file_and_alpha_is_dropped(tmp_path: Path) -> None:
+def test_colours_are_red_green_blue_in_the_file_and_alpha_is_dropped(tmp_path):
     write_image(tmp_path / "red.ppm", np.full((2, 2, 3), (255, 0, 0), np.uint8))
     assert (tmp_path / "red.ppm").read_bytes().endswith(b"\xff\x00\x00" * 4)
     bgra = random_image(4, 5, 4)
@@ -66,20 +61,20 @@ def test_colours_are_red_green_blue_in_the_file_and_alpha_is_dropped(tmp_path: P
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), bgra[:, :, 2::-1])
 
 
-def test_sixteen_bits_are_scaled_over_their_whole_range(tmp_path: Path) -> None:
+def test_sixteen_bits_are_scaled_over_their_whole_range(tmp_path):
     levels = np.array([[0, 128, 129, 257, 32768, 65535]], dtype=np.uint16)
     write_image(tmp_path / "a.png", levels)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), [[0, 0, 1, 1, 128, 255]])
 
 
-def test_jpeg_is_read_close_to_what_was_written(tmp_path: Path) -> None:
+def test_jpeg_is_read_close_to_what_was_written(tmp_path):
     ramp = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (32, 1))
     write_image(tmp_path / "a.jpg", ramp)
     # 8 levels: a smooth ramp at OpenCV's default quality of 95.
     assert np.abs(read_image(tmp_path / "a.jpg").astype(int) - ramp).max() <= 8
 
 
-def test_grey_in_three_equal_channels_is_grey_and_colours_are_refused(tmp_path: Path) -> None:
+def test_grey_in_three_equal_channels_is_grey_and_colours_are_refused(tmp_path):
     grey = random_image(4, 5)
     write_image(tmp_path / "grey.png", np.repeat(grey[:, :, None], 3, axis=2))
     np.testing.assert_array_equal(read_grey_levels(tmp_path / "grey.png"), grey)
@@ -89,7 +84,7 @@ def test_grey_in_three_equal_channels_is_grey_and_colours_are_refused(tmp_path: 
 
 
 @pytest.mark.parametrize("shape", [(16, 18), (16, 18, 3)])
-def test_a_bmp_is_read_whole_or_not_at_all(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_a_bmp_is_read_whole_or_not_at_all(tmp_path, shape):
     pixels = random_image(*shape)
     content = cv2.imencode(".bmp", pixels if pixels.ndim == 2 else pixels[:, :, ::-1])[1].tobytes()
     path = tmp_path / "a.bmp"
@@ -101,7 +96,7 @@ def test_a_bmp_is_read_whole_or_not_at_all(tmp_path: Path, shape: tuple[int, ...
             read_image(path)
 
 
-def test_a_flipped_bit_in_a_png_is_seen(tmp_path: Path) -> None:
+def test_a_flipped_bit_in_a_png_is_seen(tmp_path):
     path = tmp_path / "a.png"
     write_image(path, random_image(20, 20))
     content = bytearray(path.read_bytes())
@@ -111,7 +106,7 @@ def test_a_flipped_bit_in_a_png_is_seen(tmp_path: Path) -> None:
         read_image(path)
 
 
-def test_a_jpeg_with_an_embedded_preview_is_still_seen_to_be_truncated(tmp_path: Path) -> None:
+def test_a_jpeg_with_an_embedded_preview_is_still_seen_to_be_truncated(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path, random_image(40, 40))
     content, preview = path.read_bytes(), b"\xff\xd8preview\xff\xd9"
@@ -127,14 +122,12 @@ def test_a_jpeg_with_an_embedded_preview_is_still_seen_to_be_truncated(tmp_path:
     "content",
     [b"P5\n# a comment\n2 2\n255\nabcd", b"P2\n2 2\n255\n97 98 99 100\n", b"P5 2 2 255 abcd"],
 )
-def test_pgm_is_read_binary_and_ascii_with_comments(tmp_path: Path, content: bytes) -> None:
+def test_pgm_is_read_binary_and_ascii_with_comments(tmp_path, content):
     (tmp_path / "a.pgm").write_bytes(content)
     np.testing.assert_array_equal(read_image(tmp_path / "a.pgm"), [[97, 98], [99, 100]])
 
 
-def test_a_damaged_tiff_is_reported_by_the_error_alone_and_floats_are_refused(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_tiff_is_reported_by_the_error_alone_and_floats_are_refused(tmp_path, capfd):
     path = tmp_path / "a.tif"
     write_image(path, random_image(60, 80))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -146,7 +139,7 @@ def test_a_damaged_tiff_is_reported_by_the_error_alone_and_floats_are_refused(
         read_image(path)
 
 
-def test_the_limit_of_pixels_is_the_last_that_is_read(tmp_path: Path) -> None:
+def test_the_limit_of_pixels_is_the_last_that_is_read(tmp_path):
     write_image(tmp_path / "a.png", random_image(4, 5))
     assert read_image(tmp_path / "a.png", max_megapixels=20e-6).shape == (4, 5)
     with pytest.raises(FormatError, match=r"too many pixels .*got 5x4"):
@@ -165,9 +158,7 @@ def test_the_limit_of_pixels_is_the_last_that_is_read(tmp_path: Path) -> None:
         ("a.png", random_image(0, 3), ShapeError),
     ],
 )
-def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(
-    tmp_path: Path, name: str, image: np.ndarray, error: type[Exception]
-) -> None:
+def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(tmp_path, name, image, error):
     with pytest.raises(error):
         write_image(tmp_path / name, image)
     assert list(tmp_path.iterdir()) == []
@@ -191,8 +182,8 @@ MM_5 = IFDRational(5)
     ],
 )  # fmt: skip
 def test_the_focal_length_of_a_photo_is_that_of_its_sensor_else_of_its_diagonal(
-    tmp_path: Path, tags: dict[int, object], focal_px: float | None, basis: str
-) -> None:
+    tmp_path, tags, focal_px, basis
+):
     exif = Image.Exif()
     exif.get_ifd(0x8769).update(tags)
     Image.new("RGB", (400, 300)).save(tmp_path / "a.jpg", exif=exif)
@@ -208,9 +199,7 @@ DISPARITIES = st.tuples(st.integers(1, 6), st.integers(1, 6))
 
 @settings(max_examples=50)
 @given(arrays(np.float32, DISPARITIES, elements=st.floats(-1e6, 1e6, width=32) | st.just(NAN)))
-def test_pfm_gives_back_every_bit(
-    tmp_path_factory: pytest.TempPathFactory, values: np.ndarray
-) -> None:
+def test_pfm_gives_back_every_bit(tmp_path_factory, values):
     path = tmp_path_factory.getbasetemp() / "values.pfm"
     write_pfm(path, values)
     read = read_pfm(path)
@@ -218,7 +207,7 @@ def test_pfm_gives_back_every_bit(
     np.testing.assert_array_equal(read, values)
 
 
-def test_unknown_is_inf_in_a_pfm_and_rows_run_upwards(tmp_path: Path) -> None:
+def test_unknown_is_inf_in_a_pfm_and_rows_run_upwards(tmp_path):
     write_pfm(tmp_path / "a.pfm", np.array([[np.nan, 1.0], [2.0, 3.0]], dtype=np.float32))
     content = (tmp_path / "a.pfm").read_bytes()
     assert content.startswith(b"Pf\n2 2\n-1.0\n")
@@ -231,8 +220,8 @@ def test_unknown_is_inf_in_a_pfm_and_rows_run_upwards(tmp_path: Path) -> None:
     ("order", "scale"), [("<f4", "-1"), (">f4", "1.0"), ("<f4", "-0.003922"), (">f4", "2e3")]
 )
 def test_both_byte_orders_are_read_and_the_magnitude_of_the_scale_changes_nothing(
-    tmp_path: Path, order: str, scale: str
-) -> None:
+    tmp_path, order, scale
+):
     body = np.array([3.0, np.inf, -np.inf, 4.5], dtype=order).tobytes()
     (tmp_path / "a.pfm").write_bytes(f"Pf\n2 2\n{scale}\n".encode() + body)
     np.testing.assert_array_equal(read_pfm(tmp_path / "a.pfm"), [[np.nan, 4.5], [3.0, np.nan]])
@@ -243,9 +232,7 @@ LEVELS = st.floats(np.float32(0.005), 250, width=32) | st.just(NAN)
 
 @settings(max_examples=40)
 @given(arrays(np.float32, DISPARITIES, elements=LEVELS))
-def test_disparity_comes_back_within_half_a_level_and_nan_as_nan(
-    tmp_path_factory: pytest.TempPathFactory, values: np.ndarray
-) -> None:
+def test_disparity_comes_back_within_half_a_level_and_nan_as_nan(tmp_path_factory, values):
     path = tmp_path_factory.getbasetemp() / "disparity.png"
     write_disparity_png(path, values)
     read = read_disparity_png(path)
@@ -253,7 +240,7 @@ def test_disparity_comes_back_within_half_a_level_and_nan_as_nan(
     np.testing.assert_allclose(read, values, rtol=0, atol=0.5 / 256 + 1e-5)
 
 
-def test_a_disparity_image_is_kittis_or_of_eight_bits_and_a_scale(tmp_path: Path) -> None:
+def test_a_disparity_image_is_kittis_or_of_eight_bits_and_a_scale(tmp_path):
     write_disparity_png(tmp_path / "a.png", np.array([[NAN, 0, 1, 200.5]], dtype=np.float32))
     levels = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert levels.dtype == np.uint16
@@ -266,7 +253,7 @@ def test_a_disparity_image_is_kittis_or_of_eight_bits_and_a_scale(tmp_path: Path
 
 
 @pytest.mark.parametrize("value", [-0.1, 256.0])
-def test_what_does_not_fit_is_refused_and_not_clipped(tmp_path: Path, value: float) -> None:
+def test_what_does_not_fit_is_refused_and_not_clipped(tmp_path, value):
     with pytest.raises(OutputError, match=r"a\.png: disparity does not fit.*write PFM"):
         write_disparity_png(tmp_path / "a.png", np.array([[value, NAN]], dtype=np.float32))
     assert list(tmp_path.iterdir()) == []
@@ -275,19 +262,19 @@ def test_what_does_not_fit_is_refused_and_not_clipped(tmp_path: Path, value: flo
 @pytest.mark.parametrize(
     ("top", "scale"), [(10, 256), (255.9, 256), (256, 128), (600, 64), (NAN, 256)]
 )
-def test_fitting_scale_is_the_largest_that_fits(tmp_path: Path, top: float, scale: float) -> None:
+def test_fitting_scale_is_the_largest_that_fits(tmp_path, top, scale):
     values = np.array([[top, NAN]], dtype=np.float32)
     assert fitting_scale(values) == scale
     write_disparity_png(tmp_path / "a.png", values, scale=scale)
 
 
 @pytest.fixture
-def clip(tmp_path: Path) -> Path:
+def clip(tmp_path):
     greys = [np.full((16, 32), grey, np.uint8) for grey in (30, 90, 150, 210)]
     return write_video(tmp_path / "a.avi", greys, "MJPG")
 
 
-def test_the_frames_of_some_numbers_are_decoded_with_their_times(clip: Path) -> None:
+def test_the_frames_of_some_numbers_are_decoded_with_their_times(clip):
     opened = open_video(clip)
     assert (opened.frames, opened.width_px, opened.height_px, opened.rate_hz) == (4, 32, 16, 10)
     picked = list(opened.pick([1, 3]))
@@ -298,7 +285,7 @@ def test_the_frames_of_some_numbers_are_decoded_with_their_times(clip: Path) -> 
         list(opened.pick([4]))
 
 
-def test_a_video_of_too_many_pixels_is_refused(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_video_of_too_many_pixels_is_refused(clip, monkeypatch):
     monkeypatch.setattr(video, "MAX_MEGAPIXELS", 512e-6)
     assert open_video(clip).frames == 4
     monkeypatch.setattr(video, "MAX_MEGAPIXELS", 511e-6)
@@ -310,21 +297,21 @@ RED_GREEN_BLUE = {"r": 200, "g": 90, "b": 20}
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8"])
-def test_colours_of_a_message_become_rgb(encoding: str) -> None:
+def test_colours_of_a_message_become_rgb(encoding):
     pixel = [{**RED_GREEN_BLUE, "a": 255}[letter] for letter in encoding[:-1]]
     image = pixels_of_ros_image(np.array(pixel * 6, np.uint8), encoding, (2, 3), 3 * len(pixel))
     np.testing.assert_array_equal(image, np.full((2, 3, 3), (200, 90, 20)))
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_bayer_image_of_one_colour_gives_that_colour(pattern: str) -> None:
+def test_a_bayer_image_of_one_colour_gives_that_colour(pattern):
     tile = np.array([RED_GREEN_BLUE[letter] for letter in pattern], np.uint8).reshape(2, 2)
     image = pixels_of_ros_image(np.tile(tile, (4, 4)).ravel(), f"bayer_{pattern}8", (8, 8), 8)
     np.testing.assert_array_equal(image[2:6, 2:6], np.full((4, 4, 3), (200, 90, 20)))
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
-def test_sixteen_bits_of_a_message_are_scaled_in_either_order_of_bytes(big_endian: bool) -> None:
+def test_sixteen_bits_of_a_message_are_scaled_in_either_order_of_bytes(big_endian):
     values = np.array([[0, 257, 65535]], ">u2" if big_endian else "<u2")
     data = np.frombuffer(values.tobytes(), np.uint8)
     image = pixels_of_ros_image(data, "mono16", (1, 3), 6, big_endian=big_endian)
@@ -332,14 +319,14 @@ def test_sixteen_bits_of_a_message_are_scaled_in_either_order_of_bytes(big_endia
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422_yuy2", "yuyv"), ("yuv422", "uyvy")])
-def test_a_grey_yuv_image_is_grey(encoding: str, order: str) -> None:
+def test_a_grey_yuv_image_is_grey(encoding, order):
     data = np.array([126 if letter == "y" else 128 for letter in order * 4], np.uint8)
     image = pixels_of_ros_image(data, encoding, (2, 4), 8)
     # Video levels: 16 is black, 235 white.
     np.testing.assert_allclose(image, 255 * (126 - 16) / 219, atol=1)
 
 
-def test_a_message_with_too_few_bytes_is_refused() -> None:
+def test_a_message_with_too_few_bytes_is_refused():
     with pytest.raises(FormatError, match=r"too few bytes \(got 9 bytes, 6 per row, expected 4x2"):
         pixels_of_ros_image(np.zeros(9, np.uint8), "mono8", (2, 4), 6)
     # The last row needs no padding.

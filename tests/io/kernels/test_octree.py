@@ -1,7 +1,5 @@
 """Leaves of octrees: the reference, pieces of any size, and what is no tree."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -48,9 +46,7 @@ def listed(leaves: Leaves, first: int = 0) -> list[Leaf]:
 
 @settings(max_examples=50)
 @given(trees(), st.integers(1, 7))
-def test_the_kernel_finds_what_the_reference_finds_in_pieces_of_any_size(
-    tree: list[int], size: int
-) -> None:
+def test_the_kernel_finds_what_the_reference_finds_in_pieces_of_any_size(tree, size):
     children, walk, found = np.array(tree, np.uint8), begin_walk(DEPTH), []
     for first in range(0, len(children), size):
         piece = children[first : first + size]
@@ -63,19 +59,19 @@ def test_the_kernel_finds_what_the_reference_finds_in_pieces_of_any_size(
 
 @settings(max_examples=20)
 @given(trees(), st.integers(0, 255))
-def test_nodes_behind_the_end_of_the_tree_are_not_walked_over(tree: list[int], more: int) -> None:
+def test_nodes_behind_the_end_of_the_tree_are_not_walked_over(tree, more):
     seen, leaves = find_leaves(np.array([*tree, more], np.uint8), begin_walk(DEPTH))
     assert (seen, len(leaves.nodes)) == (len(tree), tree.count(0))
 
 
-def test_a_tree_that_is_cut_does_not_end() -> None:
+def test_a_tree_that_is_cut_does_not_end():
     walk = begin_walk(DEPTH)
     assert find_leaves(np.array([0b101, 0], np.uint8), walk)[0] == 2
     assert walk.level[0] == 1
 
 
 @pytest.mark.parametrize("depth", [1, 3, 16])
-def test_children_below_the_deepest_level_end_the_walk(depth: int) -> None:
+def test_children_below_the_deepest_level_end_the_walk(depth):
     chain = np.full(depth + 1, 0b10000000, np.uint8)
     seen, leaves = find_leaves(chain, begin_walk(depth))
     assert (seen, len(leaves.nodes)) == (depth, 0)

@@ -1,7 +1,5 @@
 """Clouds (PLY, LAS), OctoMaps and Nav2 grids: round trips, other programs, and damaged files."""
 
-from __future__ import annotations
-
 import sys
 import tracemalloc
 from pathlib import Path
@@ -70,7 +68,7 @@ def example_cloud(n: int = 20) -> PointCloud:
 @pytest.mark.parametrize("ascii", [False, True])
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cloud=clouds())
-def test_a_cloud_comes_back_bit_by_bit(tmp_path: Path, ascii: bool, cloud: PointCloud) -> None:  # noqa: A002
+def test_a_cloud_comes_back_bit_by_bit(tmp_path, ascii, cloud):  # noqa: A002
     write_ply(tmp_path / "cloud.ply", cloud, ascii=ascii)
     again = read_ply(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(again.xyz, cloud.xyz)
@@ -83,7 +81,7 @@ def test_a_cloud_comes_back_bit_by_bit(tmp_path: Path, ascii: bool, cloud: Point
 
 
 @pytest.mark.parametrize("ascii", [False, True])
-def test_meshlab_reads_positions_normals_colours_and_quality(tmp_path: Path, ascii: bool) -> None:  # noqa: A002
+def test_meshlab_reads_positions_normals_colours_and_quality(tmp_path, ascii):  # noqa: A002
     cloud = example_cloud()
     write_ply(tmp_path / "cloud.ply", cloud, ascii=ascii)
     meshes = pymeshlab.MeshSet()
@@ -95,7 +93,7 @@ def test_meshlab_reads_positions_normals_colours_and_quality(tmp_path: Path, asc
     np.testing.assert_array_equal(np.rint(seen.vertex_color_matrix()[:, :3] * 255), cloud.rgb)
 
 
-def test_open3d_reads_it_as_float_with_every_scalar(tmp_path: Path) -> None:
+def test_open3d_reads_it_as_float_with_every_scalar(tmp_path):
     o3d = pytest.importorskip("open3d")
     cloud = example_cloud()
     write_ply(tmp_path / "cloud.ply", cloud)
@@ -107,7 +105,7 @@ def test_open3d_reads_it_as_float_with_every_scalar(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_what_pymeshlab_writes_is_read(tmp_path: Path, binary: bool) -> None:
+def test_what_pymeshlab_writes_is_read(tmp_path, binary):
     cloud = example_cloud()
     xyz, normals = cloud.xyz.astype(np.float64), cloud.normals.astype(np.float64)
     meshes = pymeshlab.MeshSet()
@@ -129,7 +127,7 @@ XYZ = "property float x\nproperty float y\nproperty float z"
 DOUBLES = XYZ.replace("float", "double")
 
 
-def test_big_endian_doubles_and_unknown_properties_are_read(tmp_path: Path) -> None:
+def test_big_endian_doubles_and_unknown_properties_are_read(tmp_path):
     table = np.zeros(2, [("t", ">u2"), ("x", ">f8"), ("y", ">f8"), ("z", ">f8")])
     table["x"], table["z"] = [1.5, -2.5], [3.25, 4.0]
     properties = f"property ushort t\n{DOUBLES}"
@@ -137,9 +135,7 @@ def test_big_endian_doubles_and_unknown_properties_are_read(tmp_path: Path) -> N
     np.testing.assert_array_equal(read_ply(path).xyz, [[1.5, 0, 3.25], [-2.5, 0, 4]])
 
 
-def test_points_that_are_not_finite_are_dropped_and_a_quality_that_is_no_confidence(
-    tmp_path: Path,
-) -> None:
+def test_points_that_are_not_finite_are_dropped_and_a_quality_that_is_no_confidence(tmp_path):
     body = b"1 2 3 0.1\nnan 2 3 0.2\n4 5 inf 0.3\n7 8 9 0.4\n"
     cloud = read_ply(write_raw(tmp_path / "a.ply", XYZ + "\nproperty float sigma", body, 4))
     np.testing.assert_array_equal(cloud.xyz, [[1, 2, 3], [7, 8, 9]])
@@ -149,7 +145,7 @@ def test_points_that_are_not_finite_are_dropped_and_a_quality_that_is_no_confide
 
 
 @pytest.mark.parametrize("ascii", [False, True])
-def test_a_truncated_cloud_is_refused(tmp_path: Path, ascii: bool) -> None:  # noqa: A002
+def test_a_truncated_cloud_is_refused(tmp_path, ascii):  # noqa: A002
     path = tmp_path / "cloud.ply"
     write_ply(path, example_cloud(), ascii=ascii)
     whole = path.read_bytes()
@@ -159,13 +155,13 @@ def test_a_truncated_cloud_is_refused(tmp_path: Path, ascii: bool) -> None:  # n
             read_ply(path)
 
 
-def test_a_header_that_promises_more_than_memory_is_refused(tmp_path: Path) -> None:
+def test_a_header_that_promises_more_than_memory_is_refused(tmp_path):
     path = write_raw(tmp_path / "a.ply", XYZ, b"\0" * 24, 10**15, kind="binary_little_endian")
     with pytest.raises(FormatError, match="truncated"):
         read_ply(path)
 
 
-def test_survey_coordinates_that_would_become_steps_are_refused(tmp_path: Path) -> None:
+def test_survey_coordinates_that_would_become_steps_are_refused(tmp_path):
     xyz = np.array([4.5e5, 5.4e6, 300]) + np.random.default_rng(0).uniform(0, 10, (100, 3))
     path, kind = tmp_path / "utm.ply", "binary_little_endian"
     write_raw(path, DOUBLES, xyz.astype("<f8").tobytes(), 100, kind)
@@ -181,7 +177,7 @@ T_SURVEY_MAP = make_transform(
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_points_of_a_survey_come_back_turned_and_moved(tmp_path: Path, suffix: str) -> None:
+def test_points_of_a_survey_come_back_turned_and_moved(tmp_path, suffix):
     laspy = pytest.importorskip("laspy")
     parts = [example_cloud(1000), example_cloud(10)]
     path = tmp_path / f"cloud.{suffix}"
@@ -215,7 +211,7 @@ def test_points_of_a_survey_come_back_turned_and_moved(tmp_path: Path, suffix: s
         ("EPSG:2263", "not metres"),  # feet
     ],
 )
-def test_other_coordinates_are_refused(tmp_path: Path, name: str, why: str) -> None:
+def test_other_coordinates_are_refused(tmp_path, name, why):
     pytest.importorskip("laspy")
     with pytest.raises(SettingsError, match=why):
         write_las(tmp_path / "cloud.laz", [], np.eye(4), name)
@@ -236,9 +232,7 @@ def test_other_coordinates_are_refused(tmp_path: Path, name: str, why: str) -> N
         ("+proj=utm +zone=32 +ellps=GRS80 +units=m", 0.0, 0.0, True),  # no area is stated
     ],
 )
-def test_positions_lie_in_the_area_of_their_system(
-    name: str, east: float, north: float, inside: bool
-) -> None:
+def test_positions_lie_in_the_area_of_their_system(name, east, north, inside):
     pytest.importorskip("pyproj")
     place = np.array([east, north, 100.0])
     if inside:
@@ -248,7 +242,7 @@ def test_positions_lie_in_the_area_of_their_system(
         check_inside(name, place, "gnss.txt")
 
 
-def test_without_laspy_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_laspy_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(MissingDependencyError, match=r"recon\[survey\]"):
         write_las(tmp_path / "cloud.laz", [], np.eye(4))
@@ -259,7 +253,7 @@ CELLS = np.array([[FREE, FREE, FREE, OCCUPIED], [FREE] * 4, [UNKNOWN, FREE, FREE
 GRID = OccupancyGrid(CELLS, 0.2, (-3.4, 1.25))
 
 
-def test_a_grid_is_written_as_nav2_and_a_gis_ask_and_read_back(tmp_path: Path) -> None:
+def test_a_grid_is_written_as_nav2_and_a_gis_ask_and_read_back(tmp_path):
     image, description = write_nav2(tmp_path / "map" / "grid", GRID)
     assert (image.name, description.name) == ("grid.pgm", "grid.yaml")
     back = read_nav2(description)
@@ -280,7 +274,7 @@ def test_a_grid_is_written_as_nav2_and_a_gis_ask_and_read_back(tmp_path: Path) -
     assert (x_step, y_turn, x_turn, y_step) == (0.2, 0, 0, -0.2)
 
 
-def test_a_negated_map_with_comments_is_read(tmp_path: Path) -> None:
+def test_a_negated_map_with_comments_is_read(tmp_path):
     (tmp_path / "a.pgm").write_bytes(b"P5\n# made by hand\n2 1\n255\n\xff\x00")
     fields = {"image": "a.pgm", "resolution": 0.5, "origin": [0, 0, 0], "negate": 1}
     fields |= {"occupied_thresh": 0.65, "free_thresh": 0.196}
@@ -288,7 +282,7 @@ def test_a_negated_map_with_comments_is_read(tmp_path: Path) -> None:
     assert read_nav2(tmp_path / "a.yaml").cells.tolist() == [[OCCUPIED, FREE]]
 
 
-def test_the_origin_is_written_as_it_is_meant(tmp_path: Path) -> None:
+def test_the_origin_is_written_as_it_is_meant(tmp_path):
     origin_m = (-646 * 0.1, 3 * 0.1)
     assert origin_m == (-64.60000000000001, 0.30000000000000004)
     _, path = write_nav2(tmp_path / "grid", OccupancyGrid(np.zeros((2, 2), np.int8), 0.1, origin_m))
@@ -319,9 +313,7 @@ def by_pyoctomap(voxels: OccupancyVoxels) -> tuple[bytes, bytes]:
 @pytest.mark.parametrize(
     ("reach", "number"), [(5, 1), (6, 9000), (30, 20_000), (700, 3000), (KEY_LIMIT, 500)]
 )
-def test_files_are_those_of_octomap_byte_for_byte_and_keep_every_cell(
-    tmp_path: Path, reach: int, number: int
-) -> None:
+def test_files_are_those_of_octomap_byte_for_byte_and_keep_every_cell(tmp_path, reach, number):
     voxels = random_voxels(reach, reach, number)
     binary, full = write_octomap(tmp_path / "map", voxels)
     assert (full.read_bytes(), binary.read_bytes()) == by_pyoctomap(voxels)
@@ -333,7 +325,7 @@ def test_files_are_those_of_octomap_byte_for_byte_and_keep_every_cell(
 
 
 @pytest.mark.parametrize("depth", [1, 3, 6, 11])
-def test_a_map_in_tiles_gives_the_same_files(tmp_path: Path, depth: int) -> None:
+def test_a_map_in_tiles_gives_the_same_files(tmp_path, depth):
     voxels = random_voxels(2, 40, 6000)
     write_octomap(tmp_path / "whole", voxels)
     tile = voxels.keys[:, :2] >> depth
@@ -349,7 +341,7 @@ def test_a_map_in_tiles_gives_the_same_files(tmp_path: Path, depth: int) -> None
 
 
 @pytest.mark.parametrize("cell", [-KEY_LIMIT - 1, KEY_LIMIT])
-def test_a_map_too_large_for_octomap_is_refused(tmp_path: Path, cell: int) -> None:
+def test_a_map_too_large_for_octomap_is_refused(tmp_path, cell):
     voxels = OccupancyVoxels(np.array([[0, cell, 0]], np.int32), np.ones(1, np.float32), 0.2)
     with pytest.raises(MappingError, match="too large"):
         write_octomap(tmp_path / "map", voxels)
@@ -357,7 +349,7 @@ def test_a_map_too_large_for_octomap_is_refused(tmp_path: Path, cell: int) -> No
 
 
 @pytest.mark.parametrize("nodes_each", [1, 7, 1000, 10**9])
-def test_a_file_is_read_in_pieces_in_its_order(tmp_path: Path, nodes_each: int) -> None:
+def test_a_file_is_read_in_pieces_in_its_order(tmp_path, nodes_each):
     _, full = write_octomap(tmp_path / "map", random_voxels(3, 8, 2000))
     whole, pieces = read_octomap(full), list(octomap_pieces(full, nodes_each))
     assert len(pieces) > 1 or nodes_each == 10**9
@@ -367,7 +359,7 @@ def test_a_file_is_read_in_pieces_in_its_order(tmp_path: Path, nodes_each: int) 
         np.testing.assert_array_equal(joined, getattr(whole, name))
 
 
-def test_a_piece_takes_memory_for_its_cells_alone(tmp_path: Path) -> None:
+def test_a_piece_takes_memory_for_its_cells_alone(tmp_path):
     _, full = write_octomap(tmp_path / "map", random_voxels(5, 60, 200_000))
     cells = sum(len(piece) for piece in octomap_pieces(full, 1000))  # compiles the kernel
     tracemalloc.start()
@@ -378,7 +370,7 @@ def test_a_piece_takes_memory_for_its_cells_alone(tmp_path: Path) -> None:
     assert peak_bytes < 3e5
 
 
-def test_pruned_leaves_of_octomaps_own_files_are_expanded(tmp_path: Path) -> None:
+def test_pruned_leaves_of_octomaps_own_files_are_expanded(tmp_path):
     keys = np.stack(np.unravel_index(np.arange(12**3), (12, 12, 12)), axis=1) - 4
     tree = pyoctomap.OcTree(0.2)
     for centre in ((keys + 0.5) * 0.2).tolist():
@@ -394,7 +386,7 @@ def test_pruned_leaves_of_octomaps_own_files_are_expanded(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "kind", ["cut", "no tree", "more nodes", "leaf near the root", "not a number", "another tree"]
 )
-def test_a_damaged_ot_file_is_a_format_error(tmp_path: Path, kind: str) -> None:
+def test_a_damaged_ot_file_is_a_format_error(tmp_path, kind):
     _, full = write_octomap(tmp_path / "map", random_voxels(4, 30, 3000))
     content = full.read_bytes()
     head, data, nodes = content.partition(b"data\n")

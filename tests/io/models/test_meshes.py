@@ -1,7 +1,5 @@
 """Mesh files and MeshLab projects: each keeps what was written, and other programs read it."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -14,7 +12,6 @@ import pytest
 
 from recon.core.errors import FormatError, OutputError
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
-from recon.core.values.cloud import Frame
 from recon.io.images.image import write_image
 from recon.io.models import open3d_meshes
 from recon.io.models.mesh import MESH_SUFFIXES, read_mesh, srgb_from_linear, write_glb, write_mesh
@@ -40,9 +37,7 @@ def triangles(vertices: np.ndarray, faces: np.ndarray) -> set[tuple[tuple[float,
 
 # Text rounds; Open3D keeps a GLB's linear colours in bytes, which are coarse in the dark.
 @pytest.mark.parametrize(("suffix", "off"), [*zip(MESH_SUFFIXES, (0, 1, None, 4), strict=True)])
-def test_every_format_gives_triangles_and_colours_back(
-    tmp_path: Path, suffix: str, off: int | None
-) -> None:
+def test_every_format_gives_triangles_and_colours_back(tmp_path, suffix, off):
     write_mesh(tmp_path / f"mesh{suffix}", MESH)
     again = read_mesh(tmp_path / f"mesh{suffix}")
     assert triangles(again.vertices, again.faces) == triangles(MESH.vertices, MESH.faces)
@@ -54,7 +49,7 @@ def test_every_format_gives_triangles_and_colours_back(
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl"])
-def test_meshlab_opens_it(tmp_path: Path, suffix: str) -> None:
+def test_meshlab_opens_it(tmp_path, suffix):
     write_mesh(tmp_path / f"mesh{suffix}", MESH)
     meshes = pymeshlab.MeshSet()
     meshes.load_new_mesh(str(tmp_path / f"mesh{suffix}"))
@@ -62,7 +57,7 @@ def test_meshlab_opens_it(tmp_path: Path, suffix: str) -> None:
     assert seen == triangles(MESH.vertices, MESH.faces)
 
 
-def test_ply_keeps_floats_normals_and_colours_bit_by_bit(tmp_path: Path) -> None:
+def test_ply_keeps_floats_normals_and_colours_bit_by_bit(tmp_path):
     write_mesh(tmp_path / "mesh.ply", MESH)
     again = read_mesh(tmp_path / "mesh.ply")
     for name in ("vertices", "faces", "normals", "rgb"):
@@ -72,7 +67,7 @@ def test_ply_keeps_floats_normals_and_colours_bit_by_bit(tmp_path: Path) -> None
     assert read_mesh(tmp_path / "mesh.ply").rgb is None
 
 
-def test_an_ascii_mesh_of_others_is_read(tmp_path: Path) -> None:
+def test_an_ascii_mesh_of_others_is_read(tmp_path):
     (tmp_path / "a.ply").write_text(
         "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 3\nproperty double x\n"
         "property double y\nproperty double z\nelement face 1\n"
@@ -82,9 +77,7 @@ def test_an_ascii_mesh_of_others_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb"])
-def test_junk_and_missing_files_are_refused_quietly(
-    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_junk_and_missing_files_are_refused_quietly(tmp_path, suffix, capfd):
     with pytest.raises(FormatError, match="no such file"):
         read_mesh(tmp_path / f"none{suffix}")
     (tmp_path / f"junk{suffix}").write_bytes(b"junk")
@@ -95,7 +88,7 @@ def test_junk_and_missing_files_are_refused_quietly(
     assert capfd.readouterr().out == ""
 
 
-def test_an_unknown_suffix_and_an_empty_mesh_are_not_written(tmp_path: Path) -> None:
+def test_an_unknown_suffix_and_an_empty_mesh_are_not_written(tmp_path):
     with pytest.raises(OutputError, match=r"expected .ply .obj .stl .glb"):
         write_mesh(tmp_path / "mesh.xyz", MESH)
     empty = TriangleMesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
@@ -115,7 +108,7 @@ def read_chunks(path: Path) -> tuple[dict, bytes]:
     return json.loads(data[20:rest]), data[rest + 8 :]
 
 
-def test_the_arrays_of_a_glb_lie_where_the_accessors_say(tmp_path: Path) -> None:
+def test_the_arrays_of_a_glb_lie_where_the_accessors_say(tmp_path):
     write_glb(tmp_path / "mesh.glb", MESH)
     document, binary = read_chunks(tmp_path / "mesh.glb")
     primitive = document["meshes"][0]["primitives"][0]
@@ -140,13 +133,13 @@ def test_the_arrays_of_a_glb_lie_where_the_accessors_say(tmp_path: Path) -> None
     assert (box["min"], box["max"]) == ([0, 0, 0], [1, 2, 3])
 
 
-def test_srgb_from_linear_is_monotonic_and_keeps_the_ends() -> None:
+def test_srgb_from_linear_is_monotonic_and_keeps_the_ends():
     curve = srgb_from_linear(np.arange(256, dtype=np.uint8))
     assert (curve[0], curve[255]) == (0, 255)
     assert (np.diff(curve.astype(int)) >= 0).all()
 
 
-def test_only_colours_from_images_are_unlit_and_unknown_axes_are_not_turned(tmp_path: Path) -> None:
+def test_only_colours_from_images_are_unlit_and_unknown_axes_are_not_turned(tmp_path):
     for name, rgb in (("grey", None), ("coloured", MESH.rgb), ("again", MESH.rgb)):
         write_glb(tmp_path / name, TriangleMesh(MESH.vertices, MESH.faces, rgb=rgb))
     documents = [read_chunks(tmp_path / name)[0] for name in ("grey", "coloured")]
@@ -158,9 +151,7 @@ def test_only_colours_from_images_are_unlit_and_unknown_axes_are_not_turned(tmp_
 @pytest.mark.parametrize(
     ("frame", "up", "ahead"), [("camera", [0, -1, 0], [0, 0, 1]), ("map", [0, 0, 1], [1, 0, 0])]
 )
-def test_the_node_turns_the_mesh_upright(
-    tmp_path: Path, frame: Frame, up: list[int], ahead: list[int]
-) -> None:
+def test_the_node_turns_the_mesh_upright(tmp_path, frame, up, ahead):
     write_glb(tmp_path / "a.glb", MESH, frame)
     document, _ = read_chunks(tmp_path / "a.glb")
     turn = np.reshape(document["nodes"][0]["matrix"], (4, 4)).T
@@ -180,7 +171,7 @@ def sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def test_components_are_counted_and_labelled() -> None:
+def test_components_are_counted_and_labelled():
     vertices, faces = sheet(3)
     two = np.concatenate([faces, faces[:4] + len(vertices)])
     labels, sizes = open3d_meshes.component_labels(np.concatenate([vertices, vertices + 99]), two)
@@ -188,7 +179,7 @@ def test_components_are_counted_and_labelled() -> None:
     assert labels[0] not in labels[18:]
 
 
-def test_decimation_keeps_a_flat_sheet_flat_and_its_border() -> None:
+def test_decimation_keeps_a_flat_sheet_flat_and_its_border():
     vertices, faces = open3d_meshes.decimate(*sheet(12), 40)
     assert len(faces) <= 40
     np.testing.assert_allclose(vertices[:, 2], 0, atol=1e-6)
@@ -202,7 +193,7 @@ def opened(project: Path) -> pymeshlab.MeshSet:
     return meshes
 
 
-def test_meshlab_opens_every_layer_after_the_folder_has_moved(tmp_path: Path) -> None:
+def test_meshlab_opens_every_layer_after_the_folder_has_moved(tmp_path):
     cloud, mesh = tmp_path / "here/map/cloud & more.ply", tmp_path / "here/mesh/mesh.ply"
     write_ply(cloud, PointCloud(np.tile(MESH.vertices, (3, 1))))
     write_mesh(mesh, MESH)
@@ -212,7 +203,7 @@ def test_meshlab_opens_every_layer_after_the_folder_has_moved(tmp_path: Path) ->
     assert [(one.vertex_number(), one.face_number()) for one in layers] == [(12, 0), (4, 4)]
 
 
-def test_a_layer_that_does_not_exist_is_refused(tmp_path: Path) -> None:
+def test_a_layer_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
         write_mlp(tmp_path / "a.mlp", {"cloud": tmp_path / "none.ply"})
     assert list(tmp_path.iterdir()) == []
@@ -230,9 +221,7 @@ RIGHT, UP, AHEAD = [1, 0, 0], [0, 1, 0], [0, 0, -1]
         (None, {(1, 0, 0): RIGHT, (0, 1, 0): UP, (0, 0, -1): AHEAD}),
     ],
 )
-def test_meshlab_shows_every_frame_upright_and_from_behind_the_camera(
-    tmp_path: Path, frame: Frame | None, axes: dict[tuple[int, ...], list[int]]
-) -> None:
+def test_meshlab_shows_every_frame_upright_and_from_behind_the_camera(tmp_path, frame, axes):
     write_ply(tmp_path / "cloud.ply", PointCloud(np.array([*axes], dtype=np.float32)))
     write_mlp(tmp_path / "a.mlp", {"cloud": tmp_path / "cloud.ply"}, frame)
     meshes = opened(tmp_path / "a.mlp")  # which its meshes do not outlive
@@ -241,7 +230,7 @@ def test_meshlab_shows_every_frame_upright_and_from_behind_the_camera(
     np.testing.assert_array_equal(shown.vertex_matrix(), [*axes])
 
 
-def test_meshlab_reads_the_camera_of_a_photo(tmp_path: Path) -> None:
+def test_meshlab_reads_the_camera_of_a_photo(tmp_path):
     camera = RectifiedCamera(120.0, 50.0, 20.0, 50.0, 0.1, 160, 120)
     write_image(tmp_path / "left.png", np.zeros((120, 160), np.uint8))
     write_ply(tmp_path / "cloud.ply", PointCloud(MESH.vertices))

@@ -1,7 +1,5 @@
 """The compiled adjustment equals its reference, and its derivatives are those of its residuals."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -132,7 +130,7 @@ def rounding_of_the_normal_equations(window: Window) -> NormalEquations:
 
 @given(windows)
 @settings(max_examples=60)
-def test_normal_equations_equal_their_reference(window: Window) -> None:
+def test_normal_equations_equal_their_reference(window):
     ours, reference = linearise(*window, MODEL), linearise_reference(*window, MODEL)
     bounds = rounding_of_the_normal_equations(window)
     for name in NormalEquations._fields:
@@ -143,7 +141,7 @@ def test_normal_equations_equal_their_reference(window: Window) -> None:
 @given(windows)
 @settings(max_examples=60)
 @example(make_window(420, 3, 3, 0.5))  # 1.5e-12 of the cost apart, found by chance
-def test_cost_equals_its_reference(window: Window) -> None:
+def test_cost_equals_its_reference(window):
     difference = abs(cost(*window, tuple(MODEL)) - cost_reference(*window, MODEL))
     assert difference <= rounding_of_the_cost(window)
 
@@ -156,9 +154,7 @@ def condition(H: np.ndarray) -> float:
 
 @given(st.integers(0, 2**20), st.integers(2, 4), st.sampled_from([1e-4, 1e-1]))
 @settings(max_examples=40)
-def test_reduced_step_equals_that_of_the_whole_system(
-    seed: int, frames: int, damping: float
-) -> None:
+def test_reduced_step_equals_that_of_the_whole_system(seed, frames, damping):
     normal = linearise(*make_window(seed, frames, points=25), MODEL)
     H, g = whole_system(normal, damping)
     ours = np.concatenate([part.ravel() for part in solve_step(normal, damping)])
@@ -180,7 +176,7 @@ def test_reduced_step_equals_that_of_the_whole_system(
     assert error <= condition(H[6:, 6:]) * unsolved
 
 
-def test_the_first_pose_and_an_empty_system_make_no_step() -> None:
+def test_the_first_pose_and_an_empty_system_make_no_step():
     step_pose, _ = solve_step(linearise(*make_window(3, 4, 25), MODEL), 1e-4)
     assert not step_pose[0].any()
     assert step_pose[1:].all()
@@ -189,7 +185,7 @@ def test_the_first_pose_and_an_empty_system_make_no_step() -> None:
     assert step_point.shape == (0, 3)
 
 
-def test_gradient_is_the_slope_of_the_cost() -> None:
+def test_gradient_is_the_slope_of_the_cost():
     """Central differences along each coordinate of a pose and of a point."""
     T, uvd, xyz = make_window(5, 3, 20)
     keep = np.einsum("j,nj->n", T[0, 2, :3], xyz) > 3.0

@@ -1,7 +1,5 @@
 """The compiled placing of patches equals its reference."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from hypothesis import given, settings
@@ -30,7 +28,7 @@ def place_patches(
     growth=st.floats(0.6, 1.6),
 )
 @settings(max_examples=40)
-def test_placing_equals_its_reference(seed: int, smooth: float, turn: float, growth: float) -> None:
+def test_placing_equals_its_reference(seed, smooth, turn, growth):
     rng = np.random.default_rng(seed)
     source, target = (image(rng, smooth) for _ in range(2))
     uv = rng.uniform(-3, 35, (12, 2))
@@ -52,7 +50,7 @@ def image(rng: np.random.Generator, smooth: float) -> np.ndarray:
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-def test_a_patch_without_texture_or_with_edges_of_one_direction_has_no_place() -> None:
+def test_a_patch_without_texture_or_with_edges_of_one_direction_has_no_place():
     flat = np.full((30, 34), 128, np.uint8)
     edge = np.where(np.arange(34) < 15, 50, 200)[None].repeat(30, axis=0).astype(np.uint8)
     uv = np.array([[15.0, 15.0]])

@@ -1,7 +1,5 @@
 """What exact tracks of a drive show of a turned right camera and of lenses that bend."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -11,7 +9,7 @@ import pytest
 
 from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
-from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoCalibration
+from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.odometry.rig.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.refine import compare_rigs
@@ -98,12 +96,12 @@ def rms(off: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("values", [fault(yaw=1e-4), TURN, LENSES, TURN + LENSES])
-def test_places_are_where_a_rig_without_the_fault_sees_them(values: np.ndarray) -> None:
+def test_places_are_where_a_rig_without_the_fault_sees_them(values):
     assert rms(off_px(values, NONE)).max() > 0.05
     assert np.abs(off_px(values, values)).max() < 0.01
 
 
-def test_places_follow_the_fault_as_its_derivatives_say() -> None:
+def test_places_follow_the_fault_as_its_derivatives_say():
     rng, step = np.random.default_rng(0), 1e-6
     left, right = rng.uniform(0, [CAMERA.width_px, CAMERA.height_px], (2, 50, 2))
     at = FAULT.correct(left, right, NONE)
@@ -135,9 +133,7 @@ def raw_rig() -> StereoCalibration:
 @pytest.mark.parametrize(
     "values", [fault(yaw=2e-3), fault(pitch=2e-3, roll=-2e-3), LENSES, LENSES + TURN]
 )
-def test_the_calibration_without_a_fault_sees_what_is_left_of_it(
-    rig: Rig, values: np.ndarray
-) -> None:
+def test_the_calibration_without_a_fault_sees_what_is_left_of_it(rig, values):
     turns, depth_m = turns_of(rig, SETTINGS), 10.0
     camera = turns.camera
     refined = without_fault(rig, turns, values)
@@ -159,7 +155,7 @@ def test_the_calibration_without_a_fault_sees_what_is_left_of_it(
     assert rms((found - both)[shown]) < 0.04 * rms(both[shown])
 
 
-def test_a_refined_rig_projects_points_to_where_they_were_seen() -> None:
+def test_a_refined_rig_projects_points_to_where_they_were_seen():
     refined = without_fault(CAMERA, turns_of(CAMERA, SETTINGS), TURN + LENSES)
     rng = np.random.default_rng(0)
     xyz = rng.uniform([-0.8, -0.25, 1.0], [0.8, 0.25, 1.0], (100, 3)) * 20.0
@@ -174,7 +170,7 @@ def test_a_refined_rig_projects_points_to_where_they_were_seen() -> None:
     "values", [fault(pitch=2e-3), fault(yaw=1e-3), fault(zoom=2e-3), TURN],
     ids=["pitch", "yaw", "zoom", "all"],
 )  # fmt: skip
-def test_a_turn_of_the_right_camera_is_recovered(values: np.ndarray) -> None:
+def test_a_turn_of_the_right_camera_is_recovered(values):
     found = fitted(values)
     assert rms(off_px(values, found.values)).max() < 0.1 * rms(off_px(values, NONE)).max()
     # Where lenses cannot bend, the turn is all there is: 5e-5 rad are 0.035 px.
@@ -183,7 +179,7 @@ def test_a_turn_of_the_right_camera_is_recovered(values: np.ndarray) -> None:
     assert not turned.covariance[4:].any()
 
 
-def test_rows_meet_and_disparities_fit_with_the_lenses_that_are_found() -> None:
+def test_rows_meet_and_disparities_fit_with_the_lenses_that_are_found():
     found = fitted(LENSES)
     before, after = rms(off_px(LENSES, NONE)), rms(off_px(LENSES, found.values))
     assert (before > [0.35, 0.45]).all()
@@ -192,13 +188,13 @@ def test_rows_meet_and_disparities_fit_with_the_lenses_that_are_found() -> None:
     assert 1.0 <= found.scatter < 2.0
 
 
-def test_nothing_is_invented_by_noise() -> None:
+def test_nothing_is_invented_by_noise():
     drives = [fitted(NONE, 100 * n) for n in range(3)]
     assert max(rms(off_px(NONE, drive.values)).max() for drive in drives) < 0.05
     assert all((np.linalg.eigvalsh(drive.covariance) > 0).all() for drive in drives)
 
 
-def test_directions_that_a_drive_shows_well_stay_and_others_become_zero() -> None:
+def test_directions_that_a_drive_shows_well_stay_and_others_become_zero():
     sigmas = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
     H = np.diag([1e6, 1e6, 1.0, 100.0, 0.0])
     values = np.array([0.5, -1.0, 0.4, 0.3, 0.7])
@@ -229,7 +225,7 @@ def with_lens(**changes: object) -> StereoCalibration:
     ],
     ids=["rectified", "plain", "prisms", "rational", "fisheye"],
 )
-def test_lenses_of_other_models_are_left_as_they_are(rig: Rig, *, bends: bool) -> None:
+def test_lenses_of_other_models_are_left_as_they_are(rig, *, bends):
     assert may_bend(rig) == bends
     assert active(rig)[:4].all()
     assert (active(rig)[4:] == bends).all()

@@ -1,7 +1,5 @@
 """The rig of a rendered drive is refined where it is off, and only there."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -29,7 +27,7 @@ FRAMES = 36  # as few as are refined
 
 
 @pytest.fixture(scope="module")
-def street() -> Film:
+def street():
     size = {"width_px": 400, "height_px": 136, "focal_px": 225.0, "smooth_edges": False}
     return film(StreetScene(frames=FRAMES, seed=3, **size))
 
@@ -51,9 +49,7 @@ def off(rig: Rig, other: Rig) -> RigChange:
     [(0.25, 1.0), (-0.25, 1.005), (0.0, 0.995)],
     ids=["yaw", "yaw and focal length", "focal length"],
 )
-def test_a_turned_right_camera_is_recovered_and_said(
-    street: Film, yaw_deg: float, enlarged: float
-) -> None:
+def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
     source = faults.turned(street, yaw_deg=yaw_deg, enlarged=enlarged)
     true = turned_rig(street.calibration, yaw_deg, enlarged)
     planted = off(street.calibration, true)
@@ -82,7 +78,7 @@ def test_a_turned_right_camera_is_recovered_and_said(
     assert (len(drive), drive.name) == (len(source), source.name)
 
 
-def test_a_clean_street_keeps_its_calibration(street: Film) -> None:
+def test_a_clean_street_keeps_its_calibration(street):
     rig = refine_rig(street, CONFIG, AUTO)
     assert rig.fitted is not None
     assert off(street.calibration, rig.calibration).rms_px <= 0.05
@@ -98,9 +94,7 @@ def test_a_clean_street_keeps_its_calibration(street: Film) -> None:
     [(True, False, True), (False, True, True), (False, False, False)],
     ids=["too short", "live", "off"],
 )
-def test_what_is_not_to_be_refined_is_not_read(
-    street: Film, *, short: bool, live: bool, refine: bool
-) -> None:
+def test_what_is_not_to_be_refined_is_not_read(street, *, short, live, refine):
     def unread(_: int) -> StereoPair:
         raise AssertionError
 
@@ -114,14 +108,14 @@ def test_what_is_not_to_be_refined_is_not_read(
 
 
 @pytest.mark.parametrize("drive", ["black", "standing still"])
-def test_a_drive_that_shows_nothing_keeps_its_calibration(street: Film, drive: str) -> None:
+def test_a_drive_that_shows_nothing_keeps_its_calibration(street, drive):
     black = street.taken(slice(None), np.zeros_like)
     still = Film(FRAMES * street.pairs[:1], street.calibration, street.trajectory.T_world_camera)
     rig = refine_rig({"black": black, "standing still": still}[drive], CONFIG, AUTO)
     assert (rig.refined, rig.figures()) == (False, {"refined": False})
 
 
-def test_depth_behind_infinity_is_said_and_can_be_stored(street: Film) -> None:
+def test_depth_behind_infinity_is_said_and_can_be_stored(street):
     camera = street.calibration
     true = turned_rig(camera, yaw_deg=2.0)
     changes = tuple(compare_rigs(camera, true, z, CONFIG.rectification) for z in (10.0, 30.0))
@@ -138,7 +132,7 @@ def test_depth_behind_infinity_is_said_and_can_be_stored(street: Film) -> None:
     assert not replace(rig, sigma_px=10.0).wrong_at(10.0)
 
 
-def test_known_poses_are_those_of_the_refined_rig(street: Film) -> None:
+def test_known_poses_are_those_of_the_refined_rig(street):
     camera = street.calibration
     refined = turned_rig(camera, pitch_deg=1.0)
     rig = RefinedRig(camera, refined, camera)
@@ -186,7 +180,7 @@ GIVEN = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)
 
 
 @pytest.mark.parametrize("kind", [Cached, Plain, lambda: Frozen(GIVEN), Own])
-def test_a_source_of_any_kind_takes_another_calibration(kind) -> None:
+def test_a_source_of_any_kind_takes_another_calibration(kind):
     source, other = kind(), replace(GIVEN, baseline_m=0.25)
     assert source.calibration is GIVEN
     changed = source.with_calibration(other)

@@ -1,7 +1,5 @@
 """Ten common faults of recordings, injected into a drive without faults."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property

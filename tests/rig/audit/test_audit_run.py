@@ -1,7 +1,5 @@
 """The audit finds each injected fault, and nothing in a drive without faults."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +30,7 @@ def rendered(seed: int, frames: int) -> faults.Spoiled:
 
 
 @pytest.fixture(scope="module")
-def street() -> faults.Spoiled:
+def street():
     """A rendered drive without a fault, kept in memory."""
     return rendered(5, FRAMES)
 
@@ -41,7 +39,7 @@ def codes(source: StereoSource, *, quick: bool = False) -> set[str]:
     return {finding.code for finding in audit_source(source, CONFIG, quick=quick).findings}
 
 
-def test_a_clean_drive_is_good_and_its_figures_are_right(street: faults.Spoiled) -> None:
+def test_a_clean_drive_is_good_and_its_figures_are_right(street):
     audit = audit_source(street, CONFIG)
     assert (audit.verdict, audit.findings) == ("good", ())
     assert audit.figures["gain"] == pytest.approx(1, abs=0.02)
@@ -53,7 +51,7 @@ def test_a_clean_drive_is_good_and_its_figures_are_right(street: faults.Spoiled)
 
 
 @pytest.mark.parametrize("fault", faults.FAULTS)
-def test_each_planted_fault_is_found_and_no_other(street: faults.Spoiled, fault: str) -> None:
+def test_each_planted_fault_is_found_and_no_other(street, fault):
     code, plant = faults.FAULTS[fault]
     audit = audit_source(plant(street), CONFIG)
     assert [finding.code for finding in audit.findings] == [code]
@@ -68,9 +66,7 @@ def test_each_planted_fault_is_found_and_no_other(street: faults.Spoiled, fault:
 
 
 @pytest.mark.parametrize("pitch_deg", [0.3, -0.3])
-def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(
-    street: faults.Spoiled, tmp_path: Path, pitch_deg: float
-) -> None:
+def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(street, tmp_path, pitch_deg):
     assert_aligned(faults.turned(street, pitch_deg=pitch_deg, roll_deg=0.2), tmp_path)
 
 
@@ -92,9 +88,7 @@ def assert_aligned(spoiled: faults.Spoiled, folder: Path) -> None:
     assert abs(after.figures["mend_pitch_deg"]) < 0.02
 
 
-def test_a_rig_that_is_not_rectified_is_corrected_too(
-    street: faults.Spoiled, tmp_path: Path
-) -> None:
+def test_a_rig_that_is_not_rectified_is_corrected_too(street, tmp_path):
     """Both raw cameras look elsewhere than the rectified ones; the right one is off by 0.3°."""
     left_rad, right_rad = np.radians([[-0.8, 2.0, 0.6], [1.1, -1.5, -0.7]])
     assert codes(faults.unrectified(street, left_rad, right_rad)) == set()
@@ -102,13 +96,13 @@ def test_a_rig_that_is_not_rectified_is_corrected_too(
 
 
 @pytest.fixture(scope="module")
-def longer_street() -> faults.Spoiled:
+def longer_street():
     """A drive long enough for its motion to show the rig."""
     return rendered(3, 48)
 
 
 @pytest.mark.slow
-def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street: faults.Spoiled) -> None:
+def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street):
     audit = audit_source(longer_street, CONFIG)
     assert audit.findings == ()
     found = audit.figures["rig_by_motion"]
@@ -121,8 +115,8 @@ def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street: faults.Spoile
     ("yaw_deg", "enlarged", "pitch_deg"), [(0.25, 1.0, 0.0), (-0.25, 1.005, 0.0), (0.25, 1.0, 0.3)]
 )
 def test_a_turn_that_only_motion_shows_is_mended(
-    longer_street: faults.Spoiled, tmp_path: Path, yaw_deg: float, enlarged: float, pitch_deg: float
-) -> None:
+    longer_street, tmp_path, yaw_deg, enlarged, pitch_deg
+):
     spoiled = faults.turned(longer_street, pitch_deg, yaw_deg=yaw_deg, enlarged=enlarged)
     before = audit_source(spoiled, CONFIG)
     assert "rig" in {finding.code for finding in before.findings}
@@ -138,9 +132,7 @@ def test_a_turn_that_only_motion_shows_is_mended(
 @pytest.mark.real
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
-def test_planted_faults_alone_are_found_on_real_drives(
-    recon_data: Path, tmp_path: Path, drive: str
-) -> None:
+def test_planted_faults_alone_are_found_on_real_drives(recon_data, tmp_path, drive):
     source = open_source(recon_data / "driven" / drive)
     assert codes(source) == {"rig"}  # lenses of KITTI: 0.6 px over the image
     assert codes(source, quick=True) == set()
@@ -151,23 +143,21 @@ def test_planted_faults_alone_are_found_on_real_drives(
 
 @pytest.mark.real
 @pytest.mark.parametrize("scene", ["Motorcycle", "Piano", "Playroom", "Recycle", "Teddy"])
-def test_nothing_is_found_on_scenes_of_one_pair(recon_data: Path, scene: str) -> None:
+def test_nothing_is_found_on_scenes_of_one_pair(recon_data, scene):
     source = open_source(recon_data / "middlebury/MiddEval3/trainingQ" / scene)
     assert audit_source(source, CONFIG).findings == ()
 
 
 @pytest.mark.real
 @pytest.mark.slow
-def test_a_turn_planted_in_a_real_drive_is_found(recon_data: Path) -> None:
+def test_a_turn_planted_in_a_real_drive_is_found(recon_data):
     source = open_source(recon_data / "driven" / "kitti_raw_0013")
     drives_ = (source, faults.turned(source, yaw_deg=0.06))
     yaw_deg = [audit_source(drive, CONFIG).figures["rig_by_motion"]["yaw_deg"] for drive in drives_]
     assert yaw_deg[1] - yaw_deg[0] == pytest.approx(-0.06, rel=0.2)
 
 
-def test_frames_that_are_missing_are_reported_with_the_place(
-    street: faults.Spoiled, tmp_path: Path
-) -> None:
+def test_frames_that_are_missing_are_reported_with_the_place(street, tmp_path):
     pairs = [street.take(index) for index in (0, 1, 2, 3, 7, 8, 9)]
     pairs = [replace(pair, index=k) for k, pair in enumerate(pairs)]
     grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
@@ -176,9 +166,7 @@ def test_frames_that_are_missing_are_reported_with_the_place(
     assert "missing at 1 place, at most 0.40 s after frame 3" in findings["gaps"]
 
 
-def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither(
-    street: faults.Spoiled,
-) -> None:
+def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither(street):
     """Pairs at half speed stand in for skew: every other frame, the right one in between."""
 
     def half_late(index: int) -> StereoPair:
@@ -204,7 +192,7 @@ def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither
     assert alone.figures["row_error_rms_px"] < 0.2
 
 
-def test_noise_is_no_frozen_camera() -> None:
+def test_noise_is_no_frozen_camera():
     rng = np.random.default_rng(0)
     scene = rng.integers(20, 200, (64, 96))
     pairs = [

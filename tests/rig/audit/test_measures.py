@@ -1,7 +1,5 @@
 """The measures of an audit, each on data with a known answer."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import cv2
@@ -49,9 +47,7 @@ def features(
     wrong=st.integers(0, 150),
     seed=st.integers(0, 100),
 )
-def test_the_turn_that_mends_rows_is_found_among_wrong_matches(
-    pitch_deg: float, roll_deg: float, wrong: int, seed: int
-) -> None:
+def test_the_turn_that_mends_rows_is_found_among_wrong_matches(pitch_deg, roll_deg, wrong, seed):
     turn = np.radians([pitch_deg, roll_deg])
     left, right = features(np.random.default_rng(seed), *turn, wrong)
     alignment = align_rows(left, right, CAMERA)
@@ -63,7 +59,7 @@ def test_the_turn_that_mends_rows_is_found_among_wrong_matches(
     assert count_aligned(left, right, CAMERA) >= 0.95 * (400 - wrong)
 
 
-def test_rows_that_correspond_have_no_error_but_noise_and_few_features_none() -> None:
+def test_rows_that_correspond_have_no_error_but_noise_and_few_features_none():
     left, right = features(np.random.default_rng(1), 0.0, 0.0)
     alignment = align_rows(left, right, CAMERA)
     assert alignment.rms_px < 0.05  # the noise of 0.2 px is taken away
@@ -72,7 +68,7 @@ def test_rows_that_correspond_have_no_error_but_noise_and_few_features_none() ->
     assert count_aligned(left[:1], right[:1], CAMERA) == 0
 
 
-def test_a_mended_rig_projects_to_the_same_rows() -> None:
+def test_a_mended_rig_projects_to_the_same_rows():
     turn = np.radians([0.5, -0.8])
     left, right = features(np.random.default_rng(3), *turn)
     alignment = align_rows(left, right, CAMERA)
@@ -96,7 +92,7 @@ def texture(seed: int = 0) -> np.ndarray:
     return np.asarray(np.clip(boxes + rng.normal(0, 1, boxes.shape), 0, 255).astype(np.uint8))
 
 
-def test_sharpness_falls_with_blur_and_not_with_brightness() -> None:
+def test_sharpness_falls_with_blur_and_not_with_brightness():
     image = texture()
     sharp = measure_sharpness(image)
     blurred = [measure_sharpness(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.7, 1.2, 2.0, 3.0)]
@@ -107,7 +103,7 @@ def test_sharpness_falls_with_blur_and_not_with_brightness() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.4, 1.8])
-def test_gain_is_measured_although_bright_surfaces_saturate(factor: float) -> None:
+def test_gain_is_measured_although_bright_surfaces_saturate(factor):
     left = cv2.convertScaleAbs(texture(), alpha=1.4)  # up to 210: saturates beyond 1.2
     right = cv2.convertScaleAbs(left, alpha=factor)
     rng = np.random.default_rng(0)
@@ -116,7 +112,7 @@ def test_gain_is_measured_although_bright_surfaces_saturate(factor: float) -> No
     assert np.median(gains) == pytest.approx(factor, rel=0.02)
 
 
-def test_a_late_camera_is_measured_by_the_rows_that_move() -> None:
+def test_a_late_camera_is_measured_by_the_rows_that_move():
     rng = np.random.default_rng(0)
     flow = rng.uniform(-12, 12, 2000)
     error = 0.4 * flow + rng.normal(0, 0.3, 2000)
@@ -127,7 +123,7 @@ def test_a_late_camera_is_measured_by_the_rows_that_move() -> None:
     assert measure_time_skew(error, 0.01 * flow) is None
 
 
-def test_speed_is_that_of_the_rig_and_scales_with_the_baseline() -> None:
+def test_speed_is_that_of_the_rig_and_scales_with_the_baseline():
     rng = np.random.default_rng(0)
     xyz = rng.uniform((-4, -2, 5), (4, 2, 25), (300, 3))
 
@@ -143,7 +139,7 @@ def test_speed_is_that_of_the_rig_and_scales_with_the_baseline() -> None:
     assert measure_speed(left[:10], right[:10], later[:10], CAMERA) is None
 
 
-def test_repeats_are_counted_apart_from_frozen_cameras() -> None:
+def test_repeats_are_counted_apart_from_frozen_cameras():
     images = [texture(seed) for seed in range(8)]
     counter = RepeatCounter()
     for left, right in ((0, 0), (1, 0), (2, 0), (3, 0), (4, 4), (4, 4), (5, 5)):
@@ -154,7 +150,7 @@ def test_repeats_are_counted_apart_from_frozen_cameras() -> None:
     assert counter.both == 1
 
 
-def test_the_verdict_is_that_of_the_worst_finding() -> None:
+def test_the_verdict_is_that_of_the_worst_finding():
     small, large = Finding("gain", False, "dark"), Finding("rows", True, "off")
     assert verdict_of([]) == "good"
     assert verdict_of([small]) == "usable"
@@ -162,7 +158,7 @@ def test_the_verdict_is_that_of_the_worst_finding() -> None:
 
 
 @given(frames=st.integers(1, 5000), quick=st.booleans())
-def test_what_is_looked_at_lies_within_the_drive(frames: int, quick: bool) -> None:
+def test_what_is_looked_at_lies_within_the_drive(frames, quick):
     stretches = plan_stretches(frames, FRAMES, quick=quick)
     assert stretches[0][0] >= 0
     assert stretches[-1][1] <= frames

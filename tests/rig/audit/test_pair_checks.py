@@ -1,7 +1,5 @@
 """One pair: inputs that give no cloud, or one of the wrong scale, are reported."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +25,7 @@ SETTINGS = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
 
 
 @pytest.fixture(scope="module")
-def pair() -> StereoPair:
+def pair():
     """Blurred noise, 12 pixels further left in the right image."""
     world = np.random.default_rng(3).integers(0, 256, (240, 340)).astype(np.uint8)
     world = cv2.normalize(cv2.GaussianBlur(world, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
@@ -43,9 +41,7 @@ def run(
 
 
 @pytest.fixture(scope="module")
-def good_run(
-    pair: StereoPair, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[PairRun, Path, list[str]]:
+def good_run(pair, tmp_path_factory):
     """A run of the pair with a mesh, its folder, and the stages that it told of."""
     progress, out, told = Silent(), tmp_path_factory.mktemp("pair") / "run", []
     progress.on_stage = told.append
@@ -53,9 +49,7 @@ def good_run(
     return run_pair(given, SETTINGS, out=out, formats=("glb",), progress=progress), out, told
 
 
-def test_images_that_show_nothing_are_refused_and_leave_nothing(
-    pair: StereoPair, tmp_path: Path
-) -> None:
+def test_images_that_show_nothing_are_refused_and_leave_nothing(pair, tmp_path):
     assert run(pair, tmp_path / "good").warnings == ()
     dark = replace(pair, right=np.zeros_like(pair.right))
     with pytest.raises(MatchingError, match=r"^left\.png: no pixel .* right camera shows nothing"):
@@ -63,9 +57,7 @@ def test_images_that_show_nothing_are_refused_and_leave_nothing(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_pair_without_a_point_is_refused_with_its_depths(
-    pair: StereoPair, tmp_path: Path
-) -> None:
+def test_a_pair_without_a_point_is_refused_with_its_depths(pair, tmp_path):
     settings = load_config(None, ["cloud.max_range_m=1"], PAIR_DEFAULTS)
     # 300 px and 0.1 m at 12 px: 2.5 m.
     with pytest.raises(MappingError, match=r"the cloud is empty .* at 2\.\d+ to 2\.5 m.* to 1 m"):
@@ -73,7 +65,7 @@ def test_a_pair_without_a_point_is_refused_with_its_depths(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_same_image_twice_is_refused_as_such(pair: StereoPair, tmp_path: Path) -> None:
+def test_the_same_image_twice_is_refused_as_such(pair, tmp_path):
     matrix = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
     left = CameraIntrinsics(matrix, np.zeros(0), 320, 240)
     # Rectified, the image of such a right camera lies farther right: as if they were swapped.
@@ -86,9 +78,7 @@ def test_the_same_image_twice_is_refused_as_such(pair: StereoPair, tmp_path: Pat
     assert not (tmp_path / "out").exists()
 
 
-def test_images_of_two_things_are_said_to_be_hardly_a_pair(
-    pair: StereoPair, tmp_path: Path
-) -> None:
+def test_images_of_two_things_are_said_to_be_hardly_a_pair(pair, tmp_path):
     other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]))
     (said,) = run(other, tmp_path / "out").warnings
     assert said.startswith("only ")
@@ -102,9 +92,7 @@ def test_images_of_two_things_are_said_to_be_hardly_a_pair(
         (replace(CAMERA, cx_px=310.0, cx_right_px=310.0), "calibration is of another size"),
     ],
 )
-def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(
-    pair: StereoPair, tmp_path: Path, camera: RectifiedCamera, word: str
-) -> None:
+def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(pair, tmp_path, camera, word):
     run_ = run(pair, tmp_path / "pair", camera, "pair")
     assert any(word in line for line in run_.warnings)
     assert run_.summary["warnings"] == list(run_.warnings)
@@ -112,9 +100,7 @@ def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(
     assert run(pair, tmp_path / "disparity", camera).warnings == ()
 
 
-def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(
-    good_run: tuple[PairRun, Path, list[str]], tmp_path: Path
-) -> None:
+def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(good_run, tmp_path):
     first, folder, stages = good_run
     assert stages == ["match", "mesh", "report"]  # those that take long, as they begin
     # One plane: all but a rim of two pixels.
@@ -133,14 +119,14 @@ def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(
     assert "0 -1 0 0" in project  # camera axes, turned upright
 
 
-def test_a_pair_run_that_does_not_name_its_camera_is_refused(tmp_path: Path) -> None:
+def test_a_pair_run_that_does_not_name_its_camera_is_refused(tmp_path):
     (tmp_path / "run.json").write_text('{"command": "pair"}')
     (tmp_path / "summary.json").write_text('{"focal_px": null}')
     with pytest.raises(FormatError, match="does not describe its camera"):
         run_mesh(tmp_path, load_config(), out=tmp_path / "out")
 
 
-def test_an_unknown_format_is_refused_before_the_work(pair: StereoPair, tmp_path: Path) -> None:
+def test_an_unknown_format_is_refused_before_the_work(pair, tmp_path):
     with pytest.raises(SettingsError, match=r"--format: unknown mesh format .*fbx"):
         run_pair(PairInput(pair, CAMERA), out=tmp_path / "run", formats=("fbx",))
     assert not (tmp_path / "run").exists()

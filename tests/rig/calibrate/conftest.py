@@ -1,20 +1,15 @@
 """Views of synthetic boards with exact ground truth."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from recon.core.values import StereoCalibration
 from recon.core.values.board import parse_board
 from recon.rig.calibrate.bundle import Sighting, View
 from tests.scenery.boards import board_rig, place_boards
 
 
 @pytest.fixture(scope="session")
-def make_views() -> Callable[..., tuple[StereoCalibration, list[View]]]:
+def make_views():
     """(lens, count, sigma_px, seed, board) -> true rig and its views."""
 
     def make(lens="radtan", count=15, sigma_px=0.1, seed=0, board="chess:9x6:25mm"):

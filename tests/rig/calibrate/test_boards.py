@@ -1,12 +1,9 @@
 """Boards are found in images, told from others, and printed in their size."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from functools import cache
 from itertools import chain
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -46,7 +43,7 @@ def images(text: str) -> list[UInt8]:
 
 @pytest.mark.parametrize("lens", ["radtan", "fisheye"])
 @pytest.mark.parametrize("text", ["chess:9x6:25mm", "chess:7x7:25mm", CHARUCO])
-def test_corners_are_found_to_a_tenth_of_a_pixel(text: str, lens: str) -> None:
+def test_corners_are_found_to_a_tenth_of_a_pixel(text, lens):
     board, errors = parse_board(text), []
     for view, left, _ in rendered(text, lens):
         seen = find_board(left, board)
@@ -59,7 +56,7 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(text: str, lens: str) -> None:
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.12
 
 
-def test_corners_of_a_large_image_are_found_in_a_small_copy_and_refined_in_it() -> None:
+def test_corners_of_a_large_image_are_found_in_a_small_copy_and_refined_in_it():
     board, (view, left, _) = parse_board(CHESS), rendered(CHESS)[0]
     seen = find_board(np.kron(left, np.ones((4, 4), np.uint8)), board)
     truth = (view.left_px + 0.5) * 4 - 0.5
@@ -68,7 +65,7 @@ def test_corners_of_a_large_image_are_found_in_a_small_copy_and_refined_in_it() 
     assert np.sqrt(np.mean(np.sum((found - truth) ** 2, axis=1))) < 0.5
 
 
-def test_a_charuco_board_that_is_half_covered_is_used_in_part() -> None:
+def test_a_charuco_board_that_is_half_covered_is_used_in_part():
     board = parse_board(CHARUCO)
     view, left, _ = rendered(CHARUCO)[0]
     covered = left.copy()
@@ -79,7 +76,7 @@ def test_a_charuco_board_that_is_half_covered_is_used_in_part() -> None:
 
 
 @pytest.mark.parametrize("turn", [0, 1, 2, 3])
-def test_corners_of_the_right_image_run_as_in_the_left_one(turn: int) -> None:
+def test_corners_of_the_right_image_run_as_in_the_left_one(turn):
     board = parse_board("chess:7x7:25mm")
     view = rendered("chess:7x7:25mm")[0][0]
     grid = np.rot90(view.right_px.reshape(7, 7, 2), turn).reshape(-1, 2)
@@ -99,7 +96,7 @@ def test_corners_of_the_right_image_run_as_in_the_left_one(turn: int) -> None:
         ),
     ],
 )
-def test_a_wrong_size_is_found_out_and_the_true_one_said(claimed: str, true: str) -> None:
+def test_a_wrong_size_is_found_out_and_the_true_one_said(claimed, true):
     board, shown = parse_board(f"chess:{claimed}:25mm"), images(f"chess:{true}:25mm")
     seen = [find_board(image, board) for image in shown]
     sizes = [
@@ -115,7 +112,7 @@ def test_a_wrong_size_is_found_out_and_the_true_one_said(claimed: str, true: str
         check_chessboard(sizes, shown.__getitem__, board)
 
 
-def test_squares_that_were_counted_and_larger_boards_of_which_parts_passed_are_reported() -> None:
+def test_squares_that_were_counted_and_larger_boards_of_which_parts_passed_are_reported():
     shown = images(CHESS)
     with pytest.raises(CalibrationError, match="count inner corners, not squares"):
         check_chessboard([None] * 4, shown.__getitem__, parse_board("chess:10x7:25mm"))
@@ -124,7 +121,7 @@ def test_squares_that_were_counted_and_larger_boards_of_which_parts_passed_are_r
         check_chessboard(sizes, lambda n: shown[n % 4], parse_board("chess:7x5:25mm"))
 
 
-def test_a_part_of_a_grid_grows_to_the_whole_but_what_is_cut_off_is_no_other_board() -> None:
+def test_a_part_of_a_grid_grows_to_the_whole_but_what_is_cut_off_is_no_other_board():
     view, left, _ = rendered(CHESS)[0]
     grid = view.left_px.reshape(6, 9, 2)
     assert grown_size(left, grid[1:5, 2:8].reshape(-1, 2), (6, 4)) == (9, 6)
@@ -141,12 +138,12 @@ def test_a_part_of_a_grid_grows_to_the_whole_but_what_is_cut_off_is_no_other_boa
         (CHARUCO.replace("8x6", "5x4"), r"marker ids up to 2\d, expected 0 to 9 for 5x4"),
     ],
 )
-def test_another_charuco_board_is_reported(board: str, message: str) -> None:
+def test_another_charuco_board_is_reported(board, message):
     with pytest.raises(CalibrationError, match=message):
         check_charuco(1, images(CHARUCO).__getitem__, parse_board(board))
 
 
-def test_a_chessboard_for_a_charuco_board_is_reported_and_the_other_way_round() -> None:
+def test_a_chessboard_for_a_charuco_board_is_reported_and_the_other_way_round():
     with pytest.raises(CalibrationError, match=r"without markers \(got 9x6 .*chess:9x6"):
         check_charuco(1, images(CHESS).__getitem__, parse_board(CHARUCO))
     shown = images(CHARUCO)
@@ -154,7 +151,7 @@ def test_a_chessboard_for_a_charuco_board_is_reported_and_the_other_way_round() 
         check_chessboard([None], shown.__getitem__, parse_board("chess:11x9:25mm"))
 
 
-def test_no_board_is_seen_in_noise() -> None:
+def test_no_board_is_seen_in_noise():
     noise = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
     assert find_board(noise, parse_board(CHESS)) is None
     assert find_board(noise, parse_board(CHARUCO)) is None
@@ -163,7 +160,7 @@ def test_no_board_is_seen_in_noise() -> None:
     check_charuco(1, lambda _: flat, parse_board(CHARUCO))
 
 
-def test_an_unknown_or_small_dictionary_is_refused() -> None:
+def test_an_unknown_or_small_dictionary_is_refused():
     blank = np.full((100, 100), 255, np.uint8)
     with pytest.raises(SettingsError, match=r"unknown marker dictionary.*4X4_50"):
         find_board(blank, parse_board("charuco:8x6:30mm:22mm:9x9_10"))
@@ -175,9 +172,7 @@ PT_PER_MM = 72 / 25.4
 
 
 @pytest.mark.parametrize(("text", "square_mm"), [(CHESS, 25.0), (CHARUCO, 30.0)])
-def test_a_png_has_its_corners_where_they_are_on_paper(
-    tmp_path: Path, text: str, square_mm: float
-) -> None:
+def test_a_png_has_its_corners_where_they_are_on_paper(tmp_path, text, square_mm):
     board = parse_board(text)
     figures = write_board(tmp_path / "b.png", board, dpi=150)
     with Image.open(tmp_path / "b.png") as image:
@@ -201,9 +196,7 @@ def test_a_png_has_its_corners_where_they_are_on_paper(
     ("text", "paper", "page_mm"),
     [(CHESS, "a4", (297, 210)), ("chess:6x9:25mm", "letter", (215.9, 279.4))],
 )
-def test_a_pdf_has_the_size_of_its_paper_and_squares_of_theirs(
-    tmp_path: Path, text: str, paper: str, page_mm: tuple[float, float]
-) -> None:
+def test_a_pdf_has_the_size_of_its_paper_and_squares_of_theirs(tmp_path, text, paper, page_mm):
     board = parse_board(text)
     for name in ("a.pdf", "b.pdf"):
         write_board(tmp_path / name, board, paper)
@@ -234,9 +227,7 @@ def test_a_pdf_has_the_size_of_its_paper_and_squares_of_theirs(
         ("chess:9x6:60mm", "700x500mm", "700x500mm", True),
     ],
 )
-def test_paper_is_the_smallest_that_will_do_and_turned_as_needed(
-    text: str, paper: str | None, name: str | None, across: bool
-) -> None:
+def test_paper_is_the_smallest_that_will_do_and_turned_as_needed(text, paper, name, across):
     board = parse_board(text)
     if name is None:
         with pytest.raises(SettingsError, match=r"does not fit on a0 .*at most \d") as caught:
@@ -265,8 +256,8 @@ def test_paper_is_the_smallest_that_will_do_and_turned_as_needed(
     ],
 )  # fmt: skip
 def test_what_cannot_be_drawn_is_one_clear_line_and_no_file(
-    tmp_path: Path, text: str, name: str, options, error: type[Exception], message: str
-) -> None:
+    tmp_path, text, name, options, error, message
+):
     with pytest.raises(error, match=message):
         write_board(tmp_path / name, parse_board(text), **options)
     assert not list(tmp_path.iterdir())

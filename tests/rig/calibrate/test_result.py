@@ -1,8 +1,5 @@
 """Figures, text and files of a calibration, and the verdict on it."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -27,7 +24,7 @@ from recon.sources.image_names import ImagePairs
 SIZE = (640, 480)
 
 
-def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_path: Path) -> None:
+def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_path):
     rig, views = make_views(count=12)
     settings = CalibrationSettings(radial_terms=2)
     fit = calibrate_stereo(views, SIZE, settings)
@@ -55,7 +52,7 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
         assert read.baseline_m == pytest.approx(fit.calibration.baseline_m)
 
 
-def test_depth_errors_are_said_with_two_digits() -> None:
+def test_depth_errors_are_said_with_two_digits():
     known = {"calibration": 1.234, "low": -12.6, "high": 0.5, "matching": 33.4}
     unknown = {"calibration": None, "low": None, "high": None, "matching": 400.0}
     working = {"distance_m": 4.321, "calibration_share": 0.0123}
@@ -103,8 +100,8 @@ def judge(board: str = CHESS, **other: Any) -> tuple[str, dict[str, str]]:
     ],
 )
 def test_the_verdict_is_that_of_the_depth_error_at_the_working_distance(
-    board: str, share: float | None, verdict: str, said: str | None
-) -> None:
+    board, share, verdict, said
+):
     given, texts = judge(board, **error(share))
     assert given == verdict
     assert said is None or said in texts["depth"]
@@ -120,9 +117,7 @@ def test_the_verdict_is_that_of_the_depth_error_at_the_working_distance(
         ({"baseline_m": 12.0}, "baseline", "12 m: are the squares really 25 mm"),
     ],
 )
-def test_what_makes_the_forecast_doubtful_makes_it_usable_at_best(
-    other: dict[str, Any], code: str, figure: str
-) -> None:
+def test_what_makes_the_forecast_doubtful_makes_it_usable_at_best(other, code, figure):
     verdict, found = judge(**other)
     assert verdict == "usable"
     assert figure in found[code]
@@ -140,9 +135,7 @@ def test_what_makes_the_forecast_doubtful_makes_it_usable_at_best(
         ({}, "more", "lack nothing"),
     ],
 )
-def test_what_the_views_lack_is_said_when_depth_is_not_good(
-    other: dict[str, Any], code: str, figure: str
-) -> None:
+def test_what_the_views_lack_is_said_when_depth_is_not_good(other, code, figure):
     verdict, found = judge(**error(0.04), **other)
     assert verdict == "usable"
     assert set(found) == {"depth", code}
@@ -150,7 +143,7 @@ def test_what_the_views_lack_is_said_when_depth_is_not_good(
     assert judge(**other) == ("good", {})
 
 
-def test_what_was_left_out_is_noted_and_changes_no_verdict() -> None:
+def test_what_was_left_out_is_noted_and_changes_no_verdict():
     left_out = {"views_dropped": ["a.png"], "views_repeated": ["b.png", "c.png"]}
     verdict, found = judge("chess:9x6", **left_out, pictures_without_board=["d.png"])
     assert verdict == "good"

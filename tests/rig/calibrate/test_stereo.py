@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 
@@ -40,7 +38,7 @@ def assert_rig(fit: StereoFit, want: StereoCalibration, tolerance: float, turn_d
 
 
 @pytest.mark.parametrize(("lens", "off"), [("radtan", 0.35), ("fisheye", 0.15)])
-def test_the_first_guess_of_a_focal_length_is_near(make_views, lens: str, off: float) -> None:
+def test_the_first_guess_of_a_focal_length_is_near(make_views, lens, off):
     rig, views = make_views(lens, count=10)
     guess = stereo._guess_fisheye([view.seen[0] for view in views], SIZE).cameras[0].matrix
     assert guess[0, 0] == pytest.approx(rig.left.matrix[0, 0], rel=off)
@@ -48,7 +46,7 @@ def test_the_first_guess_of_a_focal_length_is_near(make_views, lens: str, off: f
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_without_noise_the_true_rig_comes_back(make_views, lens: str) -> None:
+def test_without_noise_the_true_rig_comes_back(make_views, lens):
     rig, views = make_views(lens, sigma_px=0.0)
     fit = calibrated(views, model=lens)
     # A rational lens is held near zero by as much as 0.1 px would, so it is not quite free.
@@ -59,8 +57,8 @@ def test_without_noise_the_true_rig_comes_back(make_views, lens: str) -> None:
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 @pytest.mark.parametrize("lens", LENSES)
 def test_with_a_tenth_of_a_pixel_of_noise_the_rig_is_right_within_the_bounds(
-    make_views, lens: str, seed: int
-) -> None:
+    make_views, lens, seed
+):
     rig, views = make_views(lens, count=30, seed=seed, board="chess:11x8:20mm")
     fit = calibrated(views, model=lens)
     # Two coordinates of 0.1 px each, less what 200-odd numbers take up of 10560.
@@ -69,7 +67,7 @@ def test_with_a_tenth_of_a_pixel_of_noise_the_rig_is_right_within_the_bounds(
     assert not fit.dropped
 
 
-def test_the_minimum_is_that_of_opencv(make_views) -> None:
+def test_the_minimum_is_that_of_opencv(make_views):
     """OpenCV's own solver, from our result, finds nothing better: both minimise the same sum."""
     _, views = make_views(count=12)
     fit = calibrated(views)
@@ -97,7 +95,7 @@ def spoil(view: View, side: int, sigma_px: float) -> View:
     return replace(view, seen=tuple(seen))
 
 
-def test_views_that_do_not_fit_are_dropped_and_named(make_views) -> None:
+def test_views_that_do_not_fit_are_dropped_and_named(make_views):
     rig, views = make_views(count=15)
     views[3], views[8] = spoil(views[3], 0, 3.0), spoil(views[8], 1, 5.0)
     # A pair of images of different moments: each fits its own camera well.
@@ -113,7 +111,7 @@ def test_views_that_do_not_fit_are_dropped_and_named(make_views) -> None:
     )
 
 
-def test_a_board_seen_in_part_by_either_camera_counts_with_what_is_seen(make_views) -> None:
+def test_a_board_seen_in_part_by_either_camera_counts_with_what_is_seen(make_views):
     rig, views = make_views(count=20, board="chess:9x6:25mm")
     rng = np.random.default_rng(4)
 
@@ -125,9 +123,7 @@ def test_a_board_seen_in_part_by_either_camera_counts_with_what_is_seen(make_vie
     assert_rig(calibrated(parts), rig, 0.005, 0.2)
 
 
-def test_other_moments_other_lenses_and_too_few_views_are_refused_as_such(
-    make_views, monkeypatch
-) -> None:
+def test_other_moments_other_lenses_and_too_few_views_are_refused_as_such(make_views, monkeypatch):
     _, views = make_views(count=12)
     shuffled = [
         replace(view, seen=(view.seen[0], views[(n + 5) % 12].seen[1]))
@@ -146,7 +142,7 @@ def test_other_moments_other_lenses_and_too_few_views_are_refused_as_such(
         calibrated(make_views("fisheye", count=12)[1], radial_terms=2)
 
 
-def test_depth_of_matched_pixels_is_that_of_the_point(make_views) -> None:
+def test_depth_of_matched_pixels_is_that_of_the_point(make_views):
     rig, _ = make_views(count=1)
     pixels = np.array([[320.0, 240], [100, 100], [500, 400]])
     xyz = rays_of(rig.left, pixels) * [[2.0], [5.0], [20.0]]
@@ -154,7 +150,7 @@ def test_depth_of_matched_pixels_is_that_of_the_point(make_views) -> None:
     np.testing.assert_allclose(measure_depth(rig, pixels, right), [2, 5, 20], rtol=1e-8)
 
 
-def test_the_spread_shrinks_with_noise_and_with_views(make_views) -> None:
+def test_the_spread_shrinks_with_noise_and_with_views(make_views):
     def width(count: int, sigma_px: float) -> float:
         low, high = spread_of(make_views(count=count, sigma_px=sigma_px)[1]).baseline_m
         return high - low
@@ -164,7 +160,7 @@ def test_the_spread_shrinks_with_noise_and_with_views(make_views) -> None:
     assert width(48, 0.2) < 0.7 * wide
 
 
-def test_depth_errors_grow_with_the_square_of_depth_and_are_the_same_each_time(make_views) -> None:
+def test_depth_errors_grow_with_the_square_of_depth_and_are_the_same_each_time(make_views):
     _, views = make_views(count=15)
     spread, other = (spread_of(views) for _ in range(2))
     # Sums of several threads are rounded in any order.
@@ -178,7 +174,7 @@ def test_depth_errors_grow_with_the_square_of_depth_and_are_the_same_each_time(m
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_intervals_hold_the_truth_in_most_repeats(make_views, lens: str) -> None:
+def test_the_intervals_hold_the_truth_in_most_repeats(make_views, lens):
     """At least 85 % of 20 repeats, of focal length, baseline and depth at every distance."""
     settings = CalibrationSettings(model=lens)
     held: dict[str, list[bool]] = {}
@@ -220,9 +216,7 @@ def again(views: list[View], times: int, sigma_px: float, seed: int = 9) -> list
 @pytest.mark.parametrize(
     "fresh_px", [0.05, *(pytest.param(k, marks=pytest.mark.slow) for k in (0.0, 0.5))]
 )
-def test_views_captured_five_times_do_not_make_the_forecast_better(
-    make_views, fresh_px: float
-) -> None:
+def test_views_captured_five_times_do_not_make_the_forecast_better(make_views, fresh_px):
     """Noise of a still board that repeats (0.1 px) and, on top of it, noise that does not."""
     _, views = make_views(count=13)
     once, fit = spread_of(again(views, 1, fresh_px)), calibrated(again(views, 5, fresh_px))
@@ -235,7 +229,7 @@ def test_views_captured_five_times_do_not_make_the_forecast_better(
         assert other.calibration_m == pytest.approx(one.calibration_m, rel=tolerance)
 
 
-def test_a_board_whose_corners_begin_at_the_other_end_repeats_the_view(make_views) -> None:
+def test_a_board_whose_corners_begin_at_the_other_end_repeats_the_view(make_views):
     _, views = make_views(count=40)
     seen = tuple(replace(seen, pixels=seen.pixels[::-1]) for seen in views[2].seen)
     turned = replace(views[2], name="turned", seen=seen)
@@ -244,9 +238,7 @@ def test_a_board_whose_corners_begin_at_the_other_end_repeats_the_view(make_view
     assert fit.calibration.left.distortion.size == 4
 
 
-def test_depth_is_judged_where_matching_errs_by_two_percent_or_where_the_user_works(
-    make_views,
-) -> None:
+def test_depth_is_judged_where_matching_errs_by_two_percent_or_where_the_user_works(make_views):
     rig, views = make_views(count=10)
     fit = calibrated(views)
     own = measure_spread(fit, CalibrationSettings()).working

@@ -1,7 +1,5 @@
 """A stand-in for the program."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest
@@ -11,5 +9,5 @@ from tests.run.batch.jobs import STAND_IN
 
 
 @pytest.fixture(autouse=True)
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
+def stand_in(monkeypatch):
     monkeypatch.setattr(process, "_PROGRAM", (sys.executable, "-c", STAND_IN))

@@ -1,7 +1,5 @@
 """Jobs for tests: a stand-in for the program, and what it is told to do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Jobs on workers: what breaks is tried again, what fails is named, nothing is lost."""
 
-from __future__ import annotations
-
 import socket
 import sys
 import threading
@@ -22,7 +20,7 @@ distributed = pytest.importorskip("distributed")
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster():
     """Two workers in threads of this process."""
     with (
         distributed.LocalCluster(
@@ -39,9 +37,7 @@ def run(cluster: Cluster, jobs: list[Job], folder: Path) -> dict[str, Outcome]:
     return dict(ended)
 
 
-def test_what_breaks_goes_on_and_what_fails_is_named_and_the_rest_is_done(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_what_breaks_goes_on_and_what_fails_is_named_and_the_rest_is_done(cluster, tmp_path):
     good = [job(f"j{n}") for n in range(25)]
     jobs = [job("a", "killed once"), job("b", "always killed", retries=3), job("c", "damaged")]
     ended = run(cluster, [*good[:9], *jobs, job("d", "bad"), *good[9:]], tmp_path)
@@ -59,9 +55,7 @@ def test_what_breaks_goes_on_and_what_fails_is_named_and_the_rest_is_done(
     assert (ended["a"].state, "unseen" in ended["a"].error) == ("broken", True)
 
 
-def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(cluster, tmp_path):
     def full_at_first(job: Job, folder: str) -> Outcome:
         here, tried = distributed.get_worker().address, Path(folder) / job.name
         before = tried.read_text().split() if tried.is_file() else []
@@ -78,9 +72,7 @@ def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
         assert first != second != third
 
 
-def test_dask_has_jobs_of_one_kind_and_not_all_of_very_many(
-    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_dask_has_jobs_of_one_kind_and_not_all_of_very_many(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr("recon.run.batch.cluster._AT_ONCE", 10)
     taken: list[str] = []
 
@@ -97,7 +89,7 @@ def test_dask_has_jobs_of_one_kind_and_not_all_of_very_many(
     assert [kind for kind in kinds if "j1" in kind] == []
 
 
-def test_jobs_need_of_workers_what_all_of_these_declare() -> None:
+def test_jobs_need_of_workers_what_all_of_these_declare():
     class Client:
         asked: ClassVar[dict[str, object]] = {}
 
@@ -117,7 +109,7 @@ def test_jobs_need_of_workers_what_all_of_these_declare() -> None:
     assert Client.asked == {"j0": {"threads": 2}, "j1": None, "j2": None}
 
 
-def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path: Path) -> None:
+def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path):
     class Lost:
         status = "error"
 
@@ -130,7 +122,7 @@ def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path: Path) 
     assert _outcome(Lost(), None, job("a"), tmp_path) == begun
 
 
-def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path: Path) -> None:
+def test_workers_that_do_not_come_back_end_the_batch(cluster, tmp_path):
     def nobody(job: Job, folder: str) -> Outcome:
         raise distributed.scheduler.NoWorkerError(job.name, 120)
 
@@ -138,18 +130,14 @@ def test_workers_that_do_not_come_back_end_the_batch(cluster: Cluster, tmp_path:
         run(Cluster(cluster._client, nobody), [job("a")], tmp_path)
 
 
-def test_two_batches_with_jobs_of_the_same_name_share_a_scheduler(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_two_batches_with_jobs_of_the_same_name_share_a_scheduler(cluster, tmp_path):
     for folder in (tmp_path / "0", tmp_path / "state" / "1"):  # which is made for its workers
         (result,) = work_off([job("a")], folder, cluster, BatchOptions())
         assert (result.ok, result.figures["points"]) == (True, 7)
         assert (folder / "a" / "run.json").is_file()
 
 
-def test_a_function_is_called_with_each_item_and_its_error_is_raised(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_a_function_is_called_with_each_item_and_its_error_is_raised(cluster, tmp_path):
     def touch(name: str) -> None:
         if name == "bad":
             raise FormatError("damaged", where=name)
@@ -163,7 +151,7 @@ def test_a_function_is_called_with_each_item_and_its_error_is_raised(
         cluster.each(int, ["no number"])
 
 
-def test_workers_share_the_cores_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_share_the_cores_of_this_machine(monkeypatch):
     monkeypatch.setattr("recon.run.batch.cluster.available_cores", lambda: 8)
     shares = [BatchOptions(workers=count).threads_of(None) for count in (None, 1, 3, 9)]
     assert shares == [1, 8, 2, 1]
@@ -189,9 +177,7 @@ def assert_not_reached(address: str | Path) -> None:
         ("", b"SSH-2.0-OpenSSH_9.6\r\n"),
     ],
 )
-def test_what_is_no_scheduler_is_one_line_and_not_waited_for(
-    protocol: str, greeting: bytes
-) -> None:
+def test_what_is_no_scheduler_is_one_line_and_not_waited_for(protocol, greeting):
     kept: list[socket.socket] = []
 
     def serve() -> None:
@@ -207,7 +193,7 @@ def test_what_is_no_scheduler_is_one_line_and_not_waited_for(
         connection.close()
 
 
-def test_what_names_no_scheduler_is_one_line(tmp_path: Path) -> None:
+def test_what_names_no_scheduler_is_one_line(tmp_path):
     here = "tcp://127.0.0.1"
     for address in (f"{here}:9", f"{here}:x", "tcp://", "ucx://x:1", "nonsense", ""):
         assert_not_reached(address)
@@ -216,7 +202,7 @@ def test_what_names_no_scheduler_is_one_line(tmp_path: Path) -> None:
         assert_not_reached(tmp_path / "scheduler.json")
 
 
-def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -> None:
+def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line():
     class Gone:
         def nthreads(self) -> None:
             raise OSError("Timed out trying to connect to tcp://127.0.0.1:9 after 20 s")
@@ -225,7 +211,7 @@ def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -
         Cluster(Gone()).workers  # noqa: B018
 
 
-def test_without_dask_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dask_the_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     for there in (join_cluster("tcp://127.0.0.1:9"), local_cluster(1)):
         with pytest.raises(MissingDependencyError, match=r"pip install 'recon\[cluster\]'"):

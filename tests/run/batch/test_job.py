@@ -1,7 +1,5 @@
 """A try of a job ends in one of three ways, and never outlives its worker."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -23,7 +21,7 @@ from tests.scenery.patience import LONG_S
 PROGRAM = process._PROGRAM
 
 
-def test_a_job_writes_its_folder_and_a_log_and_is_not_run_again(tmp_path: Path) -> None:
+def test_a_job_writes_its_folder_and_a_log_and_is_not_run_again(tmp_path):
     outcome = run_job(job("a"), tmp_path, "here")
     assert (outcome.state, outcome.error) == ("succeeded", "")
     assert (outcome.worker, outcome.tries, outcome.seconds > 0) == ("here", 1, True)
@@ -42,7 +40,7 @@ def test_a_job_writes_its_folder_and_a_log_and_is_not_run_again(tmp_path: Path) 
     assert 1 <= sum('"frame"' in line for line in log) < 10
 
 
-def test_what_is_left_of_a_log_counts(tmp_path: Path) -> None:
+def test_what_is_left_of_a_log_counts(tmp_path):
     """Of a worker that died, which is as if the try had no end."""
     log_file(tmp_path, "a").parent.mkdir()
     tried = Outcome("broken", "its worker died", worker="w", tries=6)
@@ -53,7 +51,7 @@ def test_what_is_left_of_a_log_counts(tmp_path: Path) -> None:
     assert last_outcome(tmp_path, "a").state == "broken"
 
 
-def test_a_log_that_is_none_or_leads_elsewhere_is_one_line(tmp_path: Path) -> None:
+def test_a_log_that_is_none_or_leads_elsewhere_is_one_line(tmp_path):
     log_file(tmp_path, "a").parent.mkdir()
     for line in ('{"try": 3}', '{"try": {"state": "x"}}', '{"try": {"seconds": NaN}}'):
         log_file(tmp_path, "a").write_text(line)
@@ -75,17 +73,15 @@ def test_a_log_that_is_none_or_leads_elsewhere_is_one_line(tmp_path: Path) -> No
     ],
 )
 def test_a_failure_by_the_input_has_the_line_of_the_command_and_a_death_its_signal(
-    tmp_path: Path, what: str, state: str, error: str
-) -> None:
+    tmp_path, what, state, error
+):
     outcome = run_job(job("a", what), tmp_path)
     assert (outcome.state, outcome.error, outcome.tries) == (state, error, 1)
     assert run_job(job("a", what), tmp_path).tries == 2
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Python before 3.11 looks there first")
-def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "_PROGRAM", PROGRAM)
     (tmp_path / "recon").mkdir()
     for hidden in ("recon/__init__.py", "json.py"):
@@ -94,7 +90,7 @@ def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(
     assert run_job(command, tmp_path).error.startswith("left.png: file does not exist")
 
 
-def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path: Path) -> None:
+def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path):
     outcome = run_job(job("a", "damaged"), tmp_path)
     assert (outcome.state, outcome.error, outcome.stale) == ("broken", "damaged", False)
     # What fails although it goes on with what was left begins anew.
@@ -105,9 +101,7 @@ def test_what_can_be_resumed_is_broken_and_not_failed(tmp_path: Path) -> None:
     assert (outcome.state, "elsewhere" in outcome.error) == ("broken", True)
 
 
-def test_what_is_resumed_where_the_disk_is_full_goes_on_elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_resumed_where_the_disk_is_full_goes_on_elsewhere(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "_LEAST_FREE_BYTES", 1 << 62)
     for _ in range(2):
         outcome = run_job(job("a", "damaged"), tmp_path)
@@ -119,9 +113,7 @@ def test_what_is_resumed_where_the_disk_is_full_goes_on_elsewhere(
 @pytest.mark.parametrize(
     ("timeout_s", "error"), [(1.0, "took more than 1 s"), (None, "was stopped")]
 )
-def test_a_job_that_is_late_or_that_nobody_waits_for_is_killed(
-    tmp_path: Path, timeout_s: float | None, error: str
-) -> None:
+def test_a_job_that_is_late_or_that_nobody_waits_for_is_killed(tmp_path, timeout_s, error):
     begun = tmp_path / "a.pid"
     nobody = begun.is_file if timeout_s is None else lambda: False
     outcome = run_job(job("a", "endless", timeout_s=timeout_s), tmp_path, stopped=nobody)
@@ -129,7 +121,7 @@ def test_a_job_that_is_late_or_that_nobody_waits_for_is_killed(
     assert ended(int(begun.read_text()))
 
 
-def test_a_try_waits_for_an_earlier_one_that_still_runs(tmp_path: Path) -> None:
+def test_a_try_waits_for_an_earlier_one_that_still_runs(tmp_path):
     lock = take_lock(lock_file(tmp_path / "a"), "", where=tmp_path, hint="")
     left_off = []
 
@@ -144,9 +136,7 @@ def test_a_try_waits_for_an_earlier_one_that_still_runs(tmp_path: Path) -> None:
     release.join()
 
 
-def test_a_command_without_a_result_folder_gets_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_without_a_result_folder_gets_one(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "_PROGRAM", PROGRAM)
     words = ("datasets", "list", "euroc", "--json")
     outcome = run_job(Job("a", "datasets list", "euroc", words, writes=False, folder="."), tmp_path)
@@ -154,7 +144,7 @@ def test_a_command_without_a_result_folder_gets_one(
     assert '"name": "euroc"' in (tmp_path / "a" / "summary.json").read_text()
 
 
-def test_the_process_of_a_job_dies_with_its_worker(tmp_path: Path) -> None:
+def test_the_process_of_a_job_dies_with_its_worker(tmp_path):
     """Even where the worker is killed at once, and the job has processes of its own."""
     (tmp_path / "recon").mkdir()
     (tmp_path / "recon" / "__init__.py").write_text("")

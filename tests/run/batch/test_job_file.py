@@ -1,7 +1,5 @@
 """What a job file can say, and how everything else is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -35,7 +33,7 @@ def write(folder: Path, text: str, suffix: str = "toml") -> Path:
     return path
 
 
-def test_a_job_has_all_that_it_says(tmp_path: Path) -> None:
+def test_a_job_has_all_that_it_says(tmp_path):
     listed = read_jobs(write(tmp_path, FULL))
     assert listed.folder == str(tmp_path)
     monday, pair = listed.job
@@ -45,7 +43,7 @@ def test_a_job_has_all_that_it_says(tmp_path: Path) -> None:
     assert (pair.source, pair.options, pair.timeout_s) == (["left.png", "right.png"], [], None)
 
 
-def test_yaml_says_the_same_and_its_recursion_is_one_line(tmp_path: Path) -> None:
+def test_yaml_says_the_same_and_its_recursion_is_one_line(tmp_path):
     text = "job:\n- {name: monday, command: map, source: drives/monday, set: [a=1]}\n"
     (entry,) = read_jobs(write(tmp_path, text, "yaml")).job
     assert (entry.name, entry.source, entry.set) == ("monday", ["drives/monday"], ["a=1"])
@@ -53,7 +51,7 @@ def test_yaml_says_the_same_and_its_recursion_is_one_line(tmp_path: Path) -> Non
         read_jobs(write(tmp_path, "job: &a\n- *a\n", "yaml"))
 
 
-def test_what_a_batch_says_stands_before_what_a_job_says(tmp_path: Path) -> None:
+def test_what_a_batch_says_stands_before_what_a_job_says(tmp_path):
     limits = {"threads": 1, "memory": "2G", "timeout_s": 5.0, "retries": 4}
     listed = read_jobs(write(tmp_path, FULL)).with_limits(["x=1"], ["--poses=p"], **limits)
     monday, pair = listed.job
@@ -63,7 +61,7 @@ def test_what_a_batch_says_stands_before_what_a_job_says(tmp_path: Path) -> None
     assert (pair.threads, pair.memory, pair.timeout_s, pair.retries) == (1, "2G", 5.0, 4)
 
 
-def test_what_a_batch_was_begun_with_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_what_a_batch_was_begun_with_is_read_as_it_was_written(tmp_path):
     listed = read_jobs(write(tmp_path, SWEEP + FULL)).with_limits(["x=1"], [], threads=3)
     (tmp_path / "out").mkdir()
     listed.write(tmp_path / "out")
@@ -76,13 +74,13 @@ def test_what_a_batch_was_begun_with_is_read_as_it_was_written(tmp_path: Path) -
        ("", "3", "[3]", '{"x": 1}', "{", '{"job": [{"name": "a"}]}')),
      ('[{"name": "a", "words": ["map", "drive"]}]', r"earlier version.*another --out")],
 )  # fmt: skip
-def test_a_damaged_plan_is_one_line(tmp_path: Path, content: str, words: str) -> None:
+def test_a_damaged_plan_is_one_line(tmp_path, content, words):
     (tmp_path / "jobs.json").write_text(content)
     with pytest.raises(ReconError, match=words):
         read_plan(tmp_path)
 
 
-def test_sources_are_named_by_as_many_of_their_last_parts_as_tell_them_apart() -> None:
+def test_sources_are_named_by_as_many_of_their_last_parts_as_tell_them_apart():
     for sources, names in (
         (["a/2011_09 x", "b/.c/"], ["2011_09-x", "c"]),
         (
@@ -130,7 +128,7 @@ NAMES = ["../a", "/a", "a/b", "..", ".hidden", "", "a\\\\b", "a b", "é", "-a", 
         ("job = " + "[" * 5000, "deep|not a TOML"),
     ],
 )  # fmt: skip
-def test_everything_else_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_everything_else_is_one_line(tmp_path, text, words):
     with pytest.raises(ReconError, match=words) as told:
         read_jobs(write(tmp_path, text))
     assert "\n" not in str(told.value)
@@ -144,6 +142,6 @@ def test_everything_else_is_one_line(tmp_path: Path, text: str, words: str) -> N
        ("jobs.json", "Summary.JSON", "report.html", "table.csv", "logs", "run.json")),
      (["a", "A"], "job A: two jobs have one name")],
 )  # fmt: skip
-def test_a_name_is_that_of_a_folder_below_the_batch_alone(names: list[str], words: str) -> None:
+def test_a_name_is_that_of_a_folder_below_the_batch_alone(names, words):
     with pytest.raises(SettingsError, match=words):
         check_names(names)

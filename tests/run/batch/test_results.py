@@ -1,9 +1,6 @@
 """What is unusual stands out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -21,7 +18,7 @@ def result(name: str, **figures: float) -> JobResult:
     return JobResult(job(name), DONE, figures)
 
 
-def test_only_finite_numbers_of_a_summary_are_figures(tmp_path: Path) -> None:
+def test_only_finite_numbers_of_a_summary_are_figures(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "summary.json").write_text(TEXT)
     found = result_of(job("a"), replace(DONE, seconds=0.0), tmp_path)
@@ -34,7 +31,7 @@ def test_only_finite_numbers_of_a_summary_are_figures(tmp_path: Path) -> None:
     assert result_of(job("a"), Outcome("failed", "why"), tmp_path).figures == {}
 
 
-def test_the_job_with_the_unusual_figure_comes_after_the_failed_ones() -> None:
+def test_the_job_with_the_unusual_figure_comes_after_the_failed_ones():
     drift = [0.50, 0.55, 0.45, 0.52, 5.0, 0.48]
     results = [result(f"j{n}", t_rel_percent=value, frames=n) for n, value in enumerate(drift)]
     failed = JobResult(job("bad"), Outcome("failed", "no images"))
@@ -57,14 +54,12 @@ def test_the_job_with_the_unusual_figure_comes_after_the_failed_ones() -> None:
         ("points", [10.0**n for n in range(11)], {}),  # drives differ in length
     ],
 )
-def test_what_is_much_worse_than_usual_is_remarked(
-    name: str, values: tuple[float, ...], remarks: dict[int, str]
-) -> None:
+def test_what_is_much_worse_than_usual_is_remarked(name, values, remarks):
     results = compare([result(f"j{n}", **{name: value}) for n, value in enumerate(values)])
     assert {n: one.remark for n, one in enumerate(results) if one.remark} == remarks
 
 
-def test_jobs_of_other_commands_or_settings_are_not_compared() -> None:
+def test_jobs_of_other_commands_or_settings_are_not_compared():
     for changes in ("swept", "command"):
         results = [
             JobResult(replace(job(f"j{n}"), **{changes: {"w": w}}), DONE, {"ate_m": 10.0**w})
@@ -73,7 +68,7 @@ def test_jobs_of_other_commands_or_settings_are_not_compared() -> None:
         assert [one.remark for one in compare(results)] == [""] * 8
 
 
-def test_jobs_of_each_command_are_judged_by_their_first_accuracy() -> None:
+def test_jobs_of_each_command_are_judged_by_their_first_accuracy():
     drive = {"trajectory.t_rel_percent": 0.5, "points": 7.0}
     pair = {"disparity.bad.2.0": 9.0, "valid_percent": 80.0, "points": 7.0}
     assert accuracies([pair, drive, {}]) == ["trajectory.t_rel_percent", "disparity.bad.2.0"]

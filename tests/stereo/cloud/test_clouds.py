@@ -1,7 +1,5 @@
 """Points are exact, with their errors; those between surfaces and outliers are removed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +47,7 @@ def make_pair(*, colour: bool = False) -> RectifiedPair:
 
 
 @given(st.integers(0, 2**16))
-def test_points_project_back_to_their_pixels(seed: int) -> None:
+def test_points_project_back_to_their_pixels(seed):
     rng = np.random.default_rng(seed)
     values = rng.uniform(1, 40, SHAPE)
     values[rng.random(SHAPE) < 0.3] = np.nan
@@ -63,7 +61,7 @@ def test_points_project_back_to_their_pixels(seed: int) -> None:
     np.testing.assert_allclose(cloud.xyz[:, 2] * (d + CAMERA.doffs_px), FB, rtol=1e-5)
 
 
-def test_sigma_grows_with_the_square_of_depth_and_is_its_spread_under_noise() -> None:
+def test_sigma_grows_with_the_square_of_depth_and_is_its_spread_under_noise():
     values = np.full(SHAPE, 6.0)
     values[:, 32:] = 1.0
     cloud = back_project(as_disparity(values, sigma_px=0.25), make_pair(), ALL)
@@ -78,7 +76,7 @@ def test_sigma_grows_with_the_square_of_depth_and_is_its_spread_under_noise() ->
     assert np.std(cloud.xyz[:, 2]) == pytest.approx(float(np.mean(cloud.sigma_m)), rel=0.05)
 
 
-def test_range_sigma_and_stride_decide_what_is_kept() -> None:
+def test_range_sigma_and_stride_decide_what_is_kept():
     disparity = as_disparity(np.tile(np.linspace(0.5, 36, 64), (40, 1)))
 
     def kept(**settings: float | None) -> np.ndarray:
@@ -94,7 +92,7 @@ def test_range_sigma_and_stride_decide_what_is_kept() -> None:
     np.testing.assert_array_equal(kept(stride=3), kept()[raster])
 
 
-def test_points_beyond_infinity_or_without_a_source_are_not_made() -> None:
+def test_points_beyond_infinity_or_without_a_source_are_not_made():
     values = np.full(SHAPE, -CAMERA.doffs_px)
     values[:, :10] = -CAMERA.doffs_px - 3
     values[:, 60:] = 6.0
@@ -108,7 +106,7 @@ def test_points_beyond_infinity_or_without_a_source_are_not_made() -> None:
         back_project(as_disparity(np.full((40, 63), 6.0)), make_pair(), ALL)
 
 
-def test_points_carry_the_colours_of_their_pixels() -> None:
+def test_points_carry_the_colours_of_their_pixels():
     values = EMPTY.copy()
     values[7, 11] = 6.0
     grey, coloured = make_pair(), make_pair(colour=True)
@@ -125,9 +123,7 @@ def test_points_carry_the_colours_of_their_pixels() -> None:
     ("normal", "distance_m"),
     [((0, 0, 1.0), 2.0), ((0, 0.98, 0.199), 1.0), ((0.8, 0, 0.6), 1.5), ((-0.5, 0.3, 0.81), 2.0)],
 )
-def test_normals_of_a_plane_are_exact_and_face_the_camera(
-    normal: tuple[float, float, float], distance_m: float
-) -> None:
+def test_normals_of_a_plane_are_exact_and_face_the_camera(normal, distance_m):
     n = np.array(normal) / np.linalg.norm(normal)
     v, u = np.mgrid[:40, :64]
     rays = np.stack([(u - CAMERA.cx_px) / 100, (v - CAMERA.cy_px) / 100, 1.0 + 0 * u], axis=-1)
@@ -150,14 +146,14 @@ def smeared_step(width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("width", [0, 1, 2, 3])
-def test_a_step_loses_exactly_its_mixed_pixels(width: int) -> None:
+def test_a_step_loses_exactly_its_mixed_pixels(width):
     result = remove_flying_edges(as_disparity(smeared_step(width)))
     mixed = np.zeros((40, 60), dtype=bool)
     mixed[:, 30 : 30 + width] = True
     np.testing.assert_array_equal(result.reason == Reason.EDGE, mixed)
 
 
-def test_mixed_columns_and_lone_pixels_go_and_a_pole_of_two_pixels_stays() -> None:
+def test_mixed_columns_and_lone_pixels_go_and_a_pole_of_two_pixels_stays():
     values = smeared_step(1)
     values[:, 20:30] = np.nan
     result = remove_flying_edges(as_disparity(values))
@@ -172,7 +168,7 @@ def test_mixed_columns_and_lone_pixels_go_and_a_pole_of_two_pixels_stays() -> No
 
 
 @given(across=st.floats(-0.7, 0.7), down=st.floats(-0.7, 0.7), noise_seed=st.integers(0, 2**16))
-def test_slants_below_the_gradient_limit_stay(across: float, down: float, noise_seed: int) -> None:
+def test_slants_below_the_gradient_limit_stay(across, down, noise_seed):
     # 0.7 along each axis is a gradient of 1 at most; noise of ±0.25 differs by 0.5 at most.
     v, u = np.mgrid[:24, :30]
     noise = np.random.default_rng(noise_seed).uniform(-0.25, 0.25, u.shape)
@@ -180,7 +176,7 @@ def test_slants_below_the_gradient_limit_stay(across: float, down: float, noise_
 
 
 @pytest.mark.parametrize("removed", [True, False])
-def test_removal_can_be_turned_off(removed: bool) -> None:
+def test_removal_can_be_turned_off(removed):
     class Smeared:
         def match(self, pair: RectifiedPair) -> Disparity:
             return Disparity.from_values(smeared_step(2))
@@ -193,7 +189,7 @@ def test_removal_can_be_turned_off(removed: bool) -> None:
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 200), (200, 4)])
-def test_images_as_small_as_the_window_pass(shape: tuple[int, int]) -> None:
+def test_images_as_small_as_the_window_pass(shape):
     assert remove_flying_edges(as_disparity(np.full(shape, 5.0))).valid.all()
     assert not remove_flying_edges(as_disparity(np.full(shape, np.nan))).valid.any()
 
@@ -209,7 +205,7 @@ def wall_with_outliers() -> tuple[PointCloud, np.ndarray]:
 
 
 @pytest.mark.parametrize("settings", [FilterSettings(radius_m=0.15), ANY_SCALE])
-def test_planted_outliers_go_and_the_planted_surface_stays(settings: FilterSettings) -> None:
+def test_planted_outliers_go_and_the_planted_surface_stays(settings):
     cloud, on_wall = wall_with_outliers()
     near_wall = filter_cloud(cloud, settings).xyz[:, 2] > 4.9
     assert near_wall.sum() >= 0.99 * on_wall.sum()
@@ -219,7 +215,7 @@ def test_planted_outliers_go_and_the_planted_surface_stays(settings: FilterSetti
     assert 300 < len(filter_cloud(cloud, FilterSettings(voxel_m=0.2))) < 900
 
 
-def test_a_voxel_averages_every_attribute() -> None:
+def test_a_voxel_averages_every_attribute():
     cloud = PointCloud(
         xyz=np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [5, 5, 5]], dtype=np.float32),
         rgb=np.array([[10, 20, 30], [20, 40, 60], [1, 2, 3]], dtype=np.uint8),
@@ -244,7 +240,7 @@ def test_a_voxel_averages_every_attribute() -> None:
 
 
 @pytest.mark.parametrize("points", [0, 1, 2])
-def test_clouds_of_almost_nothing_pass(points: int) -> None:
+def test_clouds_of_almost_nothing_pass(points):
     cloud = PointCloud(np.zeros((points, 3), dtype=np.float32))
     settings = FilterSettings(statistical_neighbours=20, radius_m=0.3)
     assert len(filter_cloud(cloud, settings)) <= points
@@ -259,7 +255,7 @@ def frozen(xyz: np.ndarray) -> np.ndarray:
 CLOUD = frozen(np.random.default_rng(5).random((400, 3)))
 
 
-def test_nearest_is_what_a_full_search_finds_and_a_point_needs_others_around_it() -> None:
+def test_nearest_is_what_a_full_search_finds_and_a_point_needs_others_around_it():
     query, reference = CLOUD[:50], CLOUD[50:]
     index, distance = open3d_clouds.nearest(query, reference, 3)
     full = np.linalg.norm(query[:, None] - reference[None], axis=2)
@@ -270,7 +266,7 @@ def test_nearest_is_what_a_full_search_finds_and_a_point_needs_others_around_it(
         assert open3d_clouds.radius_inliers(line, others, 1.5).tolist() == kept
 
 
-def test_normals_of_a_sphere_agree_with_their_neighbours() -> None:
+def test_normals_of_a_sphere_agree_with_their_neighbours():
     directions = np.random.default_rng(2).standard_normal((600, 3))
     xyz = frozen(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     normals = open3d_clouds.estimate_normals(xyz, 15)
@@ -290,12 +286,12 @@ def test_normals_of_a_sphere_agree_with_their_neighbours() -> None:
         lambda xyz: open3d_clouds.nearest(xyz, xyz),
     ],
 )
-def test_points_that_are_not_finite_are_refused(call) -> None:
+def test_points_that_are_not_finite_are_refused(call):
     with pytest.raises(ShapeError, match="not finite"):
         call(np.full((20, 3), np.nan, dtype=np.float32))
 
 
-def test_no_foreign_exception_leaks() -> None:
+def test_no_foreign_exception_leaks():
     apart = PointCloud(np.array([[0, 0, 0], [1e6, 0, 0]], dtype=np.float32))
     with pytest.raises(SettingsError, match="voxel is too small"):
         filter_cloud(apart, FilterSettings(voxel_m=1e-5))

@@ -1,7 +1,5 @@
 """What is made of minima equals plain references: refinement, averages, speckles, points."""
 
-from __future__ import annotations
-
 import math
 
 import numba
@@ -77,7 +75,7 @@ LEFT_RIGHT_OR_OCCLUDED = (
 
 @given(cases())
 @example(LEFT_RIGHT_OR_OCCLUDED)
-def test_refinement_equals_its_reference(case: tuple[Minima, np.ndarray, Rules]) -> None:
+def test_refinement_equals_its_reference(case):
     found, expected = refine_all(*case), refine_minima_reference(*case)
     np.testing.assert_array_equal(found.reason, expected.reason)
     # The kernel computes in float32, its reference in float64. Costs are exact in both.
@@ -97,7 +95,7 @@ def test_refinement_equals_its_reference(case: tuple[Minima, np.ndarray, Rules])
 
 
 @given(cases())
-def test_results_lie_within_their_bounds(case: tuple[Minima, np.ndarray, Rules]) -> None:
+def test_results_lie_within_their_bounds(case):
     minima, _, rules = case
     refined = refine_all(*case)
     kept = refined.reason == refine.VALID
@@ -112,7 +110,7 @@ def test_results_lie_within_their_bounds(case: tuple[Minima, np.ndarray, Rules])
     assert (np.abs(refined.values[kept] - whole) <= 0.5).all()
 
 
-def test_vertex_of_two_slopes_is_found_and_confidence_is_the_odds_of_margin_and_noise() -> None:
+def test_vertex_of_two_slopes_is_found_and_confidence_is_the_odds_of_margin_and_noise():
     assert all(getattr(refine, r.name) == r for r in set(Reason) - {Reason.SPECKLE, Reason.EDGE})
     # Costs of |d - 3.25| · 40 + 10 at 2, 3 and 4.
     refined = refine_all(one_pixel((20, 60, 40, 100)), np.ones((1, 8)), RULES._replace(odds=3.0))
@@ -125,7 +123,7 @@ def test_vertex_of_two_slopes_is_found_and_confidence_is_the_odds_of_margin_and_
     assert confidence / (1 - confidence) == pytest.approx(odds, rel=1e-5)  # float32
 
 
-def test_rejected_pixels_have_nothing_left_but_a_reason() -> None:
+def test_rejected_pixels_have_nothing_left_but_a_reason():
     refined = refine_all(one_pixel((2, 6, 6, 20)), np.ones((1, 8)), RULES)
     mask = np.arange(8)[None] >= 6
     reject(mask, int(Reason.SPECKLE), refined)
@@ -234,14 +232,14 @@ def average(values: Float32, radius: int = 3, largest_step: float = 1.0) -> Floa
 
 
 @given(smooth, st.integers(0, 4), st.sampled_from([0.25, 1.0, 5.0]))
-def test_averages_equal_those_of_the_reference(values: Float32, radius: int, step: float) -> None:
+def test_averages_equal_those_of_the_reference(values, radius, step):
     # float32: up to 40 pairs, each added up and added on, and a division, of values up to 3.
     rounding, expected = 42 * 2.0**-24 * 3, average_reference(values, radius, step)
     np.testing.assert_allclose(average(values, radius, step), expected, rtol=0, atol=rounding)
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), hnp.arrays(np.bool_, (12, 14)))
-def test_slope_with_holes_stays_as_it_is(across: float, down: float, holes: Bool) -> None:
+def test_slope_with_holes_stays_as_it_is(across, down, holes):
     y, x = np.mgrid[:12, :14]
     slope = np.where(holes, np.nan, 20 + across * x + down * y).astype(np.float32)
     # float32 values below 28: the slope's own rounding, and 24 pairs added up.
@@ -249,7 +247,7 @@ def test_slope_with_holes_stays_as_it_is(across: float, down: float, holes: Bool
     np.testing.assert_allclose(average(slope, largest_step=5.0), slope, rtol=0, atol=rounding)
 
 
-def test_noise_shrinks_by_the_root_of_the_number_of_pixels_and_steps_stay_sharp() -> None:
+def test_noise_shrinks_by_the_root_of_the_number_of_pixels_and_steps_stay_sharp():
     noise = np.random.default_rng(1).normal(30, 0.1, (60, 80)).astype(np.float32)
     pixels = 25  # of a chessboard of 7 by 7
     assert average(noise)[3:-3, 3:-3].std() < 1.2 * 0.1 / math.sqrt(pixels)
@@ -277,7 +275,7 @@ def speckles_reference(values: Float32, largest_step: float, smallest_size: int)
 
 
 @given(steps, st.sampled_from([0.5, 1.0, 2.0]), st.integers(0, 20))
-def test_speckles_equal_those_of_the_reference(values: Float32, step: float, size: int) -> None:
+def test_speckles_equal_those_of_the_reference(values, step, size):
     found = find_speckles(values, step, size)
     np.testing.assert_array_equal(found, speckles_reference(values, step, size))
 
@@ -317,7 +315,7 @@ maps = st.builds(
 
 @given(maps, st.integers(0, 4), st.integers(1, 3))
 @settings(max_examples=150)
-def test_points_equal_their_reference(given_maps: Maps, radius: int, stride: int) -> None:
+def test_points_equal_their_reference(given_maps, radius, stride):
     rules = POINT_RULES._replace(radius=radius, stride=stride)
     ours = make_points(given_maps, rules)
     reference = make_points_reference(given_maps, rules)

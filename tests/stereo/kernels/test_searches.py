@@ -1,9 +1,6 @@
 """The compiled searches equal their references: plain numpy, slow, short, what results mean."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -245,7 +242,7 @@ disparities = st.one_of(st.just(np.nan), st.integers(-4, 30))
     st.integers(-9, 9),
     supports,
 )
-def test_support_equals_the_reference(halved: Float32, minimum: int, support: Support) -> None:
+def test_support_equals_the_reference(halved, minimum, support):
     tiles = make_tiles((2 * halved.shape[0], 2 * halved.shape[1]), (8, 16), NDISP)
     rows = len(tiles.offered)
     for first, end in ((0, rows // 2), (rows // 2, rows)):
@@ -289,8 +286,8 @@ def tilings(draw: st.DrawFn, shape: tuple[int, int], search: Search) -> Tiles:
 
 @given(st.data(), pairs((1, 14), (1, 40)), searches, st.integers(0, 4))
 def test_sad_equals_the_reference_and_what_is_not_offered_does_not_exist(
-    data: st.DataObject, pair: Pair, search: Search, strips: int
-) -> None:
+    data, pair, search, strips
+):
     shape = pair[0].shape
     tiles = data.draw(tilings(shape, search)) if strips else everything(shape, search)
     found = search_all(pair, search, tiles, max(1, min(strips, shape[0])))
@@ -299,7 +296,7 @@ def test_sad_equals_the_reference_and_what_is_not_offered_does_not_exist(
 
 @pytest.mark.parametrize("slant", [0, 1, -2])
 @pytest.mark.parametrize(("ndisp", "minimum"), [(64, 0), (65, -40), (33, 20), (100, 60)])
-def test_wide_images_are_searched_in_vectors(ndisp: int, minimum: int, slant: int) -> None:
+def test_wide_images_are_searched_in_vectors(ndisp, minimum, slant):
     rng = np.random.default_rng(ndisp + slant)
     # Few grey levels, so that vectors and runs have equal costs to decide between.
     left, right = rng.integers(0, 4, (2, 5, 3 * LANES + 35), dtype=np.uint8)
@@ -312,7 +309,7 @@ def test_wide_images_are_searched_in_vectors(ndisp: int, minimum: int, slant: in
 
 # One row: the sums over a column fit into bytes, those over two do not.
 @pytest.mark.parametrize(("radius", "rows_radius"), [(7, 7), (1, 0), (4, 0)])
-def test_largest_costs_do_not_overflow(radius: int, rows_radius: int) -> None:
+def test_largest_costs_do_not_overflow(radius, rows_radius):
     pair = np.full((40, 40), 255, np.uint8), np.zeros((40, 40), np.uint8)
     search = Search(3, 0, radius, rows_radius, cost_cap=255, slant=0)
     costs = search_all(pair, search, everything((40, 40), search)).costs[0]
@@ -343,13 +340,13 @@ def planes_of(grey: UInt8, place: int, size: int) -> UInt8:
 
 
 @given(greys, st.integers(-30, 40), st.integers(1, 30))
-def test_planes_equal_the_reference_and_go_on_beyond(grey: UInt8, place: int, size: int) -> None:
+def test_planes_equal_the_reference_and_go_on_beyond(grey, place, size):
     columns = np.clip(np.arange(size) - place, 0, grey.shape[1] - 1)
     expected = planes_reference(grey)[:, :, columns]
     np.testing.assert_array_equal(planes_of(grey, place, size), expected)
 
 
-def test_census_does_not_change_with_brightness_and_contrast() -> None:
+def test_census_does_not_change_with_brightness_and_contrast():
     grey = np.random.default_rng(0).integers(0, 100, (20, 30), dtype=np.uint8)
     one, brighter = (planes_of(image, 0, 30)[1:] for image in (grey, 2 * grey + 40))
     np.testing.assert_array_equal(one, brighter)
@@ -393,14 +390,12 @@ def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
 
 @settings(max_examples=70)
 @given(pairs((1, 7), (1, 9)), windows(), st.integers(1, 4))
-def test_semi_global_search_equals_the_reference_in_strips_that_overlap_wholly(
-    pair: Pair, rules: tuple[Window, Paths], strips: int
-) -> None:
+def test_semi_global_search_equals_the_reference_in_strips_that_overlap_wholly(pair, rules, strips):
     views = make_views(pair, *rules)
     assert_equal(sweep(views, *rules, strips), semi_global_minima_reference(views, *rules))
 
 
-def test_few_rows_of_overlap_change_little() -> None:
+def test_few_rows_of_overlap_change_little():
     left = np.random.default_rng(0).integers(0, 256, (80, 60), dtype=np.uint8)
     paths = Paths(16, 0, 10, 50, 20, 12, overlap=8, side_overlap=8)
     window = scaled_window(1, 1, 16, 40, 3.0)
@@ -411,7 +406,7 @@ def test_few_rows_of_overlap_change_little() -> None:
 
 @pytest.mark.parametrize("shape", [(3 * semi_global.ROWS + 5, 70), (2 * semi_global.ROWS, 64)])
 @pytest.mark.parametrize("overlap", [4 * semi_global.ROWS, 2 * semi_global.ROWS + 1])
-def test_images_of_several_blocks_equal_the_reference(shape: tuple[int, int], overlap: int) -> None:
+def test_images_of_several_blocks_equal_the_reference(shape, overlap):
     """Paths from above go on from block to block; those from below reach through all below."""
     pair = tuple(np.random.default_rng(1).integers(0, 256, (2, *shape), dtype=np.uint8))
     paths = Paths(9, -2, 10, 50, 20, 12, overlap=max(overlap, shape[0]), side_overlap=70)
@@ -423,7 +418,7 @@ def test_images_of_several_blocks_equal_the_reference(shape: tuple[int, int], ov
 
 @pytest.mark.parametrize("minimum", [-70, 0, 3])
 @pytest.mark.parametrize("side_overlap", [0, 9])
-def test_bands_equal_the_reference_that_begins_at_sides(minimum: int, side_overlap: int) -> None:
+def test_bands_equal_the_reference_that_begins_at_sides(minimum, side_overlap):
     """The right view is put together from all bands."""
     rows = 2 if numba.config.DISABLE_JIT else 9
     left, right = np.random.default_rng(2).integers(0, 256, (2, rows, 300), dtype=np.uint8)
@@ -439,9 +434,7 @@ def test_bands_equal_the_reference_that_begins_at_sides(minimum: int, side_overl
 
 
 @given(st.integers(0, 15), st.integers(0, 15), st.integers(1, 207), st.floats(0.05, 6.0))
-def test_a_scaled_window_stays_in_its_bits(
-    radius: int, rows_radius: int, largest: int, levels: float
-) -> None:
+def test_a_scaled_window_stays_in_its_bits(radius, rows_radius, largest, levels):
     window = scaled_window(radius, rows_radius, 14, largest, min(levels, 250 / largest))
     across = ((2 * radius + 1) * largest) >> window.row_shift
     most = across * (2 * rows_radius + 1)
@@ -508,9 +501,7 @@ def shorten(a: Any, b: Any, out: Any) -> None:
         (shorten, WORDS, BYTES),
     ],
 )
-def test_compiled_vectors_do_as_numpy_does(
-    function: Callable[..., None], kind: Any, made: Any, data: st.DataObject
-) -> None:
+def test_compiled_vectors_do_as_numpy_does(function, kind, made, data):
     # Few values make ties, the whole range makes overflows.
     values = st.integers(0, 3) | st.integers(0, int(np.iinfo(kind).max))
     a, b = (data.draw(hnp.arrays(kind, LANES + 5, elements=values)) for _ in range(2))
@@ -520,7 +511,7 @@ def test_compiled_vectors_do_as_numpy_does(
     np.testing.assert_array_equal(compiled, plain)
 
 
-def test_means_are_rounded_up_bits_counted_and_ends_have_neighbours_in_the_other_vector() -> None:
+def test_means_are_rounded_up_bits_counted_and_ends_have_neighbours_in_the_other_vector():
     a, b = np.array([[0, 1, 255], [1, 1, 254]], np.uint8)
     assert simd.mean(a, b).tolist() == [1, 1, 255]
     assert simd.differing_bits(a, b).tolist() == [1, 0, 1]
@@ -534,7 +525,7 @@ def move_row(a: Any, out: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_rows_are_read_and_written_where_they_are(kind: Any) -> None:
+def test_rows_are_read_and_written_where_they_are(kind):
     a, out = np.arange(2 * (LANES + 5), dtype=kind).reshape(2, -1), np.zeros((3, LANES + 2), kind)
     move_row(a, out)
     np.testing.assert_array_equal(out[2, 1:-1], a[1, 3 : 3 + LANES])
@@ -546,7 +537,7 @@ def move_block(a: Any, out: Any) -> None:
     simd.transpose(a, 1, 2, out, 2, 3)
 
 
-def test_blocks_are_transposed_and_nothing_else_is_written() -> None:
+def test_blocks_are_transposed_and_nothing_else_is_written():
     a = np.random.default_rng(0).integers(1, 256, (LANES + 3, LANES + 7), dtype=np.uint8)
     out = np.zeros((LANES + 4, LANES + 5), np.uint8)
     move_block(a, out)
@@ -555,7 +546,7 @@ def test_blocks_are_transposed_and_nothing_else_is_written() -> None:
 
 
 @pytest.mark.skipif(not hasattr(move_row, "py_func"), reason="the compiler is switched off")
-def test_rows_that_are_not_contiguous_are_refused_by_the_compiler() -> None:
+def test_rows_that_are_not_contiguous_are_refused_by_the_compiler():
     a, out = np.zeros((2, 2 * LANES + 10), np.uint8), np.zeros((3, LANES + 2), np.uint8)
     with pytest.raises(TypingError):
         move_row(a[:, ::2], out)

@@ -1,7 +1,5 @@
 """Matchers that are not ours: OpenCV's, objects, and plug-ins that packages register."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Mapping
@@ -67,7 +65,7 @@ def altered(**fields: float | np.ndarray) -> Disparity:
     return Disparity(**arrays)
 
 
-def test_an_object_is_taken_where_a_name_is_and_recorded_by_its_name(tmp_path: Path) -> None:
+def test_an_object_is_taken_where_a_name_is_and_recorded_by_its_name(tmp_path):
     mine, out = Flat(), tmp_path / "run"
     config = recon.load_config(overrides=["cloud.remove_flying_edges=false"]).with_matcher(mine)
     given = recon.PairInput(recon.StereoPair(image(0), image(1)), CAMERA)
@@ -94,12 +92,12 @@ def test_an_object_is_taken_where_a_name_is_and_recorded_by_its_name(tmp_path: P
         (altered(values=np.inf, reason=np.full(SHAPE, 2, np.uint8)), "infinite.*expected NaN"),
     ],
 )
-def test_what_is_no_disparity_of_the_pair_is_refused(found: object, words: str) -> None:
+def test_what_is_no_disparity_of_the_pair_is_refused(found, words):
     with pytest.raises(MatchingError, match=rf"^matcher 'Flat': .*{words}"):
         recon.match(image(), image(), matcher=Flat(found))
 
 
-def test_an_error_inside_is_reported_with_its_matcher_and_kept_as_the_cause() -> None:
+def test_an_error_inside_is_reported_with_its_matcher_and_kept_as_the_cause():
     class Broken(Flat):
         name = "mine"
 
@@ -112,7 +110,7 @@ def test_an_error_inside_is_reported_with_its_matcher_and_kept_as_the_cause() ->
     assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
 
-def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named() -> None:
+def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named():
     valid, mine = np.ones(SHAPE, bool), Flat()
     valid[:, :9] = False
     found = make_matcher(mine).match(RectifiedPair(image(), image(), CAMERA, valid=valid))
@@ -130,9 +128,7 @@ def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named() -> No
         (Flat(), {"ndisp": 16}, r"only recon's own matchers take settings.*ndisp"),
     ],
 )
-def test_what_is_no_matcher_or_takes_no_settings_is_refused(
-    given: object, settings: dict[str, int], word: str
-) -> None:
+def test_what_is_no_matcher_or_takes_no_settings_is_refused(given, settings, word):
     with pytest.raises(SettingsError, match=word):
         recon.match(image(), image(), matcher=given, **settings)  # type: ignore[arg-type]
 
@@ -154,7 +150,7 @@ def fails():
 
 
 @pytest.fixture
-def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def plugin(tmp_path, monkeypatch):
     places = {"flat": "Flat", "sad": "Flat", "missing": "Nowhere"}
     names = {name: f"flat_matcher:{place}" for name, place in places.items()}
     names |= {name: f"flat_matcher:{name}" for name in ("nothing", "fails")}
@@ -165,7 +161,7 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("plugin")
-def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path: Path) -> None:
+def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
     made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
     assert type(made) is MATCHERS["sad"]
@@ -186,16 +182,14 @@ def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path: P
         ("fails", "does not load.*RuntimeError: no model here"),
     ],
 )
-def test_a_broken_plugin_is_named_in_one_line(name: str, words: str) -> None:
+def test_a_broken_plugin_is_named_in_one_line(name, words):
     with pytest.raises(SettingsError, match=words) as raised:
         recon.match(image(), image(), matcher=name)
     assert f"matcher {name!r}" in str(raised.value)
     assert "of package flat-matcher" in str(raised.value)
 
 
-def test_the_example_of_the_page_finds_a_shift_when_it_is_installed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_of_the_page_finds_a_shift_when_it_is_installed(tmp_path, monkeypatch):
     page = (Path(__file__).parents[3] / "docs" / "walk-research.md").read_text()
     blocks = re.findall(r"^```(\w+)\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     (source,) = [text for _, text in blocks if "class BlockMatcher" in text]
@@ -232,7 +226,7 @@ def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: objec
 
 @BOTH
 @pytest.mark.parametrize("shift_px", [-6, 0, 7, 20])
-def test_a_shift_is_found_wherever_the_right_image_reaches(name: str, shift_px: int) -> None:
+def test_a_shift_is_found_wherever_the_right_image_reaches(name, shift_px):
     first = -16 if shift_px < 0 else 0
     found = match(name, shifted_pair(shift_px), min_disparity_px=first).values
     # A 16th is OpenCV's step; ten of them allow for the bias of its sub-pixel fit.
@@ -242,15 +236,13 @@ def test_a_shift_is_found_wherever_the_right_image_reaches(name: str, shift_px: 
 
 
 @BOTH
-def test_without_padding_a_strip_as_wide_as_the_range_is_unknown(name: str) -> None:
+def test_without_padding_a_strip_as_wide_as_the_range_is_unknown(name):
     assert not OpencvSettings().pad  # the baseline is OpenCV as it comes
     assert np.isnan(match(name, shifted_pair(7), pad=False).values[:, :31]).all()
 
 
 @BOTH
-def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_error(
-    name: str,
-) -> None:
+def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_error(name):
     left, right = np.random.default_rng(5).integers(0, 256, (2, 60, 160), dtype=np.uint8)
     disparity = match(name, RectifiedPair(left, right, stand_in_camera(160, 60, 32)))
     assert np.isnan(disparity.values).mean() > 0.5
@@ -263,7 +255,7 @@ def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_err
 
 
 @BOTH
-def test_nothing_is_matched_beside_the_right_image_or_without_an_image(name: str) -> None:
+def test_nothing_is_matched_beside_the_right_image_or_without_an_image(name):
     pair, valid = shifted_pair(20), np.ones((60, 160), dtype=bool)
     valid[:10] = False
     found = match(name, RectifiedPair(pair.left, pair.right, pair.camera, valid=valid))
@@ -281,8 +273,6 @@ def test_nothing_is_matched_beside_the_right_image_or_without_an_image(name: str
         ("opencv-sgbm", (60, 160), {"ndisp": 4096}, "exceed the range of OpenCV"),
     ],
 )
-def test_what_opencv_refuses_or_cannot_count_is_an_error_of_ours(
-    name: str, shape: tuple[int, int], settings: dict[str, int], words: str
-) -> None:
+def test_what_opencv_refuses_or_cannot_count_is_an_error_of_ours(name, shape, settings, words):
     with pytest.raises(MatchingError, match=words):
         match(name, shifted_pair(0, shape), pad=False, **settings)

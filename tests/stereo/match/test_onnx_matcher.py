@@ -1,7 +1,5 @@
 """The ONNX matcher with a tiny network built in the test."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +35,7 @@ def write_network(
 
 
 @pytest.fixture
-def difference(tmp_path: Path) -> Path:
+def difference(tmp_path):
     """Gives ``left - right``: a "disparity" that a test can predict."""
     sides = ["left", "right"]
     return write_network(tmp_path / "net.onnx", sides, [(sides, "d", "Sub")])
@@ -52,7 +50,7 @@ def match(model: Path, pair: RectifiedPair, **settings: object) -> Disparity:
     return OnnxMatcher(OnnxSettings(model=model, **settings), threads=1).match(pair)
 
 
-def test_the_network_decides_the_disparity(difference: Path) -> None:
+def test_the_network_decides_the_disparity(difference):
     disparity = match(difference, pair_of(30, 10), std=(1 / 255,))
     assert disparity.values.shape == (40, 60)
     assert np.nanmin(disparity.values) == pytest.approx(20, abs=1e-3)
@@ -77,9 +75,7 @@ def write_mean(path: Path, inputs: list[str], shape: tuple[int | None, ...]) -> 
     return path
 
 
-def test_inputs_are_those_that_the_network_declares_and_what_is_not_finite_no_match(
-    tmp_path: Path,
-) -> None:
+def test_inputs_are_those_that_the_network_declares_and_what_is_not_finite_no_match(tmp_path):
     path = write_mean(tmp_path / "one.onnx", ["both"], (1, None, None, None))
     stacked = match(path, pair_of(4, 8), std=(1 / 255,))
     assert np.nanmedian(stacked.values) == pytest.approx(6, abs=1e-3)
@@ -91,7 +87,7 @@ def test_inputs_are_those_that_the_network_declares_and_what_is_not_finite_no_ma
     assert (match(path, pair_of(10, 30)).reason == Reason.AMBIGUOUS).all()
 
 
-def test_no_map_and_other_inputs_of_a_network_are_refused(difference: Path, tmp_path: Path) -> None:
+def test_no_map_and_other_inputs_of_a_network_are_refused(difference, tmp_path):
     sides, letters = ["left", "right"], ["a", "b", "c"]
     shape = (1, 3, None, None)
     colours = write_network(tmp_path / "colours.onnx", sides, [(sides, "d", "Sub")], shape)
@@ -107,7 +103,7 @@ def test_no_map_and_other_inputs_of_a_network_are_refused(difference: Path, tmp_
         match(difference, pair_of(1, 2), mean=(0.1, 0.2, 0.3))
 
 
-def test_a_file_that_is_no_network_and_settings_that_disagree_are_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_no_network_and_settings_that_disagree_are_refused(tmp_path):
     (tmp_path / "bad.onnx").write_bytes(b"no network")
     for name, words in (("bad.onnx", r"bad\.onnx"), ("none.onnx", "does not exist")):
         with pytest.raises(FormatError, match=words):
@@ -119,7 +115,7 @@ def test_a_file_that_is_no_network_and_settings_that_disagree_are_refused(tmp_pa
         OnnxMatcher(OnnxSettings()).match(pair_of(1, 2))
 
 
-def test_without_the_extra_pip_is_named(difference: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_pip_is_named(difference, monkeypatch):
     def absent(name: str) -> None:
         raise ModuleNotFoundError(name)
 

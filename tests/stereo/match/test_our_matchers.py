@@ -1,7 +1,5 @@
 """What our matchers promise: on images of known disparity, for any pair's range, on real pairs."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 import sys
@@ -88,12 +86,12 @@ SAD, SGM = SadSettings(ndisp=32), SgmSettings(ndisp=32)
 
 
 @pytest.fixture(params=["sad", "sgm"])
-def name(request: pytest.FixtureRequest) -> str:
+def name(request):
     return str(request.param)
 
 
 @pytest.fixture
-def match(name: str) -> Match:
+def match(name):
     """Matches a pair, by default in 32 disparities."""
 
     def matched(pair: RectifiedPair, *, threads: int | None = None, **settings: int) -> Disparity:
@@ -110,7 +108,7 @@ def shifted_noise(shift: int) -> RectifiedPair:
 
 
 @pytest.mark.parametrize("shift", [-6, -1, 0, 8])
-def test_whole_shifts_of_either_sign_are_moved_only_by_the_fit(match: Match, shift: int) -> None:
+def test_whole_shifts_of_either_sign_are_moved_only_by_the_fit(match, shift):
     pair, searched = shifted_noise(shift), {"min_disparity_px": -10, "ndisp": 20}
     fitted = inner(match(pair, **searched).values, margin=20)
     assert (np.rint(fitted) == shift).all()
@@ -121,7 +119,7 @@ def test_whole_shifts_of_either_sign_are_moved_only_by_the_fit(match: Match, shi
 
 
 @pytest.mark.parametrize("shift", [5.25, 7.5, 10.8])
-def test_fraction_of_a_pixel_is_recovered(name: str, match: Match, shift: float) -> None:
+def test_fraction_of_a_pixel_is_recovered(name, match, shift):
     values = inner(match(warped_pair(np.full((HEIGHT, WIDTH), shift))).values)
     # 0.25 is what it is off by without a fit. A tenth is what the fit reaches on clean images; the
     # caps on single costs of the semi-global matcher pull towards whole pixels.
@@ -136,14 +134,14 @@ def ground(slant: float) -> tuple[RectifiedPair, Float64]:
     return warped_pair(truth), truth
 
 
-def test_slanted_plane_is_followed(match: Match) -> None:
+def test_slanted_plane_is_followed(match):
     pair, truth = ground(0.2)
     error = inner(np.abs(match(pair).values - truth))
     assert np.nanmedian(error) < 0.15
     assert np.isfinite(error).mean() > 0.9
 
 
-def test_half_occluded_wall_is_occluded_and_not_given_a_value(match: Match) -> None:
+def test_half_occluded_wall_is_occluded_and_not_given_a_value(match):
     pair, hidden = square_before_wall()
     found = match(pair)
     # Windows that reach over the edge of the square may take its side: half a window aside.
@@ -157,7 +155,7 @@ def test_half_occluded_wall_is_occluded_and_not_given_a_value(match: Match) -> N
     assert np.nanmedian(found.values[25:55, 10:45]) == pytest.approx(4, abs=0.1)
 
 
-def test_pixels_without_an_image_are_border_and_have_no_rough_disparity(match: Match) -> None:
+def test_pixels_without_an_image_are_border_and_have_no_rough_disparity(match):
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, 50:60] = False
     pair = replace(warped_pair(np.full((HEIGHT, WIDTH), 8.0)), valid=valid)
@@ -168,7 +166,7 @@ def test_pixels_without_an_image_are_border_and_have_no_rough_disparity(match: M
 
 
 @pytest.mark.parametrize("threads", [2, 3, 7])
-def test_number_of_threads_does_not_change_the_result(match: Match, threads: int) -> None:
+def test_number_of_threads_does_not_change_the_result(match, threads):
     scene = noise(height=450, width=89)  # several strips of rows
     pair = make_pair(scene[:, :80], scene[:, 9:])
     one, many = match(pair, threads=1), match(pair, threads=threads)
@@ -178,9 +176,7 @@ def test_number_of_threads_does_not_change_the_result(match: Match, threads: int
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (2, 3), (40, 60)])
 @pytest.mark.parametrize("level", [0, 7, 255])
-def test_blank_images_have_no_disparity(
-    name: str, match: Match, shape: tuple[int, int], level: int
-) -> None:
+def test_blank_images_have_no_disparity(name, match, shape, level):
     grey = np.full(shape, level, np.uint8)
     found = match(make_pair(grey, grey))
     assert found.values.shape == shape
@@ -189,7 +185,7 @@ def test_blank_images_have_no_disparity(
     assert name == "sgm" or (found.reason == Reason.LOW_TEXTURE).all()
 
 
-def test_a_range_wider_than_the_image_is_searched_and_one_outside_refused(match: Match) -> None:
+def test_a_range_wider_than_the_image_is_searched_and_one_outside_refused(match):
     pair = shifted_noise(8)
     found = match(pair, min_disparity_px=-300, ndisp=600)
     assert (np.abs(inner(found.values) - 8) < 0.5).mean() > 0.99
@@ -199,7 +195,7 @@ def test_a_range_wider_than_the_image_is_searched_and_one_outside_refused(match:
         match(pair, min_disparity_px=first - int(np.sign(first)))
 
 
-def test_slanted_window_sees_the_ground_more_completely_and_better() -> None:
+def test_slanted_window_sees_the_ground_more_completely_and_better():
     pair, truth = ground(1 / 3)
     errors = []
     for slant in (0, 1 / 3):
@@ -211,7 +207,7 @@ def test_slanted_window_sees_the_ground_more_completely_and_better() -> None:
     assert np.nanmedian(errors[1]) < 0.6 * np.nanmedian(errors[0])
 
 
-def test_repeated_patterns_ends_of_the_range_and_what_lies_beyond_are_not_trusted() -> None:
+def test_repeated_patterns_ends_of_the_range_and_what_lies_beyond_are_not_trusted():
     stripes = np.tile(np.repeat(np.array([40, 200], np.uint8), 4), (40, 20))
     assert not inner(SadMatcher(SAD).match(make_pair(stripes, stripes)).valid).any()
     found = SadMatcher(SadSettings(ndisp=8)).match(shifted_noise(7))
@@ -228,7 +224,7 @@ def test_repeated_patterns_ends_of_the_range_and_what_lies_beyond_are_not_truste
 
 
 @pytest.mark.parametrize("grey_noise", [2.0, 6.0])
-def test_sigma_covers_the_errors_of_noisy_images(grey_noise: float) -> None:
+def test_sigma_covers_the_errors_of_noisy_images(grey_noise):
     clean, rng = warped_pair(np.full((HEIGHT, WIDTH), 7.3)), np.random.default_rng(5)
     left, right = (
         np.clip(image + rng.normal(0, grey_noise, image.shape), 0, 255).astype(np.uint8)
@@ -244,7 +240,7 @@ def test_sigma_covers_the_errors_of_noisy_images(grey_noise: float) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_slanted_ground_of_weak_texture_is_dense_and_right(seed: int) -> None:
+def test_slanted_ground_of_weak_texture_is_dense_and_right(seed):
     """Along a row it has one disparity; on every other path each third step is paid for."""
     height, width, rng = 120, 260, np.random.default_rng(seed)
     truth = np.broadcast_to(6 + np.arange(height)[:, None] / 3, (height, width))
@@ -265,7 +261,7 @@ def test_slanted_ground_of_weak_texture_is_dense_and_right(seed: int) -> None:
     assert (error[known] > 1).mean() < 0.08
 
 
-def test_what_is_flat_is_filled_in_and_brightness_of_one_camera_matters_little() -> None:
+def test_what_is_flat_is_filled_in_and_brightness_of_one_camera_matters_little():
     scene = noise(width=WIDTH + 9)
     scene[24:36, 60:90] = 128
     found = SgmMatcher(SGM).match(make_pair(scene[:, :WIDTH], scene[:, 9:]))
@@ -286,9 +282,7 @@ def test_what_is_flat_is_filled_in_and_brightness_of_one_camera_matters_little()
         (SgmSettings, {"small_penalty": 1.0}, "now called p1"),
     ],
 )
-def test_windows_and_penalties_that_do_not_fit_are_refused(
-    settings: type[SadSettings | SgmSettings], wrong: dict[str, float], words: str
-) -> None:
+def test_windows_and_penalties_that_do_not_fit_are_refused(settings, wrong, words):
     assert SgmSettings(p1=50.0).p2 == 50.0
     assert 55 * (55 + 1) * sad._COST_CAP < 65535  # costs of the widest window fit the kernel
     with pytest.raises(SettingsError, match=words):
@@ -296,7 +290,7 @@ def test_windows_and_penalties_that_do_not_fit_are_refused(
 
 
 @pytest.mark.slow
-def test_memory_of_a_large_pair_is_bounded() -> None:
+def test_memory_of_a_large_pair_is_bounded():
     code = """
 import resource
 import numpy as np
@@ -314,7 +308,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 @pytest.mark.parametrize("edges", [(0, 11, 23), (0, 1, 2, 22, 23), range(24)])
 @pytest.mark.parametrize("window_px", [1, 11, 61])
-def test_gradients_and_texture_are_those_of_strips(edges: tuple[int, ...], window_px: int) -> None:
+def test_gradients_and_texture_are_those_of_strips(edges, window_px):
     rng = np.random.default_rng(5)
     image = rng.integers(0, 256, (23, 17), dtype=np.uint8)
     pair = make_pair(image, image, rng.random(image.shape) < 0.9)
@@ -327,7 +321,7 @@ def test_gradients_and_texture_are_those_of_strips(edges: tuple[int, ...], windo
     np.testing.assert_allclose(found, 3.0, rtol=1e-6)
 
 
-def test_memory_is_lent_again_once_no_view_of_it_is_referenced() -> None:
+def test_memory_is_lent_again_once_no_view_of_it_is_referenced():
     pool = ResultPool(2)
     block = pool.lend(4096)
     address = block.ctypes.data
@@ -351,7 +345,7 @@ def plane(disparity_px: int) -> RectifiedPair:
 
 
 @pytest.mark.parametrize("disparity_px", [3, 40, 75, 120, 170])
-def test_range_of_a_plane_holds_it_without_waste(disparity_px: int) -> None:
+def test_range_of_a_plane_holds_it_without_waste(disparity_px):
     pair = plane(disparity_px)
     ndisp = estimate_ndisp(pair)
     assert disparity_px < ndisp - 1
@@ -365,15 +359,13 @@ def test_range_of_a_plane_holds_it_without_waste(disparity_px: int) -> None:
     ("shape", "ndisp"),
     [((1, 1), 16), ((1, 640), 64), ((900, 1), 16), ((3, 5), 16), ((90, 160), 16), ((9, 1242), 128)],
 )
-def test_blank_images_get_a_range_of_a_tenth_of_the_width(
-    shape: tuple[int, int], ndisp: int
-) -> None:
+def test_blank_images_get_a_range_of_a_tenth_of_the_width(shape, ndisp):
     grey = np.full(shape, 77, np.uint8)
     assert estimate_ndisp(make_pair(grey, grey)) == usual_ndisp(shape[1]) == ndisp
 
 
 @pytest.mark.parametrize("name", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
-def test_near_plane_is_found_only_with_the_automatic_range(name: str) -> None:
+def test_near_plane_is_found_only_with_the_automatic_range(name):
     settings, pair = MatchingSettings.parse({"opencv": {"pad": True}}), plane(100)
     known = replace(pair, camera=replace(pair.camera, ndisp=32))
     auto, usual = make_matcher(name, settings, 1), MATCHERS[name](settings_of(name, settings), 1)
@@ -383,7 +375,7 @@ def test_near_plane_is_found_only_with_the_automatic_range(name: str) -> None:
     assert (np.abs(found[0].values[:, 108:] - 100) < 0.5).mean() > 0.9
 
 
-def test_range_of_settings_is_kept() -> None:
+def test_range_of_settings_is_kept():
     narrow = MatchingSettings(sad=SadSettings(ndisp=16))
     assert not isinstance(make_matcher("sad", narrow), AutoRangeMatcher)
     assert searched(narrow) is narrow.sad
@@ -392,7 +384,7 @@ def test_range_of_settings_is_kept() -> None:
 
 
 @pytest.mark.real
-def test_range_holds_the_truth_of_real_pairs(recon_data: Path) -> None:
+def test_range_holds_the_truth_of_real_pairs(recon_data):
     folder = recon_data / "middlebury"
     parts = ("MiddEval3/trainingQ", "2005", "2006")
     scenes = [scene for part in parts for scene in (folder / part).iterdir()]
@@ -409,7 +401,7 @@ def test_range_holds_the_truth_of_real_pairs(recon_data: Path) -> None:
 
 @pytest.mark.parametrize("shift", [5.25, 7.5, 10.8])
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (HEIGHT + 1, WIDTH + 1)])
-def test_rough_disparities_are_right_to_a_fraction(shift: float, size: tuple[int, int]) -> None:
+def test_rough_disparities_are_right_to_a_fraction(shift, size):
     found = HalfSizeMatcher(SAD, threads=1).match(warped_pair(np.full(size, shift)))
     values = inner(found.values)
     assert found.values.shape == size
@@ -418,7 +410,7 @@ def test_rough_disparities_are_right_to_a_fraction(shift: float, size: tuple[int
     assert np.nanmin(found.sigma_px) >= 0.2  # twice that of half size
 
 
-def test_the_rough_range_is_that_of_the_full_size_or_of_the_calibration() -> None:
+def test_the_rough_range_is_that_of_the_full_size_or_of_the_calibration():
     pair = warped_pair(np.full((HEIGHT, WIDTH), 20.0))
     known = replace(pair, camera=replace(pair.camera, ndisp=32))
     for settings, given in ((SAD, pair), (SadSettings(), known)):
@@ -439,7 +431,7 @@ def match_scene(folder: Path) -> tuple[Disparity, Float32]:
 
 
 @pytest.mark.real
-def test_disparities_of_real_pairs_are_right_as_sigma_and_confidence_say(recon_data: Path) -> None:
+def test_disparities_of_real_pairs_are_right_as_sigma_and_confidence_say(recon_data):
     folder = recon_data / "middlebury" / "MiddEval3" / "trainingQ"
     scenes = [match_scene(folder / name) for name in ("ArtL", "Motorcycle", "Piano", "Teddy")]
     both = [found.valid & np.isfinite(truth) for found, truth in scenes]
@@ -464,7 +456,7 @@ def test_disparities_of_real_pairs_are_right_as_sigma_and_confidence_say(recon_d
 
 @pytest.mark.slow
 @pytest.mark.real
-def test_sgm_makes_fewer_and_smaller_errors_than_opencv(recon_data: Path, tmp_path: Path) -> None:
+def test_sgm_makes_fewer_and_smaller_errors_than_opencv(recon_data, tmp_path):
     folder, names = recon_data / "middlebury" / "MiddEval3" / "trainingQ", ("sgm", "opencv-sgbm")
     figures = run_middlebury(folder, matchers=names, out=tmp_path / "run")["matchers"]
     ours, other = (figures[name]["weighted"]["nonocc"]["dense"] for name in names)

@@ -1,11 +1,7 @@
 """Lenses, rectification, and features that show what is no rectified pair."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -34,13 +30,7 @@ from recon.stereo.rectify.features import (
     inspect_pair,
 )
 from recon.stereo.rectify.lens import project_raw, project_with_jacobian, rays_of
-from recon.stereo.rectify.rectifier import (
-    GreyMode,
-    RectificationSettings,
-    Rectifier,
-    plan_turns,
-    to_grey,
-)
+from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, plan_turns, to_grey
 
 WIDTH, HEIGHT = 320, 240
 LENS = np.array([-0.28, 0.09, 1e-3, -8e-4, 0.0])
@@ -83,9 +73,7 @@ def striped(calibration: StereoCalibration, stripes: float) -> StereoPair:
 
 # Rounding to a level, twice, and linear interpolation of the sine; 10 times that when raw.
 @pytest.mark.parametrize(("fisheye", "limit", "stripes"), [(False, 2, 25), (True, 3, 12)])
-def test_stripes_of_epipolar_planes_become_level_and_equal_in_both_images(
-    fisheye: bool, limit: float, stripes: float
-) -> None:
+def test_stripes_of_epipolar_planes_become_level_and_equal_in_both_images(fisheye, limit, stripes):
     calibration = fisheye_rig() if fisheye else rig()
     raw = striped(calibration, stripes)
     rectified = Rectifier(calibration).rectify(raw)
@@ -97,7 +85,7 @@ def test_stripes_of_epipolar_planes_become_level_and_equal_in_both_images(
     assert np.ptp(means[0]) > 100
 
 
-def test_an_aligned_rig_keeps_its_images_and_rectified_input_passes_bit_by_bit() -> None:
+def test_an_aligned_rig_keeps_its_images_and_rectified_input_passes_bit_by_bit():
     K = np.array([[250.0, 0, 160], [0, 250, 120], [0, 0, 1]])
     camera = CameraIntrinsics(K, np.zeros(0), WIDTH, HEIGHT)
     T = make_transform(np.eye(3), np.array([-0.1, 0, 0]))
@@ -116,7 +104,7 @@ def test_an_aligned_rig_keeps_its_images_and_rectified_input_passes_bit_by_bit()
     assert rectified.valid is rectified.left_rgb is None
 
 
-def test_alpha_0_leaves_only_pixels_with_a_source_and_alpha_1_keeps_all_sources() -> None:
+def test_alpha_0_leaves_only_pixels_with_a_source_and_alpha_1_keeps_all_sources():
     for calibration, least in ((rig(), 0.999), (fisheye_rig(), 1.0)):
         zoomed, whole = (Rectifier(calibration, RectificationSettings(alpha=a)) for a in (0, 1))
         assert zoomed.valid is not None
@@ -133,7 +121,7 @@ def test_alpha_0_leaves_only_pixels_with_a_source_and_alpha_1_keeps_all_sources(
 
 
 @pytest.mark.parametrize("calibration", ["raw", "rectified"])
-def test_colours_are_kept_beside_the_grey(calibration: str) -> None:
+def test_colours_are_kept_beside_the_grey(calibration):
     rectifier = Rectifier(rig() if calibration == "raw" else Rectifier(rig()).camera)
     rectified = rectifier.rectify(pair(shape=(HEIGHT, WIDTH, 3)))
     assert rectified.left_rgb is not None
@@ -143,7 +131,7 @@ def test_colours_are_kept_beside_the_grey(calibration: str) -> None:
     assert (rectified.timestamp_s, rectified.index) == (1.5, 4)
 
 
-def test_images_of_another_size_are_refused_with_both_sizes() -> None:
+def test_images_of_another_size_are_refused_with_both_sizes():
     for calibration in (rig(), RectifiedCamera(250, 1, 1, 1, 1, WIDTH, HEIGHT)):
         with pytest.raises(CalibrationError, match=r"000004\.png: .*got 320x200, expected 320x240"):
             Rectifier(calibration).rectify(pair(shape=(200, WIDTH)))
@@ -160,9 +148,7 @@ def test_images_of_another_size_are_refused_with_both_sizes() -> None:
         ({}, {"height_px": 200}, "got left 320x240, right 320x200"),
     ],
 )
-def test_rigs_that_are_no_left_and_right_are_refused(
-    change: dict[str, Any], size: dict[str, int], message: str
-) -> None:
+def test_rigs_that_are_no_left_and_right_are_refused(change, size, message):
     calibration = rig(**change)
     calibration = replace(calibration, right=replace(calibration.right, **size))
     with pytest.raises(CalibrationError, match=message):
@@ -170,7 +156,7 @@ def test_rigs_that_are_no_left_and_right_are_refused(
 
 
 @pytest.mark.real
-def test_corners_of_a_real_chessboard_share_their_rows(recon_data: Path) -> None:
+def test_corners_of_a_real_chessboard_share_their_rows(recon_data):
     folder = recon_data / "calibration" / "opencv_chessboard"
     rectifier = Rectifier(read_calibration(folder / "intrinsics.yml", 640, 480))
     offsets = []
@@ -202,7 +188,7 @@ def fisheye_rig(focal: float = 110.0) -> StereoCalibration:
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0, None])
 @pytest.mark.parametrize("lenses", ["pinhole", "fisheye", "mixed"])
-def test_points_lie_on_one_row_at_their_disparity(alpha: float | None, lenses: str) -> None:
+def test_points_lie_on_one_row_at_their_disparity(alpha, lenses):
     calibration = rig() if lenses == "pinhole" else fisheye_rig()
     if lenses == "mixed":
         calibration = replace(calibration, right=rig().right)
@@ -218,7 +204,7 @@ def test_points_lie_on_one_row_at_their_disparity(alpha: float | None, lenses: s
     assert turns.camera.cx_px == turns.camera.cx_right_px
 
 
-def test_lenses_beyond_a_half_space_or_that_fold_in_corners_give_views_of_sane_width() -> None:
+def test_lenses_beyond_a_half_space_or_that_fold_in_corners_give_views_of_sane_width():
     rectifier = Rectifier(fisheye_rig(focal=70.0), RectificationSettings(alpha=1.0))
     half_height = rectifier.camera.height_px / 2 / rectifier.camera.focal_px
     assert 1.0 < half_height < np.tan(np.radians(61))
@@ -238,7 +224,7 @@ IMAGES = arrays(np.uint8, st.tuples(st.integers(1, 8), st.integers(1, 8), st.jus
 
 
 @given(image=IMAGES)
-def test_grey_is_the_sum_of_the_norm_the_mean_or_equation_6_as_printed(image: np.ndarray) -> None:
+def test_grey_is_the_sum_of_the_norm_the_mean_or_equation_6_as_printed(image):
     exact = image @ np.array([0.299, 0.587, 0.114])
     # Rounding to nearest, and 1/2^14 steps of the weights in OpenCV's integers.
     assert np.abs(to_grey(image) - exact).max() < 0.52
@@ -248,7 +234,7 @@ def test_grey_is_the_sum_of_the_norm_the_mean_or_equation_6_as_printed(image: np
 
 
 @pytest.mark.parametrize("mode", ["bt601", "mean", "paper"])
-def test_grey_read_only_and_strided_images_are_taken_and_others_refused(mode: GreyMode) -> None:
+def test_grey_read_only_and_strided_images_are_taken_and_others_refused(mode):
     image = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     strided = image[::2, ::-1]
     strided.flags.writeable = False
@@ -275,9 +261,7 @@ def lens(model: LensModel, numbers: np.ndarray) -> CameraIntrinsics:
         ("fisheye", [0.02, -0.01, 2e-3, 1e-3]),
     ],
 )
-def test_projection_has_inverse_and_derivatives(
-    model: LensModel, coefficients: list[float]
-) -> None:
+def test_projection_has_inverse_and_derivatives(model, coefficients):
     xyz, step = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (20, 3)), 1e-6
     numbers = np.array([500.0, 501, 320, 240, *coefficients])
     camera = lens(model, numbers)
@@ -299,7 +283,7 @@ def test_projection_has_inverse_and_derivatives(
     np.testing.assert_allclose(by_lens, np.stack(lenses, axis=-1), atol=1e-6)
 
 
-def test_rays_at_ninety_degrees_and_more_are_nan() -> None:
+def test_rays_at_ninety_degrees_and_more_are_nan():
     camera = lens("fisheye", np.array([100.0, 100, 320, 240, 0, 0, 0, 0]))
     rays = rays_of(camera, np.array([[470, 240], [490, 240]]))  # at 1.5 and 1.7 radians
     assert np.isfinite(rays).any(axis=1).tolist() == [True, False]
@@ -324,7 +308,7 @@ def wall_pair(disparity_px: float = 12.0, row_px: float = 0.0, seed: int = 0) ->
     return RectifiedPair(crop(0, 0), crop(disparity_px, -row_px), CAMERA)
 
 
-def test_a_good_pair_has_rows_that_correspond_and_no_negative_disparity() -> None:
+def test_a_good_pair_has_rows_that_correspond_and_no_negative_disparity():
     pair = wall_pair()
     found = inspect_pair(pair)
     assert found.features > 100
@@ -340,7 +324,7 @@ def test_a_good_pair_has_rows_that_correspond_and_no_negative_disparity() -> Non
 
 
 @pytest.mark.parametrize("row_px", [-5.0, -1.7, 1.7, 5.0, 20.0])
-def test_rows_that_are_off_are_measured_and_said_whatever_the_exposure(row_px: float) -> None:
+def test_rows_that_are_off_are_measured_and_said_whatever_the_exposure(row_px):
     pair = wall_pair(row_px=row_px)
     darker = replace(pair, right=(pair.right // 2).astype(np.uint8))
     assert inspect_pair(darker).row_error_px == pytest.approx(row_px, abs=0.3)
@@ -352,7 +336,7 @@ def test_rows_that_are_off_are_measured_and_said_whatever_the_exposure(row_px: f
 
 
 @pytest.mark.parametrize("row_px", [0.0, 5.0])
-def test_swapped_cameras_are_an_error_that_says_so(row_px: float) -> None:
+def test_swapped_cameras_are_an_error_that_says_so(row_px):
     pair = wall_pair(row_px=row_px)
     found = inspect_pair(replace(pair, left=pair.right, right=pair.left))
     assert found.negative_share > 0.98
@@ -360,7 +344,7 @@ def test_swapped_cameras_are_an_error_that_says_so(row_px: float) -> None:
         check_inspection(found, where="frame 7")
 
 
-def test_blank_images_other_scenes_and_one_at_infinity_give_no_answer() -> None:
+def test_blank_images_other_scenes_and_one_at_infinity_give_no_answer():
     blank = np.full((240, 400), 255, np.uint8)
     found = inspect_pair(RectifiedPair(blank, blank, CAMERA))
     assert found.features == 0
@@ -371,7 +355,7 @@ def test_blank_images_other_scenes_and_one_at_infinity_give_no_answer() -> None:
     assert [check_inspection(each) for each in (found, far, strangers)] == [(), (), ()]
 
 
-def test_wrong_matches_do_not_move_the_row_error() -> None:
+def test_wrong_matches_do_not_move_the_row_error():
     rng = np.random.default_rng(3)
     left = rng.uniform(0, 400, (300, 2)).astype(np.float32)
     right = left + np.float32([-10.0, 2.0]) + rng.normal(0, 0.2, left.shape).astype(np.float32)

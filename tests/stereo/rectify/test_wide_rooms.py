@@ -1,7 +1,5 @@
 """Furnished rooms, seen by lenses of 60 to 230 degrees: rectified views, depth, maps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -31,13 +29,7 @@ from recon.stereo.rectify.rectifier import (
     plan_turns,
 )
 from recon.street.render import Stage, View, make_stage, stereo_views, take_image
-from recon.street.shapes import (
-    Material,
-    Paint,
-    boxes,
-    merge,
-    quads,
-)
+from recon.street.shapes import Material, Paint, boxes, merge, quads
 
 # The polynomial of a lens of TUM VI.
 LENS = (0.01017, -0.01082, 0.00594, -0.00166)
@@ -180,9 +172,7 @@ def tum_vi() -> StereoCalibration:
 @pytest.mark.parametrize("lens", [NONE, LENS])
 @pytest.mark.parametrize("size", [(640, 480), (512, 512)])
 @pytest.mark.parametrize("field_deg", [60, 120, 160, 195, 230])
-def test_the_field_of_view_is_bounded_however_wide_the_lens(
-    field_deg: float, size: tuple[int, int], lens: tuple[float, ...]
-) -> None:
+def test_the_field_of_view_is_bounded_however_wide_the_lens(field_deg, size, lens):
     rig = fisheye_rig(field_deg, size, lens, centre=(6.0, -9.0))
     rectifier = Rectifier(rig)
     # Of a lens of 60 degrees the views show nearly all; 120 degrees is the bound.
@@ -191,7 +181,7 @@ def test_the_field_of_view_is_bounded_however_wide_the_lens(
     assert rectifier.valid.mean() > 0.999
 
 
-def test_views_of_a_lens_beyond_a_half_space_keep_the_resolution_of_its_centre() -> None:
+def test_views_of_a_lens_beyond_a_half_space_keep_the_resolution_of_its_centre():
     rectifier = Rectifier(tum_vi())
     assert rectifier.camera.focal_px == pytest.approx(380.81)
     assert rectifier.camera.field_of_view_deg == pytest.approx(106.7, abs=0.1)
@@ -209,7 +199,7 @@ def test_views_of_a_lens_beyond_a_half_space_keep_the_resolution_of_its_centre()
         _check_focal(view, tum_vi().left)
 
 
-def test_an_opencv_file_that_may_be_of_a_fisheye_must_say_so(tmp_path: Path) -> None:
+def test_an_opencv_file_that_may_be_of_a_fisheye_must_say_so(tmp_path):
     write_opencv_calibration(tmp_path / "rig.yml", tum_vi())
     text = (tmp_path / "rig.yml").read_text()
     assert "distortion_model: fisheye" in text
@@ -226,9 +216,7 @@ def sixteen_bits(image: np.ndarray) -> np.ndarray:
     ("field_deg", "size", "lens"),
     [(120, (256, 192), NONE), (160, (224, 224), LENS), (195, (256, 256), LENS)],
 )
-def test_depth_of_a_room_is_right(
-    tmp_path: Path, field_deg: float, size: tuple[int, int], lens: tuple[float, ...]
-) -> None:
+def test_depth_of_a_room_is_right(tmp_path, field_deg, size, lens):
     rig = fisheye_rig(field_deg, size, lens)
     paths = [tmp_path / "left.png", tmp_path / "right.png"]
     for path, image in zip(paths, photograph(rig, pose(0)), strict=True):
@@ -251,7 +239,7 @@ def test_depth_of_a_room_is_right(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("field_deg", [120, 195])
-def test_a_drive_through_a_room_has_the_right_path(tmp_path: Path, field_deg: float) -> None:
+def test_a_drive_through_a_room_has_the_right_path(tmp_path, field_deg):
     rig = fisheye_rig(field_deg, (320, 320), LENS)
     frames = 8
     drive = write_euroc_room(tmp_path, rig, frames, sixteen_bits)
@@ -268,7 +256,7 @@ def test_a_drive_through_a_room_has_the_right_path(tmp_path: Path, field_deg: fl
     assert len(mapped.cloud) > 1000
 
 
-def test_sixteen_bit_images_of_a_drive_or_a_pair_share_one_white(tmp_path: Path) -> None:
+def test_sixteen_bit_images_of_a_drive_or_a_pair_share_one_white(tmp_path):
     """A camera of 12 bits; the first frame is dark, the right image darker."""
     brightest = iter([500, 400, 2100, 1500, 4000, 3000, 900, 1000])
 

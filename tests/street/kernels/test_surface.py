@@ -1,7 +1,5 @@
 """The hit kernel equals its numpy reference, and describes hits as geometry says."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
