@@ -16,8 +16,13 @@ from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import StrPath
 from recon.io.images.disparity import read_disparity
-from recon.io.images.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
-from recon.io.images.image_header import read_focal_length
+from recon.io.images.image import (
+    MAX_MEGAPIXELS,
+    eight_bits,
+    find_white,
+    read_focal_length,
+    read_levels,
+)
 from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.sources.calibration import CALIBRATE, camera_of_numbers, check_given_once, read_rig
 from recon.sources.settings import SourceSettings

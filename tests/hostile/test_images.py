@@ -19,8 +19,7 @@ import pytest
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float32
 from recon.io.images.disparity import read_pfm, write_pfm
-from recon.io.images.image import read_image, write_image
-from recon.io.images.image_header import stated_size
+from recon.io.images.image import read_image, stated_size, write_image
 from recon.io.models.ply import read_ply, write_ply
 from recon.sources.image_names import natural_key
 from recon.sources.registry import open_source

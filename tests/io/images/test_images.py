@@ -22,12 +22,12 @@ from recon.io.images.disparity import (
 )
 from recon.io.images.image import (
     pixels_of_ros_image,
+    read_focal_length,
     read_grey_levels,
     read_image,
     read_levels,
     write_image,
 )
-from recon.io.images.image_header import read_focal_length
 from recon.io.images.video import open_video
 from tests.sources.drives import write_video
 
