@@ -36,9 +36,14 @@ def calibrate(
     ] = None,
     out: Annotated[Path | None, opt.option("Calibration file to write.", "--out", "-o")] = None,
     form: Annotated[
-        Literal["recon", "opencv", "ros", "kalibr"],
-        opt.option("Format of that file; ros writes two, _left and _right.", "--format", "-f"),
-    ] = "recon",
+        Literal["recon", "opencv", "ros", "kalibr"] | None,
+        opt.option(
+            "Format of that file; ros writes two, _left and _right.",
+            "--format",
+            "-f",
+            default="by its name, as recon audit --mend",
+        ),
+    ] = None,
     model: Annotated[
         Literal["radtan", "rational", "fisheye"] | None,
         opt.setting(
@@ -74,11 +79,13 @@ def calibrate(
         from recon.core.values.board import parse_board
         from recon.io.atomic import check_targets
         from recon.rig.calibrate.result import describe_depths
+        from recon.rig.written import form_of, targets_of
 
+        if out is not None:
+            form = form or form_of(out)
+            check_targets(targets_of(out, form), filter(None, [shared.config]))
         # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form == "kalibr" else []
-        if out is not None and shared.config is not None:
-            check_targets([out], [shared.config])
         settings = load_config(shared.config, [*fitting, *shared.changes])
         how: Any = {"file": out, "form": form, "out": report, "threads": shared.threads}
         run = run_calibrate(left, right, parse_board(board), settings, **how)
@@ -173,7 +180,11 @@ def rectify(
 def audit(
     source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     mend: Annotated[
-        Path | None, opt.option("Write the rig that rows and motion show to this file.")
+        Path | None,
+        opt.option(
+            "Write the rig that rows and motion show to this file: NAME.yaml is ours, NAME.yml, "
+            ".xml or .json OpenCV's, camchain.yaml kalibr's, camera_info.yaml ROS's two files."
+        ),
     ] = None,
     out: Annotated[
         Path | None, opt.option("Folder for a report with images.", "--out", "-o", default="none")
@@ -195,6 +206,7 @@ def audit(
     Examples:
       recon audit drive.bag --calib camchain.yaml
       recon audit rides/today --mend mended.yaml
+      recon audit rides/today --mend camchain.yaml
       recon audit rides/today --out audited
     """
     with shared.one_line_errors():
@@ -202,10 +214,11 @@ def audit(
         from recon.commands.cameras import run_audit
         from recon.io.atomic import check_targets
         from recon.report.audit_page import audit_lines
+        from recon.rig.written import targets_of
         from recon.sources.registry import open_source
 
-        if mend is not None and shared.config is not None:
-            check_targets([mend], [shared.config])
+        if mend is not None:
+            check_targets(targets_of(mend), filter(None, [shared.config]))
         settings = shared.settings()
         drive = open_source(source, reading.kind, settings.source)
         announce(drive, quiet=shared.quiet, verbose=verbose)

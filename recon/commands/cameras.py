@@ -14,7 +14,6 @@ from recon.commands.config import ReconConfig
 from recon.core.errors import FormatError, OutputError, SourceError
 from recon.core.values.board import CalibrationBoard
 from recon.io.atomic import check_targets, write_text
-from recon.io.cameras.ros import camera_info_paths
 from recon.io.files import StrPath
 from recon.io.images.image import write_image
 from recon.report.audit_page import write_audit_page
@@ -22,12 +21,7 @@ from recon.report.calibration_page import write_calibration_page, write_epipolar
 from recon.rig.audit.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
 from recon.rig.calibrate.bootstrap import measure_spread
-from recon.rig.calibrate.result import (
-    CalibrationForm,
-    CalibrationRun,
-    describe_calibration,
-    write_calibration,
-)
+from recon.rig.calibrate.result import CalibrationRun, describe_calibration, write_calibration
 from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
 from recon.rig.capture import (
@@ -45,6 +39,7 @@ from recon.rig.rectification import (
     plan_by_features,
     read_pairs,
 )
+from recon.rig.written import CalibrationForm, targets_of
 from recon.run.run import Run
 from recon.run.threads import serial_algebra
 from recon.sources.image_names import ImagePairs, pair_images
@@ -61,7 +56,7 @@ def run_calibrate(
     config: ReconConfig,
     *,
     file: Path | None = None,
-    form: CalibrationForm = "recon",
+    form: CalibrationForm | None = None,
     out: Path | None = None,
     threads: int | None = None,
 ) -> CalibrationRun:
@@ -72,8 +67,8 @@ def run_calibrate(
     sure the fit is. What it will do to depth gives the verdict.
 
     ``left`` and ``right`` are folders, patterns or videos; ``right`` None: ``left`` is one video
-    with both views. The calibration is also written to ``file``, in its ``form``; ``out`` gets
-    report, images and figures.
+    with both views. The calibration is also written to ``file``, in its ``form`` (None = that of
+    its name); ``out`` gets report, images and figures.
     """
     if file is not None and file.is_dir():
         hint = f"--out {file / 'calibration.yaml'}; pictures and report go to --report"
@@ -82,7 +77,7 @@ def run_calibrate(
     images = ImagePairs((), by_order=False) if videos else pair_images(left, right or "")
     inputs = videos or [path for pair in images.pairs for path in pair]
     if file is not None:
-        check_targets(camera_info_paths(file) if form == "ros" else [file], inputs)
+        check_targets(targets_of(file, form), inputs)
     with Run("calibrate", out, config, threads=threads) as run:
         if videos:
             with run.stage("pick"):
@@ -263,7 +258,8 @@ def run_audit(
         source: The recording.
         config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
         quick: A short check of a second or two, as `recon map` makes it.
-        mend: File for the rig that rows and motion show; None = none is written.
+        mend: File for the rig that rows and motion show, in the format that its name asks for
+            (`recon.rig.written`); None = none is written.
         out: Folder for a report with images; None = none is written.
 
     Raises:
@@ -273,7 +269,7 @@ def run_audit(
             recording.
     """
     if mend is not None:
-        check_targets([Path(mend)], source.files)
+        check_targets(targets_of(Path(mend)), source.files)
     audit = audit_source(source, config, quick=quick)
     if mend is not None:
         audit = replace(audit, corrected=correct_calibration(source, config, audit, Path(mend)))

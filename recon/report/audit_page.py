@@ -150,7 +150,9 @@ def _depth_off(share: Mapping[str, float | None]) -> str:
 
 
 def _mended(mended: Mapping[str, Any]) -> str:
-    return f"{mended['calibration']}: {_turned(mended)}"
+    lens = mended.get("lens_off_px")
+    left = "" if lens is None else f"; lenses as near as kalibr's come, {lens:.2f} px rms off"
+    return f"{', '.join(mended['files'])}: {_turned(mended)}{left}"
 
 
 def _turned(found: Mapping[str, Any]) -> str:

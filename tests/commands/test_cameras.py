@@ -26,8 +26,9 @@ from recon.io.images.image import read_image, write_image
 from recon.io.trajectory import FRAMES, HEADER
 from recon.rig import capture
 from recon.rig.calibrate.board_views import find_views
-from recon.rig.calibrate.result import CalibrationForm, CalibrationRun, write_calibration
+from recon.rig.calibrate.result import CalibrationRun, write_calibration
 from recon.rig.capture import CaptureFolder, RecordingSettings
+from recon.rig.written import CalibrationForm
 from recon.sources.image_names import pair_images
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource

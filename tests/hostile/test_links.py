@@ -256,10 +256,10 @@ TARGETS: Final[dict[str, Callable[[Path], None]]] = {
 def test_a_mended_calibration_replaces_no_input_and_no_device(drive: Path, target: str) -> None:
     Path("config.yaml").write_text("matching: {matcher: sad}\n")
     Path("between").symlink_to("drive/image_0/000001.png")
-    TARGETS[target](Path("target"))
+    TARGETS[target](Path("target.yaml"))
     before = state(drive.parent)
-    command = ("audit", "drive", "--config", "config.yaml", "--mend", "target", "--quiet")
-    assert_refused(run(*command), "target: ")
+    command = ("audit", "drive", "--config", "config.yaml", "--mend", "target.yaml", "--quiet")
+    assert_refused(run(*command), "target.yaml: ")
     assert state(drive.parent) == before
 
 
@@ -274,7 +274,8 @@ def test_a_calibration_replaces_no_picture_of_the_board(pair: tuple[Path, Path])
     Path("rig_left.yaml").hardlink_to("left.png")
     before = state(pair[0].parent)
     board = ("--board", "chess:9x6:25mm", "--report", "report")
-    for words in (("left.png",), ("right.png",), ("rig.yaml", "--format", "ros")):
+    ours = ("--format", "recon")
+    for words in (("left.png", *ours), ("right.png", *ours), ("rig.yaml", "--format", "ros")):
         command = ("calibrate", "left.png", "right.png", *board, "-o", *words)
         assert_refused(run(*command), "would replace an input")
     assert state(pair[0].parent) == before

@@ -366,7 +366,7 @@ def test_lines_of_an_audit_say_what_is_not_known():
     turn = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
     none = {"mean": None, "sigma": None}
     motion = {"disparity_px": off, "depth_percent": {"10": off, "30": none}, **turn}
-    summary |= {"rig_by_motion": motion, "mended": {**turn, "calibration": "new.yaml"}}
+    summary |= {"rig_by_motion": motion, "mended": {**turn, "files": ["new.yaml"]}}
     lines = audit_page.audit_lines(summary | {"lag_frames": 2})
     turned = "rotated by +0.100 deg pitch, -0.200 deg yaw, +0.000 deg roll"
     assert lines["time"] == "right camera +2 frames late"

@@ -91,11 +91,16 @@ def read_opencv_calibration(
 
 
 def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
-    """Write one YAML file for OpenCV's ``FileStorage``, ``T`` in metres, atomically."""
+    """Write one file for OpenCV's ``FileStorage``, ``T`` in metres, atomically.
+
+    XML or JSON where it is named so, else YAML.
+    """
     models = {calibration.left.model, calibration.right.model}
     if len(models) > 1:
         raise CalibrationError("an OpenCV file cannot store two lens models", where=path)
-    storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    suffix = Path(path).suffix.lower()
+    kind = suffix if suffix in {".xml", ".json"} else ".yml"
+    storage = cv2.FileStorage(kind, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", calibration.left.width_px)
     storage.write("image_height", calibration.left.height_px)
     if "fisheye" in models:

@@ -12,13 +12,13 @@ from recon.core.errors import CalibrationError, MatchingError
 from recon.core.geometry.projection import depth_sigma
 from recon.core.values import Disparity, RectifiedCamera, Rig, StereoPair
 from recon.core.values.arrays import Float64
-from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.odometry.rig.refine import RefinedRig, refine_rig
 from recon.odometry.settings import RigSettings
 from recon.rig.audit.findings import Finding, Measured, Verdict, find_faults, verdict_of
 from recon.rig.audit.measures import find_gaps
 from recon.rig.audit.sample import Look, measure_geometry, take_sample
 from recon.rig.settings import AuditedSettings
+from recon.rig.written import form_of, nearest_of_kalibr, write_rig
 from recon.run.run import plain
 from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import StereoSource, check_source
@@ -98,7 +98,8 @@ def correct_calibration(
     """Write the calibration with which rows and motion agree, and return how it differs.
 
     It is the one that `recon map` uses; of a drive that is too short for it, rows alone are
-    aligned. The baseline stays.
+    aligned. The baseline stays. The name of the file tells its format; where that is kalibr's,
+    lenses are the nearest that it knows.
     """
     rig, rows = audit.rig, audit.alignment
     if rows is None:
@@ -118,8 +119,10 @@ def correct_calibration(
         corrected, own = rig.calibration, rig.figures()
         figures |= {name: own[name] for name in _TURNED}
         figures["disparity_rms_px"] = own["disparity_px"]["rms"]
-    write_recon_calibration(path, corrected, figures)
-    return {**figures, "calibration": str(path)}
+    if form_of(path) == "kalibr":
+        corrected, figures["lens_off_px"] = nearest_of_kalibr(corrected)
+    files = write_rig(path, corrected, config.rectification, quality=figures)
+    return {**figures, "calibration": str(files[0]), "files": [str(file) for file in files]}
 
 
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:

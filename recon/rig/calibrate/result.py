@@ -5,25 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
-from recon.io.cameras.opencv_yaml import write_opencv_calibration
-from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.io.cameras.ros import write_camera_info, write_kalibr
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bootstrap import Spread
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.stereo import StereoFit
 from recon.rig.calibrate.verdict import TILT_DEG
 from recon.rig.settings import CalibratedSettings
+from recon.rig.written import CalibrationForm, write_rig
 from recon.run.run import plain
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
-CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
 _CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there
 _DEPTH_CM: Final = ("calibration", "low", "high", "matching")  # of each `DepthError`
 # Figures that are also written into the calibration file.
@@ -61,19 +58,12 @@ def describe_calibration(
     return CalibrationRun(config, seen, fit, spread, turns, rows_px, summary)
 
 
-def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) -> tuple[Path, ...]:
-    """Write the calibrated rig in a given format, and return the files: two for ROS, else one."""
-    rig = run.fit.calibration
-    if form == "ros":
-        rotations = (run.turns.R_left, run.turns.R_right)
-        return write_camera_info(path, rig, rotations, run.turns.camera)
-    if form == "opencv":
-        write_opencv_calibration(path, rig)
-    elif form == "kalibr":
-        write_kalibr(path, rig)
-    else:
-        write_recon_calibration(path, rig, {key: run.summary[key] for key in _KEPT})
-    return (path,)
+def write_calibration(
+    path: Path, run: CalibrationRun, form: CalibrationForm | None = None
+) -> tuple[Path, ...]:
+    """Write the calibrated rig; see `write_rig`."""
+    quality = {key: run.summary[key] for key in _KEPT}
+    return write_rig(path, run.fit.calibration, run.config.rectification, form, quality)
 
 
 def _summarise(
