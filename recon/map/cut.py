@@ -17,7 +17,7 @@ from typing_extensions import Self
 from recon.core.geometry.se3 import apply
 from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.values import OccupancyVoxels
-from recon.core.values.arrays import Bool, Float64, Int64
+from recon.core.values.arrays import Bool, Float64, Int64, tree_of
 from recon.map.fusion import KNOWABLE, FusedPart
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
@@ -140,7 +140,7 @@ class Cutter:
             moved = self._moved(submap, T)
             cut.add(moved)
             for kind, key, part, nbytes in self._pieces(moved, parts):
-                parts.put(kind, key, part.to_tree(), first + place)
+                parts.put(kind, key, tree_of(part), first + place)
                 cut.nbytes[kind, key] += nbytes
             if not cut.fits(self.limit_bytes):
                 break

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -87,7 +87,7 @@ class CloudBuilder:
         """Return what was seen since the start, or since the last `take`."""
         n, s = len(self), self._sums
         known = tuple(name for name, value in self._known.items() if value and self._frames)
-        keys, sums = s.keys[:n].copy(), s.sums[:n].copy()
+        keys, sums = voxels.copy_sums(s)
         return FusedPart(keys, sums, s.information[:n].copy(), s.frames[:n].copy(), known)
 
     def take(self) -> FusedPart:
@@ -201,13 +201,9 @@ class FusedPart:
         sums[:, _PLACED.stop :] = _rounded(sums[:, _PLACED.stop :], _VALUE_BITS)
         return replace(self, sums=sums, information=_rounded(self.information, _INFORMATION_BITS))
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return everything, as a tree of arrays and values."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> FusedPart:
-        """Return what `to_tree` gave."""
+        """Return the part that a tree (`tree_of`) is of."""
         keys = array_in(tree, "keys", np.int64, (None,))
         sums = array_in(tree, "sums", np.float32, (len(keys), 4 + VALUES))
         information = array_in(tree, "information", np.float32, (len(keys),))

@@ -18,14 +18,13 @@ from recon.core.geometry.projection import depth_from_disparity, project, unproj
 from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedCamera
-from recon.core.values.arrays import Bool, Float64, Int64, UInt8
+from recon.core.values.arrays import Bool, Float64, Int64, UInt8, tree_of
 from recon.odometry.protocol import (
     Odometry,
     OdometryFrame,
     OdometryHealth,
     OdometryResult,
     pose_in,
-    tree_of,
 )
 
 _MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion

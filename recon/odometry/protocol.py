@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from recon.core.values import Disparity, RectifiedPair
-from recon.core.values.arrays import Float64, array_in, freeze
+from recon.core.values.arrays import Float64, array_in
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +56,6 @@ class OdometryResult:
     T_world_camera: Float64  # (4, 4); the first frame is the identity
     health: OdometryHealth  # how far it can be trusted
 
-    def __post_init__(self) -> None:
-        freeze(self, "T_world_camera", np.float64, (4, 4))
-
 
 @runtime_checkable
 class Odometry(Protocol):
@@ -78,11 +75,6 @@ class Odometry(Protocol):
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state` of an odometry with the same settings."""
         ...
-
-
-def tree_of(value: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass by name, as part of a state."""
-    return {field.name: getattr(value, field.name) for field in fields(value)}
 
 
 def pose_in(state: dict[str, Any], name: str) -> Float64:

@@ -13,7 +13,7 @@ from recon.core.geometry.se3 import (
 )
 from recon.core.text import counted
 from recon.core.values import Disparity
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float64, tree_of
 from recon.odometry.features import (
     VisualState,
     empty_window,
@@ -26,7 +26,7 @@ from recon.odometry.features import (
 )
 from recon.odometry.locate_camera import MIN_INLIERS, Motion, enough_agree, locate_camera
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
-from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.window import (
     TrackWindow,
     adjust,

@@ -9,16 +9,17 @@ from recon.commands.config import load_config
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform, transform_cloud
 from recon.core.values import OccupancyVoxels, join_voxels
-from recon.core.values.arrays import Float64
-from recon.map import submaps as submaps_file
+from recon.core.values.arrays import Float64, tree_of
 from recon.map.cut import Rectangle
+from recon.map.drive import mapper as mapper_file
+from recon.map.drive.mapper import SubmapBuilder
 from recon.map.fusion import CloudBuilder, join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.map import Map
 from recon.map.occupancy.builder import OccupancyBuilder
 from recon.map.occupancy.part import free_part, join_occupancy
 from recon.map.store.session import Submaps
-from recon.map.submaps import Submap, SubmapBuilder, SubmapSettings
+from recon.map.submaps import Submap, SubmapSettings
 from recon.map.tiles import Tiles
 from recon.stereo.cloud.back_project import filter_cloud
 from tests.map.walls import (
@@ -80,7 +81,7 @@ def test_submaps_put_together_are_the_map_of_the_whole_drive() -> None:
 def test_a_submap_ends_after_its_path_its_frames_or_its_bytes(
     length_m: float, sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(submaps_file, "_MAX_FRAMES", 9 if sizes[0] == 9 else 100)
+    monkeypatch.setattr(mapper_file, "_MAX_FRAMES", 9 if sizes[0] == 9 else 100)
     submaps = _submaps(_builder(length_m), frames(24))
     assert [(submap.index, submap.frames) for submap in submaps] == list(enumerate(sizes))
     assert [submap.first_frame for submap in submaps] == [0, sizes[0], sizes[0] + sizes[1]]
@@ -99,7 +100,7 @@ def test_a_builder_goes_on_from_the_state_of_another() -> None:
     resumed = [*done, *_submaps(second, frames(24)[13:])]
     assert len(resumed) == len(unbroken)
     for ours, theirs in zip(resumed, unbroken, strict=True):
-        np.testing.assert_equal(Submap.from_tree(ours.to_tree()).to_tree(), theirs.to_tree())
+        np.testing.assert_equal(tree_of(Submap.from_tree(tree_of(ours))), tree_of(theirs))
 
 
 def _moved(submap: Submap, turn: float, step_m: list[float]) -> tuple[Submap, Float64]:
@@ -237,7 +238,7 @@ def test_a_missing_or_foreign_submap_is_one_clear_line(store: Submaps) -> None:
     again = Submaps(store.store)
     assert again.entries == store.entries
     assert [submap.index for submap in again] == list(range(len(again)))
-    np.testing.assert_equal(again[1].to_tree(), store[1].to_tree())
+    np.testing.assert_equal(tree_of(again[1]), tree_of(store[1]))
     store.store.delete("submap", (0, 0))
     with pytest.raises(FormatError, match=r"map.*lacks a record"):
         store[0]

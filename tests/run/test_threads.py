@@ -21,10 +21,10 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud, join_clouds, join_voxels
+from recon.map.drive.mapper import SubmapBuilder
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.store.records import Store
 from recon.map.store.session import Submaps
-from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles
 from recon.run import threads
 from recon.run.machine import available_cores, peak_memory_mb

@@ -76,6 +76,12 @@ def make_sums(rows: int, values: int) -> VoxelSums:
     )
 
 
+def copy_sums(voxels: VoxelSums) -> tuple[Int64, Float32]:
+    """Return copies of packed cells (N,) and sums (N, 4 + C) of the rows in use."""
+    n = int(voxels.used[0])
+    return voxels.keys[:n].copy(), voxels.sums[:n].copy()
+
+
 def reserve_sums(voxels: VoxelSums, rows: int) -> VoxelSums:
     """`reserve` for sums."""
     return reserve(voxels, rows, partial(make_sums, values=voxels.sums.shape[1] - 4))

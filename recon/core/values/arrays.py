@@ -1,8 +1,12 @@
-"""Validation of array fields: dtype and shape are checked, and the array becomes read-only."""
+"""Validation of array fields: dtype and shape are checked, and the array becomes read-only.
+
+Values with such fields become trees of arrays and plain values, and arrays are read from them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -46,6 +50,13 @@ def freeze(instance: object, name: str, dtype: DTypeLike, shape: tuple[int | Non
     if value is not None:
         label = f"{type(instance).__name__}.{name}"
         object.__setattr__(instance, name, frozen_array(label, value, dtype, shape))
+
+
+def tree_of(value: Any) -> Any:
+    """Return a dataclass or named tuple, and those in it, as mappings of their fields; else it."""
+    if is_dataclass(value):
+        return {field.name: tree_of(getattr(value, field.name)) for field in fields(value)}
+    return value._asdict() if hasattr(value, "_asdict") else value
 
 
 def array_in(

@@ -3,6 +3,7 @@
 - `sequence.py`: from a source to a mapped drive, or why it is empty;
 - `drive.py`: the loop over frames, matched ahead or (while they arrive) behind; commits; the map,
   threads and stopwatch of a drive;
-- `mapper.py`: what is done with one frame: its pose, then its part of a submap;
+- `mapper.py`: what is done with one frame: its pose, then its part of the submap under
+  construction;
 - `drive_odometry.py`: which odometry finds the poses; `drive_loops.py`: loops, in a thread.
 """

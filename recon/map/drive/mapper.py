@@ -1,11 +1,11 @@
-"""The stateful part of mapping: odometry and the maps under construction."""
+"""The stateful part of mapping: odometry, and the submap under construction."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,13 +13,13 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import transform_cloud
 from recon.core.text import counted
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
-from recon.core.values.arrays import Float64, freeze
-from recon.map.fusion import fusion_range_m
+from recon.core.values.arrays import Float64, freeze, tree_of
+from recon.map.fusion import CloudBuilder, FusionSettings, fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
-from recon.map.occupancy.builder import ray_grain, thin_rays
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
-from recon.map.submaps import SubmapBuilder
+from recon.map.submaps import Submap, SubmapSettings
 from recon.odometry.health import stretches
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.run.progress import Stopwatch
@@ -153,6 +153,91 @@ class Mapper:
             self.session.T_map_world,
             config.memory.submap_bytes,
         )
+
+
+_MAX_FRAMES: Final = 100
+"""Frames after which a new submap begins at the latest, however slow the drive."""
+
+
+class SubmapBuilder:
+    """Builds the submaps of a drive, one after the other.
+
+    At ``max_bytes`` a new submap begins; None = no limit.
+    """
+
+    def __init__(
+        self,
+        settings: SubmapSettings,
+        fusion: FusionSettings,
+        occupancy: OccupancySettings,
+        T_map_world: Float64,
+        max_bytes: int | None = None,
+    ) -> None:
+        self._settings = settings
+        self._max_bytes = max_bytes
+        self._fused = CloudBuilder(fusion)
+        self._occupancy = OccupancyBuilder(occupancy, T_map_world)
+        self._index = 0
+        self._first_frame = 0
+        self._frames = 0
+        self._path_m = 0.0
+        self._last_m: Float64 | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames in the submap so far."""
+        return self._frames
+
+    def integrate(
+        self, cloud_world: PointCloud, cloud_camera: PointCloud, T_world_camera: Float64
+    ) -> None:
+        """Add a frame: ``cloud_world`` is fused, ``cloud_camera`` occupies and frees space."""
+        self._fused.integrate(cloud_world)
+        self._occupancy.integrate(cloud_camera, T_world_camera)
+        place = T_world_camera[:3, 3]
+        if self._last_m is not None:
+            self._path_m += float(np.linalg.norm(place - self._last_m))
+        self._last_m = place.copy()
+        self._frames += 1
+
+    @property
+    def full(self) -> bool:
+        """Whether the submap is to be closed."""
+        s, limit = self._settings, self._max_bytes
+        long = self._path_m >= s.length_m or self._frames >= _MAX_FRAMES
+        return long or (limit is not None and self._fused.nbytes + self._occupancy.nbytes >= limit)
+
+    def current(self) -> Submap:
+        """Return the submap so far; without frames it is empty."""
+        return Submap(
+            self._index, self._first_frame, self._frames, self._fused.part(), self._occupancy.part()
+        )
+
+    def close(self) -> Submap:
+        """Return the submap, whose place the next one takes."""
+        submap = Submap(
+            self._index,
+            self._first_frame,
+            self._frames,
+            self._fused.take().rounded(),
+            self._occupancy.take(),
+        )
+        self._first_frame += self._frames
+        self._index, self._frames, self._path_m = self._index + 1, 0, 0.0
+        return submap
+
+    def state(self) -> dict[str, Any]:
+        """Return all that decides what comes later, as a tree of arrays and plain values."""
+        return {"submap": tree_of(self.current()), "path_m": self._path_m, "last_m": self._last_m}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`."""
+        submap = Submap.from_tree(state["submap"])
+        self._index, self._first_frame = submap.index, submap.first_frame
+        self._frames = submap.frames
+        self._path_m, self._last_m = state["path_m"], state["last_m"]
+        self._fused.resume(submap.fused, submap.frames)
+        self._occupancy.resume(submap.occupancy)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, RayGrain
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.core.values.grid import log_odds
 from recon.map.kernels import clamped, raycast
-from recon.map.occupancy.part import OccupancyPart, points_of, sum_points
+from recon.map.occupancy.part import OccupancyPart, SurfacePoints, sum_points
 
 _FIRST_POINTS: Final = 1 << 12
 _LEAST_SIGMA_CELLS: Final = 0.1
@@ -82,7 +82,8 @@ class OccupancyBuilder:
 
     def part(self) -> OccupancyPart:
         """Return what was observed since the start, or since the last `take`."""
-        return OccupancyPart(clamped.observed_rows(self._map), points_of(self._points))
+        points = SurfacePoints(*voxels.copy_sums(self._points))
+        return OccupancyPart(clamped.observed_rows(self._map), points)
 
     def take(self) -> OccupancyPart:
         """Return the part so far; the builder starts a new one."""

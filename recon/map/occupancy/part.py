@@ -62,17 +62,9 @@ class OccupancyPart:
             None if self.points is None else self.points.in_blocks(blocks),
         )
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return all of it as a tree of arrays."""
-        points = self.points
-        return {
-            "rows": self.rows._asdict(),
-            "points": None if points is None else {"keys": points.keys, "sums": points.sums},
-        }
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OccupancyPart:
-        """Return what `to_tree` gave."""
+        """Return the part that a tree (`tree_of`) is of."""
         points = tree["points"]
         rows = _rows_in(tree["rows"])
         return cls(rows, None if points is None else SurfacePoints.from_tree(points))
@@ -204,7 +196,7 @@ class SurfacePoints:
 
 def join_points(parts: Iterable[SurfacePoints]) -> SurfacePoints:
     """Return points of different frames as those of one drive."""
-    return points_of(sum_points(parts))
+    return SurfacePoints(*voxels.copy_sums(sum_points(parts)))
 
 
 def sum_points(parts: Iterable[SurfacePoints]) -> voxels.VoxelSums:
@@ -214,9 +206,3 @@ def sum_points(parts: Iterable[SurfacePoints]) -> voxels.VoxelSums:
         none = np.zeros(len(part), np.float32)
         total = voxels.add_rows(total, part.keys, part.sums, none, none.astype(np.int32))
     return total
-
-
-def points_of(total: voxels.VoxelSums) -> SurfacePoints:
-    """Return a copy of what was summed up."""
-    n = int(total.used[0])
-    return SurfacePoints(total.keys[:n].copy(), total.sums[:n].copy())

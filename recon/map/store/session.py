@@ -12,7 +12,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.text import counted
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
-from recon.core.values.arrays import Bool, Float64, array_in
+from recon.core.values.arrays import Bool, Float64, array_in, tree_of
 from recon.io.files import reading
 from recon.map.store.records import Store
 from recon.map.store.trees import (
@@ -300,7 +300,7 @@ class Submaps:
         """Store the next submap."""
         entry = _entry_of(submap)
         key = (self._session, submap.index)
-        self.store.put(SUBMAP, key, submap.to_tree(), compress=compress)
+        self.store.put(SUBMAP, key, tree_of(submap), compress=compress)
         self.store.put(ENTRY, key, asdict(entry))
         self.entries.append(entry)
 
