@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from recon.core.errors import CalibrationError, SourceError
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.image import join_pair
 from recon.io.cameras.ros import NS, ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
 from recon.io.files import reading, resolved
 from recon.sources.bag_prior import read_topic
@@ -21,7 +22,7 @@ from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.image_names import find_partners, partner_names
 from recon.sources.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag, BagCameraInfo
 from recon.sources.settings import SourceSettings
-from recon.sources.source import ReadPrior, Recording, join_pair, pair_frames
+from recon.sources.source import ReadPrior, Recording, pair_frames
 from recon.sources.times import check_increasing, pair_stamps
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})

@@ -13,10 +13,11 @@ import numpy as np
 from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.image import join_pair
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
 from recon.sources.image_names import IMAGES, natural_key
 from recon.sources.settings import SourceSettings
-from recon.sources.source import FrameList, Recording, check_most, join_pair, pair_frames
+from recon.sources.source import FrameList, Recording, check_most, pair_frames
 from recon.sources.times import pair_stamps
 
 _WHITE_SAMPLE: Final = 8  # frames, over a drive of 16-bit images, that its white is taken from

@@ -12,6 +12,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError, SourceError
 from recon.core.values import DisparityTruth, Rig, StereoPair
+from recon.core.values.image import join_pair
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import StrPath
@@ -26,7 +27,7 @@ from recon.io.images.image import (
 from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.sources.calibration import CALIBRATE, camera_of_numbers, check_given_once, read_rig
 from recon.sources.settings import SourceSettings
-from recon.sources.source import StereoSource, join_pair, pair_frames
+from recon.sources.source import StereoSource, pair_frames
 
 UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
 LEAST_SIDE_PX: Final = 16  # smaller than this, an image does not hold the windows that are compared

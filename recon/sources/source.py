@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 from recon.core.errors import SourceError
 from recon.core.text import counted, is_count
 from recon.core.values import OccupancyTruth, Rig, SequenceTruth, StereoPair, Trajectory
-from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.arrays import Float64
 from recon.io.trajectory import read_tum
 from recon.sources.settings import SourceSettings
 
@@ -216,15 +216,6 @@ class SourcePart(DerivedSource):
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         return islice(self.source.frames(self.first + start), len(self) - start)
-
-
-def join_pair(
-    left: UInt8, right: UInt8, timestamp_s: float = 0.0, index: int = 0, name: str = ""
-) -> StereoPair:
-    """Join two images of equal size; if only one is in colour, the other is converted."""
-    if left.ndim != right.ndim:
-        left, right = (p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in (left, right))
-    return StereoPair(left, right, timestamp_s, index, name)
 
 
 Item = TypeVar("Item")

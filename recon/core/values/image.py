@@ -61,6 +61,15 @@ class StereoPair:
             )
 
 
+def join_pair(
+    left: UInt8, right: UInt8, timestamp_s: float = 0.0, index: int = 0, name: str = ""
+) -> StereoPair:
+    """Join two images of equal size; if only one is in colour, the other is converted."""
+    if left.ndim != right.ndim:
+        left, right = (p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in (left, right))
+    return StereoPair(left, right, timestamp_s, index, name)
+
+
 @dataclass(frozen=True, eq=False)
 class RectifiedPair:
     """Two grey images with aligned rows.

@@ -54,6 +54,7 @@ class Drive:
     ) -> None:
         self.source, self.reconstructor, self.config = source, reconstructor, config
         self.mapper, self.session = mapper, mapper.session
+        self._total = len(source)
         self._loops, self._map = loops, workspace.map
         self._stage = workspace.stopwatch.stage
         self.sample: ReconstructedFrame | None = None
@@ -89,10 +90,9 @@ class Drive:
             return replace(frame, rays=thin_rays(frame.cloud, self.config.occupancy))
 
     def _add(self, frame: ReconstructedFrame, found: OdometryResult) -> FrameResult:
-        total = len(self.source)
-        result = self.mapper.add(frame, found, total=total)
+        result = self.mapper.add(frame, found, total=self._total)
         self._loops.add(frame, result.T_world_camera, trusted=result.health.ok)
-        if result.index <= total // 2 and (self.sample is None or len(frame.cloud)):
+        if result.index <= self._total // 2 and (self.sample is None or len(frame.cloud)):
             self.sample = frame
         if self._due():
             self._save()
@@ -131,7 +131,7 @@ class Drive:
 
     def sample_again(self) -> ReconstructedFrame:
         """Reconstruct the frame in the middle, which was mapped before this process started."""
-        index = min(len(self.source) // 2, len(self.session) - 1)
+        index = min(self._total // 2, len(self.session) - 1)
         return self.reconstructor.reconstruct(next(self.source.frames(index)))
 
     @property
