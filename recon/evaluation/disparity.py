@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import (
     DepthMetrics,
     Disparity,
@@ -18,6 +17,7 @@ from recon.core.values import (
     RectifiedCamera,
 )
 from recon.core.values.arrays import Bool, Float32, Float64, float_map
+from recon.core.values.camera import depth_from_disparity
 
 THRESHOLDS_PX: Final = (0.5, 1.0, 2.0, 4.0)
 _QUANTILES: Final = (50, 90, 95, 99)

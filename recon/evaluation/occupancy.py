@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from recon.core.errors import EvaluationError
 from recon.core.geometry import se3
-from recon.core.geometry.projection import project
 from recon.core.kernels.voxels import find_keys, pack_keys
 from recon.core.text import counted
 from recon.core.values import (
@@ -29,6 +28,7 @@ from recon.core.values import (
     VoxelMetrics,
 )
 from recon.core.values.arrays import Bool, Int32
+from recon.core.values.camera import project
 
 _TOLERANCE: Final = 1
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
-from recon.core.geometry.projection import depth_from_disparity
 from recon.core.settings import Settings
 from recon.core.values import (
     Disparity,
@@ -26,6 +25,7 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import Float32, Int32
+from recon.core.values.camera import depth_from_disparity
 from recon.evaluation.disparity import evaluate_disparity
 from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
 from recon.run.run import plain

@@ -8,8 +8,8 @@ from shutil import copyfile
 from typing import Any
 
 from recon.core.errors import MeshingError
-from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera, TriangleMesh
+from recon.core.values.camera import depth_from_disparity
 from recon.core.values.cloud import Frame
 from recon.export.mesh.pieces import LAYER, WHOLE, in_other_formats
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh

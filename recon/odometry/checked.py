@@ -14,11 +14,11 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, Int64, UInt8, tree_of
+from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry.protocol import (
     Odometry,
     OdometryFrame,

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry.kernels.patches import Placing, place_patches
 from recon.odometry.locate_camera import REPROJECTION_PX, Motion
 from recon.odometry.protocol import OdometryFrame

@@ -21,11 +21,11 @@ from kiss_icp.kiss_icp import KissICP
 from numpy.typing import NDArray
 
 from recon.core.errors import RegistrationError
-from recon.core.geometry.projection import depth_from_disparity, depth_sigma, unproject
 from recon.core.geometry.se3 import angle_rad, invert, orthonormalise
 from recon.core.text import counted
 from recon.core.values import Disparity, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.core.values.camera import depth_from_disparity, depth_sigma, unproject
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 
 _VOXEL_M: Final = 0.2  # edge of a voxel of the map

@@ -8,10 +8,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, exp_so3, invert, log_so3, make_transform, orthonormalise
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
+from recon.core.values.camera import project
 
 REPROJECTION_PX: Final = 2.0  # RANSAC's inlier limit
 _ITERATIONS: Final = 200  # RANSAC's samples at most

@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, as_transform, invert, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
+from recon.core.values.camera import project
 from recon.odometry.locate_camera import find_consensus, fit_pose
 
 _ITERATIONS: Final = 500  # RANSAC's samples at most

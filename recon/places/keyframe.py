@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import ShapeError
-from recon.core.geometry.projection import depth_from_disparity, unproject
 from recon.core.kernels.voxels import distinct_keys
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
+from recon.core.values.camera import depth_from_disparity, unproject
 
 _DESCRIPTOR_BYTES: Final = 32
 _EDGE_PX: Final = 16  # half of the patch that a descriptor looks at

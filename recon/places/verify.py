@@ -8,10 +8,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
+from recon.core.values.camera import project
 from recon.places.align import MIN_INLIERS, Alignment, Seen, agreement, locate, refine
 from recon.places.keyframe import Keyframe, points_of
 from recon.places.loop import Loop

@@ -13,9 +13,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from recon.core.geometry.projection import depth_from_disparity, disparity_from_depth
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import UInt8
+from recon.core.values.camera import depth_from_disparity, disparity_from_depth
 from recon.io.images.image import write_image
 from recon.report import style
 from recon.report.page import write_page

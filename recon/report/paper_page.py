@@ -9,9 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float32
+from recon.core.values.camera import depth_from_disparity
 from recon.evaluation import paper
 from recon.report import pair_page, style
 from recon.report.page import write_page

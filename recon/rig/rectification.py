@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError
-from recon.core.geometry.projection import map_pixels
 from recon.core.values import StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64, UInt8, size_text
 from recon.io.cameras.calibration import read_calibration
@@ -23,7 +22,7 @@ from recon.run.directory import RunDirectory
 from recon.run.run import plain
 from recon.sources.image_names import ImagePairs
 from recon.sources.one_pair import read_pair
-from recon.stereo.rectify.features import match_exactly
+from recon.stereo.rectify.features import map_pixels, match_exactly
 from recon.stereo.rectify.lens import epipolar_curves, epipolar_lines
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, plan_turns, to_grey
 

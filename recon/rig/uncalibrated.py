@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError
-from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3, hat
 from recon.core.least_squares import Problem, minimise
 from recon.core.text import counted
@@ -23,6 +22,7 @@ from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.stereo.rectify.features import (
     MOST_FEATURES,
     PairFeatures,
+    map_pixels,
     match_again,
     match_exactly,
     pool_features,

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import SettingsError
-from recon.core.geometry.projection import disparity_from_depth
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8, freeze
+from recon.core.values.camera import disparity_from_depth
 from recon.street.kernels.surface import SurfaceHits, SurfaceTable, describe_hits
 from recon.street.materials import GAMMA, albedo, sky_colour
 from recon.street.shapes import TriangleSoup

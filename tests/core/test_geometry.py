@@ -10,13 +10,6 @@ from hypothesis import strategies as st
 
 from recon.core.errors import ShapeError
 from recon.core.geometry.alignment import Similarity, find_agreeing, fit_paths, fit_points
-from recon.core.geometry.projection import (
-    depth_from_disparity,
-    depth_sigma,
-    disparity_from_depth,
-    project,
-    unproject,
-)
 from recon.core.geometry.se3 import (
     angle_rad,
     apply,
@@ -35,6 +28,13 @@ from recon.core.geometry.se3 import (
 )
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import RectifiedCamera, Trajectory
+from recon.core.values.camera import (
+    depth_from_disparity,
+    depth_sigma,
+    disparity_from_depth,
+    project,
+    unproject,
+)
 
 VECTORS = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 ROTATIONS = VECTORS.map(exp_so3)

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from recon.core.errors import CalibrationError, MatchingError, SettingsError
-from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import DisparityTruth, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
+from recon.core.values.camera import depth_from_disparity
 from recon.evaluation.paper import (
     EXPERIMENTS,
     PaperSettings,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import FormatError
-from recon.core.geometry.projection import depth_from_disparity
+from recon.core.values.camera import depth_from_disparity
 from recon.evaluation.middlebury.bench import find_scenes, read_scored_scene
 from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from recon.core.errors import MappingError
-from recon.core.geometry.projection import depth_sigma
 from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_cloud
 from recon.core.values import PointCloud, RectifiedCamera
+from recon.core.values.camera import depth_sigma
 from recon.map import fusion
 from recon.map.fusion import CloudBuilder, FusedPart, FusionSettings, fusion_range_m, join_fused
 

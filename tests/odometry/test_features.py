@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.core.geometry.projection import project, unproject
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
+from recon.core.values.camera import project, unproject
 from recon.odometry import features
 from recon.odometry.features import (
     find_again,

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
+from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry import window as bundle_window
 from recon.odometry.features import MIN_DISPARITY_PX
 from recon.odometry.locate_camera import REPROJECTION_PX, Motion, locate_camera, part_of

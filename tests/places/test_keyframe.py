@@ -8,8 +8,8 @@ import pytest
 
 from recon.core.errors import ShapeError
 from recon.core.geometry import se3
-from recon.core.geometry.projection import project
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values.camera import project
 from recon.places import verify as verify_file
 from recon.places.align import Seen, refine
 from recon.places.keyframe import FEATURES, WORDS, Keyframe, make_keyframe, points_of, words_of

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from recon.core.errors import CalibrationError
-from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3
 from recon.io.middlebury import read_middlebury_scene
 from recon.rig.uncalibrated import line_distances, rectify_features, rectify_images
-from recon.stereo.rectify.features import PairFeatures, match_again, match_exactly
+from recon.stereo.rectify.features import PairFeatures, map_pixels, match_again, match_exactly
 from recon.stereo.rectify.lens import epipolar_lines
 from recon.stereo.rectify.rectifier import to_grey
 

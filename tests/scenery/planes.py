@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.core.geometry.projection import disparity_from_depth
 from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float64, UInt8
+from recon.core.values.camera import disparity_from_depth
 from recon.street.kernels.surface import fractal_noise
 from recon.street.render import View, stereo_views
 

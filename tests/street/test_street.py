@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from recon.core.errors import SettingsError
 from recon.core.geometry import se3
-from recon.core.geometry.projection import project, unproject
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import OCCUPIED
+from recon.core.values.camera import project, unproject
 from recon.street.materials import ROAD_HALF_M, both, stripe, stripes, tile_joints, tile_tone
 from recon.street.path import LANE_M, R_STREET_LEVEL, camera_poses, centre_line
 from recon.street.render import StreetCamera

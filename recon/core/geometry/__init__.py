@@ -1,1 +1,1 @@
-"""Geometry as pure functions: rigid transforms, projection, triangulation and depth error."""
+"""Geometry as pure functions: rigid transforms, and alignment."""

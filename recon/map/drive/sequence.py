@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import MappingError
-from recon.core.geometry.projection import depth_from_disparity
 from recon.core.geometry.se3 import apply, invert, transform_cloud
 from recon.core.text import counted
 from recon.core.values import (
@@ -26,6 +25,7 @@ from recon.core.values import (
     join_voxels,
 )
 from recon.core.values.arrays import Bool, Float64
+from recon.core.values.camera import depth_from_disparity
 from recon.map.drive.drive import Drive, Workspace
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
-from recon.core.geometry.projection import depth_sigma
 from recon.core.values import Disparity, RectifiedCamera, Rig, StereoPair
 from recon.core.values.arrays import Float64
+from recon.core.values.camera import depth_sigma
 from recon.odometry.rig.refine import RefinedRig, refine_rig
 from recon.odometry.settings import RigSettings
 from recon.rig.audit.findings import Finding, Measured, Verdict, find_faults, verdict_of

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import CalibrationError
-from recon.core.geometry.projection import map_pixels
 from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8, freeze
@@ -266,3 +265,9 @@ def _agreeing(row_shift: Float32) -> Bool:
     first = int(np.argmax(until - np.arange(len(ordered))))
     middle = np.median(ordered[first : until[first]])
     return np.asarray(np.abs(row_shift - middle) <= _OUTLIER_PX)
+
+
+def map_pixels(H: Float64, pixels: NDArray[Any]) -> Float64:
+    """Return float64 (N, 2), pixels (N, 2) mapped by a homography (3, 3)."""
+    mapped = pixels.astype(np.float64) @ H[:, :2].T + H[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])

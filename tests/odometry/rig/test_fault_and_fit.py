@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
+from recon.core.values.camera import project
 from recon.odometry.rig.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.refine import compare_rigs

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 import recon
 from recon.core.errors import ReconError, SettingsError, ShapeError
-from recon.core.geometry.projection import project
 from recon.core.values import Disparity, PointCloud, Reason, RectifiedCamera, RectifiedPair
+from recon.core.values.camera import project
 from recon.stereo.cloud import open3d_clouds
 from recon.stereo.cloud.back_project import (
     ANY_SCALE,

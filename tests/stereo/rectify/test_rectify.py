@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from recon.core.errors import CalibrationError, ShapeError
-from recon.core.geometry.projection import disparity_from_depth
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import (
     CameraIntrinsics,
@@ -21,6 +20,7 @@ from recon.core.values import (
     StereoCalibration,
     StereoPair,
 )
+from recon.core.values.camera import disparity_from_depth
 from recon.io.cameras.calibration import read_calibration
 from recon.io.images.image import read_image
 from recon.stereo.rectify.features import (
