@@ -1,18 +1,17 @@
-"""The SQLite file of a store: its tables, its transactions, and errors in our words."""
+"""The SQLite file of a store: its tables, its transactions, and the bytes of a record."""
 
 from __future__ import annotations
 
 import sqlite3
 import sys
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Final
 
-from recon.core.errors import FormatError, OutputError
-from recon.map.store.trees import Bytes
+from recon.core.errors import FormatError
 
 FORMAT: Final = 1
 """Number of the format; it grows with every change that older versions cannot read."""
@@ -23,7 +22,6 @@ _TABLE: Final = """CREATE TABLE record (
 )"""
 _PAGE_BYTES: Final = 1 << 14
 _PIECE_BYTES: Final = 1 << 18
-_ROOM: Final = "check that the folder is writable and the disk is not full"
 
 
 def connect(path: Path | None, *, read_only: bool = False) -> sqlite3.Connection:
@@ -55,26 +53,6 @@ def make_tables(database: sqlite3.Connection) -> None:
     database.execute(f"PRAGMA user_version = {FORMAT}")
     database.execute(_TABLE)
     database.execute("COMMIT")
-
-
-def insert_record(
-    database: sqlite3.Connection, head: tuple[str, str, str, int], content: Sequence[Bytes]
-) -> None:
-    """Insert a record (kind, key, tree, checksum), in place of one of the same kind and key.
-
-    Bound to a statement, bytes are copied twice, which for a submap is more memory than the submap
-    itself; so room is made for them, and they are written into it piece by piece.
-    """
-    insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
-    if sys.version_info >= (3, 11):
-        size = sum(map(len, content))
-        row = database.execute(insert.format("zeroblob(?)"), (*head, size)).lastrowid
-        if size:
-            with database.blobopen("record", "content", row) as blob:
-                for piece in content:
-                    blob.write(piece)
-    else:
-        database.execute(insert.format("?"), (*head, b"".join(content)))
 
 
 class Content:
@@ -144,27 +122,3 @@ def check_format(database: sqlite3.Connection, path: Path) -> None:
         )
     if ours != _OURS or tables != {_TABLE}:
         raise FormatError("not a map of recon", where=path)
-
-
-@contextmanager
-def writing(path: Path | None) -> Iterator[None]:
-    """Turn errors of the database into ours."""
-    where = "temporary map" if path is None else path
-    try:
-        yield
-    except sqlite3.Error as error:
-        text = str(error)
-        if "locked" in text:
-            what, hint = "another program uses the map", "wait for it, or write to another one"
-        elif "readonly" in text:
-            what = "the map can only be read"
-            hint = "make the file writable, and open it with read_only=False"
-        elif "full" in text:
-            what, hint = "the disk is full", "make room on it"
-        else:
-            what, hint = "cannot write the map", _ROOM
-        raise OutputError(what, where=where, got=text, hint=hint) from error
-    except OSError as error:
-        raise OutputError(
-            "cannot write the map", where=where, got=error.strerror, hint=_ROOM
-        ) from error

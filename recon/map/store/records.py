@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sqlite3
+import sys
 import weakref
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from threading import Lock, RLock
@@ -16,7 +17,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from typing_extensions import Self
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, OutputError
 from recon.io.atomic import check_targets
 from recon.io.files import reading
 from recon.map.store.database import (
@@ -26,9 +27,7 @@ from recon.map.store.database import (
     check_format,
     closed_on_error,
     connect,
-    insert_record,
     make_tables,
-    writing,
 )
 from recon.map.store.trees import Bytes, from_bytes, to_bytes
 
@@ -37,6 +36,33 @@ CACHE_BYTES: Final = 100_000_000
 _SMALL_BYTES: Final = 1 << 24
 _MOST_GROWTH: Final = 16
 """What was measured becomes two to three times smaller; small records may shrink further."""
+
+
+_ROOM: Final = "check that the folder is writable and the disk is not full"
+
+
+@contextmanager
+def writing(path: Path | None) -> Iterator[None]:
+    """Turn errors of the database into ours."""
+    where = "temporary map" if path is None else path
+    try:
+        yield
+    except sqlite3.Error as error:
+        text = str(error)
+        if "locked" in text:
+            what, hint = "another program uses the map", "wait for it, or write to another one"
+        elif "readonly" in text:
+            what = "the map can only be read"
+            hint = "make the file writable, and open it with read_only=False"
+        elif "full" in text:
+            what, hint = "the disk is full", "make room on it"
+        else:
+            what, hint = "cannot write the map", _ROOM
+        raise OutputError(what, where=where, got=text, hint=hint) from error
+    except OSError as error:
+        raise OutputError(
+            "cannot write the map", where=where, got=error.strerror, hint=_ROOM
+        ) from error
 
 
 class Store:
@@ -216,7 +242,7 @@ class Store:
     def _insert(self, kind: str, name: str, text: str, content: Sequence[Bytes]) -> None:
         checksum = _checksum(kind, name, text, *content)
         with self._lock, writing(self.path):
-            insert_record(self._database, (kind, name, text, checksum), content)
+            _write_record(self._database, (kind, name, text, checksum), content)
             self.cache.drop((kind, _key(name)))
 
     def _row(self, kind: str, name: str) -> tuple[str, Content, int]:
@@ -229,6 +255,26 @@ class Store:
         row, size, text, checksum = found
         content = Content(self._database, row, size, _checksum(kind, name, text))
         return text, content, checksum
+
+
+def _write_record(
+    database: sqlite3.Connection, head: tuple[str, str, str, int], content: Sequence[Bytes]
+) -> None:
+    """Insert a record (kind, key, tree, checksum), in place of one of the same kind and key.
+
+    Bound to a statement, bytes are copied twice, which for a submap is more memory than the submap
+    itself; so room is made for them, and they are written into it piece by piece.
+    """
+    insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
+    if sys.version_info >= (3, 11):
+        size = sum(map(len, content))
+        row = database.execute(insert.format("zeroblob(?)"), (*head, size)).lastrowid
+        if size:
+            with database.blobopen("record", "content", row) as blob:
+                for piece in content:
+                    blob.write(piece)
+    else:
+        database.execute(insert.format("?"), (*head, b"".join(content)))
 
 
 def _name(key: Key) -> str:
