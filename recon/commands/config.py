@@ -22,7 +22,7 @@ from recon.rig.settings import AuditedSettings, CalibratedSettings
 from recon.run.finished import is_pair_run
 from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings
-from recon.stereo.cloud.back_project import ANY_SCALE
+from recon.stereo.frame import ANY_SCALE
 from recon.stereo.match.protocol import name_of
 from recon.stereo.match.registry import MATCHERS, field_of
 from recon.street.settings import StreetSettings

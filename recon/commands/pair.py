@@ -6,10 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
 from recon.core.values import (
     Disparity,
+    Reason,
     RectifiedCamera,
     RectifiedPair,
     StereoCalibration,
@@ -23,18 +26,12 @@ from recon.io.files import StrPath
 from recon.io.middlebury import stand_in_camera
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.sequence import check_cloud
-from recon.report.pair_page import write_disparity_images, write_pair_page
+from recon.report.pair_page import PairRun, write_disparity_images, write_pair_page
 from recon.rig.audit.audit import check_found, find_pair_faults
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run, plain
 from recon.sources.one_pair import PairInput
-from recon.stereo.frame import (
-    FrameReconstructor,
-    PairRun,
-    ReconstructedFrame,
-    cloud_figures,
-    disparity_figures,
-)
+from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 from recon.stereo.match.protocol import Matcher, name_of
 from recon.stereo.match.registry import MATCHERS, check_matcher, field_of
 
@@ -82,7 +79,7 @@ def run_pair(
             scale = write_disparity_files(frame.disparity, run)
             write_cloud_files(frame, mesh, formats, run)
         figures = {
-            **cloud_figures(frame),
+            **_cloud_figures(frame),
             "faces": 0 if mesh is None else len(mesh.faces),
             "mesh_coverage": coverage,
             "up_to_scale": given.up_to_scale,
@@ -140,7 +137,7 @@ def _compared(
     metrics = None if given.truth is None else evaluate_disparity(disparity, given.truth)
     summary = {
         "pair": name,
-        **disparity_figures(disparity),
+        **_disparity_figures(disparity),
         **({} if metrics is None else {"disparity": plain(metrics)}),
         **figures,
         "warnings": list(warnings),
@@ -229,3 +226,31 @@ def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[s
         what = "only recon's own matchers take settings"
         raise SettingsError(what, where=where, got=", ".join(settings), hint=hint)
     return {}
+
+
+def _disparity_figures(disparity: Disparity) -> dict[str, Any]:
+    """Return size, share of pixels for each reason, and median of a disparity, ready for JSON."""
+    found = disparity.values[disparity.valid]
+    shares = disparity.reason_shares
+    return {
+        "width_px": disparity.values.shape[1],
+        "height_px": disparity.values.shape[0],
+        "valid_percent": 100.0 * float(disparity.valid.mean()),
+        "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
+        "disparity_median_px": float(np.median(found)) if len(found) else None,
+    }
+
+
+def _cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:
+    """Return the number of points, median depth and camera of a frame, ready for JSON."""
+    camera, z = frame.pair.camera, frame.cloud.xyz[:, 2]
+    return {
+        "points": len(frame.cloud),
+        "depth_median_m": float(np.median(z)) if len(z) else None,
+        "focal_px": camera.focal_px,
+        "field_of_view_deg": camera.field_of_view_deg,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
+        "baseline_m": camera.baseline_m,
+        "doffs_px": camera.doffs_px,
+    }

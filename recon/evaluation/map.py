@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.core.errors import EvaluationError, RegistrationError
 from recon.core.values import MapMetrics, PointCloud, Trajectory
 from recon.core.values.arrays import Bool, Float32, Float64
-from recon.stereo.cloud import open3d_clouds
+from recon.stereo import open3d_clouds
 
 _BAND_PERCENT: Final = (0.1, 99.9)
 _BAND_M: Final = 0.2

@@ -29,8 +29,7 @@ from recon.core.values.camera import depth_from_disparity
 from recon.evaluation.disparity import evaluate_disparity
 from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
 from recon.run.run import plain
-from recon.stereo.cloud.back_project import CloudSettings, back_project
-from recon.stereo.frame import FrameReconstructor, StereoSettings
+from recon.stereo.frame import CloudSettings, FrameReconstructor, StereoSettings, back_project
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import usual_ndisp

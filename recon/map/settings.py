@@ -15,8 +15,7 @@ from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
 from recon.odometry.settings import OdometrySettings, RigSettings
 from recon.run.threads import MemorySettings
-from recon.stereo.cloud.back_project import FilterSettings
-from recon.stereo.frame import StereoSettings
+from recon.stereo.frame import FilterSettings, StereoSettings
 
 
 class CheckpointSettings(Settings):

@@ -32,7 +32,7 @@ from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
 from recon.map.submaps import Submap
-from recon.stereo.cloud.back_project import filter_cloud
+from recon.stereo.frame import filter_cloud
 
 _POINTS: Final = "points"
 _VOXELS: Final = "voxels"

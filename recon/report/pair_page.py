@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,16 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.text import counted
+from recon.core.values import (
+    Disparity,
+    DisparityMetrics,
+    DisparityTruth,
+    PointCloud,
+    RectifiedCamera,
+    RectifiedPair,
+    TriangleMesh,
+)
 from recon.core.values.arrays import UInt8
 from recon.core.values.camera import depth_from_disparity, disparity_from_depth
 from recon.io.images.image import write_image
@@ -21,7 +31,29 @@ from recon.report import style
 from recon.report.page import write_page
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
-from recon.stereo.frame import PairRun
+from recon.stereo.frame import StereoSettings
+
+
+@dataclass(frozen=True, eq=False)
+class PairRun:
+    """Results of a run, from which its report is made."""
+
+    name: str  # display name of the pair
+    config: StereoSettings  # the configuration
+    pair: RectifiedPair  # the rectified images
+    disparity: Disparity  # their disparity
+    summary: dict[str, Any]  # the figures of ``summary.json``
+    #: The points in camera axes, or None if only the disparity was requested.
+    cloud: PointCloud | None = None
+    mesh: TriangleMesh | None = None  # the surface in camera axes, or None
+    truth: DisparityTruth | None = None  # true disparity, or None
+    metrics: DisparityMetrics | None = None  # errors against it, or None
+    warnings: tuple[str, ...] = ()  # problems that did not stop the run
+
+    def __repr__(self) -> str:
+        parts = (self.disparity, self.cloud, self.mesh)
+        made = ", ".join(repr(part) for part in parts if part is not None)
+        return f"PairRun({self.name!r}, {made}, {counted(len(self.warnings), 'warning')})"
 
 
 def write_pair_page(result: PairRun, run: RunDirectory) -> None:

@@ -1,10 +1,9 @@
 """From a recorded pair to a cloud: rectification, matching, back-projection.
 
-`frame.py` takes one pair through all of it, stage by stage:
+`frame.py` takes one pair through all of it, stage by stage, and makes points of disparities:
 
 - `rectify/rectifier.py`: both images are warped so that matching pixels share a row;
-- `match/registry.py`: the matchers by name; ours are `match/sad.py` and `match/sgm.py`;
-- `cloud/back_project.py`: from disparities to points.
+- `match/registry.py`: the matchers by name; ours are `match/sad.py` and `match/sgm.py`.
 
 The loops are in `kernels/`. `rectify/` also has what calibration and audit need of cameras: lenses,
 epipolar lines, matched features.

@@ -1,20 +1,25 @@
-"""One frame, from the recorded pair to a filtered cloud, with its settings and its figures."""
+"""One frame, from the recorded pair to a filtered cloud, with its settings.
+
+Points have their uncertainties; flying edges and outliers are left out.
+"""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 from typing_extensions import Self
 
+from recon.core.errors import ShapeError
 from recon.core.settings import Settings
-from recon.core.text import counted
 from recon.core.values import (
     Disparity,
-    DisparityMetrics,
-    DisparityTruth,
     PointCloud,
     RayCloud,
     Reason,
@@ -22,16 +27,11 @@ from recon.core.values import (
     RectifiedPair,
     Rig,
     StereoPair,
-    TriangleMesh,
 )
+from recon.core.values.arrays import Float32, UInt8
 from recon.run.progress import Stopwatch
-from recon.stereo.cloud.back_project import (
-    CloudSettings,
-    FilterSettings,
-    back_project,
-    filter_cloud,
-    remove_flying_edges,
-)
+from recon.stereo import open3d_clouds
+from recon.stereo.kernels import points
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, check_matcher, make_matcher, searched
 from recon.stereo.match.sad import HalfSizeMatcher
@@ -140,6 +140,193 @@ class FrameReconstructor:
             return remove_flying_edges(disparity)
 
 
+_NORMALS_RADIUS_PX: Final = 3  # half width of the window that gives a point its normal
+
+
+class CloudSettings(Settings):
+    """Which pixels become points."""
+
+    fixed: ClassVar = {"min_confidence": 0.0}
+
+    remove_flying_edges: bool = True
+    """Drop pixels that float between a foreground and its background. Turn it off to see what the
+    matcher found."""
+    min_range_m: float = Field(0.1, ge=0, le=1000000.0)
+    """Nearest depth kept. Set it to hide a bonnet or gripper."""
+    max_range_m: float | None = Field(30.0, ge=1e-06, le=1000000.0)
+    """Farthest depth kept; none = no limit. The error of a depth grows with its square."""
+    max_relative_sigma: float | None = Field(0.1, ge=1e-06, le=1000000.0)
+    """Largest standard deviation of a depth kept, as a share of it; none = no limit. Smaller for
+    fewer, more certain points."""
+    stride: int = Field(1, ge=1, le=16)
+    """Every n-th row and column is used. Raise it for speed with large images."""
+
+
+def back_project(
+    disparity: Disparity, pair: RectifiedPair, settings: CloudSettings, *, normals: bool = True
+) -> PointCloud:
+    """Return points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``, in row order.
+
+    The cloud is in camera axes, with colours, ``sigma_m`` (``sigma_z = Z²·sigma_d / (f·b)``),
+    confidence and, if asked for, normals towards the camera, which take as long as the rest.
+    """
+    if disparity.values.shape != pair.left.shape:
+        raise ShapeError(
+            "disparity and image differ in size",
+            got=f"disparity {disparity.values.shape}",
+            expected=f"{pair.left.shape}",
+        )
+    maps = points.Maps(
+        values=disparity.values,
+        confidence=disparity.confidence,
+        sigma=disparity.sigma_px,
+        colours=pair.left[:, :, None] if pair.left_rgb is None else pair.left_rgb,
+        usable=np.zeros((0, 0), np.bool_) if pair.valid is None else pair.valid,
+    )
+    found = points.make_points(maps, _rules(pair.camera, settings, normals))
+    return PointCloud(
+        xyz=found.xyz,
+        rgb=found.colours,
+        normals=found.normals if normals else None,
+        sigma_m=found.sigma,
+        confidence=found.confidence,
+        frame="camera",
+    )
+
+
+def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> points.PointRules:
+    return points.PointRules(
+        focal=float(camera.focal_px),
+        cx=float(camera.cx_px),
+        cy=float(camera.cy_px),
+        fb=float(camera.focal_px * camera.baseline_m),
+        doffs=float(camera.doffs_px),
+        nearest=settings.min_range_m,
+        farthest=_or_infinity(settings.max_range_m),
+        relative_sigma=_or_infinity(settings.max_relative_sigma),
+        stride=settings.stride,
+        radius=_NORMALS_RADIUS_PX if normals else 0,
+    )
+
+
+def _or_infinity(limit: float | None) -> float:
+    # The largest float, not infinity: 0 · inf is NaN, and infinite depths must be rejected.
+    return sys.float_info.max if limit is None else limit
+
+
+_RADIUS_PX: Final = 2  # half width of the window
+_MAX_GRADIENT: Final = 1.0  # largest disparity gradient of a matchable surface, pixels per pixel
+_TOLERANCE_PX: Final = 0.5  # matching noise allowed on top of the gradient
+_MIN_SUPPORT: Final = 0.36  # share of the window that must lie on the surface of its centre
+
+
+def remove_flying_edges(disparity: Disparity) -> Disparity:
+    """Drop pixels that too few of their neighbours could share a surface with (`Reason.EDGE`).
+
+    Depth noise grows with distance, disparity noise does not, so disparities are tested. A
+    surface that both cameras see changes by less than one pixel per pixel (the disparity
+    gradient limit); a neighbour within that cone supports the centre. At a clean step
+    each side keeps half of its window, at a convex corner a third, while the mixed pixels on the
+    ramp between the sides keep little more than their own column. Pixels without a disparity
+    support none; the image is mirrored at its border.
+
+    Ref: Burt & Julesz, "A disparity gradient limit for binocular fusion", Science 208 (1980).
+    """
+    needed = _MIN_SUPPORT * (2 * _RADIUS_PX + 1) ** 2
+    return disparity.reject(_support(disparity.values) < needed, Reason.EDGE)
+
+
+def _support(values: Float32) -> UInt8:
+    """Return how many pixels of each window support its centre, with itself."""
+    r = _RADIUS_PX
+    height, width = values.shape
+    padded = cv2.copyMakeBorder(values, r, r, r, r, cv2.BORDER_REFLECT_101)
+    count = np.zeros(padded.shape, dtype=np.uint8)
+    # Support is mutual, so each pair of pixels is compared once, over half of the window.
+    window = range(-r, r + 1)
+    for dy, dx in ((dy, dx) for dy in window for dx in window if (dy, dx) > (0, 0)):
+        limit = _TOLERANCE_PX + _MAX_GRADIENT * float(np.hypot(dy, dx))
+        ahead = (slice(dy, None), slice(max(dx, 0), min(dx, 0) or None))
+        here = (slice(None, -dy or None), slice(max(-dx, 0), min(-dx, 0) or None))
+        near = cv2.compare(cv2.absdiff(padded[here], padded[ahead]), limit, cv2.CMP_LE) & 1
+        cv2.add(count[here], near, dst=count[here])
+        cv2.add(count[ahead], near, dst=count[ahead])
+    return np.asarray(count[r : r + height, r : r + width] + np.uint8(1))
+
+
+_STATISTICAL_SIGMAS: Final = 2.0  # of the mean distance: limit of the statistical filter
+_RADIUS_NEIGHBOURS: Final = 2  # that a point needs within the radius: fewer are an island
+
+
+class FilterSettings(Settings):
+    """Which filters are applied to a cloud, in this order; none turns one off."""
+
+    voxel_m: float | None = Field(None, ge=1e-06, le=1000000.0)
+    """Edge of the voxels that points are averaged in. Set it for fewer points."""
+    statistical_neighbours: int | None = Field(None, ge=1, le=100)
+    """Neighbours of the statistical outlier filter, which drops points that are farther from them
+    than most. Several times as slow as the others; for one pair, or a map with noise in the air."""
+    radius_m: float | None = Field(None, ge=1e-06, le=1000000.0)
+    """Points with fewer than two others within this radius are dropped. About three voxels; larger
+    drops larger islands."""
+
+
+# For the cloud of one pair, whose scale is unknown: no filter with a length in metres.
+ANY_SCALE: Final = FilterSettings(statistical_neighbours=20)
+
+
+def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
+    """Thin a cloud, which makes the searches for neighbours cheap, then drop its outliers.
+
+    In a voxel every attribute is averaged (``sigma_m`` too: the errors of neighbouring pixels are
+    not independent), and normals are renormalised.
+    """
+    if settings.voxel_m is not None and len(cloud):
+        cloud = voxel_downsample(cloud, settings.voxel_m)
+    if settings.statistical_neighbours is not None:
+        keep = open3d_clouds.statistical_inliers(
+            cloud.xyz, settings.statistical_neighbours, _STATISTICAL_SIGMAS
+        )
+        cloud = cloud.select(keep)
+    if settings.radius_m is not None:
+        keep = open3d_clouds.radius_inliers(cloud.xyz, _RADIUS_NEIGHBOURS, settings.radius_m)
+        cloud = cloud.select(keep)
+    return cloud
+
+
+def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
+    """Return one point per voxel, the mean of its points in every attribute."""
+    names = [name for name in _ATTRIBUTES if getattr(cloud, name) is not None]
+    columns = [np.reshape(getattr(cloud, name), (len(cloud), -1)) for name in names]
+    packed = np.concatenate(columns, axis=1) if columns else np.zeros((len(cloud), 0))
+    xyz, means = open3d_clouds.voxel_downsample(cloud.xyz, packed, voxel_m)
+    widths = np.cumsum([column.shape[1] for column in columns])[:-1]
+    parts = dict(zip(names, np.split(means, widths, axis=1), strict=True)) if names else {}
+    fields: dict[str, Any] = {name: _restored(name, parts[name]) for name in names}
+    return replace(cloud, xyz=xyz, **fields)
+
+
+#: Attributes of a point except its position, and the dtype that a mean is converted to.
+_ATTRIBUTES = {
+    "rgb": np.uint8,
+    "normals": np.float32,
+    "sigma_m": np.float32,
+    "confidence": np.float32,
+    "weight": np.float32,
+    "count": np.int32,
+}
+
+
+def _restored(name: str, mean: Float32) -> NDArray[Any]:
+    """Return the mean of an attribute, converted to the dtype and shape used in a cloud."""
+    if name == "normals":
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        return np.asarray(mean / np.maximum(length, np.float32(1e-12)), dtype=np.float32)
+    dtype = np.dtype(_ATTRIBUTES[name])
+    rounded = np.rint(mean) if dtype.kind in "iu" else mean
+    return rounded.astype(dtype) if name == "rgb" else rounded[:, 0].astype(dtype)
+
+
 class StereoSettings(Settings):
     """Everything that determines the cloud of one frame."""
 
@@ -160,53 +347,3 @@ class StereoSettings(Settings):
         check_matcher(matcher)
         matching = self.matching.model_copy(update={"matcher": matcher})
         return self.model_copy(update={"matching": matching})
-
-
-@dataclass(frozen=True, eq=False)
-class PairRun:
-    """Results of a run, from which its report is made."""
-
-    name: str  # display name of the pair
-    config: StereoSettings  # the configuration
-    pair: RectifiedPair  # the rectified images
-    disparity: Disparity  # their disparity
-    summary: dict[str, Any]  # the figures of ``summary.json``
-    #: The points in camera axes, or None if only the disparity was requested.
-    cloud: PointCloud | None = None
-    mesh: TriangleMesh | None = None  # the surface in camera axes, or None
-    truth: DisparityTruth | None = None  # true disparity, or None
-    metrics: DisparityMetrics | None = None  # errors against it, or None
-    warnings: tuple[str, ...] = ()  # problems that did not stop the run
-
-    def __repr__(self) -> str:
-        parts = (self.disparity, self.cloud, self.mesh)
-        made = ", ".join(repr(part) for part in parts if part is not None)
-        return f"PairRun({self.name!r}, {made}, {counted(len(self.warnings), 'warning')})"
-
-
-def disparity_figures(disparity: Disparity) -> dict[str, Any]:
-    """Return size, share of pixels for each reason, and median of a disparity, ready for JSON."""
-    found = disparity.values[disparity.valid]
-    shares = disparity.reason_shares
-    return {
-        "width_px": disparity.values.shape[1],
-        "height_px": disparity.values.shape[0],
-        "valid_percent": 100.0 * float(disparity.valid.mean()),
-        "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
-        "disparity_median_px": float(np.median(found)) if len(found) else None,
-    }
-
-
-def cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:
-    """Return the number of points, median depth and camera of a frame, ready for JSON."""
-    camera, z = frame.pair.camera, frame.cloud.xyz[:, 2]
-    return {
-        "points": len(frame.cloud),
-        "depth_median_m": float(np.median(z)) if len(z) else None,
-        "focal_px": camera.focal_px,
-        "field_of_view_deg": camera.field_of_view_deg,
-        "cx_px": camera.cx_px,
-        "cy_px": camera.cy_px,
-        "baseline_m": camera.baseline_m,
-        "doffs_px": camera.doffs_px,
-    }

@@ -21,7 +21,7 @@ from recon.map.occupancy.part import free_part, join_occupancy
 from recon.map.store.session import Submaps
 from recon.map.submaps import Submap, SubmapSettings
 from recon.map.tiles import Tiles
-from recon.stereo.cloud.back_project import filter_cloud
+from recon.stereo.frame import filter_cloud
 from tests.map.walls import (
     CONFIG,
     T_MAP_WORLD,

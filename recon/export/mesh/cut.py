@@ -12,7 +12,7 @@ from recon.core.errors import MeshingError
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Float64, Int32
 from recon.io.models import open3d_meshes
-from recon.stereo.cloud import open3d_clouds
+from recon.stereo import open3d_clouds
 
 _CANDIDATES: Final = 8
 _SAME_M: Final = 1e-5

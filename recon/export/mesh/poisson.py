@@ -18,7 +18,7 @@ from recon.core.values.arrays import Bool, Float32
 from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
-from recon.stereo.cloud import open3d_clouds
+from recon.stereo import open3d_clouds
 
 OVERLAP_M: Final = 3.0
 """Margin around a tile whose points its surface is fitted to as well. A tile is at least as wide as

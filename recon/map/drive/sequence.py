@@ -41,8 +41,7 @@ from recon.odometry.protocol import OdometryHealth
 from recon.run.progress import SILENT, Progress
 from recon.run.threads import serial_algebra
 from recon.sources.source import StereoSource, check_source
-from recon.stereo.cloud.back_project import CloudSettings
-from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
+from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedFrame
 
 
 @dataclass(frozen=True, eq=False)

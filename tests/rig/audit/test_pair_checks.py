@@ -14,9 +14,9 @@ from recon.core.errors import FormatError, MappingError, MatchingError, Settings
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.export.mesh.view import check_coverage
+from recon.report.pair_page import PairRun
 from recon.run.progress import Silent
 from recon.sources.one_pair import PairInput
-from recon.stereo.frame import PairRun
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

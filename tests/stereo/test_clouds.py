@@ -11,8 +11,8 @@ import recon
 from recon.core.errors import ReconError, SettingsError, ShapeError
 from recon.core.values import Disparity, PointCloud, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.camera import project
-from recon.stereo.cloud import open3d_clouds
-from recon.stereo.cloud.back_project import (
+from recon.stereo import open3d_clouds
+from recon.stereo.frame import (
     ANY_SCALE,
     CloudSettings,
     FilterSettings,

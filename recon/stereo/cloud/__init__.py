@@ -1,1 +1,0 @@
-"""Filtered point clouds with uncertainties, from disparity maps; Open3D thins and filters."""
