@@ -27,7 +27,7 @@ from recon.core.values import SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
-from recon.run.threads import serial_algebra
+from recon.run.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.source import DerivedSource
 from recon.sources.synthetic import SyntheticSource

@@ -38,7 +38,7 @@ from recon.io.trajectory import read_tum
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
 from recon.run.machine import available_cores
-from recon.run.threads import serial_algebra
+from recon.run.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor

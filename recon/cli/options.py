@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from recon.commands.config import Changes, ReconConfig
     from recon.commands.map_options import MapOptions
     from recon.map.sessions.measured import Survey
-    from recon.run.progress import Progress
+    from recon.run.work import Progress
 
 _KEYWORD: Final = inspect.Parameter.KEYWORD_ONLY
 Read = str | Callable[[Any], Mapping[str, Any]]

@@ -16,7 +16,7 @@ from recon.io.files import naming
 from recon.io.middlebury import find_image, find_layout
 from recon.run.batch.job import Job
 from recon.run.batch.job_file import Entry, JobList, check_names, name_of_swept
-from recon.run.threads import parse_size_mb
+from recon.run.work import parse_size_mb
 
 COMMANDS: Final = (
     "map", "localize", "merge", "pair", "disparity", "export", "mesh", "occupancy", "rectify",

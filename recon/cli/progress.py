@@ -22,8 +22,8 @@ from rich.progress_bar import ProgressBar as Bar
 from rich.text import Text
 
 from recon.core.text import counted
-from recon.run.progress import Progress as Shown
-from recon.run.progress import Silent, Step
+from recon.run.work import Progress as Shown
+from recon.run.work import Silent, Step
 from recon.sources.source import StereoSource
 
 # Weight of the newest item in the displayed rate: steady enough to read, yet responsive.

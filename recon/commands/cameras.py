@@ -41,7 +41,7 @@ from recon.rig.rectification import (
 )
 from recon.rig.written import CalibrationForm, targets_of
 from recon.run.run import Run
-from recon.run.threads import serial_algebra
+from recon.run.work import serial_algebra
 from recon.sources.image_names import ImagePairs, pair_images
 from recon.sources.one_pair import read_pair
 from recon.sources.opencv_camera import Camera

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.core.errors import FormatError
-from recon.run.progress import SILENT, Progress
+from recon.run.work import SILENT, Progress
 from recon.sources.datasets import (
     Part,
     datasets,

@@ -22,7 +22,7 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.fusion import fusion_range_m
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
-from recon.run.progress import SILENT, Progress
+from recon.run.work import SILENT, Progress
 from recon.sources.one_pair import PairInput
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

@@ -25,8 +25,8 @@ from recon.evaluation.middlebury.score import Figures
 from recon.io.files import StrPath
 from recon.io.images.disparity import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
-from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
+from recon.run.work import SILENT, Progress
 from recon.stereo.match.protocol import Matcher
 
 

@@ -26,8 +26,8 @@ from recon.map.map import Map
 from recon.run.batch.cluster import BatchOptions
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.machine import versions
-from recon.run.progress import SILENT, Progress
 from recon.run.run import Run, fingerprint
+from recon.run.work import SILENT, Progress
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 

@@ -28,8 +28,8 @@ from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.sequence import check_cloud
 from recon.report.pair_page import PairRun, write_disparity_images, write_pair_page
 from recon.rig.audit.audit import check_found, find_pair_faults
-from recon.run.progress import SILENT, Progress
 from recon.run.run import Run, plain
+from recon.run.work import SILENT, Progress
 from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 from recon.stereo.match.protocol import Matcher, name_of

@@ -14,7 +14,7 @@ from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
 from recon.odometry.settings import OdometrySettings, RigSettings
-from recon.run.threads import MemorySettings
+from recon.run.work import MemorySettings
 from recon.stereo.frame import FilterSettings, StereoSettings
 
 

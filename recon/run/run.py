@@ -22,8 +22,7 @@ from recon.io.fields import write_yaml
 from recon.io.files import StrPath, resolved
 from recon.run.directory import RECORD, RunDirectory, default_folder
 from recon.run.machine import peak_memory_mb, versions
-from recon.run.progress import SILENT, Progress, Stopwatch
-from recon.run.threads import use_threads
+from recon.run.work import SILENT, Progress, Stopwatch, use_threads
 
 CONFIG: Final = "config.yaml"
 SUMMARY: Final = "summary.json"

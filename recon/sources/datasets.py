@@ -29,7 +29,7 @@ from recon.io.download import OnBytes, download, unpack
 from recon.io.fields import read_toml
 from recon.io.files import read_text, reading
 from recon.run.directory import refuse_links
-from recon.run.progress import Progress
+from recon.run.work import Progress
 
 _LIST: Final = Path(__file__).with_suffix(".toml")
 RECORD: Final = "dataset.json"  # what was fetched, and size and hash of each file

@@ -17,7 +17,7 @@ from recon.map.localize.sequence import LocalizedFrame
 from recon.odometry.protocol import OdometryHealth
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult
-from recon.run.progress import Progress, Silent
+from recon.run.work import Progress, Silent
 from recon.sources.datasets import _Megabyte
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings

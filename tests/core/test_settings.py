@@ -19,7 +19,7 @@ from recon.io.files import read_table
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_frames
 from recon.rig.capture import RecordingSettings
-from recon.run.threads import parse_size_mb
+from recon.run.work import parse_size_mb
 from recon.sources.times import read_dates, read_stamped_names
 from recon.street.settings import StreetScene
 from tests.scenery.bounds import Number, numbers_of

@@ -12,7 +12,7 @@ from typing import Any
 from recon.core.errors import FormatError
 from recon.map.drive.mapper import FrameResult
 from recon.map.map import Map
-from recon.run.progress import Silent
+from recon.run.work import Silent
 
 ROOT = Path(__file__).parents[2]
 RECON = [sys.executable, "-m", "recon"]

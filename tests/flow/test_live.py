@@ -21,7 +21,7 @@ from recon.map.drive.drive import MapBehind
 from recon.map.drive.mapper import FrameResult
 from recon.rig.cameras import CameraSource, is_camera, open_camera_source
 from recon.rig.capture import CaptureSettings, RecordingSettings
-from recon.run.progress import Silent
+from recon.run.work import Silent
 from recon.sources import live
 from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings

@@ -15,7 +15,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.io.images.image import write_image
 from recon.map.drive.mapper import FrameResult
-from recon.run.progress import Silent
+from recon.run.work import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti

@@ -16,8 +16,8 @@ from recon.core.settings import Settings
 from recon.io.atomic import exchange
 from recon.run import directory
 from recon.run.directory import RunDirectory, refuse_links, state_folder
-from recon.run.progress import Silent
 from recon.run.run import Run, WholeRun, fingerprint, plain
+from recon.run.work import Silent
 
 
 class _Size(Settings):

@@ -29,7 +29,7 @@ from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
 from recon.run.machine import available_cores
-from recon.run.threads import side_by_side
+from recon.run.work import side_by_side
 
 WHOLE: Final = "mesh/mesh.ply"
 LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where the run has no other cloud

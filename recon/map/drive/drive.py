@@ -28,8 +28,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.machine import versions
-from recon.run.progress import Stopwatch
-from recon.run.threads import look_ahead, work_in_background
+from recon.run.work import Stopwatch, look_ahead, work_in_background
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 

@@ -17,7 +17,7 @@ from recon.map.store.session import Keyframes
 from recon.places.closure import Closure, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.places import path_lengths
-from recon.run.progress import Stopwatch
+from recon.run.work import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
 _TELLING: Final = 3  # implausible place recognitions from which a warning is given

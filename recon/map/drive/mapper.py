@@ -22,8 +22,7 @@ from recon.map.store.session import Session
 from recon.map.submaps import Submap, SubmapSettings
 from recon.odometry.health import stretches
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
-from recon.run.progress import Stopwatch
-from recon.run.threads import OneBehind
+from recon.run.work import OneBehind, Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
 

@@ -38,8 +38,7 @@ from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 from recon.odometry.health import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
-from recon.run.progress import SILENT, Progress
-from recon.run.threads import serial_algebra
+from recon.run.work import SILENT, Progress, serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedFrame
 

@@ -19,8 +19,7 @@ from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
-from recon.run.progress import SILENT, Progress
-from recon.run.threads import look_ahead, serial_algebra
+from recon.run.work import SILENT, Progress, look_ahead, serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
 

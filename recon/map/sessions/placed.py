@@ -32,7 +32,7 @@ from recon.map.store.records import Store
 from recon.map.store.session import Session, Submaps
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
-from recon.run.threads import side_by_side
+from recon.run.work import side_by_side
 
 Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
 """Calls a function with each of several values, somewhere, and waits until all are done."""

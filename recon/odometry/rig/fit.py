@@ -26,7 +26,7 @@ from recon.odometry.window import (
     normal_equations,
     weighted,
 )
-from recon.run.threads import serial_algebra, side_by_side
+from recon.run.work import serial_algebra, side_by_side
 
 _ROUNDS: Final = 8  # times that all windows are adjusted, without the fault as known by then
 _ROUNDING: Final = 1e-9  # share of the best known direction below which one is not known at all

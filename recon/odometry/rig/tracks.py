@@ -16,7 +16,7 @@ from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
 from recon.odometry.window import TrackWindow
 from recon.run.machine import available_cores
-from recon.run.threads import serial_algebra, side_by_side
+from recon.run.work import serial_algebra, side_by_side
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 

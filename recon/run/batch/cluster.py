@@ -16,7 +16,7 @@ from uuid import uuid4
 from recon.core.errors import ClusterError, ReconError, SettingsError, require
 from recon.run.batch.job import Job, Outcome, last_outcome, run_job
 from recon.run.machine import available_cores
-from recon.run.progress import SILENT, Progress
+from recon.run.work import SILENT, Progress
 
 EXTRA: Final = "cluster"
 _REACH_S: Final = 20.0

@@ -15,7 +15,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.export.mesh.view import check_coverage
 from recon.report.pair_page import PairRun
-from recon.run.progress import Silent
+from recon.run.work import Silent
 from recon.sources.one_pair import PairInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
