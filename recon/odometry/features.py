@@ -14,14 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.geometry.se3 import apply, invert
+from recon.core.geometry.se3 import Motion, apply, invert
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry.kernels.patches import Placing, place_patches
-from recon.odometry.locate_camera import REPROJECTION_PX, Motion
+from recon.odometry.pose import REPROJECTION_PX, TrackWindow
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.window import TrackWindow
 from recon.stereo.match.sad import halve
 from recon.stereo.rectify.features import exposed_as
 

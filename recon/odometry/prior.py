@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import RegistrationError
-from recon.core.geometry.se3 import invert, make_transform, orthonormalise
+from recon.core.geometry.se3 import invert, make_transform, orthonormalise, part_of
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.odometry.locate_camera import part_of
 from recon.odometry.settings import PriorSettings
 
 _CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

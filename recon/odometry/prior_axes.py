@@ -10,7 +10,13 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from recon.core.errors import RegistrationError
-from recon.core.geometry.se3 import as_step, invert
+from recon.core.geometry.se3 import (
+    as_step,
+    covariance_of,
+    distance_in_sigmas,
+    invert,
+    step_covariance,
+)
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
@@ -18,7 +24,6 @@ from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import PriorSettings
 from recon.odometry.visual import VisualOdometry
-from recon.odometry.window import covariance_of, distance_in_sigmas, step_covariance
 
 Axes = Literal["camera", "body"]
 

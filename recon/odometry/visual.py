@@ -8,8 +8,12 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.se3 import (
+    Motion,
     as_step,
+    covariance_of,
+    distance_in_sigmas,
     invert,
+    step_covariance,
 )
 from recon.core.text import counted
 from recon.core.values import Disparity
@@ -24,19 +28,18 @@ from recon.odometry.features import (
     points_of,
     replenish,
 )
-from recon.odometry.locate_camera import MIN_INLIERS, Motion, enough_agree, locate_camera
-from recon.odometry.prior import MAX_SIGMAS, MotionPrior
-from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
-from recon.odometry.window import (
+from recon.odometry.pose import (
+    MIN_INLIERS,
     TrackWindow,
     adjust,
-    covariance_of,
-    distance_in_sigmas,
+    enough_agree,
+    locate_camera,
     misfits,
     newest_health,
     newest_information,
-    step_covariance,
 )
+from recon.odometry.prior import MAX_SIGMAS, MotionPrior
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.stereo.rectify.features import match_features
 
 _FRAMES: Final = 6  # frames adjusted together

@@ -12,7 +12,7 @@ from recon.core.geometry.se3 import apply, as_transform, invert, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
-from recon.odometry.locate_camera import find_consensus, fit_pose
+from recon.odometry.pose import find_consensus, fit_pose
 
 _ITERATIONS: Final = 500  # RANSAC's samples at most
 _LIMIT_PX: Final = 2.5  # RANSAC's inlier limit

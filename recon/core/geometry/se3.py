@@ -1,13 +1,13 @@
 """Rigid transforms (4×4), rotations as matrices, vectors and quaternions (x, y, z, w), axes.
 
-``T_a_b`` maps points of frame b to frame a.
+``T_a_b`` maps points of frame b to frame a. Also how sure a step is, and a motion that goes on.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -188,3 +188,62 @@ def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> Poin
     """Transform a cloud to another frame by ``T`` (4, 4); only positions and normals change."""
     normals = None if cloud.normals is None else rotate(T, cloud.normals)
     return replace(cloud, xyz=apply(T, cloud.xyz), normals=normals, frame=frame)
+
+
+def part_of(T: Float64, share: float) -> Float64:
+    """A fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
+    if share == 1.0:
+        return T
+    return make_transform(exp_so3(share * log_so3(T[:3, :3])), share * T[:3, 3])
+
+
+_LONGEST_GAP: Final = 20.0
+"""In intervals: over a longer gap the motion is not extrapolated in time, but repeated once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The last pose, and how the camera moved to it."""
+
+    T_world_camera: Float64  # (4, 4), the last pose
+    timestamp_s: float  # time of the last pose
+    # float64 (4, 4), the motion to it
+    T_before_camera: Float64 = field(default_factory=lambda: np.eye(4))
+    interval_s: float = 0.0  # time that the motion took; 0 = not known
+
+    def predict(self, timestamp_s: float) -> Float64:
+        """The pose (4, 4) at a time: with constant velocity, where times are known."""
+        passed_s = timestamp_s - self.timestamp_s
+        share = passed_s / self.interval_s if self.interval_s > 0.0 else 1.0
+        if not 0.0 < share <= _LONGEST_GAP:
+            share = 1.0
+        return orthonormalise(self.T_world_camera @ part_of(self.T_before_camera, share))
+
+    def moved(self, T_world_camera: Float64, timestamp_s: float) -> Motion:
+        """The model after a measured pose, which gives a new motion."""
+        motion = invert(self.T_world_camera) @ T_world_camera
+        return Motion(T_world_camera, timestamp_s, motion, timestamp_s - self.timestamp_s)
+
+    def drifted(self, timestamp_s: float) -> Motion:
+        """The model after a frame without a measured pose: the same motion continues."""
+        T = self.predict(timestamp_s)
+        return Motion(T, timestamp_s, self.T_before_camera, self.interval_s)
+
+
+_LEAST_INFORMATION: Final = 1e-4
+"""Added along every direction, so that one that nothing fixes gets 100 m or rad, not infinity."""
+
+
+def covariance_of(information: Float64) -> Float64:
+    """The covariance (6, 6) of an information matrix (6, 6), which may be singular."""
+    return np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)))
+
+
+def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:
+    """The covariance (6, 6) of a step that is equally uncertain in all directions."""
+    return np.diag(np.repeat([sigma_m**2, np.deg2rad(sigma_deg) ** 2], 3))
+
+
+def distance_in_sigmas(step: Float64, covariance: Float64) -> float:
+    """The length of a step (6,) in standard deviations (Mahalanobis distance)."""
+    return float(np.sqrt(step @ np.linalg.solve(covariance, step)))

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.se3 import invert
+from recon.core.geometry.se3 import covariance_of, invert, step_covariance
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Rig, StereoPair
 from recon.core.values.arrays import Bool, Float64
@@ -23,7 +23,6 @@ from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualEstimate, VisualOdometry
-from recon.odometry.window import covariance_of, step_covariance
 from recon.places.closure import loop_bias
 from recon.places.detector import KnownPlaces
 from recon.places.keyframe import Keyframe, make_keyframe

@@ -13,7 +13,16 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.se3 import adjoint, apply, as_step, as_transform, invert
+from recon.core.geometry.se3 import (
+    adjoint,
+    apply,
+    as_step,
+    as_transform,
+    covariance_of,
+    distance_in_sigmas,
+    invert,
+    step_covariance,
+)
 from recon.core.values.arrays import Float64
 from recon.io.files import reading
 from recon.map.localize.belief import MAX_SIGMA_DEG, MAX_SIGMA_M, Belief
@@ -23,7 +32,6 @@ from recon.map.store.session import Session
 from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
 from recon.odometry.prior import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.window import covariance_of, distance_in_sigmas, step_covariance
 from recon.places.places import SIGMAS
 
 _VOXEL_M: Final = 0.3  # edge of a voxel of the map of ICP

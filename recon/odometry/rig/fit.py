@@ -15,9 +15,7 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.kernels import bundle
-from recon.odometry.rig.fault import Places, RigFault, shrink
-from recon.odometry.rig.tracks import THREADS, StereoTracks
-from recon.odometry.window import (
+from recon.odometry.pose import (
     CAUCHY_SIGMAS,
     SIGMA_D_PX,
     SIGMA_UV_PX,
@@ -26,6 +24,8 @@ from recon.odometry.window import (
     normal_equations,
     weighted,
 )
+from recon.odometry.rig.fault import Places, RigFault, shrink
+from recon.odometry.rig.tracks import THREADS, StereoTracks
 from recon.run.work import serial_algebra, side_by_side
 
 _ROUNDS: Final = 8  # times that all windows are adjusted, without the fault as known by then

@@ -12,9 +12,9 @@ import numpy as np
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.features import find_in_right, surface_slopes
+from recon.odometry.pose import TrackWindow
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
-from recon.odometry.window import TrackWindow
 from recon.run.machine import available_cores
 from recon.run.work import serial_algebra, side_by_side
 from recon.sources.source import StereoSource

@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
-from recon.odometry.locate_camera import find_consensus, fit_pose
+from recon.odometry.pose import find_consensus, fit_pose
 from recon.sources.source import StereoSource
 
 _AROUND_PX: Final = 9  # half of these may be saturated before their median is

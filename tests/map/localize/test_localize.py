@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.errors import FormatError, MappingError
 from recon.core.geometry import se3
-from recon.core.geometry.se3 import apply, as_transform
+from recon.core.geometry.se3 import apply, as_transform, step_covariance
 from recon.core.kernels.voxels import pack_keys
 from recon.map.drive.drive import Workspace
 from recon.map.drive.sequence import map_sequence
@@ -22,7 +22,6 @@ from recon.map.map import Map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import SessionInfo
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.window import step_covariance
 from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film

@@ -10,11 +10,11 @@ import pytest
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.core.values.camera import project
+from recon.odometry.pose import TrackWindow
 from recon.odometry.rig.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.refine import compare_rigs
 from recon.odometry.rig.tracks import StereoTracks
-from recon.odometry.window import TrackWindow
 from recon.stereo.rectify.lens import project_raw
 from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 

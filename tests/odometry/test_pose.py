@@ -3,16 +3,25 @@
 import numpy as np
 import pytest
 
-from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
+from recon.core.geometry.se3 import (
+    Motion,
+    angle_rad,
+    apply,
+    exp_so3,
+    invert,
+    make_transform,
+    part_of,
+)
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_from_disparity, project, unproject
-from recon.odometry import window as bundle_window
+from recon.odometry import pose
 from recon.odometry.features import MIN_DISPARITY_PX
-from recon.odometry.locate_camera import REPROJECTION_PX, Motion, locate_camera, part_of
-from recon.odometry.window import (
+from recon.odometry.pose import (
+    REPROJECTION_PX,
     TrackWindow,
     adjust,
+    locate_camera,
     misfits,
     newest_health,
     newest_information,
@@ -24,8 +33,8 @@ from recon.odometry.window import (
 @pytest.fixture(autouse=True)
 def _to_the_minimum(monkeypatch):
     """Adjust until nothing changes any more, not only as far as a drive needs."""
-    monkeypatch.setattr(bundle_window, "_ITERATIONS", 30)
-    monkeypatch.setattr(bundle_window, "_MIN_GAIN", 1e-9)
+    monkeypatch.setattr(pose, "_ITERATIONS", 30)
+    monkeypatch.setattr(pose, "_MIN_GAIN", 1e-9)
 
 
 def seen_as(right: TrackWindow, uvd: np.ndarray) -> TrackWindow:
@@ -93,7 +102,7 @@ def test_information_predicts_the_scatter(camera):
     """Noise of the stated size in the newest frame alone: scatter against the covariance."""
     right = truth(camera, frames=2)
     rng = np.random.default_rng(13)
-    sigmas = np.array([bundle_window.SIGMA_UV_PX] * 2 + [bundle_window.SIGMA_D_PX])
+    sigmas = np.array([pose.SIGMA_UV_PX] * 2 + [pose.SIGMA_D_PX])
     offs = []
     for _ in range(60):
         uvd = right.uvd + sigmas * rng.normal(size=right.uvd.shape)

@@ -1,7 +1,7 @@
-"""Bundle adjustment over a short window of frames.
+"""The pose of a frame: found from known points that it sees, then adjusted with the last frames.
 
 Two frames give a motion; with a few more, each point is seen several times, so that errors of its
-disparities average out before they become errors of the path.
+disparities average out before they become errors of the path (bundle adjustment over a window).
 """
 
 from __future__ import annotations
@@ -9,14 +9,148 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
+import cv2
 import numpy as np
 
-from recon.core.geometry.se3 import apply, as_transform, invert
+from recon.core.geometry.se3 import (
+    apply,
+    as_transform,
+    covariance_of,
+    invert,
+    make_transform,
+)
 from recon.core.least_squares import Problem, minimise
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, frozen_array
+from recon.core.values.camera import project
 from recon.odometry.kernels import bundle
 from recon.odometry.protocol import OdometryHealth
+
+REPROJECTION_PX: Final = 2.0  # RANSAC's inlier limit
+_SAMPLES: Final = 200  # RANSAC's samples at most
+MIN_INLIERS: Final = 15  # fewer agreeing tracks give no pose
+_MIN_INLIER_SHARE: Final = 0.3  # a smaller share of agreeing tracks gives no pose
+
+
+def locate_camera(
+    xyz_world: Float64,
+    uv: Float64,
+    camera: RectifiedCamera,
+    T_world_guess: Float64,
+) -> LocatedCamera | None:
+    """Locate a camera that sees known points, from the largest set of them that agrees.
+
+    The pose is fitted to that set from the guess and from RANSAC's pose; the fit with more inliers
+    wins. None where too few points agree on one.
+    """
+    consensus = find_consensus(
+        xyz_world,
+        uv,
+        camera,
+        limit_px=REPROJECTION_PX,
+        iterations=_SAMPLES,
+        min_inliers=MIN_INLIERS,
+    )
+    if consensus is None:
+        return None
+    among = consensus.agree
+    fits = [
+        _agreement(fit_pose(xyz_world[among], uv[among], camera, T), xyz_world, uv, camera)
+        for T in (T_world_guess, consensus.T_world_camera)
+    ]
+    best = max(fits, key=lambda fit: int(fit.agree.sum()))
+    return best if enough_agree(int(best.agree.sum()), len(xyz_world)) else None
+
+
+def enough_agree(agreeing: int, tracks: int) -> bool:
+    """Whether so many of the tracks agree that the pose counts as measured."""
+    return agreeing >= max(MIN_INLIERS, _MIN_INLIER_SHARE * tracks)
+
+
+def _agreement(
+    T_world_camera: Float64,
+    xyz_world: Float64,
+    uv: Float64,
+    camera: RectifiedCamera,
+) -> LocatedCamera:
+    """Which points agree with a pose; none, where it is not finite."""
+    u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
+    error_px = np.hypot(u - uv[:, 0], v - uv[:, 1])
+    # A point behind the camera has a NaN error, which compares as False.
+    return LocatedCamera(T_world_camera, np.asarray(error_px <= REPROJECTION_PX))
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedCamera:
+    """The pose of a camera, from known points."""
+
+    T_world_camera: Float64  # (4, 4)
+    agree: Bool  # (N,), True for the points that agree with it
+
+
+def find_consensus(
+    xyz_world: Float64,
+    uv: Float64,
+    camera: RectifiedCamera,
+    *,
+    limit_px: float,
+    iterations: int,
+    min_inliers: int,
+) -> LocatedCamera | None:
+    """Find the largest set of points (N, 3), seen at (N, 2), that agree on one pose (RANSAC).
+
+    The pose that comes with it is a closed-form fit (EPnP) that one point near the horizon throws
+    off by metres or kilometres: fit it again with `fit_pose`. RANSAC seeds its own generator, so
+    equal input gives equal output.
+
+    Ref: Fischler and Bolles, "Random sample consensus", CACM 1981.
+    """
+    if len(xyz_world) < min_inliers:
+        return None
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        xyz_world,
+        uv,
+        camera.matrix,
+        None,
+        iterationsCount=iterations,
+        reprojectionError=limit_px,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    # Four points give a closed-form pose anyhow; the fit that follows needs more.
+    if not found or inliers is None or len(inliers) < min_inliers:
+        return None
+    agree = np.zeros(len(xyz_world), np.bool_)
+    agree[inliers.reshape(-1)] = True
+    return LocatedCamera(_pose(rotation, translation), agree)
+
+
+def fit_pose(
+    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, T_world_start: Float64 | None = None
+) -> Float64:
+    """Fit the pose (4, 4) of least squared reprojection error (Levenberg-Marquardt).
+
+    From an initial pose, or else in closed form from the points.
+    """
+    if T_world_start is None:
+        _, rotation, translation = cv2.solvePnP(
+            xyz_world, uv, camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    else:
+        T_camera_world = invert(T_world_start)
+        rotation, _ = cv2.Rodrigues(T_camera_world[:3, :3])
+        translation = T_camera_world[:3, 3].reshape(3, 1).copy()
+    rotation, translation = cv2.solvePnPRefineLM(
+        xyz_world, uv, camera.matrix, None, rotation, translation
+    )
+    return _pose(rotation, translation)
+
+
+def _pose(rotation: Float64, translation: Float64) -> Float64:
+    """T_world_camera from OpenCV's rotation vector and translation."""
+    R, _ = cv2.Rodrigues(rotation)
+    return invert(make_transform(R, translation))
+
 
 _ITERATIONS: Final = 6  # Levenberg-Marquardt steps at most
 _MIN_GAIN: Final = 1e-3  # relative decrease of the cost below which a step is the last
@@ -112,7 +246,7 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
 def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
     """Residuals (W, N, 3) in standard deviations, 0 where unseen, and Cauchy weights (W, N).
 
-    As `adjust` weighs them in its kernel; for the audit of a rig (`recon/rig/audit/`) alone.
+    As `adjust` weighs them in its kernel; for the rig of a drive (`rig/fit.py`) alone.
     """
     sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
     residual = np.nan_to_num(reprojection(window, camera) / sigmas)
@@ -181,7 +315,7 @@ def pose_information(
 def normal_equations(window: TrackWindow, camera: RectifiedCamera) -> bundle.NormalEquations:
     """The normal equations of all poses and points of a window, as `bundle.linearise`.
 
-    For the audit of a rig (`recon/rig/audit/`) alone, which has one more unknown than `adjust`.
+    For the rig of a drive (`rig/fit.py`) alone, which has one more unknown than `adjust`.
     """
     return _linearise(window, _model(camera))
 
@@ -260,22 +394,3 @@ def _scale_px(disparity: Float64, camera: RectifiedCamera) -> float:
     """
     d = disparity[np.isfinite(disparity)] + camera.doffs_px
     return float(d @ d / d.sum()) if len(d) else float("nan")
-
-
-_LEAST_INFORMATION: Final = 1e-4
-"""Added along every direction, so that one that nothing fixes gets 100 m or rad, not infinity."""
-
-
-def covariance_of(information: Float64) -> Float64:
-    """The covariance (6, 6) of an information matrix (6, 6), which may be singular."""
-    return np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)))
-
-
-def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:
-    """The covariance (6, 6) of a step that is equally uncertain in all directions."""
-    return np.diag(np.repeat([sigma_m**2, np.deg2rad(sigma_deg) ** 2], 3))
-
-
-def distance_in_sigmas(step: Float64, covariance: Float64) -> float:
-    """The length of a step (6,) in standard deviations (Mahalanobis distance)."""
-    return float(np.sqrt(step @ np.linalg.solve(covariance, step)))
