@@ -35,7 +35,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
+from recon.map.builders import OccupancyBuilder, OccupancySettings
 from recon.run.machine import available_cores
 from recon.sources.registry import open_source
 

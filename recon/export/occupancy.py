@@ -18,6 +18,7 @@ from recon.core.values.grid import log_odds
 from recon.export.product import Made, Order
 from recon.io.models.nav2 import write_nav2
 from recon.io.models.octomap import write_octomap_tiles
+from recon.map.builders import MIN_PROBABILITY
 from recon.map.cut import Rectangle, TileKey
 from recon.map.ground.axes import base_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
@@ -29,7 +30,6 @@ from recon.map.ground.surface import (
     estimate_ground_surface,
     measure_camera_height,
 )
-from recon.map.occupancy.builder import MIN_PROBABILITY
 from recon.map.occupancy.part import OccupancyPart, free_part
 from recon.map.sessions.placed import PlacedMap
 

@@ -6,12 +6,12 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from recon.core.settings import Settings
+from recon.map.builders import OccupancySettings
 from recon.map.fusion import FusionSettings
 from recon.map.ground.axes import AxesSettings
 from recon.map.ground.grid import GridSettings
 from recon.map.ground.surface import GroundSettings
 from recon.map.kernels.raycast import BLOCK_EDGE
-from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
 from recon.odometry.settings import OdometrySettings, RigSettings
 from recon.run.work import MemorySettings

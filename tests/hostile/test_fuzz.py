@@ -36,8 +36,8 @@ from recon.io.models.nav2 import read_nav2, write_nav2
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import read_frames, read_trajectory
+from recon.map.builders import OccupancySettings, ray_grain
 from recon.map.map import Map
-from recon.map.occupancy.builder import OccupancySettings, ray_grain
 from recon.map.store.session import SessionInfo
 from recon.odometry.protocol import OdometryHealth
 from recon.sources.registry import open_source

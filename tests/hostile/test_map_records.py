@@ -16,10 +16,10 @@ import pytest
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import RayCloud, RectifiedCamera
 from recon.io.models.octomap import read_octomap
+from recon.map.builders import OccupancySettings, ray_grain
 from recon.map.fusion import FusedPart, join_fused
 from recon.map.kernels.clamped import CellRows
 from recon.map.map import Map
-from recon.map.occupancy.builder import OccupancySettings, ray_grain
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, join_occupancy
 from recon.map.store.map_file import MapViews
 from recon.map.store.records import Key, Store

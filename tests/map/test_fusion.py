@@ -10,7 +10,8 @@ from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_c
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.camera import depth_sigma
 from recon.map import fusion
-from recon.map.fusion import CloudBuilder, FusedPart, FusionSettings, fusion_range_m, join_fused
+from recon.map.builders import CloudBuilder
+from recon.map.fusion import FusedPart, FusionSettings, fusion_range_m, join_fused
 
 HERE, ELSEWHERE = [0.05, 0.05, 0.05], [1.05, 1.05, 1.05]
 

@@ -10,13 +10,13 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform, transform_cloud
 from recon.core.values import OccupancyVoxels, join_voxels
 from recon.core.values.arrays import Float64, tree_of
+from recon.map.builders import CloudBuilder, OccupancyBuilder
 from recon.map.cut import Rectangle
 from recon.map.drive import mapper as mapper_file
 from recon.map.drive.mapper import SubmapBuilder
-from recon.map.fusion import CloudBuilder, join_fused
+from recon.map.fusion import join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.map import Map
-from recon.map.occupancy.builder import OccupancyBuilder
 from recon.map.occupancy.part import free_part, join_occupancy
 from recon.map.store.session import Submaps
 from recon.map.submaps import Submap, SubmapSettings

@@ -11,10 +11,10 @@ from recon.commands.config import ReconConfig, load_config
 from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, join_clouds, join_voxels
 from recon.core.values.arrays import Float64
+from recon.map.builders import ray_grain, thin_rays
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.map import Map
-from recon.map.occupancy.builder import ray_grain, thin_rays
 from recon.map.store.session import Session, SessionInfo
 from recon.map.store.trees import Link
 from recon.map.tiles import Tiles

@@ -20,10 +20,10 @@ import numpy as np
 from recon.core.errors import FormatError, ReconError, RegistrationError
 from recon.core.values import RectifiedPair, Trajectory
 from recon.io.files import reading
+from recon.map.builders import thin_rays
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.map import Map
-from recon.map.occupancy.builder import thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
 from recon.odometry.protocol import OdometryFrame, OdometryResult

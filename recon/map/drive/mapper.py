@@ -14,9 +14,15 @@ from recon.core.geometry.se3 import transform_cloud
 from recon.core.text import counted
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64, freeze, tree_of
-from recon.map.fusion import CloudBuilder, FusionSettings, fusion_range_m
+from recon.map.builders import (
+    CloudBuilder,
+    OccupancyBuilder,
+    OccupancySettings,
+    ray_grain,
+    thin_rays,
+)
+from recon.map.fusion import FusionSettings, fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import Submap, SubmapSettings

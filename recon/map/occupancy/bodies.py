@@ -26,8 +26,8 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.kernels.voxels import find_keys, pack_keys, unpack_keys
 from recon.core.values import PointCloud, RayCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int8, Int64
+from recon.map.builders import SPREAD_SIGMAS, OccupancySettings, frame_rays
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE, cast_rays, make_blocks
-from recon.map.occupancy.builder import SPREAD_SIGMAS, OccupancySettings, frame_rays
 
 _DISAGREEMENT: Final = 0.4
 """Largest disagreement within a body, root mean square of that of all and of upright pairs.

@@ -28,8 +28,8 @@ from recon.core.kernels.voxels import are_among, find_keys, pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
+from recon.map.builders import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
 from recon.map.occupancy.bodies import Looks, came_or_went, strides
-from recon.map.occupancy.builder import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))

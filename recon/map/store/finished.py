@@ -10,8 +10,8 @@ import numpy as np
 
 from recon.core.errors import FormatError, SettingsError
 from recon.core.values.arrays import Float64
+from recon.map.builders import OccupancyBuilder
 from recon.map.kernels import clamped
-from recon.map.occupancy.builder import OccupancyBuilder
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile

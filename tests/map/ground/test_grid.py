@@ -11,12 +11,12 @@ from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, exp_so3
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels, PointCloud
 from recon.core.values.grid import log_odds
+from recon.map.builders import OccupancyBuilder, OccupancySettings
 from recon.map.ground import grid as grid_file
 from recon.map.ground.axes import AxesSettings, GroundPlane, base_axes, estimate_ground, map_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
 from recon.map.ground.surface import GroundSurface
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy.part import OccupancyPart, free_part, join_occupancy
 from tests.map.walls import T_MAP_WORLD
 

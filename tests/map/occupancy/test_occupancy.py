@@ -13,9 +13,9 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import OccupancyVoxels, PointCloud
+from recon.map import builders as occupancy
+from recon.map.builders import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
 from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.occupancy import builder as occupancy
-from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
 from recon.map.occupancy.part import OccupancyPart
 
 Cell = tuple[int, int, int]

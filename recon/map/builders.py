@@ -1,6 +1,6 @@
-"""From clouds and poses to the occupancy of space: log-odds of voxels, by ray casting.
+"""What frames add to a submap: sums per voxel of the cloud, and log-odds of cells by ray casting.
 
-Maps are built from the rays that are kept of each frame, points averaged in small cubes and
+Occupancy is built from the rays that are kept of each frame, points averaged in small cubes and
 rounded, so that the same map can be built again, and others with other voxels, heights or poses.
 """
 
@@ -18,8 +18,107 @@ from recon.core.settings import Settings
 from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, RayGrain
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.core.values.grid import log_odds
+from recon.map.fusion import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPart, FusionSettings
 from recon.map.kernels import clamped, raycast
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, sum_points
+
+_MIN_SIGMA_M: Final = 0.02  # points more precise than this count as this precise: bounds the weight
+_MAX_SIGMA_M: Final = 0.6
+"""Points less precise than this are left out: they would smear over voxels."""
+
+
+class CloudBuilder:
+    """Fuses clouds frame by frame.
+
+    A point weighs ``confidence / sigma²``. Time per frame grows with its points alone, memory with
+    the number of voxels. The same clouds in the same order give the same map.
+    """
+
+    def __init__(self, settings: FusionSettings) -> None:
+        self._settings = settings
+        self._sums = voxels.make_sums(1, VALUES)
+        self._frames = 0
+        self._known = dict.fromkeys(KNOWABLE, True)
+
+    def __len__(self) -> int:
+        """Return the number of voxels seen by at least one frame."""
+        return int(self._sums.used[0])
+
+    def integrate(self, cloud: PointCloud) -> None:
+        """Add what one frame saw, in world axes.
+
+        ``confidence`` None = 1, ``sigma_m`` None = all equally precise. What one of the clouds does
+        not have, the map does not have.
+        """
+        self._check(cloud)
+        for name in self._known:
+            self._known[name] &= getattr(cloud, name) is not None or len(cloud) == 0
+        points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), _values(cloud))
+        self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
+        self._frames += 1
+
+    def part(self) -> FusedPart:
+        """Return what was seen since the start, or since the last `take`."""
+        n, s = len(self), self._sums
+        known = tuple(name for name, value in self._known.items() if value and self._frames)
+        keys, sums = voxels.copy_sums(s)
+        return FusedPart(keys, sums, s.information[:n].copy(), s.frames[:n].copy(), known)
+
+    def take(self) -> FusedPart:
+        """Return the part so far; the builder starts a new one."""
+        part = self.part()
+        self._sums = voxels.make_sums(1, VALUES)
+        self._known, self._frames = dict.fromkeys(self._known, True), 0
+        return part
+
+    def resume(self, part: FusedPart, frames: int) -> None:
+        """Continue a part into which so many frames were integrated."""
+        empty = voxels.make_sums(max(1, len(part)), VALUES)
+        self._sums = voxels.add_rows(empty, part.keys, part.sums, part.information, part.frames)
+        self._known = {name: name in part.known or frames == 0 for name in self._known}
+        self._frames = frames
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the voxels seen so far; the same after `resume` as before."""
+        return len(self) * sum(array[:1].nbytes for array in self._sums[1:-1])
+
+    def _weights(self, cloud: PointCloud) -> Float32:
+        """Return the weight of each point; 0 = not used. float32 (N,)."""
+        confidence = np.float32(1) if cloud.confidence is None else cloud.confidence
+        if cloud.sigma_m is None:
+            return np.full(len(cloud), 1.0, np.float32) * confidence
+        bounded = np.maximum(cloud.sigma_m, np.float32(_MIN_SIGMA_M))
+        weights = confidence / bounded**2
+        return np.where(cloud.sigma_m <= _MAX_SIGMA_M, weights, 0).astype(np.float32)
+
+    def _check(self, cloud: PointCloud) -> None:
+        """Refuse what would silently spoil the map."""
+        if cloud.frame != "world":
+            raise MappingError(
+                "the fused map takes clouds in world axes", got=cloud.frame, expected="world"
+            )
+        limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
+        numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence, cloud.normals)
+        if not all(a is None or np.isfinite(a).all() for a in numbers):
+            raise MappingError("a point to map is not finite")
+        if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
+            raise MappingError(
+                "a point is too far from the origin for this voxel size",
+                got=f"{np.abs(cloud.xyz).max():.0f} m",
+                expected=f"at most {limit_m:.0f} m",
+            )
+
+
+def _values(cloud: PointCloud) -> Float32:
+    """Return what is averaged of each point, (N, 7): colour, normal, confidence; 0 = unknown."""
+    values = np.zeros((len(cloud), VALUES), np.float32)
+    named = ((RGB, cloud.rgb), (NORMAL, cloud.normals), (CONFIDENCE, cloud.confidence))
+    for columns, array in named:
+        if array is not None:
+            values[:, columns] = array
+    return values
+
 
 _FIRST_POINTS: Final = 1 << 12
 _LEAST_SIGMA_CELLS: Final = 0.1
