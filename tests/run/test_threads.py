@@ -26,7 +26,7 @@ from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.store.records import Store
 from recon.map.store.session import Submaps
 from recon.map.tiles import Tiles
-from recon.run import work
+from recon.run import work as work_file
 from recon.run.machine import available_cores, peak_memory_mb
 from recon.run.work import (
     MemorySettings,
@@ -88,7 +88,7 @@ def test_nothing_is_begun_after_an_interruption(monkeypatch):
         first.wait(LONG_S)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(work, "ThreadPoolExecutor", pool)
+    monkeypatch.setattr(work_file, "ThreadPoolExecutor", pool)
     monkeypatch.setattr(Future, "result", interrupted)
     with pytest.raises(KeyboardInterrupt):
         list(side_by_side(work, range(100), threads=1))
@@ -192,9 +192,9 @@ def test_what_takes_more_than_the_limit_is_one_line(monkeypatch):
     free, limited = MemorySettings(), MemorySettings(limit_mb=500)
     assert (free.submap_bytes, free.tile_bytes) == (None, None)
     assert 0 < (limited.submap_bytes or 0) < (limited.tile_bytes or 0) < limited.cache_bytes < 1e8
-    monkeypatch.setattr(work, "peak_memory_mb", lambda: 500.0)
+    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: 500.0)
     limited.check("frame 7")
-    monkeypatch.setattr(work, "peak_memory_mb", lambda: 512.0)
+    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: 512.0)
     free.check("frame 7")
     with pytest.raises(MemoryLimitError, match=r"^frame 7: .*got 512 MB.*at most 500 MB") as caught:
         limited.check("frame 7")
@@ -223,7 +223,7 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(monke
     assert len(stores[0]) == 1
     assert len(stores[1]) > 3
     # The limit is that of a map alone here: the libraries of the test take more.
-    monkeypatch.setattr(work, "peak_memory_mb", lambda: 0.0)
+    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: 0.0)
     maps = [
         Tiles.of_submaps(store, config, T_MAP_WORLD)
         for store, config in zip(stores, (free, limited), strict=True)
@@ -247,7 +247,7 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(monke
 @pytest.mark.usefixtures("blank_figures")
 def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(tmp_path, monkeypatch):
     peaks = iter([400.0] * 6)
-    monkeypatch.setattr(work, "peak_memory_mb", lambda: next(peaks, 600.0))
+    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: next(peaks, 600.0))
     drive, out = street_drive(tmp_path / "drive", 12, speed_m_per_frame=0.5), tmp_path / "run"
     overrides = ["checkpoints.every_frames=4", "submaps.length_m=4", "memory.limit_mb=500"]
     config = load_config(None, overrides)
