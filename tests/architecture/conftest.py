@@ -14,18 +14,15 @@ else:
 
 @pytest.fixture(scope="session")
 def root():
-    """Folder of the project."""
     return Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="session")
 def pyproject(root):
-    """Content of pyproject.toml."""
     return tomllib.loads((root / "pyproject.toml").read_text())
 
 
 @pytest.fixture(scope="session")
 def trees(root):
-    """The modules of the library, parsed."""
     modules = sorted((root / "recon").rglob("*.py"))
     return {path: ast.parse(path.read_text()) for path in modules}

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import packages_distributions
-from typing import Any
 
 import pytest
 
@@ -40,25 +39,19 @@ def imported(trees):
     }
 
 
-def _declared(pyproject: dict[str, Any]) -> set[str]:
-    return {_normal(entry) for entry in pyproject["project"]["dependencies"]}
-
-
-def _extras(pyproject: dict[str, Any]) -> dict[str, list[str]]:
-    return pyproject["project"]["optional-dependencies"]
-
-
 def test_what_is_imported_is_declared_and_pinned_and_nothing_else(imported, pyproject, root):
-    declared = _declared(pyproject)
+    declared = {_normal(entry) for entry in pyproject["project"]["dependencies"]}
     assert {name for name, providers in imported.items() if not declared & providers} == set()
     assert declared - set().union(*imported.values()) == set()
     lines = (root / "constraints.txt").read_text().splitlines()
     pinned = {_normal(line) for line in lines if "==" in line and not line.startswith("#")}
-    assert declared | set(map(_normal, _extras(pyproject)["dev"])) <= pinned
+    assert (
+        declared | set(map(_normal, pyproject["project"]["optional-dependencies"]["dev"])) <= pinned
+    )
 
 
 def test_every_optional_library_is_declared_by_the_extra_that_its_error_names(trees, pyproject):
-    extras = _extras(pyproject)
+    extras = pyproject["project"]["optional-dependencies"]
     asked = {pair for tree in trees.values() for pair in _required(tree)}
     providers = packages_distributions()
     assert {extra for _, extra in asked} == set(extras) - {"dev"}
@@ -84,22 +77,19 @@ def _required(tree: ast.Module) -> Iterator[tuple[str, str]]:
 
 
 def test_kernels_need_no_linear_algebra_of_scipy(trees):
+    """What numba compiles is decorated with `kernel`, with options or without."""
     found = [
         f"{path.name}:{node.lineno}"
         for path, tree in trees.items()
         for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef) and _is_compiled(function)
+        if isinstance(function, ast.FunctionDef)
+        for mark in function.decorator_list
+        if ast.unparse(getattr(mark, "func", mark)) == "kernel"
         for node in ast.walk(function)
         if (isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult))
         or (isinstance(node, ast.Attribute) and node.attr in FROM_SCIPY)
     ]
     assert found == []
-
-
-def _is_compiled(function: ast.FunctionDef) -> bool:
-    """Whether a function is decorated with `kernel`, with options or without."""
-    names = {ast.unparse(getattr(mark, "func", mark)) for mark in function.decorator_list}
-    return "kernel" in names
 
 
 def test_version_is_the_same_everywhere(root, pyproject):

@@ -1,7 +1,6 @@
 """`recon audit` on the command line: table, JSON, corrected calibration, one line for bad input."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -55,15 +54,6 @@ def test_a_good_drive_is_announced_measured_and_found_good(good, tmp_path):
     assert summary["verdict"] == "good"
 
 
-def test_a_report_is_made_of_a_camera_that_shows_nothing(drive, tmp_path):
-    pairs, camera = drive
-    dark = [replace(pair, right=pair.right * 0) for pair in pairs]
-    folder = drives.write_kitti(dark, camera, tmp_path / "dark")
-    done = recon("audit", folder, "--out", tmp_path / "audited")
-    assert done.exit_code == 0
-    assert "shows nothing" in (tmp_path / "audited" / "report.html").read_text()
-
-
 def test_a_layout_that_is_named_and_not_there_is_refused(good):
     done = recon("audit", good, "--source", "euroc")
     assert done.exit_code == 1
@@ -94,31 +84,3 @@ def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(drive, tmp_pat
     # The same file is what `recon map --calib` opens the drive with.
     source = open_source(path, settings=SourceSettings(calibration=str(mended)))
     assert source.calibration.baseline_m == pytest.approx(drive[1].baseline_m)
-
-
-@pytest.mark.slow
-def test_mapping_warns_of_rows_first_and_takes_the_mended_file(drive, tmp_path):
-    path = drives.write_kitti(*spoiled(drive, pitch_deg=0.6), tmp_path / "drive")
-    common = ("--no-mesh", "--json", "--set", "matching.matcher=opencv-bm")
-    done = recon("map", path, *common, "--verbose", "--out", tmp_path / "bad")
-    events = [json.loads(line) for line in done.stderr.splitlines() if line.startswith("{")]
-    order = [event["event"] for event in events]
-    assert order.index("source") < order.index("warning") < order.index("frame")
-    assert any("[quick audit]" in line for line in json.loads(done.stdout)["warnings"])
-    mended = tmp_path / "mended.yaml"
-    assert recon("audit", path, "--mend", mended).exit_code == 0
-    again = recon("map", path, "--calib", mended, *common, "--out", tmp_path / "good")
-    assert again.exit_code == 0
-    summary = json.loads(again.stdout)
-    assert not any("rows" in line for line in summary["warnings"])
-    assert summary["points"] > json.loads(done.stdout)["points"]
-
-
-def test_images_of_another_size_are_refused_in_one_line(drive, tmp_path):
-    pairs, camera = drive
-    half = [replace(p, left=p.left[::2, ::2].copy(), right=p.right[::2, ::2].copy()) for p in pairs]
-    done = recon("audit", drives.write_euroc(half, camera, tmp_path))
-    assert done.exit_code == 1
-    assert "images have another size than the calibration" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert done.stdout == ""

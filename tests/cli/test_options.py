@@ -27,7 +27,6 @@ from recon.commands.config import (
 )
 from recon.core.errors import SettingsError
 from recon.core.settings import setting_names
-from recon.export.make import PRODUCTS
 from recon.map.localize.sequence import StartPose
 from recon.map.sessions.measured import Survey
 from tests.docs.blocks import ROOT
@@ -86,7 +85,7 @@ def test_every_option_that_names_a_setting_names_one_that_there_is():
     assert {*named} <= {*setting_names(ReconConfig)}
 
 
-def test_a_survey_is_positions_with_an_offset_and_a_system():
+def test_positions_of_a_survey_and_the_begin_of_a_drive_are_read():
     positions = Path("gnss.txt")
     assert survey_of(None, None) is None
     assert survey_of(positions, None) == Survey(positions, (0.0, 0.0, 0.0), None)
@@ -98,9 +97,6 @@ def test_a_survey_is_positions_with_an_offset_and_a_system():
     for half, where in ((("0,0,1", None), "--antenna"), ((None, "EPSG:25832"), "--crs")):
         with pytest.raises(SettingsError, match=where):
             survey_of(None, *half)
-
-
-def test_a_drive_begins_at_a_pose_or_a_frame():
     assert read_start(None) == (None, None)
     assert read_start("7") == (None, 7)
     assert read_start("12.5,-3,90") == (StartPose(12.5, -3.0, 90.0), None)
@@ -151,12 +147,6 @@ def test_help_is_shown_whole_on_a_narrow_terminal(words):
     assert {"--json", "--quiet"} <= {name for one in command.params for name in one.opts}
 
 
-def test_help_has_the_groups_of_commands_and_every_product():
-    for title in ("Getting started", "Reconstruction", "Cameras", "Evaluation"):
-        assert title in help_of()
-    assert all(name in help_of("export") for name in PRODUCTS)
-
-
 def settings(*arguments: str) -> Result:
     return CliRunner().invoke(app, ["settings", *arguments], env={"COLUMNS": "200"})
 
@@ -183,7 +173,7 @@ def test_the_page_of_the_documentation_is_up_to_date():
     assert settings("--markdown").stdout == page == settings_page(list_settings())
 
 
-def test_a_group_a_setting_or_a_part_of_a_name_selects():
+def test_settings_are_selected_by_name_and_shown_with_units_and_other_defaults():
     assert all(name.startswith("matching.sgm.") for name in entries("matching.sgm"))
     assert [*entries("grid.min_height_m")] == ["grid.min_height_m"]
     assert {"fusion.voxel_m", "filters.voxel_m"} <= {*entries("voxel")}
@@ -193,9 +183,6 @@ def test_a_group_a_setting_or_a_part_of_a_name_selects():
     assert failed.exit_code == 1
     assert failed.stderr.startswith("error: no setting is named 'grid.min_heigt_m'")
     assert "did you mean grid.min_height_m" in failed.stderr
-
-
-def test_unit_values_and_other_defaults_of_a_pair_are_shown():
     entry = entries("cloud.max_range_m")["cloud.max_range_m"]
     assert (entry.unit, entry.default_pair) == ("m", "none")
     assert entry.values.endswith("or none")

@@ -1,13 +1,11 @@
 """Command lines of jobs are those of the program, and stay in their folder."""
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from recon.cli import app
 from recon.cli.program import _NOT_OPTIONS, COMMANDS, _command, plan_jobs
 from recon.cli.tables import print_batch
 from recon.commands import config
@@ -40,8 +38,7 @@ def test_a_command_line_has_what_the_job_says_and_limits_are_needs_of_a_worker()
         "map", "drive", "--set", "matching.sad.window_px=9", "--threads", "2", "--memory-limit",
         "4G", "--no-mesh", "--json", "--verbose", "--out", "out",
     ]  # fmt: skip
-    assert (job.timeout_s, job.retries) == (5.0, 0)
-    assert job.needs == {"threads": 2.0, "memory": 4e9}
+    assert (job.timeout_s, job.retries, job.needs) == (5.0, 0, {"threads": 2.0, "memory": 4e9})
     sources = ["a.txt", "b.txt"]  # of a command that has no such limits
     words = line(command="evaluate trajectory", source=sources, threads=1, memory="2G")
     assert words == ["evaluate", "trajectory", *sources, "--json", "--out", "out"]
@@ -98,17 +95,18 @@ def test_what_was_begun_is_resumed_with_its_limits(tmp_path):
     assert resumed == [*words, "--resume", str(tmp_path / "3")]
 
 
-def test_a_sweep_spreads_every_job_over_every_combination():
+def test_a_sweep_spreads_every_job_over_every_combination_of_right_values():
     sweep = {"matching__sad__window_px": [9, 11], "matching__matcher": ["sad", "sgm"]}
     jobs = plan(DRIVE, {**DRIVE, "name": "b"}, **sweep)
-    assert len(jobs) == 8
-    assert jobs[0].name == "a_window_px=9_matcher=sad"
+    assert (len(jobs), jobs[0].name) == (8, "a_window_px=9_matcher=sad")
     found = jobs[0].words
     assert found[-4:] == (
         "--set", "matching.sad.window_px=9", "--set", 'matching.matcher="sad"',
     )  # fmt: skip
     assert jobs[7].name == "b_window_px=11_matcher=sgm"
     assert jobs[7].swept == {"matching.sad.window_px": 11, "matching.matcher": "sgm"}
+    with pytest.raises(SettingsError, match=r"job a: .*matching\.sad\.window_px"):
+        plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
 
 
 def test_of_a_large_sweep_each_value_is_checked_once(monkeypatch):
@@ -119,11 +117,6 @@ def test_of_a_large_sweep_each_value_is_checked_once(monkeypatch):
     jobs = plan(DRIVE, matching__sad__window_px=windows, checkpoints__every_frames=frames)
     assert len(jobs) == 5 * 600
     assert len(checked) == 5 + 600 - 1
-
-
-def test_a_wrong_value_of_a_sweep_is_refused():
-    with pytest.raises(SettingsError, match=r"job a: .*matching\.sad\.window_px"):
-        plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
 
 
 TWO = {"command": "evaluate disparity", "source": ["a", "b"]}
@@ -169,17 +162,13 @@ def test_jobs_that_are_none_are_one_line(changes, words):
     assert "\n" not in str(told.value)
 
 
-def test_no_help_loses_words_in_brackets_to_the_markup():
-    texts = [each.callback.__doc__ or "" for each in app.registered_commands if each.callback]
-    assert "recon\\[cluster]" in "".join(texts)
-    assert [text for text in texts if re.search(r"(?<!\\)\[[a-z]+\]", text)] == []
-
-
 def job(name: str, state: str = "succeeded", **more: Any) -> dict[str, Any]:
     return {"name": name, "state": state, "tries": 1, "seconds": 12.34, "figures": {}, **more}
 
 
-def test_the_table_has_the_accuracy_of_each_command(capsys, monkeypatch):
+def test_the_table_has_the_accuracy_of_each_command_and_not_all_of_very_many_jobs(
+    capsys, monkeypatch
+):
     monkeypatch.setenv("COLUMNS", "80")
     jobs = [
         job("drive_window=9", figures={"trajectory.t_rel_percent": 0.512345, "points": 7.0}),
@@ -194,9 +183,6 @@ def test_the_table_has_the_accuracy_of_each_command(capsys, monkeypatch):
     assert "unusual: pair_window=9: odd" in out
     assert err == "error: nowhere: there is no such folder\n"
     assert max(map(len, out.splitlines())) <= 80
-
-
-def test_of_very_many_jobs_the_first_are_printed(capsys):
     print_batch({"jobs": [job(f"j{n}") for n in range(1000)], "out": "outputs/week"})
     out = capsys.readouterr().out
     assert "j199 " in out

@@ -25,8 +25,6 @@ from tests.run.batch.jobs import job
 
 
 class Terminal(io.StringIO):
-    """A stream that claims to be a terminal."""
-
     def isatty(self) -> bool:
         return True
 
@@ -57,9 +55,15 @@ def test_every_event_is_one_json_line_with_null_for_nan():
     assert names == ["start", "frame", "frame", "frame", "finish", "stage"]
     assert (last["index"], last["measured"], last["valid_share"]) == (1, False, None)
     assert (last["position_m"], last["notes"]) == ([0.0, 0.0, 0.0], ["a [bold] note"])
+    stream = io.StringIO()
+    JsonLines(stream).on_step(SceneDone("Piano", {"sad": {"seconds": 0.25}}, 0.5))
+    JsonLines(stream).on_step(SceneDone("Pipes", None, 0.5))
+    first, second = lines(stream)
+    assert first == {"event": "scene", "name": "Piano", "seconds": {"sad": 0.25}}
+    assert second["seconds"] == {}
 
 
-def test_bar_shows_frames_rate_and_lost_poses():
+def test_bar_shows_frames_rate_and_lost_poses_and_may_be_finished_twice():
     stream = Terminal()
     run(ProgressBar(Console(file=stream, force_terminal=True, width=140)))
     shown = stream.getvalue()
@@ -69,9 +73,6 @@ def test_bar_shows_frames_rate_and_lost_poses():
     assert "70 % valid, 120 inliers" in shown
     assert "drive [1]" in shown  # a name is no markup
     assert "mesh" in shown
-
-
-def test_bar_may_be_finished_twice_and_asked_before_its_start():
     viewer = ProgressBar(Console(file=io.StringIO()))
     viewer.on_step(frame(0))
     viewer.on_finish()
@@ -89,15 +90,6 @@ def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose(capsys):
     out, err = capsys.readouterr()
     assert out == ""
     assert err
-
-
-def test_lines_of_scenes_have_the_seconds_of_each_matcher():
-    stream = io.StringIO()
-    JsonLines(stream).on_step(SceneDone("Piano", {"sad": {"seconds": 0.25}}, 0.5))
-    JsonLines(stream).on_step(SceneDone("Pipes", None, 0.5))
-    first, second = lines(stream)
-    assert first == {"event": "scene", "name": "Piano", "seconds": {"sad": 0.25}}
-    assert second["seconds"] == {}
 
 
 def located(state: State) -> LocalizedFrame:

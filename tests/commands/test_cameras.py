@@ -17,7 +17,7 @@ import pytest
 from recon.commands.cameras import record, run_calibrate, run_capture, run_rectify
 from recon.commands.config import load_config
 from recon.core.errors import CalibrationError, OutputError, ReconError, SourceError
-from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
+from recon.core.values import RectifiedCamera, StereoPair
 from recon.core.values.board import parse_board
 from recon.io import atomic
 from recon.io.cameras.calibration import read_calibration
@@ -27,8 +27,6 @@ from recon.io.trajectory import FRAMES, HEADER
 from recon.rig import capture
 from recon.rig.calibrate.board_views import find_views
 from recon.rig.calibrate.result import CalibrationRun, write_calibration
-from recon.rig.capture import CaptureFolder, RecordingSettings
-from recon.rig.written import CalibrationForm
 from recon.sources.image_names import pair_images
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
@@ -59,14 +57,10 @@ def drawn(tmp_path_factory):
     return folder
 
 
-def calibrate(
-    folder: Path, out: Path, form: CalibrationForm = "recon", board: str = "chess:9x6:25mm"
-) -> CalibrationRun:
-    terms = ["calibration.radial_terms=2"] if form == "kalibr" else []
+def calibrate(folder: Path, out: Path, board: str = "chess:9x6:25mm") -> CalibrationRun:
     sides = (str(folder / "left*.png"), str(folder / "right*.png"))
     files = {"file": out / "rig.yaml", "out": out / "report"}
-    settings = load_config(None, terms)
-    return run_calibrate(*sides, parse_board(board), settings, form=form, threads=1, **files)
+    return run_calibrate(*sides, parse_board(board), load_config(), threads=1, **files)
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +69,10 @@ def run(drawn, tmp_path_factory):
     return calibrate(drawn, tmp_path_factory.mktemp("calibrated"))
 
 
-def assert_true_rig(run: CalibrationRun) -> None:
+def test_images_give_the_true_rig_with_its_report_which_comes_back_from_every_format(run, tmp_path):
     summary, rig = run.summary, board_rig()
+    written = json.loads((Path(summary["out"]) / "summary.json").read_text())
+    assert written == json.loads(json.dumps(summary))
     assert summary["stereo_rms_px"] < 0.15
     assert summary["epipolar_px"] < 0.1
     # Corners of rendered images are good to about 0.1 px, and eight views are few.
@@ -85,44 +81,21 @@ def assert_true_rig(run: CalibrationRun) -> None:
     assert (summary["views"], summary["views_used"]) == (9, 8)
     assert summary["pictures_without_board"] == ["right04.png"]
     assert any("right04.png" in line for line in summary["warnings"])
-
-
-def assert_read_back(file: Path, run: CalibrationRun) -> None:
-    read = read_calibration(file, 640, 480)
-    assert isinstance(read, StereoCalibration)
-    assert read.baseline_m == pytest.approx(run.fit.calibration.baseline_m, rel=1e-9)
-    focal_px = run.summary["rectified_focal_px"]
-    assert Rectifier(read).camera.focal_px == pytest.approx(focal_px, rel=1e-6)
-
-
-def test_images_give_the_true_rig_which_comes_back_from_every_format(run, tmp_path):
-    written = json.loads((Path(run.summary["out"]) / "summary.json").read_text())
-    assert written == json.loads(json.dumps(run.summary))
-    assert_true_rig(run)
-    assert_read_back(Path(run.summary["files"][0]), run)
-    for form in ("recon", "opencv", "ros"):
-        assert_read_back(write_calibration(tmp_path / f"{form}.yaml", run, form)[0], run)
-
-
-def test_images_give_the_true_rig_with_a_lens_that_kalibr_knows(drawn, tmp_path):
-    run = calibrate(drawn, tmp_path, "kalibr")
-    assert_true_rig(run)
-    assert_read_back(Path(run.summary["files"][0]), run)
-
-
-def test_report_and_images_are_written(run):
+    forms = [tmp_path / f"{form}.yaml" for form in ("recon", "opencv", "ros")]
+    files = [write_calibration(path, run, path.stem)[0] for path in forms]
+    for file in (summary["files"][0], *files):
+        read = read_calibration(Path(file), 640, 480)
+        assert read.baseline_m == pytest.approx(run.fit.calibration.baseline_m, rel=1e-9)
+        focal_px = summary["rectified_focal_px"]
+        assert Rectifier(read).camera.focal_px == pytest.approx(focal_px, rel=1e-6)
     out, summary = Path(run.summary["out"]), run.summary
     names = {path.name for path in out.rglob("*.png")}
     assert {"coverage.png", "epipolar_raw.png", "epipolar_rectified.png"} <= names
     # Eight views are too few to be sure of the forecast, however small it is.
     assert summary["verdict"] in ("usable", "repeat")
     html = (out / "report.html").read_text()
-    for words in (
-        f"Verdict: {summary['verdict']}", summary["findings"][0]["text"],
-        f"{summary['stereo_rms_px']:.3f} px",
-    ):  # fmt: skip
-        assert words in html
-    assert "No warnings" not in html
+    assert f"Verdict: {summary['verdict']}" in html
+    assert summary["findings"][0]["text"] in html
     assert (out / "calibration.yaml").is_file()
 
 
@@ -152,12 +125,6 @@ def test_images_without_a_rig_are_refused_and_nothing_is_left(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
-def test_a_wrong_board_is_reported_with_the_true_size(drawn, tmp_path):
-    with pytest.raises(CalibrationError, match=r"does not have 8x6 inner corners \(got 9x6"):
-        calibrate(drawn, tmp_path / "out", board="chess:8x6:25mm")
-
-
 def test_a_board_without_a_size_gives_squares_and_says_so(drawn, tmp_path):
     run = calibrate(drawn, tmp_path, board="chess:9x6")
     assert run.summary["baseline_squares"] == pytest.approx(0.12 / 0.025, rel=0.01)
@@ -185,24 +152,6 @@ def test_a_folder_for_a_calibration_file_is_refused(drawn, tmp_path):
         calibrate(drawn, tmp_path)
 
 
-@pytest.mark.slow
-def test_a_still_board_on_video_gives_the_forecast_of_one_image_each(drawn, tmp_path):
-    often = tmp_path / "often"
-    often.mkdir()
-    rng = np.random.default_rng(3)
-    for path in drawn.iterdir():
-        for number in range(3):
-            fresh = noisy(read_image(path), number > 0, rng)
-            write_image(often / f"{path.stem}_{number}.png", fresh)
-    once = calibrate(drawn, tmp_path / "a").summary
-    thrice = calibrate(often, tmp_path / "b").summary
-    assert (thrice["views_used"], len(thrice["views_repeated"])) == (8, 16)
-    # Another draw of the sensor's noise in the corners: a spread from 8 views varies by a third.
-    spread = "rotation_spread_deg"
-    assert thrice[spread] == pytest.approx(once[spread], rel=0.35)
-    assert any(finding["code"] == "repeats" for finding in thrice["findings"])
-
-
 def test_an_image_without_a_partner_is_left_out_and_counted(drawn, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(drawn, copy)
@@ -214,10 +163,7 @@ def test_an_image_without_a_partner_is_left_out_and_counted(drawn, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("layout", ["two videos", "side by side"])
-def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
-    drawn, tmp_path, layout
-):
+def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(drawn, tmp_path):
     """A second of each view, with new noise in every image, and half a second of moving there."""
     rng, films = np.random.default_rng(2), []
     for number in range(9):
@@ -225,14 +171,11 @@ def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
         for shift in [0] * 10 + [40, 80, 120, 160, 200]:
             moved = np.hstack([np.roll(image, shift, axis=1) for image in np.hsplit(both, 2)])
             films.append(noisy(moved, 2, rng))
-    left, right = drives.write_video(tmp_path / "both.mkv", films), None
-    if layout == "two videos":
-        left, other = (
-            drives.write_video(tmp_path / f"{side}.mkv", [np.hsplit(one, 2)[n] for one in films])
-            for n, side in enumerate(SIDES)
-        )
-        right = str(other)
-    run = run_calibrate(str(left), right, BOARD, load_config(), out=tmp_path / "out")
+    videos = [
+        str(drives.write_video(tmp_path / f"{side}.mkv", [np.hsplit(one, 2)[n] for one in films]))
+        for n, side in enumerate(SIDES)
+    ]
+    run = run_calibrate(*videos, BOARD, load_config(), out=tmp_path / "out")
     # In one of the nine places the right camera does not see the board.
     assert 9 <= run.summary["views"] <= 11
     assert run.summary["views_used"] == 8
@@ -296,7 +239,13 @@ def test_a_folder_is_rectified_by_its_features_and_says_up_to_scale(street, tmp_
     assert np.abs(left[1] / left[2] - right[1] / right[2]).mean() < 0.7
 
 
-def test_a_calibration_gives_metric_pictures_that_other_commands_take(street, tmp_path):
+def test_a_calibration_gives_metric_pictures_and_none_of_rectified_ones(street, tmp_path):
+    camera = RectifiedCamera(270, 240, 120, 240, 0.5, 480, 240)
+    write_recon_calibration(tmp_path / "c.yaml", camera)
+    sides, file = (str(street / "left"), str(street / "right")), tmp_path / "c.yaml"
+    with pytest.raises(CalibrationError, match=r"c\.yaml: .*already rectified"):
+        run_rectify(*sides, load_config(), calibration=file, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
     height, width = read_image(street / "left" / "0.png").shape[:2]
     rig = board_rig("fisheye", width, height)
     write_recon_calibration(tmp_path / "rig.yaml", rig)
@@ -304,31 +253,9 @@ def test_a_calibration_gives_metric_pictures_that_other_commands_take(street, tm
     sides = (str(street / "left" / "0.png"), str(street / "right" / "0.png"))
     run = run_rectify(*sides, load_config(), calibration=rig_file, out=out, threads=1)
     camera = read_calibration(tmp_path / "out" / "calibration.yaml", width, height)
-    assert isinstance(camera, RectifiedCamera)
     assert camera.baseline_m == pytest.approx(rig.baseline_m)
     assert run.summary["up_to_scale"] is False
     assert read_image(tmp_path / "out" / "left" / "0.png").shape == (height, width, 3)
-
-
-def test_a_calibration_of_rectified_pictures_is_refused(street, tmp_path):
-    camera = RectifiedCamera(270, 240, 120, 240, 0.5, 480, 240)
-    write_recon_calibration(tmp_path / "c.yaml", camera)
-    sides, file = (str(street / "left"), str(street / "right")), tmp_path / "c.yaml"
-    with pytest.raises(CalibrationError, match=r"c\.yaml: .*already rectified"):
-        run_rectify(*sides, load_config(), calibration=file, out=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_one_pair_is_enough_with_features_and_keeps_its_file_type(street, tmp_path):
-    for side in ("left", "right"):
-        write_image(tmp_path / side / "0.jpg", read_image(street / side / "0.png"))
-    sides = (str(tmp_path / "left" / "0.jpg"), str(tmp_path / "right" / "0.jpg"))
-    run = run_rectify(*sides, load_config(), out=tmp_path / "out", threads=1)
-    assert run.summary["row_error_px"] < 0.7
-    for side, rectified in zip(("left", "right"), run.rectified, strict=True):
-        written = read_image(tmp_path / "out" / side / "0.jpg").astype(int)
-        # What JPEG at OpenCV's quality of 95 loses.
-        assert np.abs(written - rectified).mean() < 3
 
 
 def test_blank_images_are_refused_with_what_would_help(tmp_path):
@@ -357,10 +284,9 @@ def pairs():
 class FakeCamera:
     """A live camera whose frames come at given times; each shows the time it was taken."""
 
-    def __init__(self, name: str, stamps_s: list[float], rate_hz: float = 10.0) -> None:
-        self.name, self.live, self.rate_hz = name, True, rate_hz
+    def __init__(self, name: str, stamps_s: list[float], live: bool = True) -> None:
+        self.name, self.live, self.rate_hz, self.closed = name, live, 10.0, False
         self.stamps_s, self.at, self.exposure = stamps_s, -1, 100.0
-        self.grabbed: list[str] = []
 
     def grab(self) -> float | None:
         self.at += 1
@@ -373,7 +299,8 @@ class FakeCamera:
         self.exposure = self.exposure if exposure is None else exposure
         return self.exposure
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        self.closed = True
 
 
 @pytest.fixture(autouse=True)
@@ -385,7 +312,7 @@ def _no_warm_up(monkeypatch):
 def recorded(folder: Path, left_s: list[float], right_s: list[float], frames: int) -> Any:
     cameras = FakeCamera("l", left_s), FakeCamera("/dev/video2", right_s)
     cameras[1].exposure = 7.0
-    settings = RecordingSettings(frames=frames)
+    settings = capture.RecordingSettings(frames=frames)
     return cameras, record(cameras, folder, settings, None, lambda: False)
 
 
@@ -394,9 +321,10 @@ def test_two_videos_are_recorded_and_mapped_at_once(pairs, tmp_path):
     devices = [str(folder / "left.avi"), str(folder / "right.avi")]
     out = tmp_path / "out"
     calibration = folder / "calib.txt"
-    summary = run_capture(devices, out, RecordingSettings(preview_every=4), calibration=calibration)
-    assert summary["frames"] == 12
-    assert summary["rate_hz"] == pytest.approx(10, rel=1e-3)
+    summary = run_capture(
+        devices, out, capture.RecordingSettings(preview_every=4), calibration=calibration
+    )
+    assert (summary["frames"], summary["rate_hz"]) == (12, pytest.approx(10, rel=1e-3))
     assert summary["skew_max_ms"] == 0
     assert (out / "preview.jpg").is_file()
     assert json.loads((out / "capture.json").read_text()) == summary
@@ -410,7 +338,7 @@ def test_two_videos_are_recorded_and_mapped_at_once(pairs, tmp_path):
 
 def test_one_device_with_both_views_is_halved(pairs, tmp_path):
     video = drives.write_side_by_side(pairs, CAMERA, tmp_path / "in")
-    run_capture([str(video)], tmp_path / "out", RecordingSettings(frames=5))
+    run_capture([str(video)], tmp_path / "out", capture.RecordingSettings(frames=5))
     drives.write_calib(tmp_path / "out", CAMERA)
     read = list(open_source(tmp_path / "out"))
     assert len(read) == 5
@@ -420,21 +348,52 @@ def test_one_device_with_both_views_is_halved(pairs, tmp_path):
 TIMES_S = [0.1 * k for k in range(10)]
 
 
-def test_skew_is_recorded(tmp_path):
-    _, summary = recorded(tmp_path, TIMES_S, [t + 0.003 for t in TIMES_S], 8)
-    assert summary["skew_mean_ms"] == pytest.approx(3)
-    assert summary["gaps"] == 0
-    rows = (tmp_path / FRAMES).read_text().splitlines()
-    assert rows[3] == "left/000002.png,right/000002.png,0.200000,0.203000"
+def test_a_camera_that_does_not_open_is_named_and_the_other_one_closed(monkeypatch):
+    opened, asked = [], []
+
+    def make(device: str, size: object, rate_hz: object) -> FakeCamera:
+        if device == "bad":
+            raise SourceError("camera cannot be opened", where=device)
+        asked.append((size, rate_hz))
+        opened.append(FakeCamera(device, []))
+        return opened[-1]
+
+    monkeypatch.setattr(capture, "Camera", make)
+    settings = capture.CaptureSettings(width_px=640, height_px=480, rate_hz=15)
+    with pytest.raises(SourceError, match="bad"), capture.open_cameras(["good", "bad"], settings):
+        pass
+    assert (asked, [camera.closed for camera in opened]) == ([((640, 480), 15.0)], [True])
+    with capture.open_cameras(["good"], capture.CaptureSettings(width_px=640)) as cameras:
+        assert not cameras[0].closed
+    assert asked[-1] == (None, None)
+
+
+def test_pairs_are_nearest_in_time_and_end_when_asked(monkeypatch):
+    late = [t + 0.003 for t in TIMES_S if t != TIMES_S[3]]  # the right camera loses a frame
+
+    def taken(**limits: float) -> list[tuple[float, float]]:
+        cameras = FakeCamera("left", TIMES_S, False), FakeCamera("right", late, False)
+        settings = capture.RecordingSettings.parse(limits)
+        return [
+            (p.left_s, p.right_s) for p in capture.capture_pairs(cameras, settings, lambda: False)
+        ]
+
+    assert [left for left, _ in taken()] == [t for t in TIMES_S if t != TIMES_S[3]]
+    assert max(right - left for left, right in taken()) < 0.004
+    assert (len(taken(frames=4)), len(taken(seconds=0.55))) == (4, 5)
+    monkeypatch.undo()
+    cameras = FakeCamera("left", 2 * TIMES_S), FakeCamera("right", 2 * TIMES_S)
+    assert capture.warm_up(cameras, capture.CaptureSettings(lock_exposure=False)) is False
+    assert cameras[0].at == 14
 
 
 def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path):
     kept = [t for t in TIMES_S if round(10 * t) not in {3, 4}]
     _, summary = recorded(tmp_path, TIMES_S, [t + 0.002 for t in kept], 8)
-    assert summary["skew_max_ms"] == pytest.approx(2)
+    assert (summary["skew_max_ms"], summary["skew_mean_ms"]) == (pytest.approx(2), pytest.approx(2))
     assert summary["gaps"] == 1
     drives.write_calib(tmp_path, SMALL_CAMERA)
-    stamps = [frame.timestamp_s for frame in open_source(tmp_path).images]  # type: ignore[attr-defined]
+    stamps = [frame.timestamp_s for frame in open_source(tmp_path).images]
     np.testing.assert_allclose(stamps, kept)
 
 
@@ -475,7 +434,7 @@ def test_a_full_disk_takes_the_pair_back_whole(pairs, tmp_path, monkeypatch, vic
     monkeypatch.setattr(os, "write", full_write)
     devices = [str(folder / "left.avi"), str(folder / "right.avi")]
     with pytest.raises(OutputError, match=r"(No space left on device).*disk"):
-        run_capture(devices, tmp_path / "out", RecordingSettings())
+        run_capture(devices, tmp_path / "out", capture.RecordingSettings())
     drives.write_calib(tmp_path / "out", CAMERA)
     assert len(list(open_source(tmp_path / "out"))) == 5
     written = sorted(path.name for path in (tmp_path / "out").rglob("*.png"))
@@ -485,13 +444,13 @@ def test_a_full_disk_takes_the_pair_back_whole(pairs, tmp_path, monkeypatch, vic
 def test_a_folder_that_holds_something_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("x")
     with pytest.raises(OutputError, match=r"folder is not empty.*--out"):
-        CaptureFolder(tmp_path, "png")
+        capture.CaptureFolder(tmp_path, "png")
 
 
 @pytest.mark.parametrize("device", ["no_such_camera", "97"])
 def test_a_camera_that_is_not_there_is_one_line_and_leaves_no_folder(tmp_path, device, capfd):
     with pytest.raises(ReconError, match=f"{device}: camera cannot be opened"):
-        run_capture([device], tmp_path / "out", RecordingSettings())
+        run_capture([device], tmp_path / "out", capture.RecordingSettings())
     assert capfd.readouterr().err == ""
     assert not (tmp_path / "out").exists()
 
@@ -501,7 +460,7 @@ def test_cameras_of_different_size_are_reported(pairs, tmp_path):
     drives.write_video(tmp_path / "r.avi", [pair.right[:, :32] for pair in pairs])
     devices = [str(tmp_path / "l.avi"), str(tmp_path / "r.avi")]
     with pytest.raises(SourceError, match="left 64x32, right 32x32"):
-        run_capture(devices, tmp_path / "out", RecordingSettings())
+        run_capture(devices, tmp_path / "out", capture.RecordingSettings())
 
 
 @pytest.mark.slow
@@ -522,5 +481,4 @@ def test_interrupting_the_command_leaves_a_drive_and_exit_code_0(tmp_path):
     frames = json.loads(stdout)["frames"]
     assert 0 < frames < 400
     drives.write_calib(out, RectifiedCamera(300.0, 159.5, 119.5, 159.5, 0.1, 320, 240))
-    assert len(list(open_source(out))) == frames
-    assert len(list(out.rglob("*.png"))) == 2 * frames
+    assert (len(list(open_source(out))), len(list(out.rglob("*.png")))) == (frames, 2 * frames)

@@ -1,6 +1,5 @@
 """What a run is asked for: settings from defaults, file and overrides; and what resuming keeps."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,16 +49,19 @@ def test_the_groups_of_every_command_are_settings(command):
     assert {*GROUPS[command]} <= {*ReconConfig.model_fields}
 
 
-def test_what_comes_later_wins_and_only_for_its_key(tmp_path):
+def test_an_override_wins_for_its_key_and_the_file_is_not_blamed_for_a_wrong_one(tmp_path):
     (tmp_path / "c.yaml").write_text("mesh: {max_depth: 8}\nmatching: {sad: {window_px: 7}}\n")
     changes = ["matching.sad.window_px=9", "fusion.min_count=2", "fusion.min_count=5"]
     config = load_config(f"{tmp_path}/c.yaml", [*changes, "fusion.voxel_m=0.2"], PAIR_DEFAULTS)
     assert config.matching.sad.window_px == 9
-    assert (config.fusion.min_count, config.fusion.voxel_m) == (5, 0.2)
-    assert config.mesh.max_depth == 8
+    assert (config.fusion.min_count, config.fusion.voxel_m, config.mesh.max_depth) == (5, 0.2, 8)
     assert config.cloud.max_range_m is None
     (tmp_path / "c.yaml").write_text("")
     assert load_config(tmp_path / "c.yaml") == ReconConfig()
+    (tmp_path / "good.yaml").write_text("matching:\n  matcher: sgm\n")
+    with pytest.raises(SettingsError, match=r"^setting 'matching\.sad\.window_px': ") as refused:
+        load_config(tmp_path / "good.yaml", ["matching.sad.window_px=8"])
+    assert "good.yaml" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -81,13 +83,6 @@ def test_a_wrong_file_is_refused_by_name(tmp_path, text, message):
     path.unlink()
     with pytest.raises(SettingsError, match=r"c\.yaml: file does not exist"):
         load_config(path)
-
-
-def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path):
-    (tmp_path / "good.yaml").write_text("matching:\n  matcher: sgm\n")
-    with pytest.raises(SettingsError, match=r"^setting 'matching\.sad\.window_px': ") as refused:
-        load_config(tmp_path / "good.yaml", ["matching.sad.window_px=8"])
-    assert "good.yaml" not in str(refused.value)
 
 
 @pytest.mark.parametrize("text", ["fusion.voxel_m", "=3", "fusion.voxel_m=[1"])
@@ -114,7 +109,6 @@ def test_a_folder_that_is_no_run_is_named_whatever_the_type(tmp_path):
         recon.run_localize(source, str(tmp_path), options=recon.MapOptions(out=f"{tmp_path}/out"))
 
 
-Begin = Callable[..., Path]
 RAN = load_config(None, ["fusion.voxel_m=0.2", "memory.limit_mb=900"])
 
 
@@ -154,8 +148,7 @@ def test_settings_must_be_those_of_the_run_but_for_the_memory(begin):
     for same in ([], ["fusion.voxel_m=0.2"], [{"fusion.voxel_m": 0.2}]):
         assert MapOptions().resumed(run, None, same)[1] == RAN
     _, settings = MapOptions().resumed(run, None, [{"memory.limit_mb": 700}])
-    assert settings.memory.limit_mb == 700
-    assert settings.fusion.voxel_m == 0.2
+    assert (settings.memory.limit_mb, settings.fusion.voxel_m) == (700, 0.2)
     with pytest.raises(SettingsError, match=r"other settings.*voxel_m = 0.1, expected 0.2"):
         MapOptions().resumed(run, None, ["fusion.voxel_m=0.1"])
     with pytest.raises(SettingsError, match="started with a mesh"):
@@ -175,7 +168,10 @@ def test_settings_that_there_are_not_are_refused_by_the_name_of_the_run(begin, c
         MapOptions().resumed(run, None, [])
 
 
-def test_where_nothing_can_be_resumed_it_is_said_why(tmp_path):
+def test_where_nothing_can_be_opened_or_resumed_it_is_said_why(tmp_path):
+    assert MapOptions().arguments == {}
+    with pytest.raises(SettingsError, match="name SOURCE"):
+        MapOptions().open(ReconConfig())
     with pytest.raises(OutputError, match=r"no unfinished run.*start it without --resume"):
         MapOptions().resumed(tmp_path, None, [])
     (tmp_path / "run.json").touch()
@@ -186,9 +182,3 @@ def test_where_nothing_can_be_resumed_it_is_said_why(tmp_path):
     path.write_bytes(b"no map")
     with pytest.raises(FormatError, match="cannot be read"):
         MapOptions().resumed(tmp_path, None, [])
-
-
-def test_without_a_source_there_is_nothing_to_open_and_nothing_to_keep():
-    assert MapOptions().arguments == {}
-    with pytest.raises(SettingsError, match="name SOURCE"):
-        MapOptions().open(ReconConfig())

@@ -28,7 +28,6 @@ def _no_pause(monkeypatch):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """The archive of a scene."""
     folder = tmp_path_factory.mktemp("scene") / "Pipes"
     write_scene(folder)
     return zipped({f"Pipes-perfect/{path.name}": path.read_bytes() for path in folder.iterdir()})
@@ -76,8 +75,7 @@ def test_a_scene_arrives_once_as_recon_reads_it(mirror, tmp_path):
     mirror.break_after = 1000
     (found,) = run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"]
     assert found["fetched"]
-    assert recognise_source(found["out"]) == "middlebury"
-    assert len(open_source(found["out"])) == 1
+    assert (recognise_source(found["out"]), len(open_source(found["out"]))) == ("middlebury", 1)
     assert [path.name for path in tmp_path.iterdir()] == ["middlebury-2014"]
     asked = len(mirror.asked)
     assert run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"] == [

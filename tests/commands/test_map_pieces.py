@@ -33,9 +33,7 @@ def test_pieces_have_every_frame_once_behind_their_leads(frames, workers):
     assert len(pieces) == 1 or len(pieces) % workers == 0 or len(pieces) == frames // (2 * LEAD)
 
 
-@pytest.fixture(scope="module")
-def mapped():
-    """The drive mapped whole, and in pieces that are joined."""
+def test_path_and_map_are_those_of_one_run():
     source = film(STREET)
     config = load_config(None, ["submaps.length_m=4", "submaps.tile_m=12.8"])
 
@@ -51,11 +49,7 @@ def mapped():
     odometry = odometry_of(config, source, None, None, None).state()
     session.set_state({"mapper": {"odometry": odometry, "builder": None}, "seconds": 1.0})
     whole = map_sequence(source, config, workspace=Workspace(threads=1))
-    return whole, map_sequence(source, config, workspace=work)
-
-
-def test_the_path_has_every_frame_once_and_is_that_of_one_run(mapped):
-    whole, joined = mapped
+    joined = map_sequence(source, config, workspace=work)
     np.testing.assert_array_equal(joined.trajectory.timestamps_s, whole.trajectory.timestamps_s)
     assert joined.session.submaps.frames == len(joined.health) == STREET.frames
     # The first piece is the drive itself; behind it only the odometry has begun elsewhere.
@@ -65,10 +59,6 @@ def test_the_path_has_every_frame_once_and_is_that_of_one_run(mapped):
     assert 0 < apart_m.max() < 0.01 * whole.trajectory.path_length_m
     np.testing.assert_array_equal(joined.T_map_world, whole.T_map_world)
     assert joined.loops.keyframes >= STREET.frames // 2
-
-
-def test_the_map_is_about_that_of_one_run(mapped):
-    whole, joined = mapped
     # Voxels that are turned into others share some of these: fewer points for the same surface.
     assert 0.8 < len(joined.cloud) / len(whole.cloud) < 1.05
     assert len(joined.voxels) == pytest.approx(len(whole.voxels), rel=0.05)

@@ -18,7 +18,6 @@ from recon.sources.settings import SourceSettings
 from tests.sources.test_drives import ALL
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
-Noise = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -27,15 +26,6 @@ def noise():
     world = np.random.default_rng(8).integers(0, 256, (50, 130), dtype=np.uint8)
     world = cv2.GaussianBlur(world, (3, 3), 0)
     return world[:, :120], world[:, 6:126]
-
-
-@pytest.mark.parametrize("matcher", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
-def test_every_matcher_finds_the_shift(noise, matcher):
-    disparity = recon.match(*noise, matcher=matcher, ndisp=16)
-    # All fit parts of a pixel; a quarter is more than the bias of any of them.
-    assert np.nanmedian(disparity.values) == pytest.approx(6, abs=0.25)
-    # OpenCV as it comes leaves out the range at the left and half a window at each other side.
-    assert disparity.valid[4:-4, 20:-4].mean() > 0.8
 
 
 def test_settings_are_those_of_the_matcher_that_is_named(noise):
@@ -86,13 +76,11 @@ def read(images: tuple[Path, Path], known: SourceSettings) -> PairInput:
 def test_focal_length_and_baseline_give_metres_and_a_principal_point_is_that_of_both_views(images):
     given = read(images, SourceSettings(focal_px=300, baseline_m=0.2))
     camera = given.calibration
-    assert isinstance(camera, RectifiedCamera)
     assert (camera.focal_px, camera.baseline_m) == (300, 0.2)
     assert (camera.cx_px, camera.cy_px, camera.doffs_px) == (119.5, 59.5, 0)
     assert (given.notes, given.up_to_scale) == ((), False)
     known = SourceSettings(focal_px=300, baseline_m=0.2, cx_px=100, cy_px=50)
     camera = read(images, known).calibration
-    assert isinstance(camera, RectifiedCamera)
     assert (camera.cx_px, camera.cy_px, camera.cx_right_px) == (100, 50, 100)
 
 
@@ -127,7 +115,6 @@ def test_numbers_take_the_place_of_the_calibration_of_every_layout(tmp_path, lay
     path = ALL[layout](pairs, RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32), tmp_path)
     numbers = SourceSettings(focal_px=50, baseline_m=0.1, cx_px=30)
     camera = open_source(path, settings=numbers).calibration
-    assert isinstance(camera, RectifiedCamera)
     assert (camera.focal_px, camera.baseline_m, camera.cx_px) == (50, 0.1, 30)
 
 

@@ -9,23 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.errors import ShapeError
+from recon.core.geometry import se3
 from recon.core.geometry.alignment import Similarity, find_agreeing, fit_paths, fit_points
-from recon.core.geometry.se3 import (
-    angle_rad,
-    apply,
-    as_step,
-    as_transform,
-    exp_so3,
-    hat,
-    invert,
-    log_so3,
-    make_transform,
-    orthonormalise,
-    quaternion_from_rotation,
-    rotate,
-    rotation_from_quaternion,
-    step_jacobian,
-)
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.camera import (
@@ -37,8 +22,8 @@ from recon.core.values.camera import (
 )
 
 VECTORS = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
-ROTATIONS = VECTORS.map(exp_so3)
-TRANSFORMS = st.builds(make_transform, ROTATIONS, VECTORS)
+ROTATIONS = VECTORS.map(se3.exp_so3)
+TRANSFORMS = st.builds(se3.make_transform, ROTATIONS, VECTORS)
 POINTS = np.random.default_rng(0).uniform(-10, 10, (20, 3))
 
 # float64 on numbers up to about 20.
@@ -47,68 +32,82 @@ EXACT = {"rtol": 0, "atol": 1e-12}
 
 @given(A=TRANSFORMS, B=TRANSFORMS)
 def test_inverses_undo_and_neighbouring_frames_cancel(A, B):
-    np.testing.assert_allclose(A @ invert(A), np.eye(4), **EXACT)
-    np.testing.assert_array_equal(invert(np.stack([A, B])), np.stack([invert(A), invert(B)]))
-    np.testing.assert_allclose(apply(A @ B, POINTS), apply(A, apply(B, POINTS)), **EXACT)
+    np.testing.assert_allclose(A @ se3.invert(A), np.eye(4), **EXACT)
+    np.testing.assert_array_equal(
+        se3.invert(np.stack([A, B])), np.stack([se3.invert(A), se3.invert(B)])
+    )
+    np.testing.assert_allclose(
+        se3.apply(A @ B, POINTS), se3.apply(A, se3.apply(B, POINTS)), **EXACT
+    )
 
 
 @given(T=TRANSFORMS)
 def test_a_rigid_motion_keeps_distances_and_dtypes_and_turns_directions(T):
-    moved = apply(T, POINTS)
+    moved = se3.apply(T, POINTS)
     steps_m = [np.linalg.norm(np.diff(xyz, axis=0), axis=1) for xyz in (moved, POINTS)]
     np.testing.assert_allclose(*steps_m, **EXACT)
-    np.testing.assert_allclose(rotate(T, POINTS), moved - T[:3, 3], **EXACT)
+    np.testing.assert_allclose(se3.rotate(T, POINTS), moved - T[:3, 3], **EXACT)
     for dtype in (np.float32, np.float64):
         assert (
-            apply(T, POINTS.astype(dtype)).dtype == rotate(T, POINTS.astype(dtype)).dtype == dtype
+            se3.apply(T, POINTS.astype(dtype)).dtype
+            == se3.rotate(T, POINTS.astype(dtype)).dtype
+            == dtype
         )
 
 
 @given(w=VECTORS)
 def test_exp_gives_a_rotation_about_w_by_its_length(w):
-    R = exp_so3(w)
+    R = se3.exp_so3(w)
     np.testing.assert_allclose(R @ R.T, np.eye(3), **EXACT)
     np.testing.assert_allclose(R @ w, w, **EXACT)
     angle = np.linalg.norm(w) % (2 * np.pi)
     # Near half a turn the sine is small, and its square root of rounding shows.
     np.testing.assert_allclose(
-        angle_rad(make_transform(R, np.zeros(3))), min(angle, 2 * np.pi - angle), atol=1e-9
+        se3.angle_rad(se3.make_transform(R, np.zeros(3))), min(angle, 2 * np.pi - angle), atol=1e-9
     )
 
 
 @given(w=VECTORS, v=VECTORS, scale=st.floats(1e-12, 1e-6))
 def test_hat_is_cross_product_and_first_order_of_exp(w, v, scale):
-    np.testing.assert_allclose(hat(w) @ v, np.cross(w, v), **EXACT)
+    np.testing.assert_allclose(se3.hat(w) @ v, np.cross(w, v), **EXACT)
     # The rest is of second order: |w·scale|² / 2 < 1.5e-11.
-    np.testing.assert_allclose(exp_so3(w * scale), np.eye(3) + hat(w * scale), rtol=0, atol=2e-11)
+    np.testing.assert_allclose(
+        se3.exp_so3(w * scale), np.eye(3) + se3.hat(w * scale), rtol=0, atol=2e-11
+    )
 
 
 @given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
 def test_steps_and_transforms_are_inverse(step):
     # sqrt(3)·1.5 < π, so the rotation vector is unique.
-    np.testing.assert_allclose(as_step(as_transform(np.array(step))), step, atol=1e-9)
+    np.testing.assert_allclose(se3.as_step(se3.as_transform(np.array(step))), step, atol=1e-9)
 
 
 def test_the_jacobian_of_a_step_is_the_derivative_of_moved_points():
     xyz, h = np.random.default_rng(3).normal(0.0, 5.0, (7, 3)), 1e-6
     for axis, step in enumerate(h * np.eye(6)):
-        moved = (apply(as_transform(step), xyz) - apply(as_transform(-step), xyz)) / (2 * h)
+        moved = (
+            se3.apply(se3.as_transform(step), xyz) - se3.apply(se3.as_transform(-step), xyz)
+        ) / (2 * h)
         # The third derivative, |xyz|·h², and rounding, |xyz|·2⁻⁵²/h: both far below 1e-7.
-        np.testing.assert_allclose(step_jacobian(xyz)[:, :, axis], moved, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(se3.step_jacobian(xyz)[:, :, axis], moved, rtol=0, atol=1e-7)
 
 
-def test_angles_keep_their_precision_where_acos_loses_it():
+def test_angles_keep_their_precision_and_published_numbers_give_the_published_depth():
     for angle in (1e-9, 1e-5, 1.0, np.pi - 1e-9):
-        T = make_transform(exp_so3(np.array([0, angle, 0])), np.zeros(3))
+        T = se3.make_transform(se3.exp_so3(np.array([0, angle, 0])), np.zeros(3))
         # acos of the trace would be off by 1e-8.
-        np.testing.assert_allclose(angle_rad(T), angle, rtol=0, atol=1e-15 + 1e-14 * angle)
+        np.testing.assert_allclose(se3.angle_rad(T), angle, rtol=0, atol=1e-15 + 1e-14 * angle)
+    # Middlebury's own formula Z = baseline·f/(d + doffs), with the numbers of Motorcycle at Q.
+    camera = RectifiedCamera(999.421, 294.182, 252.932, 326.96, 0.193001, 741, 497)
+    depth = depth_from_disparity(np.array([50.0]), camera)
+    assert depth[0] == pytest.approx(193.001e-3 * 999.421 / (50 + 32.778), rel=1e-6)
 
 
 @given(T=TRANSFORMS, noise=st.integers(0, 1000))
 def test_orthonormalising_mends_small_noise(T, noise):
     rough = T.copy()
     rough[:3, :3] += np.random.default_rng(noise).uniform(-1e-4, 1e-4, (3, 3))
-    mended = orthonormalise(rough)
+    mended = se3.orthonormalise(rough)
     np.testing.assert_allclose(mended[:3, :3] @ mended[:3, :3].T, np.eye(3), **EXACT)
     assert np.linalg.det(mended[:3, :3]) > 0
     # The nearest rotation is no further from the noisy matrix than the one it came from.
@@ -119,27 +118,27 @@ def test_orthonormalising_mends_small_noise(T, noise):
 
 @given(R=ROTATIONS)
 def test_a_rotation_comes_back_from_its_quaternion_of_any_length_and_sign(R):
-    xyzw = quaternion_from_rotation(R)
+    xyzw = se3.quaternion_from_rotation(R)
     np.testing.assert_allclose(np.linalg.norm(xyzw), 1, **EXACT)
     assert xyzw[3] >= 0
-    np.testing.assert_allclose(rotation_from_quaternion(xyzw), R, **EXACT)
-    np.testing.assert_allclose(rotation_from_quaternion(-3 * xyzw), R, **EXACT)
+    np.testing.assert_allclose(se3.rotation_from_quaternion(xyzw), R, **EXACT)
+    np.testing.assert_allclose(se3.rotation_from_quaternion(-3 * xyzw), R, **EXACT)
 
 
 @given(w=VECTORS.filter(lambda v: np.linalg.norm(v) > 0.1), angle=st.floats(0.0, math.pi - 1e-6))
 def test_log_is_the_inverse_of_exp(w, angle):
     w = angle * w / np.linalg.norm(w)
     # 1e-7: near π the rotation vector amplifies the matrix's rounding by its square root.
-    np.testing.assert_allclose(log_so3(exp_so3(w)), w, atol=1e-7)
+    np.testing.assert_allclose(se3.log_so3(se3.exp_so3(w)), w, atol=1e-7)
 
 
 @pytest.mark.parametrize("axis", np.eye(3))
 def test_half_a_turn_has_an_axis_and_a_quaternion(axis):
     R = 2.0 * np.outer(axis, axis) - np.eye(3)
-    w = log_so3(R)
+    w = se3.log_so3(R)
     assert np.linalg.norm(w) == pytest.approx(math.pi)
-    np.testing.assert_allclose(exp_so3(w), R, atol=1e-12)
-    np.testing.assert_allclose(np.abs(quaternion_from_rotation(R)[:3]), axis, **EXACT)
+    np.testing.assert_allclose(se3.exp_so3(w), R, atol=1e-12)
+    np.testing.assert_allclose(np.abs(se3.quaternion_from_rotation(R)[:3]), axis, **EXACT)
 
 
 def points(seed: int, n: int = 40) -> np.ndarray:
@@ -159,16 +158,16 @@ def test_points_in_one_place_are_not_scaled_and_a_straight_path_is_not_turned_ab
     here, there = np.ones((5, 3)), np.full((5, 3), 3.0)
     found = fit_points(here, there, scaled=True)
     assert found.scale == 1.0
-    np.testing.assert_allclose(apply(found.T_to_from, here), there)
+    np.testing.assert_allclose(se3.apply(found.T_to_from, here), there)
     poses = np.tile(np.eye(4), (30, 1, 1))
     poses[:, 2, 3] = np.arange(30)
-    T = make_transform(exp_so3(np.array([0.1, 0.2, 1.0])), np.array([4.0, 5.0, 6.0]))
+    T = se3.make_transform(se3.exp_so3(np.array([0.1, 0.2, 1.0])), np.array([4.0, 5.0, 6.0]))
     truth = Trajectory(poses, np.arange(30.0))
     found = fit_paths(Trajectory(T @ poses, np.arange(30.0)), truth)
-    assert angle_rad(found.T_to_from @ T) < 1e-9
+    assert se3.angle_rad(found.T_to_from @ T) < 1e-9
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = [0, 1, 2]
-    T = make_transform(exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
+    T = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
     moved = Similarity(T, 3.0).move(Trajectory(poses, np.arange(3.0)))
     np.testing.assert_allclose(moved.positions_m[:, 1], [0, 3, 6], atol=1e-12)
     np.testing.assert_allclose(moved.T_world_camera[1, :3, :3], T[:3, :3], atol=1e-12)
@@ -180,10 +179,10 @@ def test_places_decide_more_the_wider_a_path_winds():
         poses = np.tile(np.eye(4), (60, 1, 1))
         poses[:, :3, 3] = np.random.default_rng(4).normal(0, reach_m, (60, 3))
         tilted = poses.copy()
-        tilted[:, :3, :3] = exp_so3(np.array([0.02, 0.0, 0.0]))
+        tilted[:, :3, :3] = se3.exp_so3(np.array([0.02, 0.0, 0.0]))
         times = np.arange(60.0)
         found = fit_paths(Trajectory(tilted, times), Trajectory(poses, times))
-        turns.append(float(angle_rad(found.T_to_from)))
+        turns.append(float(se3.angle_rad(found.T_to_from)))
     assert 0.019 < turns[0] < 0.02
     assert turns[0] > turns[1] > turns[2]
     assert turns[2] < 0.02 / 100
@@ -193,7 +192,7 @@ def test_places_decide_more_the_wider_a_path_winds():
 def test_points_that_contradict_more_than_half_are_found(wrong):
     random = np.random.default_rng(8)
     along = np.column_stack([np.arange(40.0), np.zeros((40, 2))])  # straight: the hardest case
-    T = make_transform(exp_so3(np.array([0.0, 0.0, 2.0])), np.array([5e5, 5e6, 100.0]))
+    T = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, 2.0])), np.array([5e5, 5e6, 100.0]))
     there = along @ T[:3, :3].T + T[:3, 3] + random.normal(0, 0.02, (40, 3))
     bad = random.permutation(40)[:wrong]
     there[bad] += random.choice([-1, 1], (wrong, 3)) * random.uniform(2, 50, (wrong, 3))
@@ -224,15 +223,7 @@ def test_depth_and_disparity_are_inverse(camera, depth_m):
     assert found[0] == pytest.approx(disparity, rel=1e-6, abs=1e-4)
     # In float64: float32 of a disparity beside a large doffs loses digits of the depth.
     back = depth_from_disparity(np.array([disparity]), camera)
-    assert back.dtype == np.float32
-    assert back[0] == pytest.approx(depth_m, rel=1e-5)
-
-
-def test_a_published_pair_of_numbers_gives_the_published_depth():
-    # Middlebury's own formula Z = baseline·f/(d + doffs), with the numbers of Motorcycle at Q.
-    camera = RectifiedCamera(999.421, 294.182, 252.932, 326.96, 0.193001, 741, 497)
-    depth = depth_from_disparity(np.array([50.0]), camera)
-    assert depth[0] == pytest.approx(193.001e-3 * 999.421 / (50 + 32.778), rel=1e-6)
+    assert (back.dtype, back[0]) == (np.float32, pytest.approx(depth_m, rel=1e-5))
 
 
 @pytest.mark.parametrize("doffs_px", [0.0, 20.0, -20.0])
@@ -294,24 +285,17 @@ def scene():
     return RayScene(np.concatenate([_square(2.0), _square(5.0, 3.0)]))
 
 
-def test_the_nearest_triangle_is_hit_also_from_behind_and_minus_one_where_none_is(scene):
+def test_rays_hit_the_nearest_triangle_and_segments_are_blocked_between_their_ends(scene):
     rays = np.array([[0.3, 0.1, 1.0], [-0.1, 0.3, 1.0], [0.55, 0.1, 1.0], [0, 0, -1.0], [5, 0, 1]])
     hits = scene.first_hit(np.zeros(3), rays)
-    assert hits.dtype == np.int32
-    assert hits.tolist() == [0, 1, 2, -1, -1]
+    assert (hits.dtype, hits.tolist()) == (np.int32, [0, 1, 2, -1, -1])
     assert scene.first_hit(np.array([0.0, 0.0, 9.0]), np.array([[0.2, 0.1, -4.0]]))[0] in (2, 3)
     assert scene.first_hit(np.zeros(3), np.empty((0, 3))).shape == (0,)
-
-
-def test_a_segment_is_blocked_only_between_its_ends(scene):
     reach = np.array([[0.0, 0.1, 1.9], [0.0, 0.1, 2.1], [0.0, 0.1, 4.0]])
     assert scene.blocked(np.zeros(3), reach).tolist() == [False, True, True]
     assert scene.blocked(np.zeros(3), reach, far=0.45).tolist() == [False, False, False]
     starts = np.array([[0.0, 0.1, 0.0], [0.0, 0.1, 3.0]])
     assert scene.blocked(starts, np.array([[0, 0, 2.5], [0, 0, 1.5]])).tolist() == [True, False]
-
-
-def test_read_only_arrays_are_taken_and_the_number_of_threads_changes_no_answer(scene):
     triangles = _square(1.0).astype(np.float32)
     rays = np.array([[0.1, 0.0, 1.0]], dtype=np.float32)
     for array in (triangles, rays):

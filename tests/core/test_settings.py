@@ -22,7 +22,7 @@ from recon.rig.capture import RecordingSettings
 from recon.run.work import parse_size_mb
 from recon.sources.times import read_dates, read_stamped_names
 from recon.street.settings import StreetScene
-from tests.scenery.bounds import Number, numbers_of
+from tests.scenery.bounds import numbers_of
 
 FOREIGN = ["1_0", "١٢", "1_0.5", "\uff11\uff12"]
 PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
@@ -36,13 +36,20 @@ READERS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("text", FOREIGN)
-def test_decimal_numbers_are_what_python_reads_and_other_notations_none(text):
+def test_numbers_settings_and_options_are_decimals_and_other_notations_none(text):
     for number in ("1", "-1.5", "+.5", "1e-05", "7."):
         assert parse_number(number) == float(number)
     assert not is_count(text)
     for parse in (parse_number, parse_integer):
         with pytest.raises(ValueError, match=r"not a decimal number|invalid literal"):
             parse(text)
+    for setting in (f"fusion.voxel_m={text}", f"audit.baseline_m=[0.1, {text}]"):
+        with pytest.raises(ReconError, match="number"):
+            load_config(None, [setting])
+    with pytest.raises(ReconError, match="--antenna"):
+        parse_option(f"1,{text},3", "--antenna")
+    with pytest.raises(ReconError):
+        parse_size_mb(f"{text}M")
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -63,17 +70,6 @@ def test_numbers_of_old_yaml_are_text(tmp_path, text):
     assert read_file_storage(tmp_path / "rig.yml") == {"fx": text}
     decimals = "[10, 010, -2, 0.5, 1.5e+3, -.inf, true]"
     assert parse_yaml(decimals, "x.yaml") == [10, 10, -2, 0.5, 1500.0, -float("inf"), True]
-
-
-@pytest.mark.parametrize("text", FOREIGN)
-def test_settings_and_options_refuse_other_notations(text):
-    for setting in (f"fusion.voxel_m={text}", f"audit.baseline_m=[0.1, {text}]"):
-        with pytest.raises(ReconError, match="number"):
-            load_config(None, [setting])
-    with pytest.raises(ReconError, match="--antenna"):
-        parse_option(f"1,{text},3", "--antenna")
-    with pytest.raises(ReconError):
-        parse_size_mb(f"{text}M")
 
 
 def test_things_are_counted_with_their_plural():
@@ -138,7 +134,7 @@ class Outer(Settings):
     name: str = Field(default="a", description="Name.")
 
 
-def test_the_word_none_leaves_open_what_can_be_left_open():
+def test_the_word_none_leaves_open_and_a_part_of_a_group_keeps_its_other_defaults():
     class Open(Settings):
         limit_m: float | None = Field(default=1.0, description="Limit.")
         kind: Literal["none", "all"] = Field(default="all", description="Kind.")
@@ -147,8 +143,6 @@ def test_the_word_none_leaves_open_what_can_be_left_open():
     with pytest.raises(SettingsError, match="inner"):
         Outer.parse({"inner": "none"})
 
-
-def test_a_part_of_a_group_keeps_the_other_defaults_of_that_group():
     class Filtered(Settings):
         outer: Outer = Outer(inner=Inner(window_px=5), name="b")
 
@@ -175,7 +169,7 @@ def test_a_bad_setting_is_named_with_its_path(values, message):
         Outer.parse(values, where="config.yaml")
 
 
-def test_settings_cannot_be_changed_and_defaults_keep_their_bounds():
+def test_settings_cannot_be_changed_keep_their_bounds_and_may_come_back():
     class Wrong(Settings):
         window_px: int = Field(default=0, ge=1, description="Window.")
 
@@ -183,6 +177,14 @@ def test_settings_cannot_be_changed_and_defaults_keep_their_bounds():
         Outer().name = "b"
     with pytest.raises(ValidationError):
         Wrong()
+
+    class Old(Settings):
+        fixed = {"size": 1}  # noqa: RUF012
+
+    class New(Old):
+        size: int = 2
+
+    assert New.parse({"size": 3}) == New(size=3)
 
 
 #: What settings of before are fixed at.
@@ -204,36 +206,20 @@ def test_a_constant_of_now_is_read_from_files_of_before_with_its_value_alone(nam
         load_config(None, [{name: 7}])
 
 
-def test_a_setting_that_a_group_has_again_is_not_fixed():
-    class Old(Settings):
-        fixed = {"size": 1}  # noqa: RUF012
-
-    class New(Old):
-        size: int = 2
-
-    assert New.parse({"size": 3}) == New(size=3)
-
-
 @pytest.mark.parametrize("settings", [ReconConfig, TrajectoryRules, RecordingSettings, StreetScene])
 def test_every_number_has_two_bounds(settings):
     open_ended = [one.name for one in numbers_of(settings) if None in (one.low, one.high)]
     assert open_ended == []
 
 
-def _given(number: Number, value: object) -> list[str]:
-    text = f"[{', '.join([str(value)] * number.count)}]" if number.count else f"{value}"
-    return [f"{number.name}={text}"]
-
-
 @pytest.mark.parametrize("number", [*numbers_of(ReconConfig)], ids=lambda number: number.name)
 def test_a_number_beyond_its_bounds_is_refused_in_one_line(number):
-    assert number.low is not None
-    assert number.high is not None
     step = 1 if number.whole else 1e-9 * max(1.0, abs(number.low), abs(number.high))
     ends = zip((number.low, number.high), number.outside, strict=True)
     far = ("1e300", "-1e300", ".inf", "-.inf", ".nan", "1" + "0" * 30, "-1" + "0" * 30)
     near = (number.low - step, number.high + step, *(end for end, outside in ends if outside))
     for value in (*far, *near):
+        text = f"[{', '.join([str(value)] * number.count)}]" if number.count else f"{value}"
         with pytest.raises(SettingsError, match=number.name) as raised:
-            load_config(None, _given(number, value))
+            load_config(None, [f"{number.name}={text}"])
         assert "\n" not in str(raised.value)

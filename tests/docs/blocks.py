@@ -18,8 +18,6 @@ _ENDS_OF_COMMANDS = {"&&", "||", ";", "|", "&"}
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block."""
-
     page: str  # path of the page, from the root of the project
     line: int  # line of its opening fence, from 1
     language: str  # what follows the fence
@@ -30,7 +28,6 @@ class Block:
 
 
 def blocks_of(page: Path) -> list[Block]:
-    """The blocks of a page, in order."""
     text, name = page.read_text(), page.relative_to(ROOT).as_posix()
     return [
         Block(name, 1 + text.count("\n", 0, found.start()), found[2], found[3])

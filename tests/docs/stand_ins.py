@@ -58,18 +58,12 @@ def drive(folder: Path) -> None:
 
 
 def true_path() -> Trajectory:
-    truth = street().truth
-    assert truth is not None
-    assert truth.trajectory is not None
-    return truth.trajectory
+    return street().truth.trajectory
 
 
 def lidar(path: Path) -> None:
-    """The true surface of the street."""
-    truth = street().truth
-    assert truth is not None
-    assert truth.surface is not None
-    write_ply(path, PointCloud(xyz=np.asarray(truth.surface.xyz, np.float32)))
+    surface = street().truth.surface
+    write_ply(path, PointCloud(xyz=np.asarray(surface.xyz, np.float32)))
 
 
 def drive_with_truth(folder: Path) -> None:

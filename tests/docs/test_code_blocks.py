@@ -32,24 +32,18 @@ NOT_RUN = {
 }
 """Beginnings of shell lines that are checked but not run, and why."""
 
-every_shell_block = pytest.mark.parametrize("block", SHELL, ids=str)
-
 
 @pytest.mark.parametrize("block", BLOCKS, ids=str)
 def test_a_block_says_whether_it_runs(block):
     assert block.language in {"sh", "python", *SHOWN}
 
 
-@every_shell_block
-def test_a_shell_block_is_shell(block):
+@pytest.mark.parametrize("block", SHELL, ids=str)
+def test_a_shell_block_is_shell_with_commands_of_the_program(block):
     done = subprocess.run(
         ["bash", "-n"], input=block.text, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-
-
-@every_shell_block
-def test_its_commands_are_those_of_the_program(block):
     for name, *arguments in commands_in(block.text):
         if name == "recon":
             command = typer.main.get_command(app)
@@ -65,16 +59,12 @@ def test_nothing_is_left_out_without_need():
     assert unused == []
 
 
-def runnable(script: str) -> str:
-    return "\n".join(
-        line for line in script.splitlines() if not any(re.match(s, line) for s in NOT_RUN)
-    )
-
-
 def as_command(block: Block) -> list[str]:
     if block.language == "python":
         return [sys.executable, "-c", block.text]
-    return ["bash", "-e", "-c", runnable(block.text)]
+    lines = block.text.splitlines()
+    run = [line for line in lines if not any(re.match(start, line) for start in NOT_RUN)]
+    return ["bash", "-e", "-c", "\n".join(run)]
 
 
 @pytest.fixture

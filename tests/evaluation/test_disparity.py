@@ -28,7 +28,7 @@ def estimate(values: list[float]) -> np.ndarray:
     return np.array([values], dtype=np.float32)
 
 
-def test_a_case_counted_by_hand():
+def test_disparities_and_depths_of_a_case_counted_by_hand():
     # Errors 0, 0.5, 1, 3, none; the sixth truth is unknown, the seventh occluded.
     given = (
         estimate([10, 10.5, 9, 13, N, 4, 90]),
@@ -37,8 +37,7 @@ def test_a_case_counted_by_hand():
     result = evaluate_disparity(*given)
     assert result.pixels == 5
     assert result.bad == pytest.approx({0.5: 40.0, 1.0: 20.0, 2.0: 20.0, 4.0: 0.0})
-    assert result.invalid == pytest.approx(20.0)
-    assert result.avgerr_px == pytest.approx(4.5 / 4)
+    assert (result.invalid, result.avgerr_px) == (pytest.approx(20.0), pytest.approx(4.5 / 4))
     assert result.rms_px == pytest.approx(np.sqrt((0.25 + 1 + 9) / 4))
     # One of six is off by more than 4 px when occluded ones count; 3 px are not more than 3.
     assert evaluate_disparity(*given, occluded=True).bad[4.0] == pytest.approx(100 / 6)
@@ -46,6 +45,13 @@ def test_a_case_counted_by_hand():
     # KITTI's outliers are off by three pixels, and by a twentieth.
     found, true = estimate([13.5, 13, 103.5, 106, N]), truth([10, 10, 100, 100, 9])
     assert evaluate_disparity(found, true).d1 == pytest.approx(40.0)
+    # f·b = 10, doffs 1: disparities 1, 4, 9 are 5 m, 2 m, 1 m.
+    camera = RectifiedCamera(100.0, 1.0, 0.0, 2.0, 0.1, 4, 1)
+    found = evaluate_depth(estimate([4, 4, -1, N]), truth([1, 4, 9, 9]), camera)
+    assert (found.mean_m, found.median_m) == pytest.approx((1.5, 3.0))
+    assert found.rms_m == pytest.approx(math.sqrt(4.5))
+    assert found.median_percent == pytest.approx(60.0)
+    assert (found.over_5_percent, found.infinite) == pytest.approx((200 / 3, 100 / 3))
 
 
 def test_maps_without_values_or_truth_or_of_another_size_have_no_errors():
@@ -73,19 +79,7 @@ def test_plain_arrays_are_evaluated_like_values():
         assert evaluate_middlebury(one, true.tolist()) == expected
 
 
-def test_depth_errors_of_a_case_counted_by_hand():
-    # f·b = 10, doffs 1: disparities 1, 4, 9 are 5 m, 2 m, 1 m.
-    camera = RectifiedCamera(100.0, 1.0, 0.0, 2.0, 0.1, 4, 1)
-    found = evaluate_depth(estimate([4, 4, -1, N]), truth([1, 4, 9, 9]), camera)
-    assert (found.mean_m, found.median_m) == pytest.approx((1.5, 3.0))
-    assert found.rms_m == pytest.approx(math.sqrt(4.5))
-    assert found.median_percent == pytest.approx(60.0)
-    assert (found.over_5_percent, found.infinite) == pytest.approx((200 / 3, 100 / 3))
-
-
-def made(
-    error_px: np.ndarray, confidence: np.ndarray | float = 0.8
-) -> tuple[Disparity, DisparityTruth]:
+def made(error_px, confidence=0.8):
     """A map off by ``error_px`` from a truth of 20 px."""
     values = np.full(error_px.shape, 20, np.float32)
     estimate = Disparity(
@@ -97,13 +91,10 @@ def made(
     return estimate, DisparityTruth(values, np.ones(values.shape, bool))
 
 
-def test_share_within_sigma_counts_what_is_less_than_it():
+def test_share_within_sigma_and_honest_confidence_are_counted():
     pair = made(np.array([[0.2, 0.7, 1.2, 5.0]]))
     assert [share_within_sigma(*pair, n) for n in (1, 2, 3)] == [0.25, 0.5, 0.75]
-
-
-def test_honest_confidence_has_no_calibration_error():
-    """Pixels are right just as often as their confidence says."""
+    # Pixels are right just as often as their confidence says.
     rng, shape = np.random.default_rng(0), (200, 500)
     confidence = rng.uniform(0, 1, shape)
     error_px = np.where(rng.uniform(0, 1, shape) < confidence, 0.5, 5.0)
@@ -133,8 +124,7 @@ def test_confidence_that_sorts_better_leaves_less_area():
         measure_sparsification(*made(error_px, np.where(error_px > 1, wrong, right)))
         for wrong, right in ((0.2, 0.8), (0.5, 0.5), (0.8, 0.2))
     )
-    assert best.ause == pytest.approx(0, abs=1e-12)
-    assert best.wrong[0] == pytest.approx(0.3)
+    assert (best.ause, best.wrong[0]) == (pytest.approx(0, abs=1e-12), pytest.approx(0.3))
     # 0.7 of the pixels are right: nothing wrong is left once the 0.3 are gone.
     assert not best.wrong[31:].any()
     assert best.wrong[:30].all()

@@ -44,22 +44,16 @@ def test_an_offset_is_the_median_and_decides_at_the_threshold():
     assert (far.precision, far.recall, far.f_score) == (0, 0, 0)
 
 
-def test_precision_counts_wrong_points_and_recall_missing_ones():
+def test_precision_and_recall_count_places_however_dense_or_far_away():
     clouds = cloud(np.concatenate([grid()[:240], grid(5.0)[:80]])), cloud(grid())
     there, back = evaluate_map(*clouds, 0.2), evaluate_map(*clouds[::-1], 0.2)
     assert (there.precision, there.recall) == pytest.approx((0.75, 0.6))
     assert (back.precision, back.recall) == pytest.approx((0.6, 0.75))
     assert there.f_score == back.f_score == pytest.approx(2 * 0.75 * 0.6 / 1.35)
-
-
-def test_density_does_not_weigh():
     rng = np.random.default_rng(0)
     dense_wrong = rng.uniform([0, 0, 4], [0.05, 0.05, 4.05], (5000, 3))
     result = evaluate_map(cloud(np.concatenate([grid(), dense_wrong])), cloud(grid()), 0.2)
     assert result.precision >= 400 / 408  # the heap fills at most eight voxels
-
-
-def test_distances_hold_far_from_the_origin():
     far = np.array([4000.0, 0, 9000.0])
     here, there = ((grid(z) + far).astype(np.float32) for z in (0.125, 0.0))
     # float32 places points at 9 km to half a millimetre.
@@ -163,16 +157,13 @@ def test_the_tolerance_is_one_cell(shift, exact, tolerant):
     assert (found.grid_exact.iou_occupied, found.grid.iou_occupied) == (exact, tolerant)
 
 
-def test_voxels_that_no_image_held_do_not_count():
+def test_voxels_count_that_images_held_and_true_ones_that_were_seen_often():
     beside, behind, far = (WALL + np.array(by) for by in ([0, 80, 0], [-100, 0, 0], [60, 0, 0]))
     found = evaluate_occupancy(voxels(WALL, beside, behind, far), TRUTH.grid, TRUTH)
     assert (found.voxels.precision, found.voxels.voxels) == (1.0, 72)
     # What is invented behind a wall is wrong.
     found = evaluate_occupancy(voxels(WALL, WALL + np.array([6, 0, 0])), TRUTH.grid, TRUTH)
     assert (found.voxels.precision, found.voxels.recall) == (0.5, 1.0)
-
-
-def test_true_voxels_must_have_been_seen_often_enough():
     frames = np.where(WALL[:, 1] < 0, 3, 2).astype(np.int32)
     seldom = replace(TRUTH, frames=frames)
     half = evaluate_occupancy(voxels(WALL[WALL[:, 1] < 0]), TRUTH.grid, seldom)
@@ -181,7 +172,7 @@ def test_true_voxels_must_have_been_seen_often_enough():
     assert evaluate_occupancy(voxels(WALL), TRUTH.grid, seldom).voxels.precision == 1.0
 
 
-def test_intersection_over_union_on_paper():
+def test_intersection_over_union_on_paper_counts_seen_cells_wherever_the_grid_lies():
     cells = np.full((20, 60), FREE, np.int8)
     cells[4:10, 50] = OCCUPIED  # 6 of 12 found
     cells[10:12, 50] = UNKNOWN  # 2 not known, so 4 are called free
@@ -194,9 +185,6 @@ def test_intersection_over_union_on_paper():
     assert found.grid_exact.unknown == pytest.approx(2 / 1200)
     # Within one cell, a seventh true cell is found.
     assert found.grid.iou_occupied == pytest.approx(7 / 18)
-
-
-def test_only_seen_cells_of_the_grid_count_wherever_it_lies():
     ahead = np.zeros_like(TRUTH.seen)
     ahead[:, 40:60] = True
     part = OccupancyGrid(CELLS[:, 45:], EDGE_M, (9.0, -2.0))

@@ -10,25 +10,7 @@ from hypothesis import strategies as st
 from recon.commands.evaluate_middlebury import run_middlebury
 from recon.core.errors import EvaluationError, SettingsError, ShapeError, SourceError
 from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedPair
-from recon.evaluation.middlebury.bench import (
-    Bench,
-    find_results,
-    find_scenes,
-    read_result,
-    read_scored_scene,
-    summarise_scenes,
-)
-from recon.evaluation.middlebury.score import (
-    MiddleburyRules,
-    at_truth_size,
-    confidence_figures,
-    error_map,
-    evaluate_middlebury,
-    fill_holes,
-    scene_weight,
-    weighted_confidence,
-    weighted_figures,
-)
+from recon.evaluation.middlebury import bench, score
 from recon.io.images.disparity import write_pfm
 from recon.stereo.frame import StereoSettings
 from tests.evaluation.test_disparity import made
@@ -38,9 +20,7 @@ N = float("nan")
 SHAPE = (60, 100)
 
 
-def plain_figures(
-    disp: np.ndarray, gt: np.ndarray, mask: np.ndarray | None, ndisp: int, rounded: bool, full: int
-) -> dict[str, float]:
+def plain_figures(disp, gt, mask, ndisp, rounded, full):
     """What SDK 1.6 describes, in loops: infinity is unknown, limits are in full-size pixels."""
     scale = gt.shape[1] // disp.shape[1]
     n = invalid = 0
@@ -90,33 +70,15 @@ def test_figures_are_those_of_the_plain_definitions(seed, scale, full, rounded, 
     expected = plain_figures(disp, gt, mask if masked else None, 20, rounded, full)
 
     truth = DisparityTruth(np.where(np.isinf(gt), np.float32(np.nan), gt), mask == 255)
-    rules = MiddleburyRules(full_size_factor=full, largest_px=20.0 * scale, isint=rounded)
+    rules = score.MiddleburyRules(full_size_factor=full, largest_px=20.0 * scale, isint=rounded)
     values = np.where(np.isinf(disp), np.float32(np.nan), disp)
-    found = evaluate_middlebury(values, truth, rules, occluded=not masked)
+    found = score.evaluate_middlebury(values, truth, rules, occluded=not masked)
 
     named = {f"bad{t:g}": share for t, share in found.bad.items()}
     named |= {"invalid": found.invalid, "avgerr": found.avgerr_px, "rms": found.rms_px}
     named |= {f"a{q}": error for q, error in found.quantiles_px.items()}
     # float32 in, float64 sums: what differs is the order of addition.
     assert named == pytest.approx(expected, rel=1e-6, abs=1e-9)
-
-
-def test_a_result_is_taken_to_the_size_of_the_truth_up_to_the_rest_of_a_division():
-    values = np.arange(24, dtype=np.float32).reshape(4, 6)
-    assert at_truth_size(values, (2, 3)).tolist() == [[0, 1, 2], [6, 7, 8]]
-    smaller = at_truth_size(np.array([[1, N]], dtype=np.float32), (2, 4))
-    assert np.array_equal(smaller, [[2, 2, N, N], [2, 2, N, N]], equal_nan=True)
-    for shape in ((5, 7), (6, 8), (5, 8)):
-        assert at_truth_size(np.ones(shape, np.float32), (3, 4)).shape == (3, 4)
-    with pytest.raises(EvaluationError, match="differ in size"):
-        at_truth_size(np.ones((10, 10), np.float32), (10, 15))
-
-
-def test_five_scenes_count_half():
-    halved = {"PianoL", "Playroom", "Playtable", "Shelves", "Vintage", "trainingQ/Playroom"}
-    assert {scene_weight(name) for name in halved} == {4}
-    assert {scene_weight(name) for name in ("PlaytableP", "Piano", "Teddy")} == {8}
-    assert weighted_figures({"Teddy": 10.0, "Vintage": 40.0}) == pytest.approx(20.0)
 
 
 def plainly_filled(row: list[float]) -> list[float]:
@@ -137,27 +99,24 @@ def test_known_values_stay_and_holes_follow_the_rule(seed, width):
     values[rng.random(values.shape) < 0.6] = np.nan
     values[:, rng.integers(width)] = 7
     expected = [plainly_filled(row) for row in values.tolist()]
-    assert fill_holes(values).tolist() == expected
+    assert score.fill_holes(values).tolist() == expected
 
 
-def test_rows_without_values_are_filled_from_the_nearest_the_upper_one_first():
+def test_rows_without_values_are_filled_and_results_taken_to_the_size_of_the_truth():
     rows = [[N, N], [1, N], [N, N], [N, 2], [N, N], [N, N]]
-    filled = fill_holes(np.array(rows, np.float32))
+    filled = score.fill_holes(np.array(rows, np.float32))
     assert filled[:, 0].tolist() == [1, 1, 1, 2, 2, 2]
-    assert np.isnan(fill_holes(np.full((2, 2), N, np.float32))).all()
+    assert np.isnan(score.fill_holes(np.full((2, 2), N, np.float32))).all()
     with pytest.raises(ShapeError, match="values"):
-        fill_holes(np.zeros((2, 2)))
-
-
-def test_confidence_that_is_right_as_often_as_it_says_has_no_error():
-    fifth_wrong = np.where(np.arange(np.prod(SHAPE)).reshape(SHAPE) % 5 == 0, 3.0, 0.25)
-    figures = confidence_figures(*made(fifth_wrong))
-    assert figures is not None
-    # 1e-6: confidence is float32.
-    assert figures["ece"] == pytest.approx(0, abs=1e-6)
-    assert figures["within_1_sigma"] == figures["within_2_sigma"] == pytest.approx(0.8)
-    assert figures["reliability"]["right"].count(None) == 9
-    assert sum(figures["reliability"]["share"]) == pytest.approx(1)
+        score.fill_holes(np.zeros((2, 2)))
+    values = np.arange(24, dtype=np.float32).reshape(4, 6)
+    assert score.at_truth_size(values, (2, 3)).tolist() == [[0, 1, 2], [6, 7, 8]]
+    smaller = score.at_truth_size(np.array([[1, N]], dtype=np.float32), (2, 4))
+    assert np.array_equal(smaller, [[2, 2, N, N], [2, 2, N, N]], equal_nan=True)
+    for shape in ((5, 7), (6, 8), (5, 8)):
+        assert score.at_truth_size(np.ones(shape, np.float32), (3, 4)).shape == (3, 4)
+    with pytest.raises(EvaluationError, match="differ in size"):
+        score.at_truth_size(np.ones((10, 10), np.float32), (10, 15))
 
 
 @pytest.mark.parametrize(
@@ -167,25 +126,31 @@ def test_a_map_larger_than_the_truth_is_judged_in_its_own_pixels(factor, error_p
     """Off by 0.75 of its own pixels is right; at half the size that is 0.375 px of the truth."""
     small = tuple(n // factor for n in SHAPE)
     truth = DisparityTruth(np.full(small, 20 / factor, np.float32), np.ones(small, bool))
-    figures = confidence_figures(made(np.full(SHAPE, error_px))[0], truth)
-    assert figures is not None
+    figures = score.confidence_figures(made(np.full(SHAPE, error_px))[0], truth)
     assert (figures["reliability"]["right"][8], figures["within_1_sigma"]) == (right, within)
 
 
 def test_the_mean_counts_scenes_by_weight_and_leaves_out_those_without():
     """PianoL counts half: two thirds and one third."""
     estimate, truth = made(np.zeros(SHAPE))
-    nothing = confidence_figures(estimate.reject(np.ones(SHAPE, bool), Reason.AMBIGUOUS), truth)
+    nothing = score.confidence_figures(
+        estimate.reject(np.ones(SHAPE, bool), Reason.AMBIGUOUS), truth
+    )
     assert nothing is None
-    assert weighted_confidence({"Piano": None}) is None
-    right, wrong = (confidence_figures(*made(np.full(SHAPE, error_px))) for error_px in (0, 5))
-    mean = weighted_confidence({"Piano": right, "PianoL": wrong, "Teddy": nothing})
-    assert mean is not None
+    assert score.weighted_confidence({"Piano": None}) is None
+    right, wrong = (
+        score.confidence_figures(*made(np.full(SHAPE, error_px))) for error_px in (0, 5)
+    )
+    mean = score.weighted_confidence({"Piano": right, "PianoL": wrong, "Teddy": nothing})
     assert mean["ece"] == pytest.approx(2 / 3 * 0.2 + 1 / 3 * 0.8, abs=1e-6)
     assert mean["within_1_sigma"] == pytest.approx(2 / 3)
     # 1e-5: the lists have six digits.
     assert mean["reliability"]["right"][8] == pytest.approx(2 / 3, abs=1e-5)
     assert mean["sparsification"]["wrong"][0] == pytest.approx(1 / 3, abs=1e-5)
+    halved = {"PianoL", "Playroom", "Playtable", "Shelves", "Vintage", "trainingQ/Playroom"}
+    assert {score.scene_weight(name) for name in halved} == {4}
+    assert {score.scene_weight(name) for name in ("PlaytableP", "Piano", "Teddy")} == {8}
+    assert score.weighted_figures({"Teddy": 10.0, "Vintage": 40.0}) == pytest.approx(20.0)
 
 
 class Shifted:
@@ -203,40 +168,37 @@ class Shifted:
 def test_scenes_and_results_of_a_folder_become_figures(tmp_path):
     for name in ("Teddy", "Vintage"):
         write_scene(tmp_path / "trainingQ" / name, square())
-    paths = find_scenes(tmp_path / "trainingQ")
-    scenes = {name: read_scored_scene(name, path, None) for name, path in paths.items()}
+    paths = bench.find_scenes(tmp_path / "trainingQ")
+    scenes = {name: bench.read_scored_scene(name, path, None) for name, path in paths.items()}
     teddy = scenes["Teddy"]
-    assert teddy is not None
     true, submitted = teddy.truth.values, tmp_path / "theirs" / "trainingQ" / "Teddy"
     write_pfm(submitted / "disp0X.pfm", true + np.float32(0.5))
     (submitted / "timeX.txt").write_text("1.5\n")
-    (theirs,) = find_results([tmp_path / "theirs"], paths, ["shifted"])
-    (named,) = find_results([tmp_path / "theirs"], paths, ["theirs"])
+    (theirs,) = bench.find_results([tmp_path / "theirs"], paths, ["shifted"])
+    (named,) = bench.find_results([tmp_path / "theirs"], paths, ["theirs"])
     assert (theirs.name, named.name) == ("theirs", f"{tmp_path.name}/theirs")
-    given = read_result(theirs, teddy)
-    assert given is not None
-    assert read_result(theirs, scenes["Vintage"]) is None
-    (own,) = Bench([Shifted(true)], StereoSettings(), 1).results(teddy)
+    given = bench.read_result(theirs, teddy)
+    assert bench.read_result(theirs, scenes["Vintage"]) is None
+    (own,) = bench.Bench([Shifted(true)], StereoSettings(), 1).results(teddy)
     figures = {"Teddy": {"shifted": own.figures, "theirs": given.figures}, "Vintage": None}
-    summary = summarise_scenes(figures, ["shifted", "theirs"], [theirs], tmp_path)
+    summary = bench.summarise_scenes(figures, ["shifted", "theirs"], [theirs], tmp_path)
     for name, error_px in (("shifted", 4.0), ("theirs", 2.0)):
         mask = summary["matchers"][name]["weighted"]["nonocc"]
         # A pixel is four full-size ones here; what is exactly off by a limit is not bad.
         assert mask["dense"]["avgerr"] == mask["sparse"]["rms"] == pytest.approx(error_px)
-        assert mask["dense"]["bad"]["4"] == 0
-        assert mask["dense"]["bad"]["1"] == 100
+        assert (mask["dense"]["bad"]["4"], mask["dense"]["bad"]["1"]) == (0, 100)
         assert mask["dense"]["depth"]["median_m"] > 0
         assert (mask["invalid"], own.figures["confidence"]) == (0, None)
     assert summary["matchers"]["theirs"]["weighted"]["seconds"] == 1.5
     assert summary["matchers"]["shifted"]["weighted"]["seconds"] >= 0
     assert (summary["skipped"], summary["mean_over"]) == (["Vintage"], ["Teddy"])
     assert (teddy.camera.ndisp or 0) > np.nanmax(true)
-    assert error_map(teddy, own.values)[np.isfinite(true)] == pytest.approx(4.0)
+    assert score.error_map(teddy, own.values)[np.isfinite(true)] == pytest.approx(4.0)
 
 
 def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path):
     write_scene(tmp_path / "Teddy", square())
-    paths = find_scenes(tmp_path)
+    paths = bench.find_scenes(tmp_path)
     for folder, names, message in (
         ("none", (), "no result for any scene"),
         ("several", ("disp0A.pfm", "disp0B.pfm", "disp0B_s.pfm"), "several results"),
@@ -244,11 +206,11 @@ def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path):
         for name in names or ("other.pfm",):
             write_pfm(tmp_path / folder / "Teddy" / name, np.zeros((2, 2), np.float32))
         with pytest.raises(SourceError, match=message):
-            find_results([tmp_path / folder], paths, [])
+            bench.find_results([tmp_path / folder], paths, [])
     with pytest.raises(SettingsError, match="given twice"):
-        find_results([tmp_path / "none", tmp_path / "none"], paths, [])
+        bench.find_results([tmp_path / "none", tmp_path / "none"], paths, [])
     with pytest.raises(SourceError, match="no Middlebury scene"):
-        find_scenes(tmp_path / "none")
+        bench.find_scenes(tmp_path / "none")
 
 
 # Measured elsewhere with OpenCV 5 on all 15 scenes of the table, of which 8 are here: bad1, bad2,

@@ -10,15 +10,7 @@ from recon.core.errors import CalibrationError, MatchingError, SettingsError
 from recon.core.values import DisparityTruth, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.core.values.camera import depth_from_disparity
-from recon.evaluation.paper import (
-    EXPERIMENTS,
-    PaperSettings,
-    PrintedMatcher,
-    camera_of_table_1,
-    compare_depth,
-    read_experiments,
-    table_1_row,
-)
+from recon.evaluation import paper
 from tests.scenery.planes import fronto_parallel_pair
 
 CAMERA = RectifiedCamera(935.0, 148.0, 138.0, 198.0, 0.16, 347, 277, 64)
@@ -33,51 +25,51 @@ def camera_for(width_px: int, height_px: int, ndisp: int | None = None) -> Recti
 def test_true_depths_have_no_error_and_those_of_table_1_a_large_one():
     values = np.linspace(16, 58, 200, dtype=np.float32).reshape(10, 20)
     truth = DisparityTruth(values, np.isfinite(values))
-    believed_m = depth_from_disparity(values, camera_of_table_1(CAMERA))
+    believed_m = depth_from_disparity(values, paper.camera_of_table_1(CAMERA))
     assert np.allclose(believed_m, 50 * 0.16 / values, rtol=1e-6)
-    right = compare_depth(depth_from_disparity(values, CAMERA), truth, CAMERA) or {}
-    wrong = compare_depth(believed_m, truth, CAMERA) or {}
-    assert right["median_error_percent"] == 0
-    assert right["median_ratio"] == 1
+    right = paper.compare_depth(depth_from_disparity(values, CAMERA), truth, CAMERA) or {}
+    wrong = paper.compare_depth(believed_m, truth, CAMERA) or {}
+    assert (right["median_error_percent"], right["median_ratio"]) == (0, 1)
     # Z'/Z = doffs·(d + doffs) / (f·d): 0.22 at d = 16, 0.10 at d = 58.
     assert 0.10 < wrong["median_ratio"] < 0.22
     assert wrong["pixels"] == 200
-    assert compare_depth(np.full((10, 20), np.nan, np.float32), truth, CAMERA) is None
+    assert paper.compare_depth(np.full((10, 20), np.nan, np.float32), truth, CAMERA) is None
     with pytest.raises(CalibrationError, match="doffs"):
-        camera_of_table_1(camera_for(347, 277))
+        paper.camera_of_table_1(camera_for(347, 277))
 
 
 @pytest.mark.parametrize("values", [{"patch_px": 4}, {"patches_px": [3, 6]}, {"patches_px": []}])
 def test_even_patches_and_none_are_refused(values):
     with pytest.raises(SettingsError, match="patch"):
-        PaperSettings.parse(values)
+        paper.PaperSettings.parse(values)
 
 
 @pytest.mark.real
 def test_the_real_scenes_have_the_numbers_that_identify_table_1(recon_data):
-    rows = [*map(table_1_row, read_experiments(recon_data / "middlebury/MiddEval3/trainingQ"))]
-    assert {row["experiment"]: row["scene"] for row in rows} == EXPERIMENTS
+    rows = [
+        *map(
+            paper.table_1_row, paper.read_experiments(recon_data / "middlebury/MiddEval3/trainingQ")
+        )
+    ]
+    assert {row["experiment"]: row["scene"] for row in rows} == paper.EXPERIMENTS
     # Ref: doffs, baseline, ndisp as the paper's Table 1 prints them.
     printed = [(50.0, 160.0, 64), (201.044, 380.135, 160), (19.331, 236.922, 75)]
     assert [tuple(row["printed"].values()) for row in rows] == printed
     assert [row["corrected"]["focal_px"] for row in rows] == [935.0, 1823.297, 989.886]
 
 
-def test_only_absolute_differences_find_a_wall_to_the_whole_pixel():
+def test_only_absolute_differences_find_a_wall_and_only_whole_patches_have_a_value():
     # 60 px · 0.5 m / 5 m = 6 px exactly.
     scene = fronto_parallel_pair(camera_for(64, 40, 16), 5.0)
-    found = PrintedMatcher(7, signed=False).match(scene.pair)
+    found = paper.PrintedMatcher(7, signed=False).match(scene.pair)
     seen = found.valid.copy()
     seen[:, : 6 + 3] = False  # there the right image does not show the patch
     assert np.mean(found.values[seen] == 6) > 0.99
-    signed = PrintedMatcher(7, signed=True).match(scene.pair)
+    signed = paper.PrintedMatcher(7, signed=True).match(scene.pair)
     assert np.mean(signed.values[:, 9:-3] == 6) < 0.3
-
-
-def test_only_pixels_whose_patch_leaves_the_image_have_no_value():
     left = np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8)
     pair = RectifiedPair(left, left, camera_for(30, 20))
-    found = PrintedMatcher(5, signed=True).match(pair)
+    found = paper.PrintedMatcher(5, signed=True).match(pair)
     expected = np.zeros(left.shape, dtype=bool)
     expected[2:-2, 2:-2] = True
     assert np.array_equal(found.valid, expected)
@@ -86,7 +78,7 @@ def test_only_pixels_whose_patch_leaves_the_image_have_no_value():
     sigma_px = np.std(np.linspace(-0.5, 0.5, 999))
     np.testing.assert_allclose(found.sigma_px[expected], sigma_px, rtol=0.01)
     with pytest.raises(MatchingError, match="at most 20 px"):
-        PrintedMatcher(21, signed=True).match(pair)
+        paper.PrintedMatcher(21, signed=True).match(pair)
 
 
 @settings(max_examples=40)
@@ -99,7 +91,7 @@ def test_only_pixels_whose_patch_leaves_the_image_have_no_value():
 def test_it_equals_the_sums_written_out(data, shape, patch_px, signed):
     left, right = (data.draw(hnp.arrays(np.uint8, shape)) for _ in range(2))
     pair = RectifiedPair(left, right, camera_for(shape[1], shape[0], 6))
-    found = PrintedMatcher(patch_px, signed).match(pair).values
+    found = paper.PrintedMatcher(patch_px, signed).match(pair).values
     assert np.array_equal(found, written_out(left, right, patch_px, signed), equal_nan=True)
 
 

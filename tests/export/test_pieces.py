@@ -1,7 +1,5 @@
 """Cut meshes meet without a gap, and the surface of a drive is built of such tiles."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,16 +8,7 @@ from hypothesis import strategies as st
 from recon.commands.config import load_config
 from recon.core.errors import MeshingError, OutputError
 from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
-from recon.export.mesh.cut import (
-    Plane,
-    close_seam,
-    cut_mesh,
-    drop_small_components,
-    keep_vertices,
-    nearest_on_edges,
-    open_edges,
-    vertex_normals,
-)
+from recon.export.mesh import cut
 from recon.export.mesh.pieces import export_mesh
 from recon.export.mesh.poisson import MeshSettings
 from recon.io.models.mesh import read_mesh
@@ -55,8 +44,8 @@ def area_m2(mesh: TriangleMesh) -> float:
 
 @given(axis=st.integers(0, 1), at=st.floats(-0.9, 0.9), seed=st.integers(0, 5))
 def test_the_halves_are_the_whole(axis, at, seed):
-    mesh, plane = sheet(seed), Plane(axis, at)
-    halves = [cut_mesh(mesh, plane, keep_above=above) for above in (False, True)]
+    mesh, plane = sheet(seed), cut.Plane(axis, at)
+    halves = [cut.cut_mesh(mesh, plane, keep_above=above) for above in (False, True)]
     # float32 places new vertices to 1e-7 m.
     assert sum(map(area_m2, halves)) == pytest.approx(area_m2(mesh), rel=1e-5)
     assert halves[0].vertices[:, axis].max() == np.float32(at)
@@ -64,15 +53,13 @@ def test_the_halves_are_the_whole(axis, at, seed):
     for half in halves:
         assert (ups(half)[:, 2] > -1e-9).all()
         assert set(np.unique(half.faces)) == set(range(len(half.vertices)))
-    borders = [np.unique(open_edges(half, plane).reshape(-1, 3), axis=0) for half in halves]
+    borders = [np.unique(cut.open_edges(half, plane).reshape(-1, 3), axis=0) for half in halves]
     np.testing.assert_array_equal(borders[0], borders[1])
 
 
 def test_new_vertices_have_normals_and_colours_between():
-    half = cut_mesh(sheet(0), Plane(0, 0.0), keep_above=True)
+    half = cut.cut_mesh(sheet(0), cut.Plane(0, 0.0), keep_above=True)
     on_plane = half.vertices[:, 0] == 0
-    assert half.rgb is not None
-    assert half.normals is not None
     assert np.abs(half.rgb[on_plane].astype(int) - 127).max() <= 12
     np.testing.assert_allclose(np.linalg.norm(half.normals, axis=1), 1, atol=1e-6)
 
@@ -80,28 +67,30 @@ def test_new_vertices_have_normals_and_colours_between():
 @pytest.mark.parametrize("above", [True, False])
 def test_a_mesh_on_one_side_is_kept_or_dropped_whole(above):
     mesh = sheet(1)
-    kept = cut_mesh(mesh, Plane(0, -5.0 if above else 5.0), keep_above=above)
+    kept = cut.cut_mesh(mesh, cut.Plane(0, -5.0 if above else 5.0), keep_above=above)
     assert len(kept.faces) == len(mesh.faces)
-    assert len(cut_mesh(mesh, Plane(0, 5.0 if above else -5.0), keep_above=above).faces) == 0
+    assert (
+        len(cut.cut_mesh(mesh, cut.Plane(0, 5.0 if above else -5.0), keep_above=above).faces) == 0
+    )
 
 
-def gaps_m(one: TriangleMesh, other: TriangleMesh, plane: Plane) -> np.ndarray:
+def gaps_m(one: TriangleMesh, other: TriangleMesh, plane: cut.Plane) -> np.ndarray:
     """How far points along each border are from the other border."""
-    borders, found = [open_edges(mesh, plane) for mesh in (one, other)], []
+    borders, found = [cut.open_edges(mesh, plane) for mesh in (one, other)], []
     along = np.linspace(0, 1, 7, dtype=np.float32)[None, :, None]
     for here, there in (borders, borders[::-1]):
         points = here[:, :1] * (1 - along) + here[:, 1:] * along
-        found.append(nearest_on_edges(points.reshape(-1, 3), there).distance_m)
+        found.append(cut.nearest_on_edges(points.reshape(-1, 3), there).distance_m)
     return np.concatenate(found)
 
 
 @pytest.mark.parametrize("n", [12, 24, 57])
 def test_a_seam_between_two_versions_of_a_surface_is_closed(n):
-    plane = Plane(0, 0.1)
-    left = cut_mesh(sheet(2), plane, keep_above=False)
-    right = cut_mesh(sheet(3, n, shift_m=0.02, noise_m=0.005), plane, keep_above=True)
+    plane = cut.Plane(0, 0.1)
+    left = cut.cut_mesh(sheet(2), plane, keep_above=False)
+    right = cut.cut_mesh(sheet(3, n, shift_m=0.02, noise_m=0.005), plane, keep_above=True)
     assert gaps_m(left, right, plane).max() > 0.01
-    closed = close_seam(right, plane, open_edges(left, plane), 0.2)
+    closed = cut.close_seam(right, plane, cut.open_edges(left, plane), 0.2)
     # Both ends of the seam lie where the sheets end, up to 0.02 m apart.
     assert gaps_m(_within(left, 0.9), _within(closed, 0.9), plane).max() < 1e-5
     assert area_m2(closed) == pytest.approx(area_m2(right), rel=0.02)
@@ -110,15 +99,15 @@ def test_a_seam_between_two_versions_of_a_surface_is_closed(n):
 
 def _within(mesh: TriangleMesh, y_m: float) -> TriangleMesh:
     """The mesh between two planes across y."""
-    below = cut_mesh(mesh, Plane(1, y_m), keep_above=False)
-    return cut_mesh(below, Plane(1, -y_m), keep_above=True)
+    below = cut.cut_mesh(mesh, cut.Plane(1, y_m), keep_above=False)
+    return cut.cut_mesh(below, cut.Plane(1, -y_m), keep_above=True)
 
 
 def test_a_seam_whose_neighbour_is_far_stays_as_it_is():
-    plane = Plane(0, 0.0)
-    left = cut_mesh(sheet(2), plane, keep_above=False)
-    right = cut_mesh(sheet(3, shift_m=1.0), plane, keep_above=True)
-    closed = close_seam(right, plane, open_edges(left, plane), 0.2)
+    plane = cut.Plane(0, 0.0)
+    left = cut.cut_mesh(sheet(2), plane, keep_above=False)
+    right = cut.cut_mesh(sheet(3, shift_m=1.0), plane, keep_above=True)
+    closed = cut.close_seam(right, plane, cut.open_edges(left, plane), 0.2)
     np.testing.assert_array_equal(closed.vertices, right.vertices)
     np.testing.assert_array_equal(closed.faces, right.faces)
 
@@ -127,26 +116,23 @@ SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32
 HALVES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
 
 
-def test_a_face_stays_only_with_all_its_vertices_and_in_a_large_component():
-    vertices, faces = keep_vertices(SQUARE, HALVES, np.array([True, False, True, True]))
+def test_faces_and_normals_of_a_square_are_kept_dropped_and_weighed():
+    vertices, faces = cut.keep_vertices(SQUARE, HALVES, np.array([True, False, True, True]))
     np.testing.assert_array_equal(vertices, SQUARE[[0, 2, 3]])
     np.testing.assert_array_equal(faces, [[0, 1, 2]])
     both = np.concatenate([HALVES, [[4, 5, 6]]]).astype(np.int32)
-    kept, left = drop_small_components(np.concatenate([SQUARE, SQUARE[:3] + 10]), both, 2)
+    kept, left = cut.drop_small_components(np.concatenate([SQUARE, SQUARE[:3] + 10]), both, 2)
     np.testing.assert_array_equal(kept, SQUARE)
     np.testing.assert_array_equal(left, HALVES)
     with pytest.raises(MeshingError, match="trimming left no face"):
-        drop_small_components(SQUARE, HALVES, 3)
-
-
-def test_normals_of_a_flat_square_are_its_normal_and_large_faces_weigh_more():
-    np.testing.assert_allclose(vertex_normals(SQUARE, HALVES), [[0, 0, 1]] * 4)
-    np.testing.assert_allclose(vertex_normals(SQUARE, HALVES[:, ::-1]), [[0, 0, -1]] * 4)
+        cut.drop_small_components(SQUARE, HALVES, 3)
+    np.testing.assert_allclose(cut.vertex_normals(SQUARE, HALVES), [[0, 0, 1]] * 4)
+    np.testing.assert_allclose(cut.vertex_normals(SQUARE, HALVES[:, ::-1]), [[0, 0, -1]] * 4)
     vertices = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, -1]], dtype=np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     # Areas 4.5 (normal z) and 1.5 (normal -x) at the shared vertices.
     expected = np.array([-1.5, 0, 4.5]) / np.hypot(1.5, 4.5)
-    np.testing.assert_allclose(vertex_normals(vertices, faces)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(cut.vertex_normals(vertices, faces)[0], expected, atol=1e-6)
 
 
 STEP_M = 0.1
@@ -180,9 +166,7 @@ def store(monkeypatch):
     return store
 
 
-def written(
-    store: Tiles, folder: Path, settings: MeshSettings = SETTINGS, threads: int | None = None
-) -> tuple[TriangleMesh, list[TriangleMesh], list[str]]:
+def written(store, folder, settings=SETTINGS, threads=None):
     """The whole mesh, that of each tile, and the warnings."""
     with RunDirectory(folder) as directory:
         layer = directory.path("mesh/cloud.ply")
@@ -203,9 +187,8 @@ def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(store, tmp_path
     x, y, z = whole.vertices[inside].T
     # Noise of 1 cm is smoothed; an octree cell of 0.1 m adds little on a bump of 1 m.
     assert np.abs(z - 0.1 * np.sin(x) - 0.05 * np.cos(2 * y)).max() < 0.03
-    assert whole.rgb is not None
     assert set(np.unique(whole.rgb)) >= {90, 200}
-    distance_m = gaps_m(*tiles, Plane(0, 4.0))
+    distance_m = gaps_m(*tiles, cut.Plane(0, 4.0))
     assert len(distance_m) > 2 * 60 * 7
     assert distance_m.max() < 0.1
     assert np.percentile(distance_m, 95) < 1e-4
@@ -235,20 +218,17 @@ def test_what_hangs_where_cameras_looked_is_cut_off(store, tmp_path):
     assert len(above) == 0
 
 
-def test_tiles_with_too_few_points_are_reported_in_one_line(store, tmp_path):
-    stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
-    cloud = street().select(np.arange(3))
-    store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
-    coarse = SETTINGS.model_copy(update={"max_depth": 5})
-    warnings = written(store, tmp_path / "out", coarse)[2]
-    assert len(warnings) == 1
-    assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")
-
-
-def test_a_store_without_a_surface_or_a_folder_is_an_error(store, tmp_path):
+def test_tiles_with_too_few_points_are_reported_and_none_is_an_error(store, tmp_path):
     with pytest.raises(MeshingError, match="no part of the map gives a surface"):
         written(Tiles(CONFIG, np.eye(4)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (tmp_path / "out").write_text("a file")
     with pytest.raises(OutputError):
         written(store, tmp_path / "out")
+    stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
+    cloud = street().select(np.arange(3))
+    store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
+    coarse = SETTINGS.model_copy(update={"max_depth": 5})
+    warnings = written(store, tmp_path / "few", coarse)[2]
+    assert len(warnings) == 1
+    assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")

@@ -32,8 +32,7 @@ def test_text_appears_whole_under_its_name_and_nothing_else_stays(tmp_path):
 
 def test_the_temporary_shares_folder_and_suffixes_with_the_target(tmp_path):
     with atomic_path(tmp_path / "map.tar.gz") as temporary:
-        assert temporary.parent == tmp_path
-        assert temporary.suffixes == [".tar", ".gz"]
+        assert (temporary.parent, temporary.suffixes) == (tmp_path, [".tar", ".gz"])
         assert not temporary.exists()
         temporary.write_bytes(b"x")
 

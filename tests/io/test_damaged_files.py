@@ -57,9 +57,7 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
         [
             (b"%YAML:1.0\n---\nM1: [1,2\n", "not a YAML file"),
             (b"hello", ": not an OpenCV FileStorage"),
-            (b'<?xml version="1.0"?>\n<opencv_storage><M1>1', ": not an OpenCV FileStorage"),
             (b"<html></html>", ": not an OpenCV FileStorage"),
-            (b"{", ": not an OpenCV FileStorage"),
         ],
     ),
     "jobs.toml": (read_toml, [(b"a = [1\n", ": not a TOML file")]),
@@ -78,11 +76,9 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
             (IDENTITY + b"1 0 0 0 0 1 0 0 0 0 1 nan\n", ":2: number is not finite"),
             (b"2" + IDENTITY[1:], ":1: pose is not a rigid transform"),
             (b"1 0 0 0 0 1 0 0 0 0 -1 0\n", ":1: pose is not a rigid transform"),
-            (b"0 " * 11 + b"0\n", ":1: pose is not a rigid transform"),
             (IDENTITY + b"0 0 0 0 0 0 0 1\n", ":2: wrong number of columns .got 8, expected 12"),
             (b"1 2 3\n", ":1: wrong number of columns .got 3, expected 12 or 8"),
             (b"0 0 0 0 0 0 0 0\n", ":1: quaternion is not of unit length .got 0"),
-            (b"0 0 0 0 0 0 0 2\n", ":1: quaternion is not of unit length .got 2"),
             (b"2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: time runs backwards"),
             (b"1 0 0 1e30 0 1 0 0 0 0 1 0\n", r":1: position .*got 1e\+30 m"),
             (b"0 0 0 0 0 0 0 1\n0.5 0 -1e30 0 0 0 0 1\n", r":2: position .*got 1e\+30 m"),
@@ -113,10 +109,8 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
             (b"P5\n1 1\n255\n\x00", "not a PFM file"),
             (b"PF\n1 1\n-1\n" + bytes(12), "PFM file is in colour"),
             (b"Pf\n2 2\n-1\n" + bytes(12), r"truncated \(got 12 bytes, expected 16 for 2x2 pixel"),
-            (b"Pf\n0 2\n-1\n" + bytes(12), "truncated"),
             (b"Pf\n1 1\n0\n" + bytes(4), r"scale .* \(got 0\)"),
             (b"Pf\n1 1\n1-1\n" + bytes(4), r"scale .* \(got 1-1\)"),
-            (b"Pf\n1 1\n-1e999\n" + bytes(4), r"scale .* \(got -1e999\)"),
         ],
     ),
     "left.png": (
@@ -128,12 +122,10 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
             (b"\x89PNG\r\n\x1a\n" + bytes(3) + b"\x09IHDR1234", "inside a chunk of 9 bytes"),
             (b"\xff\xd8\xff\xe0", "JPEG image is truncated"),
             (b"P5\n4 4\n255\nabc", r"PGM/PPM image is truncated or .* \(got 3 of 16 samples\)"),
-            (b"P5\n2 2\n999\nabcdefg", "got 3 of 4 samples"),
             (b"P6\n2 2\n255\nabcdefghijk", "got 11 of 12 samples"),
             (b"P2\n2 2\n255\n1 2 3\n", "got 3 of 4 samples"),
             (b"P5\nfour", "no readable header"),
             (b"BM", "BMP image is truncated .*in its header"),
-            (b"BM" + bytes(52), "image cannot be decoded"),
             (b"II*\x00garbage", "image cannot be decoded"),
         ],
     ),
@@ -146,13 +138,9 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
             (b"ply\nformat binary_middle_endian 1.0\nend_header\n", "cannot read the PLY header"),
             (b"ply\nelement vertex 0\nend_header\n", "no format line"),
             (PLY + b"property float x\nend_header\n", "cannot read the PLY header"),
-            (PLY + b"element vertex -1\nend_header\n", "cannot read the PLY header"),
-            (PLY + b"element vertex 1\nproperty\nend_header\n", "cannot read the PLY header"),
             (PLY + b"element vertex 1\nproperty quad x\nend_header\n1\n", "the PLY header"),
             (PLY + b"element v 1\nproperty int x\nproperty int x\nend_header\n", "twice"),
             (PLY + b"element vertex 1\nproperty float x\nend_header\n1\n", "no vertices with x, y"),
-            (PLY + b"element vertex 1\nend_header\n\n", "no vertices with x, y and z"),
-            (PLY + b"end_header\n", "no vertices with x, y and z"),
             (PLY + b"element vertex 2\n" + XYZ + b"end_header\n1 2 3\n1 two 3\n", "got 1 row, exp"),
             (PLY + b"element vertex 2\n" + XYZ + b"end_header\n1 2 3\n1 2\n", "truncated"),
             (PLY + b"element vertex 1\n" + XYZ + b"end_header\nnan 0 0\n", "no point .* is finite"),
@@ -163,9 +151,7 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
         [
             (FACE + CORNERS + b"4 0 1 2 0\n", "truncated in its element 'face'"),
             (FACE + CORNERS + b"4 0 1 2\n", "a face is not a triangle"),
-            (FACE + CORNERS + b"3 0 1\n", "truncated in its element 'face'"),
             (FACE + CORNERS + b"3 0 1 3\n", r"does not exist \(got 3, expected less than 3"),
-            (FACE + CORNERS + b"3 0 1 -1\n", "does not exist"),
             (FACE + CORNERS.replace(b"1 0 0", b"1 inf 0") + b"3 0 1 2\n", "is not finite"),
             (PLY + b"element vertex 1\n" + XYZ + b"end_header\n0 0 0\n", "it is a point cloud"),
         ],
@@ -175,9 +161,7 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
         read_octomap,
         [
             (b"", "not an .ot OctoMap"),
-            (b"# Octomap OcTree binary file\n", "not an .ot OctoMap"),
             (b"# Octomap OcTree file\nid OcTree\nsize 1\nres 0\ndata\n", "no occupancy octree"),
-            (b"# Octomap OcTree file\nid OcTree\nsize -1\nres 1\ndata\n", "no occupancy octree"),
             (b"# Octomap OcTree file\nid Tree\nsize 1\nres 1\ndata\n", "no occu.*got .*Tree"),
             (b"# Octomap OcTree file\nid OcTree\nres 1\ndata\n", "truncated or damaged"),
         ],
@@ -195,7 +179,6 @@ ROWS = [
 
 
 def refusal(read: Callable[[Path], object], path: Path) -> str:
-    """The line with which a file is refused."""
     with pytest.raises(ReconError) as caught:
         read(path)
     line = str(caught.value)
@@ -247,14 +230,12 @@ VALID: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     [
         ("ours.yaml", "fx_px: 500.0", "fx_px: many", "'left.fx_px' is wrong .*many"),
         ("ours.yaml", "fx_px: 500.0", "f: 500.0", "calibration has no 'left.fx_px'"),
-        ("ours.yaml", "fx_px: 500.0", "fx_px: .nan", "'left.fx_px' is wrong .*finite"),
         ("ours.yaml", "fx_px: 500.0", "fx_px: -500.0", "focal length is not positive"),
         ("ours.yaml", "k2:", "k9:", "distortion has gaps"),
         ("ours.yaml", "version: 1", "version: 7", "version .* not supported"),
         ("ours.yaml", "kind: stereo", "kind: mono", "unknown kind"),
         ("ours.yaml", "model: pinhole", "model: pinhead", "unknown lens model"),
         ("ours.yaml", "width_px: 640", "width_px: 0.5", "'left.width_px' is wrong"),
-        ("ours.yaml", "width_px: 640", "width_px: 0", "'left.width_px' is wrong"),
         ("ours.yaml", "\nleft:", "\nleft: 1\nother:", "'left' is wrong .*a mapping"),
         ("chain.yaml", "camera_model: pinhole", "camera_model: omni", "not supported .*omni"),
         ("chain.yaml", "radtan", "fov", "lens model is not supported .*fov"),
@@ -265,7 +246,6 @@ VALID: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         ("calib.txt", "193.001", "wide", r"'baseline' is wrong \(got wide, expected numbers"),
         ("calib.txt", "width=24", "width=nan", "'width' is wrong .*finite numbers"),
         ("calib.txt", "cam0=[999.421 0", "cam0=[", "'cam0' is wrong .*expected 9 numbers"),
-        ("calib.txt", "[999.421 0 294", "[nan 0 294", "'cam0' is wrong .*finite numbers"),
         ("calib.txt", "doffs=32.778", "doffs=31", r"doffs is .*got 31, expected 32\.778"),
         ("calib.txt", "999.421 0 326", "500 0 326", "different focal lengths"),
         ("grid.yaml", "trinary", "scale", r"mode .*got scale, expected trinary"),

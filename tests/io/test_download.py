@@ -4,7 +4,7 @@ import io
 import stat
 import tarfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,14 +13,11 @@ import pytest
 
 from recon.core.errors import DownloadError, FormatError, OutputError
 from recon.io import download as module
-from recon.io.download import OnBytes, download, unpack
+from recon.io.download import download, unpack
 from tests.io.mirror import Mirror, serving
 
 CONTENT = np.random.default_rng(0).bytes(3_500_000)
 SIZE = len(CONTENT)
-
-
-Fetch = Callable[..., Path]
 
 
 @pytest.fixture
@@ -34,9 +31,7 @@ def mirror(monkeypatch):
 def fetch(mirror, tmp_path):
     """Download ``a.zip``, or what has that name, into a folder of its own."""
 
-    def fetch(
-        size: int | None = SIZE, on_bytes: OnBytes = lambda *_: None, name: str = "a.zip"
-    ) -> Path:
+    def fetch(size=SIZE, on_bytes=lambda *_: None, name="a.zip"):
         download(f"{mirror.address}/{name}", tmp_path / "a.zip", size, on_bytes)
         return tmp_path / "a.zip"
 
@@ -51,15 +46,17 @@ def test_a_download_is_what_the_server_has(mirror, fetch):
     told: list[tuple[int, int | None]] = []
     mirror.redirect, mirror.busy = f"{mirror.address}/moved", 3
     path = fetch(None, lambda *now: told.append(now))
-    assert path.read_bytes() == CONTENT
-    assert names(path.parent) == {"a.zip"}
+    assert (path.read_bytes(), names(path.parent)) == (CONTENT, {"a.zip"})
     assert told[-1] == (SIZE, SIZE)
 
 
-def test_a_connection_that_breaks_off_goes_on_where_it_was(mirror, fetch):
+def test_a_download_goes_on_where_a_connection_breaks_off(mirror, fetch, monkeypatch):
     mirror.break_after = 1_200_000
     assert fetch().read_bytes() == CONTENT
     assert mirror.asked == ["", "bytes=1199999-", "bytes=2399998-"]
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
+    with pytest.raises(OutputError, match="no room for the download"):
+        fetch()
 
 
 # A file that is complete is not received again.
@@ -117,12 +114,6 @@ def test_other_addresses_are_refused(tmp_path, address):
         download(address, tmp_path / "a")
 
 
-def test_a_full_disk_is_one_line(fetch, monkeypatch):
-    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
-    with pytest.raises(OutputError, match="no room for the download"):
-        fetch()
-
-
 FILES = {"data/a.txt": b"one", "data/b/c.png": b"two", "README": b"three"}
 
 
@@ -159,19 +150,16 @@ def test_everything_is_unpacked_over_what_was_there(tmp_path, kind):
     assert content(tmp_path / "out") == FILES
 
 
-def test_only_what_is_chosen_is_unpacked(tmp_path):
+def test_only_what_is_chosen_is_unpacked_and_archives_in_it_beside_themselves(tmp_path):
+    inner = write_zip(tmp_path / "inner.zip", {"mav0/a": b"one"}).read_bytes()
+    path = write_zip(tmp_path / "a.zip", {"hall/MH/MH.zip": inner, "hall/MH/MH.bag": b"x"})
+    unpack(path, tmp_path / "inner", below="hall", without=[".bag"], zips=True)
+    assert content(tmp_path / "inner") == {"MH/mav0/a": b"one"}
     path = write_zip(tmp_path / "a.zip", {**FILES, "__MACOSX/data/._a": b"x", "data/d.bag": b"y"})
     unpack(path, tmp_path / "out", below="data", without=[".bag"])
     assert content(tmp_path / "out") == {"a.txt": b"one", "b/c.png": b"two"}
     with pytest.raises(FormatError, match=r"archive is empty .*below nowhere"):
         unpack(path, tmp_path / "out", below="nowhere")
-
-
-def test_archives_in_an_archive_are_unpacked_beside_themselves(tmp_path):
-    inner = write_zip(tmp_path / "inner.zip", {"mav0/a": b"one"}).read_bytes()
-    path = write_zip(tmp_path / "a.zip", {"hall/MH/MH.zip": inner, "hall/MH/MH.bag": b"x"})
-    unpack(path, tmp_path / "out", below="hall", without=[".bag"], zips=True)
-    assert content(tmp_path / "out") == {"MH/mav0/a": b"one"}
 
 
 @pytest.mark.parametrize(

@@ -20,16 +20,13 @@ from recon.io.trajectory import (
 )
 
 
-def test_a_table_skips_comments_empty_lines_and_the_mark_of_byte_order(tmp_path):
+def test_tables_and_yaml_are_read_as_they_are_meant(tmp_path):
     path = tmp_path / "t.txt"
     path.write_bytes(b"\xef\xbb\xbf# t x\n1 2\n\n3, 4  # late\n")
     assert read_text(path)[0] == "#"
     table, lines = read_table(path, (2,))
     np.testing.assert_array_equal(table, [[1, 2], [3, 4]])
     assert lines == [2, 4]
-
-
-def test_yaml_comes_back_as_it_was_written_and_in_order(tmp_path):
     values = {"b": {"window_px": 9, "alpha": None}, "a": [1, 2.5, "größe"]}
     write_yaml(tmp_path / "c.yaml", values)
     assert read_yaml(tmp_path / "c.yaml") == values
@@ -71,7 +68,7 @@ def test_tum_line_is_time_position_and_quaternion_xyzw_with_positive_w(tmp_path)
     np.testing.assert_allclose(first, second, rtol=0, atol=1e-12)
 
 
-def test_rotations_of_few_digits_become_orthonormal(tmp_path):
+def test_rotations_of_few_digits_become_orthonormal_and_poses_get_times(tmp_path):
     path = tmp_path / "p.txt"
     path.write_text("0.9998 -0.02 0 1 0.02 0.9998 0 2 0 0 1 3\n")
     kitti = read_kitti_poses(path).T_world_camera[0]
@@ -79,9 +76,6 @@ def test_rotations_of_few_digits_become_orthonormal(tmp_path):
     path.write_text("# groundtruth\n0 0 0 0 0.57 0.57 0.57 0.16\n")
     for pose in (kitti, read_tum(path).T_world_camera[0]):
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
-
-
-def test_kitti_poses_get_a_second_each_or_as_many_times_as_they_are(tmp_path):
     (tmp_path / "p.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
     assert read_kitti_poses(tmp_path / "p.txt").timestamps_s.tolist() == [0, 1]
     with pytest.raises(FormatError, match=r"p\.txt: numbers of poses .*\(got 2 poses, expected 3"):

@@ -92,8 +92,6 @@ def camera():
 
 @pytest.fixture(scope="session")
 def see():
-    """See the street from a pose: a frame with exact disparity."""
-
     def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
         grey, depth = _render(T_world_camera)
         return make_frame(grey, CAMERA.focal_px * CAMERA.baseline_m / depth, index)

@@ -78,7 +78,7 @@ def test_exact_observations_give_exact_poses_and_points(camera):
     np.testing.assert_array_equal(found.T_world_camera[0], start.T_world_camera[0])
 
 
-def test_some_wrong_tracks_hardly_matter(camera):
+def test_wrong_tracks_hardly_matter_and_those_without_disparity_count(camera):
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[-1, :20, 0] += 15.0
@@ -87,9 +87,6 @@ def test_some_wrong_tracks_hardly_matter(camera):
     wrong = misfits(found, camera)
     assert wrong[:20].all()
     assert not wrong[20:].any()
-
-
-def test_a_track_without_disparity_still_counts(camera):
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[1:, :, 2] = np.nan
@@ -189,14 +186,11 @@ def test_noisy_depths_do_not_throw_the_camera(seed):
     np.testing.assert_array_equal(found.agree, error_px <= REPROJECTION_PX)
 
 
-def test_a_guess_that_is_far_off_does_no_harm():
+def test_a_far_guess_does_no_harm_and_points_that_agree_on_nothing_give_no_pose():
     xyz, uv = street(1)
     far = make_transform(exp_so3(np.array([0.0, 0.3, 0.0])), np.array([3.0, 0.0, -4.0]))
     found = locate_camera(xyz, uv, CAMERA, far)
     assert np.linalg.norm((invert(T_TRUE) @ found.T_world_camera)[:3, 3]) < 0.12
-
-
-def test_points_that_agree_on_nothing_and_too_few_give_no_pose():
     xyz, uv = street(2)
     wrong = np.random.default_rng(2).permutation(uv)
     assert locate_camera(xyz, wrong, CAMERA, np.eye(4)) is None
@@ -206,12 +200,15 @@ def test_points_that_agree_on_nothing_and_too_few_give_no_pose():
 STEP = make_transform(exp_so3(np.array([0.0, 0.03, 0.01])), np.array([0.1, 0.0, 1.2]))
 
 
-def test_with_known_times_the_velocity_goes_on():
+def test_the_velocity_goes_on_also_where_frames_are_not_seen():
     motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1)
     np.testing.assert_allclose(motion.predict(0.2), STEP @ STEP, atol=1e-12)
     np.testing.assert_allclose(motion.predict(0.4), STEP @ part_of(STEP, 3.0), atol=1e-12)
     half = part_of(STEP, 0.5)
     np.testing.assert_allclose((half @ half)[:3, :3], STEP[:3, :3], atol=1e-12)
+    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1).drifted(0.2).drifted(0.3)
+    np.testing.assert_allclose(motion.T_world_camera, np.linalg.matrix_power(STEP, 3), atol=1e-12)
+    np.testing.assert_allclose(motion.predict(0.4), np.linalg.matrix_power(STEP, 4), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -220,9 +217,3 @@ def test_with_known_times_the_velocity_goes_on():
 def test_times_that_give_no_answer_repeat_the_last_motion(after_s, time_s):
     motion = Motion(np.eye(4), 0.0).moved(STEP, after_s)
     np.testing.assert_allclose(motion.predict(time_s), STEP @ STEP, atol=1e-12)
-
-
-def test_frames_that_are_not_seen_keep_the_velocity():
-    motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1).drifted(0.2).drifted(0.3)
-    np.testing.assert_allclose(motion.T_world_camera, np.linalg.matrix_power(STEP, 3), atol=1e-12)
-    np.testing.assert_allclose(motion.predict(0.4), np.linalg.matrix_power(STEP, 4), atol=1e-12)

@@ -44,10 +44,13 @@ def forward(distance_m: float) -> np.ndarray:
     return make_transform(np.eye(3), np.array([0.0, 0.0, distance_m]))
 
 
-def test_a_camera_that_stands_still_stays(see):
+def test_a_still_camera_stays_and_a_blank_wall_gives_no_motion(see, blind):
     poses = path_of(register([see(np.eye(4))] * 4))
     # Equal images: what is left is the optimiser's rounding.
     np.testing.assert_allclose(poses, np.tile(np.eye(4), (4, 1, 1)), atol=1e-4)
+    results = register([blind(128, n) for n in range(3)])
+    assert [result.health.ok for result in results[:2]] == [True, False]
+    np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
 
 
 @pytest.mark.parametrize("step", [forward(0.5), yaw(0.02), forward(-0.3), forward(0.4) @ yaw(0.01)])
@@ -69,24 +72,6 @@ def test_features_stay_spread_over_the_image_where_a_drive_backwards_gathers_the
     assert not in_crowd(newest, street[0].pair.left.shape).any()
 
 
-def test_motion_begins_at_the_identity_wherever_the_drive_begins(street, results):
-    late, whole = path_of(register(street[4:8])), path_of(results)
-    np.testing.assert_array_equal(late[0], np.eye(4))
-    relative = invert(whole[4]) @ whole[7]
-    # Other frames were in the window; both are good to about 1 % of 1.5 m.
-    assert np.linalg.norm(relative[:3, 3] - late[3][:3, 3]) < 0.03
-
-
-def test_two_runs_are_equal_to_the_bit(street, results):
-    np.testing.assert_array_equal(path_of(register(street)), path_of(results))
-
-
-def test_a_blank_wall_gives_no_motion_and_no_exception(blind):
-    results = register([blind(128, n) for n in range(3)])
-    assert [result.health.ok for result in results[:2]] == [True, False]
-    np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
-
-
 def test_an_object_that_moves_does_not_move_the_camera(see):
     """A third of the image shows the street from elsewhere, as on the side of a passing bus."""
     frames, third = [], np.s_[:, :133]
@@ -97,10 +82,6 @@ def test_an_object_that_moves_does_not_move_the_camera(see):
         pair = replace(below.pair, left=grey, right=grey)
         frames.append(OdometryFrame(pair, replace(below.disparity, values=values)))
     assert off_m(register(frames)[-1], forward(1.6)) < 0.05
-
-
-def _without_disparity(street: Street, blind: See) -> list[OdometryFrame]:
-    return [*street[:6], OdometryFrame(street[6].pair, blind().disparity), *street[7:]]
 
 
 def _jump(street: Street, _: See) -> list[OdometryFrame]:
@@ -121,14 +102,10 @@ def _exposed(gain: float) -> Callable[[Street, See], list[OdometryFrame]]:
     ("spoil", "lost", "most_m"),
     [
         # The motion is constant, so the extrapolated step costs hardly more than a seen one.
-        (lambda street, blind: [*street[:6], blind(index=6), *street[7:]], [6], 0.1),
+        (lambda s, b: [*s[:6], b(index=6), *s[7:]], [6], 0.1),
         # Measured across the gap: 2 m in one step, by patches that grew meanwhile.
-        (
-            lambda street, blind: [*street[:5], *(blind(index=n) for n in (5, 6, 7)), *street[8:]],
-            [5, 6, 7],
-            0.1,
-        ),
-        (_without_disparity, [], 0.06),
+        (lambda s, b: [*s[:5], *(b(index=n) for n in (5, 6, 7)), *s[8:]], [5, 6, 7], 0.1),
+        (lambda s, b: [*s[:6], OdometryFrame(s[6].pair, b().disparity), *s[7:]], [], 0.06),
         # Some thirty features, placed to about a pixel; the last motion going on is 2 m off.
         (_jump, [], 0.2),
         (_exposed(0.5), [], 0.06),
@@ -199,20 +176,14 @@ def led_by(frames: list[OdometryFrame], prior: Trajectory | None) -> list[Odomet
     return [odometry.register(frame) for frame in frames]
 
 
-def test_motions_do_not_depend_on_the_world_of_the_path():
+def test_motions_of_a_path_are_those_of_the_camera_in_any_world_rate_and_axes():
     prior = MotionPrior(path(steps(5)), PriorSettings())
     # Positions of 500 m have 1e-13 of them as rounding.
     np.testing.assert_allclose(prior.motion(0.1, 0.2), STEP, atol=1e-9)
-
-
-def test_between_poses_the_path_is_interpolated():
     coarse = MotionPrior(path(steps(9)[::4], interval_s=0.4), PriorSettings())
     found = coarse.motion(0.1, 0.2)
     # A chord of an arc of 0.04 rad and 2 m: 2 m · 0.04 / 8 to the side at most.
     np.testing.assert_allclose(found, STEP, atol=0.01)
-
-
-def test_body_axes_are_turned_into_those_of_the_camera():
     body = np.stack([T @ CAMERA_FROM_BODY for T in steps(4)])
     prior = MotionPrior(path(body), PriorSettings(axes="body"))
     np.testing.assert_allclose(prior.motion(0.0, 0.1), STEP, atol=1e-9)
@@ -305,13 +276,10 @@ def test_a_body_near_the_camera_and_a_scale_two_per_cent_off_are_recognised(fram
     assert found.axes == "body"
 
 
-def test_a_path_of_other_axes_is_refused(frames):
+def test_a_path_of_other_axes_is_refused_and_without_motion_they_stay_open(frames, see):
     backwards = make_transform(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     with pytest.raises(RegistrationError, match=r"does not fit what the cameras see.*body"):
         find_axes(prior(backwards), iter(frames), PriorSettings())
-
-
-def test_without_motion_the_axes_stay_open(see):
     still = [see(np.eye(4), n) for n in range(4)]
     assert find_axes(prior(np.eye(4), np.eye(4)), iter(still), PriorSettings()) is None
 

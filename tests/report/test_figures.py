@@ -1,6 +1,7 @@
 """What figures show: their colours, lines, bars, limits and words."""
 
 import math
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -53,7 +54,7 @@ def colour(scale: str, place: int) -> np.ndarray:
     return colormaps[scale](place, bytes=True)[:3]
 
 
-def test_colours_of_disparities_are_those_of_the_scale_and_near_is_red():
+def test_colours_of_disparities_and_errors_are_those_of_the_scale_and_near_is_red():
     values = np.array([[0.0, 10.0, np.nan, -5.0, 99.0]], dtype=np.float32)
     far, near, missing, below, above = style.colour_disparity(values, (0.0, 10.0))[0]
     assert (far == below).all()
@@ -63,20 +64,14 @@ def test_colours_of_disparities_are_those_of_the_scale_and_near_is_red():
     far, near = style.colour_disparity(np.array([[20.0, 85.0]]), (0.0, 100.0))[0].astype(int)
     assert far[2] > far[0]
     assert near[0] > near[2]
-
-
-def test_range_ignores_what_is_not_finite_and_is_never_empty():
-    assert style.value_range(np.array([np.nan, np.inf])) == (0.0, 1.0)
-    assert style.value_range(np.array([4.0, 4.0, np.nan])) == (4.0, 5.0)
-    assert style.value_range(np.arange(101.0)) == pytest.approx((1.0, 99.0))
-
-
-def test_errors_are_coloured_by_size_up_to_the_limit_and_no_confidence_as_missing():
     wrong, other, missing, far = style.colour_error(np.array([[2.0, -2.0, np.nan, 9.0]]), 4.0)[0]
     nothing, sure = style.colour_confidence(np.array([[0.0, 1.0]], dtype=np.float32))[0]
     np.testing.assert_array_equal(wrong, other)
     np.testing.assert_array_equal([missing, nothing], [style.MISSING] * 2)
     np.testing.assert_array_equal([far, sure], [colour("RdYlBu_r", 255), colour("viridis", 255)])
+    assert style.value_range(np.array([np.nan, np.inf])) == (0.0, 1.0)
+    assert style.value_range(np.array([4.0, 4.0, np.nan])) == (4.0, 5.0)
+    assert style.value_range(np.arange(101.0)) == pytest.approx((1.0, 99.0))
 
 
 def test_each_reason_has_a_colour_and_a_label_of_its_own():
@@ -89,14 +84,11 @@ def test_each_reason_has_a_colour_and_a_label_of_its_own():
         style.colour_reasons(np.array([[len(Reason)]], dtype=np.uint8))
 
 
-def test_grid_is_drawn_with_its_largest_y_on_top():
+def test_a_grid_is_drawn_with_its_largest_y_on_top_in_cells_large_enough_to_be_seen():
     grid = OccupancyGrid(np.array([[0, 100], [-1, -1]], dtype=np.int8), 1.0, (0.0, 0.0))
     picture = style.colour_grid(grid)
     np.testing.assert_array_equal(picture[0], [style.GRID_UNKNOWN] * 2)
     np.testing.assert_array_equal(picture[1], [style.GRID_FREE, style.GRID_OCCUPIED])
-
-
-def test_each_cell_of_a_small_grid_is_large_enough_to_be_seen():
     cells = np.array([[FREE, OCCUPIED], [OCCUPIED, FREE]], dtype=np.int8)
     grid, seen = OccupancyGrid(cells, 0.2, (0.0, 0.0)), np.array([[True, True], [True, False]])
     camera = RectifiedCamera(100.0, 49.5, 49.5, 49.5, 0.5, 100, 100)
@@ -129,16 +121,6 @@ def test_a_figure_shows_its_picture(pair, disparity):
     assert right[2] > right[0] + 60  # near: red (OpenCV decodes to BGR)
     assert [pair_page.is_wide((10, width, 3)) for width in (19, 20)] == [False, True]
     assert [*disparity.reason_shares.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
-
-
-def test_depth_marks_are_round_inside_the_range_and_apart():
-    limits = (math.log(3.3), math.log(80.0))
-    marks = pair_page.depth_marks(3.3, 80.0, math.log, limits)
-    assert {5.0, 10.0, 20.0, 50.0} <= set(marks)
-    assert 3.3 <= min(marks) < max(marks) <= 80.0
-    # Room for a label.
-    assert (np.diff(np.log(marks)) / (limits[1] - limits[0])).min() >= 0.1
-    assert len(marks) >= 7
 
 
 @pytest.mark.parametrize("frames", [0, 1, 3])
@@ -188,14 +170,6 @@ def test_a_thinned_grid_keeps_its_obstacles_and_its_place():
     assert figures.thin_grid(small, 4) is small
 
 
-def test_a_grid_is_cropped_to_its_known_cells_and_a_margin():
-    cells = np.full((60, 50), UNKNOWN, np.int8)
-    cells[20, 30] = cells[25, 33] = FREE
-    cropped = figures._crop_to_known(OccupancyGrid(cells, 0.5, (1.0, 2.0)))
-    assert cropped.cells.shape == (26, 24)
-    assert cropped.origin_m == (1.0 + 20 * 0.5, 2.0 + 10 * 0.5)
-
-
 @pytest.fixture
 def drawn(monkeypatch):
     """The figures that are drawn; none becomes a PNG."""
@@ -214,17 +188,13 @@ def test_path_is_drawn_with_truth_drift_and_frames_that_are_not_trusted_or_witho
     assert [[name for name in line if name[0] != "_"] for line in names] == [given, ["estimate"]]
 
 
-def legend(figure: Figure) -> list[str]:
-    (found,) = figure.legends
-    return [text.get_text() for text in found.get_texts()]
-
-
 def test_the_effect_of_the_patch_size_has_a_line_per_method(drawn):
     tried = [{"patch_px": px, "bad_percent": None, "valid_percent": 90.0} for px in (5, 9)]
     tried = [{**one, "avgerr_px": one["patch_px"] / 10} for one in tried]
     paper_page.patches_figure({CORRECTED: tried, AS_PRINTED: tried, ABSOLUTE: tried})
     wrong, error, valid = drawn[0].axes
-    assert legend(drawn[0]) == [TITLES[name] for name in (CORRECTED, AS_PRINTED, ABSOLUTE)]
+    names = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert names == [TITLES[name] for name in (CORRECTED, AS_PRINTED, ABSOLUTE)]
     assert [len(line.get_xdata()) for line in wrong.lines] == [0, 0, 0]
     assert wrong.texts[0].get_text() == "no truth to compare with"
     np.testing.assert_array_equal(error.lines[1].get_xydata(), [[5, 0.5], [9, 0.9]])
@@ -362,19 +332,9 @@ def test_lines_of_an_audit_say_what_is_not_known():
         "rig": "baseline 54 cm, f 700 px (80 deg wide), moving at 9.5 m/s",
         "depth error": "3.1 cm at 10 m, 4.2 mm at 30 m, 3 m at 90 m",
     }
-    off = {"mean": 0.5, "sigma": 0.1, "rms": 0.75}
     turn = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
-    none = {"mean": None, "sigma": None}
-    motion = {"disparity_px": off, "depth_percent": {"10": off, "30": none}, **turn}
-    summary |= {"rig_by_motion": motion, "mended": {**turn, "files": ["new.yaml"]}}
-    lines = audit_page.audit_lines(summary | {"lag_frames": 2})
-    turned = "rotated by +0.100 deg pitch, -0.200 deg yaw, +0.000 deg roll"
-    assert lines["time"] == "right camera +2 frames late"
-    assert "disparities +0.50 ± 0.20 px off, 0.75 px rms" in lines["by its motion"]
-    assert "(depth +0.5 ± 0.2 % at 10 m, infinite at 30 m)" in lines["by its motion"]
-    assert turned in lines["by its motion"]
-    assert lines["mended"].startswith("new.yaml")
-    assert turned in lines["mended"]
+    lines = audit_page.audit_lines(summary | {"mended": {**turn, "files": ["new.yaml"]}})
+    assert re.match(r"new.yaml.* \+0.100 deg pitch, -0.200 deg yaw", lines["mended"])
 
 
 @pytest.mark.parametrize(("off_px", "limit"), [(-2.0, 2.0), (0.01, 0.1), (math.nan, 0.1)])

@@ -43,7 +43,6 @@ def summary(error: float | None = 3.25, *, depth: bool = True) -> dict[str, Any]
 
 
 def tables(found: dict[str, Any], form: Callable[[Table], str] = Table.text) -> dict[str, list]:
-    """The lines of each table, by its title."""
     parts = join(map(form, middlebury_tables(found))).strip("\n").split("\n\n")
     return {
         title.lstrip("#% ").partition(" (bad")[0]: lines
@@ -73,7 +72,7 @@ def test_csv_has_every_scene_mask_and_filling_and_the_confidence_where_it_is_cou
     assert counted == 3 * [("sad", "all", "sparse")]
 
 
-def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell():
+def test_what_is_not_known_is_a_dash_and_means_over_some_scenes_say_so():
     found = tables(summary())
     rows = found["Confidence, weighted mean, all, sparse"]
     assert rows[1].split() == ["sad", "0.125", "0.125", "0.125", "0.125"]
@@ -82,9 +81,14 @@ def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell():
     given = summary(None, depth=False)
     assert "–" in tables(given)["Weighted mean, nonocc, dense"][1]
     assert csv_rows(given)[0]["avgerr"] == csv_rows(given)[0]["depth_mean_m"] == ""
+    given = summary() | {"mean_over": ["Piano"]}
+    del given["matchers"]["opencv-bm"]["scenes"]["Teddy"]
+    found = tables(given)
+    assert "Weighted mean of 1 of 2 scenes, nonocc, dense" in found
+    assert found["seconds of each scene, matching alone"][2].split() == ["Teddy", "0.500", "–"]
 
 
-def test_the_best_of_several_is_bold_in_latex():
+def test_the_best_of_several_is_bold_in_latex_whose_signs_are_escaped():
     given = summary()
     given["matchers"]["sad"]["weighted"]["seconds"] = 0.25
     better = masked(2.5, depth=True)
@@ -99,20 +103,9 @@ def test_the_best_of_several_is_bold_in_latex():
     errors = found["avgerr (px) of each scene, nonocc, dense"]
     assert errors[5] == r"Teddy & 3.25 & \textbf{2.50} \\"
     assert "textbf" not in "".join(found["Confidence, weighted mean, all, sparse"])
-
-
-def test_signs_of_latex_are_escaped():
     table = Table("t", ("my_method", "50 %"), [("a&b–c", "{x}~^#$\\")]).latex()
     assert r"my\_method & 50 \% \\" in table
     assert r"a\&b--c & \{x\}\textasciitilde{}\textasciicircum{}\#\$\textbackslash{} \\" in table
-
-
-def test_means_over_some_of_the_scenes_say_so():
-    given = summary() | {"mean_over": ["Piano"]}
-    del given["matchers"]["opencv-bm"]["scenes"]["Teddy"]
-    found = tables(given)
-    assert "Weighted mean of 1 of 2 scenes, nonocc, dense" in found
-    assert found["seconds of each scene, matching alone"][2].split() == ["Teddy", "0.500", "–"]
 
 
 DONE = Outcome("succeeded", seconds=10.0, worker="host", tries=1)

@@ -1,6 +1,5 @@
 """What overlaps gives the same results in the same order; a memory limit is kept."""
 
-import platform
 import subprocess
 import sys
 import threading
@@ -142,32 +141,13 @@ def test_no_more_threads_are_used_than_there_are_cores():
 
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
-PRINT_PEAK = "from recon.run.machine import peak_memory_mb; print(peak_memory_mb())"
-FREE_AND_RETURN = """
-import resource
-from pathlib import Path
-from recon.run.machine import return_free_memory
-
-def resident_bytes():
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-
-blocks = [b"1" * 60_000 for _ in range(2000)]  # smaller than what malloc maps on its own
-last = blocks[-1]  # stays behind them, so that they are a gap
-blocks.clear()
-freed = resident_bytes()
-return_free_memory()
-print(freed - resident_bytes())
-"""
-
-
-def printed_by(code: str) -> float:
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return float(done.stdout)
 
 
 def test_the_peak_is_that_of_the_process_alone_and_stays():
     ballast = np.ones(100_000_000)  # 800 MB
-    peak_mb, below_mb = peak_memory_mb(), printed_by(PRINT_PEAK)
+    code = "from recon.run.machine import peak_memory_mb; print(peak_memory_mb())"
+    below_mb = float(subprocess.check_output([sys.executable, "-c", code], text=True))
+    peak_mb = peak_memory_mb()
     assert peak_mb > ballast.nbytes / 1e6
     assert 10 < below_mb < 700
     del ballast
@@ -175,20 +155,12 @@ def test_the_peak_is_that_of_the_process_alone_and_stays():
     assert peak_memory_mb() > 0.99 * peak_mb
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="malloc_trim is glibc's")
-def test_what_was_freed_before_something_that_stays_is_returned():
-    assert printed_by(FREE_AND_RETURN) > 100_000_000
-
-
-def test_a_size_is_read_in_its_unit():
+def test_a_size_is_read_in_its_unit_and_what_takes_more_than_the_limit_is_one_line(monkeypatch):
     sizes_mb = {"2G": 2000, "1.5 GB": 1500, "1500M": 1500, "800mb": 800, "640": 640}
     assert {text: parse_size_mb(text) for text in sizes_mb} == sizes_mb
     for text in ("", "2T", "-1G", "G", "0", "1e3M", "two"):
         with pytest.raises(SettingsError, match="cannot read this size"):
             parse_size_mb(text)
-
-
-def test_what_takes_more_than_the_limit_is_one_line(monkeypatch):
     free, limited = MemorySettings(), MemorySettings(limit_mb=500)
     assert (free.submap_bytes, free.tile_bytes) == (None, None)
     assert 0 < (limited.submap_bytes or 0) < (limited.tile_bytes or 0) < limited.cache_bytes < 1e8

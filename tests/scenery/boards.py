@@ -63,7 +63,6 @@ def board_rig(
 def place_boards(
     rig: StereoCalibration, board: CalibrationBoard, count: int, seed: int = 0
 ) -> list[BoardView]:
-    """Board poses that together cover both images, at various tilts and distances."""
     rng = np.random.default_rng(seed)
     tried = (_try_place(rig, board, rng) for _ in range(400 * count))
     return list(islice((view for view in tried if view is not None), count))
@@ -135,7 +134,6 @@ def render_views(
 
 
 def _texture(board: CalibrationBoard) -> Float64:
-    """Texture of the board with a margin of one square on each side."""
     columns, rows = board.squares
     texture = np.full(((rows + 2) * _TEXELS, (columns + 2) * _TEXELS), _WHITE)
     texels = np.rint((dark_rectangles(board) / board.square_m + 2) * _TEXELS).astype(int)

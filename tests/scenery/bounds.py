@@ -9,8 +9,6 @@ from recon.core.settings import Settings
 
 @dataclass(frozen=True)
 class Number:
-    """A setting that is a number, or several."""
-
     name: str
     low: float | None  # None = no bound
     high: float | None

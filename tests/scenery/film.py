@@ -45,6 +45,5 @@ class Film(StereoSource):
 
 
 def film(scene: StreetScene) -> Film:
-    """Render a drive."""
     source = SyntheticSource(scene)
     return Film(list(source), source.calibration, source.trajectory.T_world_camera)

@@ -65,13 +65,11 @@ def test_sigma_grows_with_the_square_of_depth_and_is_its_spread_under_noise():
     values = np.full(SHAPE, 6.0)
     values[:, 32:] = 1.0
     cloud = back_project(as_disparity(values, sigma_px=0.25), make_pair(), ALL)
-    assert cloud.sigma_m is not None
     # f·b / (d + doffs) = 20 / (6 + 4)
     assert sorted(set(cloud.xyz[:, 2].tolist())) == [2, 4]
     np.testing.assert_allclose(cloud.sigma_m, cloud.xyz[:, 2] ** 2 * 0.25 / FB, rtol=1e-5)
     noisy = 16.0 + 0.1 * np.random.default_rng(3).standard_normal(SHAPE)
     cloud = back_project(as_disparity(noisy, sigma_px=0.1), make_pair(), ALL)
-    assert cloud.sigma_m is not None
     # 2560 samples give the standard deviation within 1.4 %; the first order adds less.
     assert np.std(cloud.xyz[:, 2]) == pytest.approx(float(np.mean(cloud.sigma_m)), rel=0.05)
 
@@ -92,7 +90,15 @@ def test_range_sigma_and_stride_decide_what_is_kept():
     np.testing.assert_array_equal(kept(stride=3), kept()[raster])
 
 
-def test_points_beyond_infinity_or_without_a_source_are_not_made():
+def test_points_carry_colours_and_those_beyond_infinity_or_without_source_are_not_made():
+    values = EMPTY.copy()
+    values[7, 11] = 6.0
+    grey, coloured = make_pair(), make_pair(colour=True)
+    for pair, colour in ((grey, [grey.left[7, 11]] * 3), (coloured, coloured.left_rgb[7, 11])):
+        cloud = back_project(as_disparity(values), pair, ALL)
+        np.testing.assert_array_equal(cloud.rgb, [colour])
+        assert cloud.normals[0, 2] < -0.99  # that of a lone pixel
+    assert back_project(as_disparity(values), grey, ALL, normals=False).normals is None
     values = np.full(SHAPE, -CAMERA.doffs_px)
     values[:, :10] = -CAMERA.doffs_px - 3
     values[:, 60:] = 6.0
@@ -104,19 +110,6 @@ def test_points_beyond_infinity_or_without_a_source_are_not_made():
     assert len(back_project(as_disparity(EMPTY), make_pair(), ALL)) == 0
     with pytest.raises(ShapeError, match="differ in size"):
         back_project(as_disparity(np.full((40, 63), 6.0)), make_pair(), ALL)
-
-
-def test_points_carry_the_colours_of_their_pixels():
-    values = EMPTY.copy()
-    values[7, 11] = 6.0
-    grey, coloured = make_pair(), make_pair(colour=True)
-    assert coloured.left_rgb is not None
-    for pair, colour in ((grey, [grey.left[7, 11]] * 3), (coloured, coloured.left_rgb[7, 11])):
-        cloud = back_project(as_disparity(values), pair, ALL)
-        np.testing.assert_array_equal(cloud.rgb, [colour])
-        assert cloud.normals is not None
-        assert cloud.normals[0, 2] < -0.99  # that of a lone pixel
-    assert back_project(as_disparity(values), grey, ALL, normals=False).normals is None
 
 
 @pytest.mark.parametrize(
@@ -131,7 +124,6 @@ def test_normals_of_a_plane_are_exact_and_face_the_camera(normal, distance_m):
     values[values + CAMERA.doffs_px < 0.5] = np.nan
     values[::5, ::7] = np.nan
     cloud = back_project(as_disparity(values), make_pair(), ALL)
-    assert cloud.normals is not None
     assert (np.einsum("ij,ij->i", cloud.normals, cloud.xyz) < 0).all()
     # Single precision sums over a window of 49 pixels.
     np.testing.assert_allclose(cloud.normals, np.tile(-n, (len(cloud), 1)), atol=2e-3)
@@ -253,27 +245,6 @@ def frozen(xyz: np.ndarray) -> np.ndarray:
 
 
 CLOUD = frozen(np.random.default_rng(5).random((400, 3)))
-
-
-def test_nearest_is_what_a_full_search_finds_and_a_point_needs_others_around_it():
-    query, reference = CLOUD[:50], CLOUD[50:]
-    index, distance = open3d_clouds.nearest(query, reference, 3)
-    full = np.linalg.norm(query[:, None] - reference[None], axis=2)
-    np.testing.assert_array_equal(index, np.argsort(full, axis=1)[:, :3])
-    np.testing.assert_allclose(distance, np.sort(full, axis=1)[:, :3], atol=1e-5)
-    line = frozen(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]]))
-    for others, kept in ((1, [True, True, True, False]), (2, [False, True, False, False])):
-        assert open3d_clouds.radius_inliers(line, others, 1.5).tolist() == kept
-
-
-def test_normals_of_a_sphere_agree_with_their_neighbours():
-    directions = np.random.default_rng(2).standard_normal((600, 3))
-    xyz = frozen(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-    normals = open3d_clouds.estimate_normals(xyz, 15)
-    agreed = open3d_clouds.agree_normals(xyz, normals, 15)
-    outwards = np.einsum("ij,ij->i", agreed, xyz)
-    assert (np.abs(outwards) > 0.9).all()
-    assert len(set(np.sign(outwards))) == 1
 
 
 @pytest.mark.parametrize(

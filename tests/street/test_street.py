@@ -14,24 +14,11 @@ from recon.core.geometry import se3
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import OCCUPIED
 from recon.core.values.camera import project, unproject
-from recon.street.materials import ROAD_HALF_M, both, stripe, stripes, tile_joints, tile_tone
+from recon.street import shapes
+from recon.street.materials import ROAD_HALF_M, both, stripe, stripes, tile_joints
 from recon.street.path import LANE_M, R_STREET_LEVEL, camera_poses, centre_line
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
-from recon.street.shapes import (
-    Material,
-    Paint,
-    boxes,
-    bumpy_ball,
-    cylinder,
-    disc,
-    extrusion,
-    frustum,
-    icosphere,
-    merge,
-    move,
-    quads,
-)
 from recon.street.street import StreetWorld, build_street, rig
 from recon.street.truth import true_occupancy, true_surface
 
@@ -48,11 +35,11 @@ def box_world():
     """A level road, a wall 20 m ahead, a box of 2 × 2 × 1.8 m whose front is 8 m ahead."""
     size = {"width_px": 200, "height_px": 100, "focal_px": 100.0, "baseline_m": 0.5}
     settings = StreetScene(frames=1, noise_dn=0.0, **size)
-    grey = Paint(Material.PLAIN, (0.5, 0.5, 0.5), 1)
-    soup = merge([
-        quads([-5, -50, 0], [100, 0, 0], [0, 100, 0], grey),
-        quads([20, -50, 0], [0, 100, 0], [0, 0, 30], grey),
-        boxes([8, -1, 0.01], [10, 1, 1.8], grey),
+    grey = shapes.Paint(shapes.Material.PLAIN, (0.5, 0.5, 0.5), 1)
+    soup = shapes.merge([
+        shapes.quads([-5, -50, 0], [100, 0, 0], [0, 100, 0], grey),
+        shapes.quads([20, -50, 0], [0, 100, 0], [0, 0, 30], grey),
+        shapes.boxes([8, -1, 0.01], [10, 1, 1.8], grey),
     ])  # fmt: skip
     pose = se3.make_transform(R_STREET_LEVEL, np.array([0.0, 0.0, 1.5]))
     return StreetWorld(settings, soup, rig(settings), pose[None], np.array([0.0, 0.0, 1.0]))
@@ -134,7 +121,7 @@ def test_depth_and_occlusion_of_the_box_world_are_those_on_paper(box_world):
     assert row[box].all()
 
 
-def test_the_right_view_warped_by_the_truth_is_the_left_view(frame):
+def test_the_other_view_and_the_next_frame_show_the_same_points(frame, street):
     d, keep = frame.truth.values, frame.truth.nonocc.copy()
     v, u = np.mgrid[0:120, 0:320].astype(np.float32)
     x = (u - np.nan_to_num(d)).astype(np.float32)
@@ -147,9 +134,6 @@ def test_the_right_view_warped_by_the_truth_is_the_left_view(frame):
     shifted = cv2.remap(frame.pair.right.astype(np.float32), x + 1, v, cv2.INTER_LANCZOS4)
     worse = np.abs(shifted - frame.pair.left).mean(axis=2)[keep & (x > 3) & (x < 316)]
     assert worse.mean() > 2.0 * error.mean()
-
-
-def test_points_of_one_frame_are_found_by_the_next(street):
     camera, here, there = street.world.camera, 0, 2
     poses = street.world.trajectory.T_world_camera
     xyz = _points(street.depth(here), camera)
@@ -237,7 +221,6 @@ def test_the_ground_plan_of_a_box_is_that_on_paper_and_turns_with_the_map_axes(b
     # Up to 5.5 m rows of pixels meet the road less than a cell apart: Z² / (f·h) = 0.2 m.
     assert truth.seen[(x > 3) & (x < 5.5) & (np.abs(y) < 0.9)].all()
     assert not truth.seen[(x > 10.5) & (x < 14) & (np.abs(y) < 0.5)].any()
-    camera = StreetCamera(box_world)
     turn = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
     plain = true_occupancy(camera, range_m=15.0)
     turned = true_occupancy(camera, range_m=15.0, T_map_world=turn @ box_world.T_map_world)
@@ -325,7 +308,6 @@ def test_map_axes_look_along_the_first_view_and_nothing_stands_in_the_lane(stree
     assert forward[0] > 0.99
     assert forward[1] == pytest.approx(0.0, abs=1e-12)
     assert np.allclose(world.T_map_world[:3, 3], 0.0)
-    world = street.world
     assert len(build_street(StreetScene(seed=4, frames=4)).soup) != len(world.soup)
     centres = world.soup.vertices.mean(axis=1)
     for pose in world.T_street_camera:
@@ -430,73 +412,6 @@ def test_equal_settings_give_the_streets_and_images_that_they_gave_before(shape,
     assert [_weighed(part) for part in parts[4:]] == pytest.approx(figures[4:], abs=0.05)
 
 
-PAINT = Paint(Material.BRICK, (0.2, 0.4, 0.6), 5)
-
-
-def _area(soup) -> float:
-    v = soup.vertices
-    return 0.5 * np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]), axis=1).sum()
-
-
-def _open_edges(vertices: np.ndarray) -> int:
-    """Edges that belong to an odd number of triangles."""
-    keys = {}
-    for triangle in np.round(vertices, 9):
-        for k in range(3):
-            edge = frozenset([tuple(triangle[k] + 0.0), tuple(triangle[(k + 1) % 3] + 0.0)])
-            keys[edge] = keys.get(edge, 0) + 1
-    return sum(count % 2 for count in keys.values())
-
-
-def test_a_quad_has_its_area_and_metric_surface_coordinates():
-    soup = quads([1, 2, 3], [2, 0, 0], [0, 0, 3], PAINT, (10.0, 20.0))
-    assert _area(soup) == pytest.approx(6.0)
-    assert soup.uv.reshape(-1, 2).min(axis=0).tolist() == [10.0, 20.0]
-    assert soup.uv.reshape(-1, 2).max(axis=0).tolist() == [12.0, 23.0]
-
-
-@pytest.mark.parametrize(
-    ("soup", "area", "closed"),
-    [
-        (boxes([0, 0, 0], [1, 2, 3], PAINT), 22.0, True),
-        (cylinder((0.5, 0.5), 2.0, PAINT, 64), 2.0 * np.pi, False),
-        (disc(2.0, PAINT, 100), 4.0 * np.pi, False),
-        (extrusion([(0, 0), (2, 0), (2, 1), (0, 1)], 1.5, PAINT), 13.0, True),
-        (frustum([0, 0, 0], [1, 2, 3], (0, 0, 0), PAINT), 18.0, False),
-    ],
-    ids=["box", "cylinder", "disc", "extrusion", "frustum"],
-)
-def test_shapes_have_their_area_and_are_closed(soup, area, closed):
-    assert _area(soup) == pytest.approx(area, rel=2e-3)
-    assert (_open_edges(soup.vertices) == 0) == closed
-    assert np.allclose(np.linalg.norm(soup.normals, axis=2), 1.0)
-
-
-def test_an_icosphere_is_closed_and_round_and_a_bumpy_ball_near_its_radius():
-    for splits in (0, 1, 3):
-        triangles = icosphere(splits)
-        assert len(triangles) == 20 * 4**splits
-        assert np.allclose(np.linalg.norm(triangles, axis=2), 1.0)
-        assert _open_edges(triangles) == 0
-    ball = bumpy_ball([2.0, 2.0, 2.0], PAINT, bump=0.2, wavelength=0.4)
-    radius = np.linalg.norm(ball.vertices, axis=2)
-    assert _open_edges(ball.vertices) == 0
-    # Bumps reach 1.5 times the share that was asked for: one octave and half of another.
-    assert 2.0 * (1 - 0.3) <= radius.min() < 2.0 < radius.max() <= 2.0 * (1 + 0.3)
-    assert ((ball.normals * ball.vertices).sum(axis=2) > 0).all()
-
-
-def test_moving_keeps_paint_and_turns_normals():
-    T = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.array([5.0, 0, 0]))
-    soup = merge([boxes([0, 0, 0], [1, 1, 1], PAINT), disc(1.0, PAINT)])
-    moved = move(soup, T)
-    assert np.array_equal(moved.uv, soup.uv)
-    assert _area(moved) == pytest.approx(_area(soup))
-    back = move(moved, se3.invert(T))
-    assert np.allclose(back.vertices, soup.vertices)
-    assert np.allclose(back.normals, soup.normals)
-
-
 @given(st.floats(-20, 20), st.floats(0.2, 5), st.floats(0.05, 0.95), st.floats(0.01, 9))
 def test_stripes_are_the_mean_over_the_footprint(x, period, share, w):
     fine = x + w * ((np.arange(4000) + 0.5) / 4000 - 0.5)
@@ -514,12 +429,3 @@ def test_stripes_and_joints_cover_their_share_of_an_area():
     got = tile_joints(uv, (0.5, 0.25), 0.05, np.full((50, 2), 40.0))
     # 10 % of the columns, 20 % of the rows, the crossings once.
     assert np.allclose(got, both(np.array(0.1), np.array(0.2)), atol=0.01)
-
-
-def test_a_tile_has_one_tone_its_neighbour_another_and_tones_fade_over_many_tiles():
-    uv = np.array([[0.1, 0.1], [0.4, 0.3], [0.6, 0.1]])
-    tone = tile_tone(uv, (0.5, 0.5), np.zeros((3, 2)), np.zeros(3, int))
-    assert tone[0] == tone[1] != tone[2]
-    uv = np.random.default_rng(0).uniform(0, 100, (500, 2))
-    tone = tile_tone(uv, (0.1, 0.1), np.full((500, 2), 2.0), np.zeros(500, int))
-    assert np.abs(tone).max() < 0.01

@@ -1,8 +1,7 @@
 """Machine code is never older than its sources; the voxel hash agrees with a dictionary."""
 
+import fcntl
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numba.core.caching import FunctionCache
 
-import recon
 from recon.core.kernels import voxels
 from recon.core.kernels.cache import cache_folder, cache_parent, when_compiling
 from recon.core.kernels.compiled import kernel
 from recon.core.kernels.voxels import are_among, distinct_keys, find_keys
-from tests.scenery.patience import LONG_S
 
 compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
 
@@ -87,78 +85,24 @@ def test_a_user_without_a_home_gets_a_temporary_folder_that_nobody_else_can_writ
     assert cache_parent().stat().st_mode & 0o077 == 0
 
 
-RACE = """
-import sys, time
-from pathlib import Path
-from numba.core.caching import IndexDataCacheFile
-from race_kernel import double
-
-meeting, (mine, other, value) = Path(sys.argv[1]), sys.argv[2:]
-
-def wait(name, seconds=3):
-    until = time.monotonic() + seconds
-    while not (meeting / name).exists() and time.monotonic() < until:
-        time.sleep(0.01)
-
-load, save = IndexDataCacheFile._load_index, IndexDataCacheFile._save_data
-save_index = IndexDataCacheFile._save_index
-
-def load_and_meet(self):
-    index = load(self)
-    if compiling:
-        (meeting / f"{mine} has read").touch()
-        wait(f"{other} has read")
-    return index
-
-def save_index_in_turn(self, overloads):
-    if mine == "second":
-        wait("first has an index")
-    save_index(self, overloads)
-    (meeting / f"{mine} has an index").touch()
-
-def save_in_turn(self, name, data):
-    if mine == "first":
-        wait("second has written")
-    save(self, name, data)
-    (meeting / f"{mine} has written").touch()
-
-compiling = []
-IndexDataCacheFile._load_index, IndexDataCacheFile._save_data = load_and_meet, save_in_turn
-IndexDataCacheFile._save_index = save_index_in_turn
-from recon.core.kernels.cache import when_compiling
-(meeting / f"{mine} is ready").touch()
-wait(f"{other} is ready", 60)
-with when_compiling(compiling.append):
-    assert double(eval(value)) == 2 * eval(value)
-"""
-
-
 @compiled
-@pytest.mark.slow
-def test_processes_that_compile_different_types_do_not_mix_up_code(tmp_path):
-    """The second writes the index last and the first the code: what numba alone would mix up."""
-    (tmp_path / "race_kernel.py").write_text(
-        "from recon.core.kernels.compiled import kernel\n\n"
-        "@kernel\ndef double(x):\n    return 2 * x\n"
-    )
-    (tmp_path / "race.py").write_text(RACE)
-    environment = {
-        **os.environ,
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(recon.__file__).parents[1])]),
-    }
-    both = [
-        subprocess.Popen(
-            [sys.executable, str(tmp_path / "race.py"), str(tmp_path), *arguments], env=environment
-        )
-        for arguments in (("first", "second", "3"), ("second", "first", "2.5"))
-    ]
-    assert [process.wait(LONG_S) for process in both] == [0, 0]
-    check = "from race_kernel import double; print(double(3), double(2.5))"
-    found = subprocess.run(
-        [sys.executable, "-c", check], env=environment, capture_output=True, text=True, check=True
-    )
-    assert found.stdout.split() == ["6", "5.0"]
+def test_one_process_at_a_time_writes_the_code_of_a_kernel(monkeypatch):
+    """Two that compile for different types would mix up what they write."""
+    locked = []
+
+    def save(cache: FunctionCache, *_: object) -> None:
+        folder = os.open(cache.cache_path, os.O_RDONLY)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.close(folder)
+        locked.append(cache)
+
+    def double(value: int) -> int:
+        return 2 * value
+
+    monkeypatch.setattr(FunctionCache, "save_overload", save)
+    assert kernel(double)(np.uint16(3)) == 6
+    assert len(locked) == 1
 
 
 @compiled
@@ -174,8 +118,7 @@ def test_what_is_compiled_is_announced_unless_it_is_cached(monkeypatch):
     function = kernel(treble)
     assert numba.config.CACHE_DIR == "elsewhere"
     with when_compiling(announced.append):
-        assert function(np.int32(1)) == 3
-        assert function(np.int32(2)) == 6
+        assert (function(np.int32(1)), function(np.int32(2))) == (3, 6)
         first = tuple(announced)
         assert kernel(treble)(np.int32(3)) == 9
     kernel(treble)(np.complex64(1))
@@ -183,9 +126,7 @@ def test_what_is_compiled_is_announced_unless_it_is_cached(monkeypatch):
     assert tuple(announced) == first
 
 
-def sum_points_reference(
-    frames: list[tuple[np.ndarray, ...]], edge: float
-) -> dict[tuple[int, ...], dict[str, Any]]:
+def sum_points_reference(frames, edge):
     """Sum frames of points (xyz, weights, values) up per voxel, in the order first seen."""
     found: dict[tuple[int, ...], dict[str, Any]] = {}
     for xyz, weights, values in frames:
@@ -235,23 +176,6 @@ def test_unpacking_inverts_packing(cells):
     assert (keys >= 0).all()
     assert keys.tolist() == [voxels.pack_key(*cell) for cell in cells]
     assert voxels.unpack_keys(keys).tolist() == [list(cell) for cell in cells]
-
-
-def test_growing_keeps_every_row_and_a_row_is_found_where_it_was_entered():
-    keys = voxels.pack_keys(np.stack(np.unravel_index(np.arange(8000), (20, 20, 20)), axis=1))
-    sums = voxels.make_sums(len(keys), 0)
-    assert voxels.reserve_sums(sums, len(keys)) is sums
-    sums.keys[:] = keys
-    sums.used[0] = len(keys)
-    sums = voxels.reserve_sums(sums, len(keys) + 1)
-    assert len(sums.table) >= 2 * len(sums.keys) >= 4 * len(keys)
-    rows = [voxels.find_or_add(sums.table, key, -7) for key in keys.tolist()]
-    assert rows == list(range(len(keys)))
-    table = voxels.make_table(10)
-    keys = voxels.pack_keys(np.array([[1, 2, 3], [-4, 0, 9]]))
-    voxels.enter_keys(table, keys)
-    assert [voxels.find(table, key) for key in keys.tolist()] == [0, 1]
-    assert voxels.find(table, voxels.pack_key(1, 2, 4)) == voxels.EMPTY
 
 
 def test_neighbouring_cells_spread_over_the_table():

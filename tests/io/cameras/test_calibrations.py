@@ -1,6 +1,7 @@
 """Calibration files: what each format keeps, what its consumers make of it, and of which images."""
 
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -69,7 +70,6 @@ def test_every_format_gives_the_rig_back_whatever_its_name(tmp_path, form, lens)
     want = rig(lens)
     WRITERS[form](tmp_path / "left_rig.yaml", want)
     have = read_calibration(tmp_path / "left_rig.yaml", 640, 480)
-    assert isinstance(have, StereoCalibration)
     # ROS tells the pose by two rotations, multiplied: rounding alone.
     np.testing.assert_allclose(have.T_right_left, want.T_right_left, atol=1e-12)
     for got, camera in ((have.left, want.left), (have.right, want.right)):
@@ -80,7 +80,7 @@ def test_every_format_gives_the_rig_back_whatever_its_name(tmp_path, form, lens)
         assert (got.model, got.width_px, got.height_px) == (camera.model, 640, 480)
 
 
-def test_our_file_is_exact_names_every_unit_and_keeps_figures_aside(tmp_path):
+def test_our_file_is_exact_names_every_unit_and_is_believed(tmp_path):
     camera = RectifiedCamera(1 / 3 + 700, 600.1, 180.7, 610.3, 0.54, 1242, 375, ndisp=96)
     write_recon_calibration(tmp_path / "c.yaml", camera)
     assert read_calibration(tmp_path / "c.yaml", camera.width_px, camera.height_px) == camera
@@ -88,6 +88,9 @@ def test_our_file_is_exact_names_every_unit_and_keeps_figures_aside(tmp_path):
     text = (tmp_path / "c.yaml").read_text()
     for word in ("fx_px:", "width_px: 640", "translation_m:", "k1: -0.3", "stereo_rms_px: 0.25"):
         assert word in text
+    cropped = replace(CAMERA, cy_px=1.0)
+    write_recon_calibration(tmp_path / "crop.yaml", cropped)
+    assert read_calibration(tmp_path / "crop.yaml", *RECTIFIED) == cropped
 
 
 @pytest.mark.parametrize("lens", ["brown", "rational"])
@@ -97,9 +100,7 @@ def test_kalibr_refuses_a_lens_that_it_has_no_name_for(tmp_path, lens):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_opencv_file_says_that_it_is_of_a_fisheye_and_refuses_two_models(tmp_path):
-    write_opencv_calibration(tmp_path / "f.yml", rig("fisheye"))
-    assert read_opencv_calibration(tmp_path / "f.yml").right.model == "fisheye"
+def test_an_opencv_file_refuses_two_models(tmp_path):
     mixed = StereoCalibration(rig("fisheye").left, rig("radtan").right, T_RIGHT_LEFT)
     with pytest.raises(CalibrationError, match="two lens models"):
         write_opencv_calibration(tmp_path / "mixed.yml", mixed)
@@ -146,14 +147,6 @@ def test_camera_info_files_are_those_of_left_and_right(given, names):
     assert [path.name for path in camera_info_paths(given)] == names
 
 
-def forget_right(left: Path, right: Path) -> None:
-    right.unlink()
-
-
-def calibrate_alone(left: Path, right: Path) -> None:
-    right.write_text(left.read_text())
-
-
 def swap(left: Path, right: Path) -> None:
     P = yaml.safe_load(right.read_text())["projection_matrix"]["data"]
     right.write_text(right.read_text().replace(repr(P[3]), repr(-P[3])))
@@ -162,8 +155,8 @@ def swap(left: Path, right: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (forget_right, "CameraInfo of the other camera"),
-        (calibrate_alone, r"CameraInfo has no baseline \(got P\[0, 3\] = 0.*alone.*--calib$"),
+        (lambda left, right: right.unlink(), "CameraInfo of the other camera"),
+        (shutil.copy, r"CameraInfo has no baseline \(got P\[0, 3\] = 0.*alone.*--calib$"),
         (swap, "to the left of the left.*swap left and right"),
     ],
 )
@@ -350,7 +343,6 @@ def test_a_bad_calibration_is_one_clear_line_with_the_file(tmp_path, change, err
 def test_the_published_chessboard_calibration_is_read_from_its_two_files(recon_data):
     folder = recon_data / "calibration" / "opencv_chessboard"
     read = read_calibration(folder / "intrinsics.yml", 640, 480)
-    assert isinstance(read, StereoCalibration)
     assert read.baseline_m == pytest.approx(3.343, abs=1e-3)  # squares of the board
     assert read.left.distortion.size == 14
 
@@ -386,17 +378,7 @@ def test_each_pair_of_a_kitti_rig_has_its_own_baseline_offset_and_doffs(tmp_path
     path.write_text(KITTI.replace("600 -350", "610 -350"))
     assert read_kitti_calib(path, *SIZE).doffs_px == 10
     path.write_text("calib_time: 09-Jan-2012\nS_rect_00: 1 2\n" + KITTI.replace("P", "P_rect_0"))
-    assert list_kitti_cameras(path) == {0, 1}
-    assert read_kitti_calib(path, *SIZE).baseline_m == 0.5
-
-
-@pytest.mark.real
-def test_real_grey_and_colour_baselines_are_those_of_the_rig(recon_data):
-    path = recon_data / "driven" / "kitti_raw_0013" / "calib.txt"
-    # 0.5327 m of the colour pair: neither the 0.47 m of P3 alone nor the grey pair's.
-    for cameras, baseline_m, near in (((0, 1), 0.5372, 1e-4), ((2, 3), 0.533, 1e-3)):
-        camera = read_kitti_calib(path, *SIZE, cameras=cameras)
-        assert camera.baseline_m == pytest.approx(baseline_m, abs=near)
+    assert (list_kitti_cameras(path), read_kitti_calib(path, *SIZE).baseline_m) == ({0, 1}, 0.5)
 
 
 # A calibration is used only for images of its own size; KITTI's raw files have two sizes.
@@ -435,7 +417,6 @@ def write_pair(folder: Path, size: tuple[int, int], names: tuple[str, str]) -> l
 
 def test_images_get_the_cameras_of_a_kitti_file_that_have_their_size(kitti_raw):
     rig = read_calibration(kitti_raw, *RAW)
-    assert isinstance(rig, StereoCalibration)
     assert (rig.left.matrix[0, 0], rig.right.matrix[0, 0]) == FOCAL[:2]
     assert rig.left.distortion.tolist() == [float(word) for word in RAW_LENS.split()]
     assert (rig.left.width_px, rig.left.height_px) == RAW
@@ -473,7 +454,6 @@ def test_every_way_in_rectifies_raw_kitti_images_with_their_cameras(kitti_raw, k
         rig = open_source(folder, "kitti").calibration
     else:
         rig = open_source(folder, kind, SourceSettings(calibration=str(kitti_raw))).calibration
-    assert isinstance(rig, StereoCalibration)
     assert (rig.left.matrix[0, 0], rig.right.matrix[0, 0]) == focal
 
 
@@ -511,9 +491,3 @@ def test_a_file_without_a_size_is_refused_if_its_centre_cannot_be_that_of_the_im
     message = r"another size .*principal point at \(70\.5, 21\.5\) of 71x22 pixels.*stores the size"
     with pytest.raises(CalibrationError, match=message):
         read_calibration(path, 71, 22)
-
-
-def test_a_stated_size_is_believed_however_far_off_the_centre_is(tmp_path):
-    cropped = replace(CAMERA, cy_px=1.0)
-    write_recon_calibration(tmp_path / "crop.yaml", cropped)
-    assert read_calibration(tmp_path / "crop.yaml", *RECTIFIED) == cropped

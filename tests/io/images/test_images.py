@@ -53,25 +53,19 @@ def test_lossless_formats_give_back_every_level(image, suffix, tmp_path_factory)
     np.testing.assert_array_equal(read_levels(path), image)
 
 
-def test_colours_are_red_green_blue_in_the_file_and_alpha_is_dropped(tmp_path):
+def test_channels_levels_and_the_limit_of_pixels_of_a_file(tmp_path):
     write_image(tmp_path / "red.ppm", np.full((2, 2, 3), (255, 0, 0), np.uint8))
     assert (tmp_path / "red.ppm").read_bytes().endswith(b"\xff\x00\x00" * 4)
     bgra = random_image(4, 5, 4)
     cv2.imwrite(str(tmp_path / "a.png"), bgra)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), bgra[:, :, 2::-1])
-
-
-def test_sixteen_bits_are_scaled_over_their_whole_range(tmp_path):
     levels = np.array([[0, 128, 129, 257, 32768, 65535]], dtype=np.uint16)
     write_image(tmp_path / "a.png", levels)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), [[0, 0, 1, 1, 128, 255]])
-
-
-def test_jpeg_is_read_close_to_what_was_written(tmp_path):
-    ramp = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (32, 1))
-    write_image(tmp_path / "a.jpg", ramp)
-    # 8 levels: a smooth ramp at OpenCV's default quality of 95.
-    assert np.abs(read_image(tmp_path / "a.jpg").astype(int) - ramp).max() <= 8
+    write_image(tmp_path / "a.png", random_image(4, 5))
+    assert read_image(tmp_path / "a.png", max_megapixels=20e-6).shape == (4, 5)
+    with pytest.raises(FormatError, match=r"too many pixels .*got 5x4"):
+        read_image(tmp_path / "a.png", max_megapixels=19e-6)
 
 
 def test_grey_in_three_equal_channels_is_grey_and_colours_are_refused(tmp_path):
@@ -96,7 +90,7 @@ def test_a_bmp_is_read_whole_or_not_at_all(tmp_path, shape):
             read_image(path)
 
 
-def test_a_flipped_bit_in_a_png_is_seen(tmp_path):
+def test_a_flipped_bit_of_a_png_and_a_cut_behind_the_preview_of_a_jpeg_are_seen(tmp_path):
     path = tmp_path / "a.png"
     write_image(path, random_image(20, 20))
     content = bytearray(path.read_bytes())
@@ -104,9 +98,6 @@ def test_a_flipped_bit_in_a_png_is_seen(tmp_path):
     path.write_bytes(bytes(content))
     with pytest.raises(FormatError, match=r"damaged \(got checksum of chunk b'IDAT' differs\)"):
         read_image(path)
-
-
-def test_a_jpeg_with_an_embedded_preview_is_still_seen_to_be_truncated(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path, random_image(40, 40))
     content, preview = path.read_bytes(), b"\xff\xd8preview\xff\xd9"
@@ -137,13 +128,6 @@ def test_a_damaged_tiff_is_reported_by_the_error_alone_and_floats_are_refused(tm
     cv2.imwrite(str(path), np.ones((3, 3), dtype=np.float32))
     with pytest.raises(FormatError, match=r"pixel type.*got float32, expected 8 or 16 bits"):
         read_image(path)
-
-
-def test_the_limit_of_pixels_is_the_last_that_is_read(tmp_path):
-    write_image(tmp_path / "a.png", random_image(4, 5))
-    assert read_image(tmp_path / "a.png", max_megapixels=20e-6).shape == (4, 5)
-    with pytest.raises(FormatError, match=r"too many pixels .*got 5x4"):
-        read_image(tmp_path / "a.png", max_megapixels=19e-6)
 
 
 @pytest.mark.parametrize(
@@ -243,8 +227,7 @@ def test_disparity_comes_back_within_half_a_level_and_nan_as_nan(tmp_path_factor
 def test_a_disparity_image_is_kittis_or_of_eight_bits_and_a_scale(tmp_path):
     write_disparity_png(tmp_path / "a.png", np.array([[NAN, 0, 1, 200.5]], dtype=np.float32))
     levels = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
-    assert levels.dtype == np.uint16
-    assert levels.tolist() == [[0, 1, 256, 51328]]
+    assert (levels.dtype, levels.tolist()) == (np.uint16, [[0, 1, 256, 51328]])
     write_image(tmp_path / "b.pgm", np.array([[0, 1, 240]], dtype=np.uint8))
     values = read_disparity_png(tmp_path / "b.pgm", scale=16)
     np.testing.assert_array_equal(values, np.array([[NAN, 1 / 16, 15]], "f4"))
@@ -274,7 +257,9 @@ def clip(tmp_path):
     return write_video(tmp_path / "a.avi", greys, "MJPG")
 
 
-def test_the_frames_of_some_numbers_are_decoded_with_their_times(clip):
+def test_frames_of_some_numbers_are_decoded_and_videos_of_too_many_pixels_refused(
+    clip, monkeypatch
+):
     opened = open_video(clip)
     assert (opened.frames, opened.width_px, opened.height_px, opened.rate_hz) == (4, 32, 16, 10)
     picked = list(opened.pick([1, 3]))
@@ -283,9 +268,6 @@ def test_the_frames_of_some_numbers_are_decoded_with_their_times(clip):
     assert picked[1][0] - picked[0][0] == pytest.approx(0.2)
     with pytest.raises(FormatError, match=r"a\.avi: .*to its end \(got 4 frames, expected 4"):
         list(opened.pick([4]))
-
-
-def test_a_video_of_too_many_pixels_is_refused(clip, monkeypatch):
     monkeypatch.setattr(video, "MAX_MEGAPIXELS", 512e-6)
     assert open_video(clip).frames == 4
     monkeypatch.setattr(video, "MAX_MEGAPIXELS", 511e-6)

@@ -1,7 +1,5 @@
 """Leaves of octrees: the reference, pieces of any size, and what is no tree."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,9 +12,7 @@ Place = tuple[int, int, int]
 Leaf = tuple[int, int, Place]  # its number, level and place
 
 
-def find_leaves_reference(
-    nodes: Iterator[tuple[int, int]], level: int = 0, place: Place = (0, 0, 0)
-) -> Iterator[Leaf]:
+def find_leaves_reference(nodes, level=0, place=(0, 0, 0)):
     """The same walk by recursion, over numbered nodes with a bit for each of their children."""
     node, children = next(nodes)
     if not children:

@@ -14,7 +14,7 @@ from recon.core.errors import FormatError, OutputError
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.io.images.image import write_image
 from recon.io.models import open3d_meshes
-from recon.io.models.mesh import MESH_SUFFIXES, read_mesh, srgb_from_linear, write_glb, write_mesh
+from recon.io.models.mesh import MESH_SUFFIXES, read_mesh, write_glb, write_mesh
 from recon.io.models.mlp import Photo, write_mlp
 from recon.io.models.ply import write_ply
 
@@ -48,16 +48,7 @@ def test_every_format_gives_triangles_and_colours_back(tmp_path, suffix, off):
     assert np.abs(again.rgb[order].astype(int) - MESH.rgb).max() <= off
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl"])
-def test_meshlab_opens_it(tmp_path, suffix):
-    write_mesh(tmp_path / f"mesh{suffix}", MESH)
-    meshes = pymeshlab.MeshSet()
-    meshes.load_new_mesh(str(tmp_path / f"mesh{suffix}"))
-    seen = triangles(meshes.current_mesh().vertex_matrix(), meshes.current_mesh().face_matrix())
-    assert seen == triangles(MESH.vertices, MESH.faces)
-
-
-def test_ply_keeps_floats_normals_and_colours_bit_by_bit(tmp_path):
+def test_ply_keeps_all_bit_by_bit_and_that_of_others_is_read(tmp_path):
     write_mesh(tmp_path / "mesh.ply", MESH)
     again = read_mesh(tmp_path / "mesh.ply")
     for name in ("vertices", "faces", "normals", "rgb"):
@@ -65,9 +56,6 @@ def test_ply_keeps_floats_normals_and_colours_bit_by_bit(tmp_path):
     assert b"property float x" in (tmp_path / "mesh.ply").read_bytes()
     write_mesh(tmp_path / "mesh.ply", TriangleMesh(MESH.vertices, MESH.faces))
     assert read_mesh(tmp_path / "mesh.ply").rgb is None
-
-
-def test_an_ascii_mesh_of_others_is_read(tmp_path):
     (tmp_path / "a.ply").write_text(
         "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 3\nproperty double x\n"
         "property double y\nproperty double z\nelement face 1\n"
@@ -88,12 +76,15 @@ def test_junk_and_missing_files_are_refused_quietly(tmp_path, suffix, capfd):
     assert capfd.readouterr().out == ""
 
 
-def test_an_unknown_suffix_and_an_empty_mesh_are_not_written(tmp_path):
+def test_an_unknown_suffix_an_empty_mesh_and_a_missing_layer_are_not_written(tmp_path):
     with pytest.raises(OutputError, match=r"expected .ply .obj .stl .glb"):
         write_mesh(tmp_path / "mesh.xyz", MESH)
     empty = TriangleMesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
     with pytest.raises(OutputError, match="no face"):
         write_mesh(tmp_path / "mesh.ply", empty)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OutputError, match="does not exist"):
+        write_mlp(tmp_path / "a.mlp", {"cloud": tmp_path / "none.ply"})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -133,12 +124,6 @@ def test_the_arrays_of_a_glb_lie_where_the_accessors_say(tmp_path):
     assert (box["min"], box["max"]) == ([0, 0, 0], [1, 2, 3])
 
 
-def test_srgb_from_linear_is_monotonic_and_keeps_the_ends():
-    curve = srgb_from_linear(np.arange(256, dtype=np.uint8))
-    assert (curve[0], curve[255]) == (0, 255)
-    assert (np.diff(curve.astype(int)) >= 0).all()
-
-
 def test_only_colours_from_images_are_unlit_and_unknown_axes_are_not_turned(tmp_path):
     for name, rgb in (("grey", None), ("coloured", MESH.rgb), ("again", MESH.rgb)):
         write_glb(tmp_path / name, TriangleMesh(MESH.vertices, MESH.faces, rgb=rgb))
@@ -161,32 +146,6 @@ def test_the_node_turns_the_mesh_upright(tmp_path, frame, up, ahead):
     assert np.linalg.det(turn) == pytest.approx(1)
 
 
-def sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """A flat sheet of 2·n² triangles."""
-    y, x = np.mgrid[: n + 1, : n + 1]
-    vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1).astype(np.float32)
-    at = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    a, b, c, d = at[:-1, :-1].ravel(), at[:-1, 1:].ravel(), at[1:, :-1].ravel(), at[1:, 1:].ravel()
-    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
-    return vertices, faces
-
-
-def test_components_are_counted_and_labelled():
-    vertices, faces = sheet(3)
-    two = np.concatenate([faces, faces[:4] + len(vertices)])
-    labels, sizes = open3d_meshes.component_labels(np.concatenate([vertices, vertices + 99]), two)
-    assert sizes[labels[0]] == 18
-    assert labels[0] not in labels[18:]
-
-
-def test_decimation_keeps_a_flat_sheet_flat_and_its_border():
-    vertices, faces = open3d_meshes.decimate(*sheet(12), 40)
-    assert len(faces) <= 40
-    np.testing.assert_allclose(vertices[:, 2], 0, atol=1e-6)
-    # Corners of a border may be cut a little where edges collapse.
-    np.testing.assert_allclose(np.ptp(vertices[:, :2], axis=0), 12, atol=0.5)
-
-
 def opened(project: Path) -> pymeshlab.MeshSet:
     meshes = pymeshlab.MeshSet()
     meshes.load_project(str(project))
@@ -201,12 +160,6 @@ def test_meshlab_opens_every_layer_after_the_folder_has_moved(tmp_path):
     shutil.move(tmp_path / "here", tmp_path / "there")
     layers = opened(tmp_path / "there" / "mesh" / "a.mlp")
     assert [(one.vertex_number(), one.face_number()) for one in layers] == [(12, 0), (4, 4)]
-
-
-def test_a_layer_that_does_not_exist_is_refused(tmp_path):
-    with pytest.raises(OutputError, match="does not exist"):
-        write_mlp(tmp_path / "a.mlp", {"cloud": tmp_path / "none.ply"})
-    assert list(tmp_path.iterdir()) == []
 
 
 # x right, y up, z towards the viewer: what is ahead has a negative z.

@@ -12,9 +12,7 @@ from recon.odometry.kernels.patches import LEAST_POWER, Placing
 PLACING = Placing(radius=4, steps=6, close=0.01, reach=3.0)
 
 
-def place_patches(
-    source: np.ndarray, target: np.ndarray, *places: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def place_patches(source, target, *places):
     """Place patches in read-only images, as all are in the program: others are compiled anew."""
     for image in (source, target):
         image.setflags(write=False)
@@ -64,10 +62,7 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 
-def place_patches_reference(
-    source: UInt8, target: UInt8, uv: Float64, warp: Float64, guess: Float64, placing: Placing
-) -> tuple[Float64, Float64]:
-    """Reference implementation of `recon.odometry.kernels.patches.place_patches`."""
+def place_patches_reference(source, target, uv, warp, guess, placing):
     place, correlation = np.full((len(uv), 2), np.nan), np.full(len(uv), np.nan)
     for n in range(len(uv)):
         wide = _cut(source, uv[n], np.eye(2), placing.radius + 1)
@@ -76,9 +71,7 @@ def place_patches_reference(
     return place, correlation
 
 
-def _place(
-    wide: Float64, target: UInt8, warp: Float64, guess: Float64, placing: Placing
-) -> tuple[Float64, float]:
+def _place(wide, target, warp, guess, placing):
     """Place one patch, given a pixel wider than it is; NaN where that fails."""
     lost = np.full(2, np.nan), float("nan")
     by_v, by_u = (np.asarray(slope)[1:-1, 1:-1] for slope in np.gradient(wide))

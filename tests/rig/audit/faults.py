@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
-from recon.core.values.arrays import Float64
 from recon.sources.source import StereoSource
 
 
@@ -40,13 +39,10 @@ def at(source: StereoSource, index: int) -> StereoPair:
 
 
 def rectified(source: StereoSource) -> RectifiedCamera:
-    assert isinstance(source.calibration, RectifiedCamera)
     return source.calibration
 
 
-def changed(
-    source: StereoSource, change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-) -> Spoiled:
+def changed(source, change):
     def take(index: int) -> StereoPair:
         pair = at(source, index)
         left, right = change(pair.left, pair.right)
@@ -66,9 +62,7 @@ def turned(source: StereoSource, pitch_deg=0.0, roll_deg=0.0, yaw_deg=0.0, enlar
     return changed(source, lambda left, right: (left, warped(right, H, size)))
 
 
-def unrectified(
-    source: StereoSource, left_rad: Float64, right_rad: Float64, pitch_deg: float = 0.0
-) -> Spoiled:
+def unrectified(source, left_rad, right_rad, pitch_deg=0.0):
     """Cameras rotated relative to their rectified orientation, and calibrated so.
 
     The right one is off its calibration by ``pitch_deg``.
@@ -91,19 +85,11 @@ def warped(image: np.ndarray, H: np.ndarray, size: tuple[int, int]) -> np.ndarra
     return np.asarray(cv2.warpPerspective(image, H, size))
 
 
-def gain(source: StereoSource, factor: float) -> Spoiled:
-    return changed(source, lambda left, right: (left, cv2.convertScaleAbs(right, alpha=factor)))
-
-
 def lag(source: StereoSource, frames: int) -> Spoiled:
     def take(index: int) -> StereoPair:
         return replace(at(source, index + frames), right=at(source, index).right)
 
     return Spoiled(rectified(source), len(source) - frames, take)
-
-
-def row_shift(source: StereoSource, rows: int) -> Spoiled:
-    return changed(source, lambda left, right: (left, np.roll(right, rows, axis=0)))
 
 
 def duplicated(source: StereoSource, every: int = 5) -> Spoiled:
@@ -117,6 +103,12 @@ def duplicated(source: StereoSource, every: int = 5) -> Spoiled:
     return Spoiled(rectified(source), len(order), take)
 
 
+def tenfold_baseline(source: StereoSource) -> Spoiled:
+    camera = rectified(source)
+    wider = replace(camera, baseline_m=10 * camera.baseline_m)
+    return Spoiled(wider, len(source), lambda index: at(source, index))
+
+
 def half_as_large(source: StereoSource) -> Spoiled:
     return changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
 
@@ -127,11 +119,7 @@ def wrong_size(source: StereoSource) -> Spoiled:
 
     def take(index: int) -> StereoPair:
         pair = half.take(index)
-        raise CalibrationError(
-            "images have another size than the calibration",
-            where=pair.name,
-            got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
-        )
+        raise CalibrationError("images have another size than the calibration", where=pair.name)
 
     return replace(half, take=take)
 
@@ -143,26 +131,22 @@ def silently_wrong_size(source: StereoSource) -> Spoiled:
     return replace(half, camera=replace(rectified(half), width_px=width, height_px=height))
 
 
-def blur(right: np.ndarray) -> np.ndarray:
-    return np.asarray(cv2.GaussianBlur(right, (0, 0), 2.0))
-
-
-def tenfold_baseline(source: StereoSource) -> Spoiled:
-    same, camera = changed(source, lambda left, right: (left, right)), rectified(source)
-    return replace(same, camera=replace(camera, baseline_m=10 * camera.baseline_m))
-
-
+Change = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+CHANGES: dict[str, tuple[str, Change]] = {
+    "swapped": ("swapped", lambda left, right: (right, left)),
+    "rows 2 px down": ("rows", lambda left, right: (left, np.roll(right, 2, axis=0))),
+    "gain of 1.4": ("gain", lambda left, right: (left, cv2.convertScaleAbs(right, alpha=1.4))),
+    "right camera blurred": ("blur", lambda left, right: (left, blurred(right))),
+    "both cameras blurred": ("blur", lambda left, right: (blurred(left), blurred(right))),
+    "right camera black": ("black", lambda left, right: (left, 0 * right)),
+}
+blurred = partial(cv2.GaussianBlur, ksize=(0, 0), sigmaX=2.0)
 FAULTS: dict[str, tuple[str, Callable[[StereoSource], Spoiled]]] = {
-    "swapped": ("swapped", lambda s: changed(s, lambda left, right: (right, left))),
+    **{name: (code, partial(changed, change=change)) for name, (code, change) in CHANGES.items()},
     "lag of three frames": ("lag", lambda s: lag(s, 3)),
-    "rows 2 px down": ("rows", lambda s: row_shift(s, 2)),
     "roll of 1 degree": ("rows", lambda s: turned(s, roll_deg=1.0)),
-    "gain of 1.4": ("gain", lambda s: gain(s, 1.4)),
     "duplicated frames": ("duplicates", duplicated),
     "baseline times ten": ("baseline", tenfold_baseline),
-    "right camera blurred": ("blur", lambda s: changed(s, lambda left, right: (left, blur(right)))),
-    "both cameras blurred": ("blur", lambda s: changed(s, lambda *both: tuple(map(blur, both)))),
-    "right camera black": ("black", lambda s: changed(s, lambda left, right: (left, 0 * right))),
     "wrong size": ("size", wrong_size),
     "wrong size untold": ("size", silently_wrong_size),
 }

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.core.values import StereoCalibration, StereoPair
+from recon.core.values import StereoPair
 from recon.io.cameras.calibration import read_calibration
 from recon.rig.audit.audit import audit_source, correct_calibration
 from recon.sources.registry import open_source
@@ -31,7 +31,6 @@ def rendered(seed: int, frames: int) -> faults.Spoiled:
 
 @pytest.fixture(scope="module")
 def street():
-    """A rendered drive without a fault, kept in memory."""
     return rendered(5, FRAMES)
 
 
@@ -77,7 +76,6 @@ def assert_aligned(spoiled: faults.Spoiled, folder: Path) -> None:
     correct_calibration(spoiled, CONFIG, before, path)
     height_px, width_px = spoiled.take(0).left.shape[:2]
     mended = read_calibration(path, width_px, height_px)
-    assert isinstance(mended, StereoCalibration)
     assert mended.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
     after = audit_source(replace(spoiled, camera=mended), CONFIG)
     assert "rows" not in {finding.code for finding in after.findings}
@@ -99,15 +97,6 @@ def test_a_rig_that_is_not_rectified_is_corrected_too(street, tmp_path):
 def longer_street():
     """A drive long enough for its motion to show the rig."""
     return rendered(3, 48)
-
-
-@pytest.mark.slow
-def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street):
-    audit = audit_source(longer_street, CONFIG)
-    assert audit.findings == ()
-    found = audit.figures["rig_by_motion"]
-    assert not audit.rig.wrong_at(10.0)
-    assert found["disparity_px"]["rms"] < 0.05
 
 
 @pytest.mark.slow
@@ -157,13 +146,22 @@ def test_a_turn_planted_in_a_real_drive_is_found(recon_data):
     assert yaw_deg[1] - yaw_deg[0] == pytest.approx(-0.06, rel=0.2)
 
 
-def test_frames_that_are_missing_are_reported_with_the_place(street, tmp_path):
+def test_frames_that_are_missing_are_reported_and_noise_is_no_frozen_camera(street, tmp_path):
     pairs = [street.take(index) for index in (0, 1, 2, 3, 7, 8, 9)]
     pairs = [replace(pair, index=k) for k, pair in enumerate(pairs)]
     grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
     source = open_source(drives.write_kitti(grey, faults.rectified(street), tmp_path))
     findings = {finding.code: finding.text for finding in audit_source(source, CONFIG).findings}
     assert "missing at 1 place, at most 0.40 s after frame 3" in findings["gaps"]
+    rng = np.random.default_rng(0)
+    scene = rng.integers(20, 200, (64, 96))
+    pairs = [
+        StereoPair(*(np.uint8(scene + rng.normal(0, 1, (2, 64, 96))).clip(0, 255)), 0.1 * k, k)
+        for k in range(8)
+    ]
+    camera = faults.RectifiedCamera(60.0, 47.5, 31.5, 47.5, 0.1, 96, 64)
+    found = codes(faults.Spoiled(camera, 8, pairs.__getitem__))
+    assert not found & {"frozen", "duplicates"}
 
 
 def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither(street):
@@ -190,15 +188,3 @@ def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither
     alone = audit_source(replace(street, count=1), CONFIG)
     assert (alone.verdict, alone.figures["frames_read"]) == ("good", 1)
     assert alone.figures["row_error_rms_px"] < 0.2
-
-
-def test_noise_is_no_frozen_camera():
-    rng = np.random.default_rng(0)
-    scene = rng.integers(20, 200, (64, 96))
-    pairs = [
-        StereoPair(*(np.uint8(scene + rng.normal(0, 1, (2, 64, 96))).clip(0, 255)), 0.1 * k, k)
-        for k in range(8)
-    ]
-    camera = faults.RectifiedCamera(60.0, 47.5, 31.5, 47.5, 0.1, 96, 64)
-    found = codes(faults.Spoiled(camera, 8, pairs.__getitem__))
-    assert not found & {"frozen", "duplicates"}

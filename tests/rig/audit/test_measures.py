@@ -10,23 +10,15 @@ from hypothesis import strategies as st
 
 from recon.core.geometry.se3 import exp_so3
 from recon.core.values import RectifiedCamera
+from recon.rig.audit import measures
 from recon.rig.audit.findings import Finding, verdict_of
-from recon.rig.audit.measures import (
-    RepeatCounter,
-    measure_gain,
-    measure_sharpness,
-    measure_speed,
-    measure_time_skew,
-)
 from recon.rig.audit.sample import FRAMES, plan_centres, plan_stretches
 from recon.stereo.rectify.row_alignment import align_rows, correct_rig, count_aligned, turn_features
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 
 
-def features(
-    rng: np.random.Generator, pitch_rad: float, roll_rad: float, wrong: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def features(rng, pitch_rad, roll_rad, wrong=0):
     """Features of a right camera that is turned from where rows correspond; some are wrong."""
     left = rng.uniform([20, 20], [620, 380], (400, 2))
     right = left - np.column_stack([rng.uniform(2, 60, 400), np.zeros(400)])
@@ -94,12 +86,14 @@ def texture(seed: int = 0) -> np.ndarray:
 
 def test_sharpness_falls_with_blur_and_not_with_brightness():
     image = texture()
-    sharp = measure_sharpness(image)
-    blurred = [measure_sharpness(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.7, 1.2, 2.0, 3.0)]
+    sharp = measures.measure_sharpness(image)
+    blurred = [
+        measures.measure_sharpness(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.7, 1.2, 2.0, 3.0)
+    ]
     assert sharp > blurred[0] > blurred[1] > blurred[2] > blurred[3]
     dark = cv2.convertScaleAbs(image, alpha=0.5)
-    assert measure_sharpness(np.asarray(dark)) == pytest.approx(sharp, abs=0.03)
-    assert measure_sharpness(np.full((64, 64), 7, np.uint8)) == 0
+    assert measures.measure_sharpness(np.asarray(dark)) == pytest.approx(sharp, abs=0.03)
+    assert measures.measure_sharpness(np.full((64, 64), 7, np.uint8)) == 0
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.4, 1.8])
@@ -108,7 +102,7 @@ def test_gain_is_measured_although_bright_surfaces_saturate(factor):
     right = cv2.convertScaleAbs(left, alpha=factor)
     rng = np.random.default_rng(0)
     uv = rng.uniform([10, 10], [390, 290], (500, 2)).astype(np.float32)
-    gains = measure_gain(np.asarray(left), np.asarray(right), uv, uv)
+    gains = measures.measure_gain(np.asarray(left), np.asarray(right), uv, uv)
     assert np.median(gains) == pytest.approx(factor, rel=0.02)
 
 
@@ -117,10 +111,10 @@ def test_a_late_camera_is_measured_by_the_rows_that_move():
     flow = rng.uniform(-12, 12, 2000)
     error = 0.4 * flow + rng.normal(0, 0.3, 2000)
     error[:150] = rng.uniform(-10, 10, 150)
-    found = measure_time_skew(error, flow)
+    found = measures.measure_time_skew(error, flow)
     assert found[0] == pytest.approx(0.4, abs=0.01)
     assert abs(found[0] - 0.4) < 5 * found[1] < 0.02
-    assert measure_time_skew(error, 0.01 * flow) is None
+    assert measures.measure_time_skew(error, 0.01 * flow) is None
 
 
 def test_speed_is_that_of_the_rig_and_scales_with_the_baseline():
@@ -134,14 +128,14 @@ def test_speed_is_that_of_the_rig_and_scales_with_the_baseline():
     left = seen(xyz, CAMERA.cx_px)
     right = seen(xyz - np.array([CAMERA.baseline_m, 0, 0]), CAMERA.cx_right_px)
     later = seen(xyz - np.array([0.1, 0.0, 1.2]), CAMERA.cx_px)
-    moved_m = measure_speed(left, right, later, CAMERA)
+    moved_m = measures.measure_speed(left, right, later, CAMERA)
     assert moved_m == pytest.approx(np.hypot(0.1, 1.2), rel=0.01)
-    assert measure_speed(left[:10], right[:10], later[:10], CAMERA) is None
+    assert measures.measure_speed(left[:10], right[:10], later[:10], CAMERA) is None
 
 
 def test_repeats_are_counted_apart_from_frozen_cameras():
     images = [texture(seed) for seed in range(8)]
-    counter = RepeatCounter()
+    counter = measures.RepeatCounter()
     for left, right in ((0, 0), (1, 0), (2, 0), (3, 0), (4, 4), (4, 4), (5, 5)):
         counter.add(images[left], images[right])
     assert (counter.steps, counter.both, counter.frozen) == (6, 1, [0, 3])

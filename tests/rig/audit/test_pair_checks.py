@@ -1,7 +1,6 @@
 """One pair: inputs that give no cloud, or one of the wrong scale, are reported."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +13,6 @@ from recon.core.errors import FormatError, MappingError, MatchingError, Settings
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.export.mesh.view import check_coverage
-from recon.report.pair_page import PairRun
 from recon.run.work import Silent
 from recon.sources.one_pair import PairInput
 
@@ -33,9 +31,7 @@ def pair():
     return StereoPair(world[:, :320], world[:, 12:332], name="left.png")
 
 
-def run(
-    pair: StereoPair, out: Path, camera: RectifiedCamera = CAMERA, command: str = "disparity"
-) -> PairRun:
+def run(pair, out, camera=CAMERA, command="disparity"):
     run_command = run_pair if command == "pair" else run_disparity
     return run_command(PairInput(pair, camera), SETTINGS, out=out)
 
@@ -119,14 +115,11 @@ def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(good_run, tmp_path):
     assert "0 -1 0 0" in project  # camera axes, turned upright
 
 
-def test_a_pair_run_that_does_not_name_its_camera_is_refused(tmp_path):
+def test_a_run_without_a_camera_and_an_unknown_format_are_refused_before_the_work(tmp_path, pair):
     (tmp_path / "run.json").write_text('{"command": "pair"}')
     (tmp_path / "summary.json").write_text('{"focal_px": null}')
     with pytest.raises(FormatError, match="does not describe its camera"):
         run_mesh(tmp_path, load_config(), out=tmp_path / "out")
-
-
-def test_an_unknown_format_is_refused_before_the_work(pair, tmp_path):
     with pytest.raises(SettingsError, match=r"--format: unknown mesh format .*fbx"):
         run_pair(PairInput(pair, CAMERA), out=tmp_path / "run", formats=("fbx",))
     assert not (tmp_path / "run").exists()

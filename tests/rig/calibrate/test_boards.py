@@ -151,16 +151,13 @@ def test_a_chessboard_for_a_charuco_board_is_reported_and_the_other_way_round():
         check_chessboard([None], shown.__getitem__, parse_board("chess:11x9:25mm"))
 
 
-def test_no_board_is_seen_in_noise():
+def test_no_board_is_seen_in_noise_and_unknown_dictionaries_are_refused():
     noise = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
     assert find_board(noise, parse_board(CHESS)) is None
     assert find_board(noise, parse_board(CHARUCO)) is None
     flat = np.full((240, 320), 90, np.uint8)
     check_chessboard([None], lambda _: flat, parse_board(CHESS))
     check_charuco(1, lambda _: flat, parse_board(CHARUCO))
-
-
-def test_an_unknown_or_small_dictionary_is_refused():
     blank = np.full((100, 100), 255, np.uint8)
     with pytest.raises(SettingsError, match=r"unknown marker dictionary.*4X4_50"):
         find_board(blank, parse_board("charuco:8x6:30mm:22mm:9x9_10"))

@@ -5,12 +5,11 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from recon.core.values import StereoCalibration
 from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
+from recon.rig.calibrate import result
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bootstrap import measure_spread
-from recon.rig.calibrate.result import describe_calibration, describe_depths, write_calibration
 from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
 from recon.rig.settings import CalibratedSettings, CalibrationSettings
@@ -27,7 +26,7 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     seen = BoardViews(tuple(views), {}, (), SIZE, 14, parse_board(CHESS))
     spread = measure_spread(fit, settings)
     config = CalibratedSettings(calibration=settings)
-    run = describe_calibration(seen, fit, spread, config)
+    run = result.describe_calibration(seen, fit, spread, config)
     found = run.summary
     assert found["baseline_squares"] == pytest.approx(rig.baseline_m / 0.025, rel=0.01)
     assert 0.05 < found["epipolar_px"] < found["epipolar_95_px"] < 0.5
@@ -42,24 +41,9 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     assert found["depth_error_cm"]["2"]["high"] == pytest.approx(100 * spread.depths[0].high_m)
     found["verdict"] = "good"
     for form in get_args(CalibrationForm):
-        files = write_calibration(tmp_path / form / "rig.yaml", run, form)
+        files = result.write_calibration(tmp_path / form / "rig.yaml", run, form)
         read = read_calibration(files[0], *SIZE)
-        assert isinstance(read, StereoCalibration)
         assert read.baseline_m == pytest.approx(fit.calibration.baseline_m)
-
-
-def test_depth_errors_are_said_with_two_digits():
-    known = {"calibration": 1.234, "low": -12.6, "high": 0.5, "matching": 33.4}
-    unknown = {"calibration": None, "low": None, "high": None, "matching": 400.0}
-    working = {"distance_m": 4.321, "calibration_share": 0.0123}
-    summary = {"working_error": working, "depth_error_cm": {"2": known, "9": unknown}}
-    assert describe_depths(summary) == {
-        "depth error at the working distance of 4.32 m": "1.2 %",
-        "depth error at 2 m": "1.2 cm, in the middle -13 to 0.5; of matching 33 cm",
-        "depth error at 9 m": "no common view; of matching 400 cm",
-    }
-    working["calibration_share"] = None
-    assert "unknown" in describe_depths(summary).values()
 
 
 CHESS = "chess:9x6:25mm"

@@ -37,14 +37,6 @@ def assert_rig(fit: StereoFit, want: StereoCalibration, tolerance: float, turn_d
     assert float(np.degrees(turn)) < turn_deg
 
 
-@pytest.mark.parametrize(("lens", "off"), [("radtan", 0.35), ("fisheye", 0.15)])
-def test_the_first_guess_of_a_focal_length_is_near(make_views, lens, off):
-    rig, views = make_views(lens, count=10)
-    guess = stereo._guess_fisheye([view.seen[0] for view in views], SIZE).cameras[0].matrix
-    assert guess[0, 0] == pytest.approx(rig.left.matrix[0, 0], rel=off)
-    assert guess[:2, 2].tolist() == [319.5, 239.5]
-
-
 @pytest.mark.parametrize("lens", LENSES)
 def test_without_noise_the_true_rig_comes_back(make_views, lens):
     rig, views = make_views(lens, sigma_px=0.0)
@@ -142,15 +134,23 @@ def test_other_moments_other_lenses_and_too_few_views_are_refused_as_such(make_v
         calibrated(make_views("fisheye", count=12)[1], radial_terms=2)
 
 
-def test_depth_of_matched_pixels_is_that_of_the_point(make_views):
+def test_depth_is_that_of_the_point_and_judged_where_matching_errs_or_the_user_works(make_views):
     rig, _ = make_views(count=1)
     pixels = np.array([[320.0, 240], [100, 100], [500, 400]])
     xyz = rays_of(rig.left, pixels) * [[2.0], [5.0], [20.0]]
     right = project_raw(rig.right, apply(rig.T_right_left, xyz))
     np.testing.assert_allclose(measure_depth(rig, pixels, right), [2, 5, 20], rtol=1e-8)
+    rig, views = make_views(count=10)
+    fit = calibrated(views)
+    own = measure_spread(fit, CalibrationSettings()).working
+    assert own.matching_m == pytest.approx(0.02 * own.depth_m)
+    depth_m = 0.02 * rig.left.matrix[0, 0] * rig.baseline_m / 0.25
+    assert own.depth_m == pytest.approx(depth_m, rel=0.01)
+    asked = measure_spread(fit, CalibrationSettings(working_m=1.5)).working
+    assert asked.depth_m == 1.5
 
 
-def test_the_spread_shrinks_with_noise_and_with_views(make_views):
+def test_the_spread_shrinks_with_noise_and_views_and_grows_with_the_square_of_depth(make_views):
     def width(count: int, sigma_px: float) -> float:
         low, high = spread_of(make_views(count=count, sigma_px=sigma_px)[1]).baseline_m
         return high - low
@@ -158,9 +158,6 @@ def test_the_spread_shrinks_with_noise_and_with_views(make_views):
     wide = width(12, 0.2)
     assert width(12, 0.1) == pytest.approx(wide / 2, rel=0.3)
     assert width(48, 0.2) < 0.7 * wide
-
-
-def test_depth_errors_grow_with_the_square_of_depth_and_are_the_same_each_time(make_views):
     _, views = make_views(count=15)
     spread, other = (spread_of(views) for _ in range(2))
     # Sums of several threads are rounded in any order.
@@ -236,14 +233,3 @@ def test_a_board_whose_corners_begin_at_the_other_end_repeats_the_view(make_view
     fit = calibrated([*views, turned], radial_terms=2)
     assert fit.repeated == ("turned",)  # and none of those that only resemble each other
     assert fit.calibration.left.distortion.size == 4
-
-
-def test_depth_is_judged_where_matching_errs_by_two_percent_or_where_the_user_works(make_views):
-    rig, views = make_views(count=10)
-    fit = calibrated(views)
-    own = measure_spread(fit, CalibrationSettings()).working
-    assert own.matching_m == pytest.approx(0.02 * own.depth_m)
-    depth_m = 0.02 * rig.left.matrix[0, 0] * rig.baseline_m / 0.25
-    assert own.depth_m == pytest.approx(depth_m, rel=0.01)
-    asked = measure_spread(fit, CalibrationSettings(working_m=1.5)).working
-    assert asked.depth_m == 1.5

@@ -11,8 +11,8 @@ from typing import ClassVar
 import pytest
 
 from recon.core.errors import ClusterError, FormatError, MissingDependencyError, SettingsError
-from recon.run.batch.cluster import BatchOptions, Cluster, _outcome, join_cluster, local_cluster
-from recon.run.batch.job import Job, Outcome, log_file
+from recon.run.batch.cluster import BatchOptions, Cluster, join_cluster, local_cluster
+from recon.run.batch.job import Job, Outcome
 from recon.run.batch.results import work_off
 from tests.run.batch.jobs import job, tries
 
@@ -21,7 +21,6 @@ distributed = pytest.importorskip("distributed")
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Two workers in threads of this process."""
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
@@ -109,19 +108,6 @@ def test_jobs_need_of_workers_what_all_of_these_declare():
     assert Client.asked == {"j0": {"threads": 2}, "j1": None, "j2": None}
 
 
-def test_a_job_whose_workers_died_is_broken_and_its_tries_count(tmp_path):
-    class Lost:
-        status = "error"
-
-        def exception(self) -> Exception:
-            return distributed.KilledWorker("a", None, 3)
-
-    begun = Outcome("broken", "its worker died", worker="w", tries=4)
-    log_file(tmp_path, "a").parent.mkdir()
-    log_file(tmp_path, "a").write_bytes(begun.line())
-    assert _outcome(Lost(), None, job("a"), tmp_path) == begun
-
-
 def test_workers_that_do_not_come_back_end_the_batch(cluster, tmp_path):
     def nobody(job: Job, folder: str) -> Outcome:
         raise distributed.scheduler.NoWorkerError(job.name, 120)
@@ -202,16 +188,13 @@ def test_what_names_no_scheduler_is_one_line(tmp_path):
         assert_not_reached(tmp_path / "scheduler.json")
 
 
-def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line():
+def test_a_scheduler_that_goes_and_dask_that_is_not_there_are_one_line(monkeypatch):
     class Gone:
         def nthreads(self) -> None:
             raise OSError("Timed out trying to connect to tcp://127.0.0.1:9 after 20 s")
 
     with pytest.raises(ClusterError, match="the scheduler is gone"):
         Cluster(Gone()).workers  # noqa: B018
-
-
-def test_without_dask_the_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     for there in (join_cluster("tcp://127.0.0.1:9"), local_cluster(1)):
         with pytest.raises(MissingDependencyError, match=r"pip install 'recon\[cluster\]'"):

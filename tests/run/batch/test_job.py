@@ -166,7 +166,6 @@ def test_the_process_of_a_job_dies_with_its_worker(tmp_path):
         stdout=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
     )
-    assert worker.stdout is not None
     pids = [int(worker.stdout.readline()) for _ in range(2)]
     os.kill(worker.pid, signal.SIGKILL)
     worker.wait()

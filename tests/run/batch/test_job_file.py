@@ -33,7 +33,7 @@ def write(folder: Path, text: str, suffix: str = "toml") -> Path:
     return path
 
 
-def test_a_job_has_all_that_it_says(tmp_path):
+def test_a_job_has_all_that_it_says_behind_what_the_batch_says(tmp_path):
     listed = read_jobs(write(tmp_path, FULL))
     assert listed.folder == str(tmp_path)
     monday, pair = listed.job
@@ -41,6 +41,13 @@ def test_a_job_has_all_that_it_says(tmp_path):
     assert (monday.options, monday.set) == (["--no-mesh"], ["odometry.method=visual"])
     assert (monday.threads, monday.memory, monday.timeout_s, monday.retries) == (2, "4G", 60, 0)
     assert (pair.source, pair.options, pair.timeout_s) == (["left.png", "right.png"], [], None)
+    limits = {"threads": 1, "memory": "2G", "timeout_s": 5.0, "retries": 4}
+    listed = read_jobs(write(tmp_path, FULL)).with_limits(["x=1"], ["--poses=p"], **limits)
+    monday, pair = listed.job
+    assert monday.set == ["x=1", "odometry.method=visual"]
+    assert monday.options == ["--poses=p", "--no-mesh"]
+    assert (monday.threads, monday.memory, monday.timeout_s, monday.retries) == (2, "4G", 60, 0)
+    assert (pair.threads, pair.memory, pair.timeout_s, pair.retries) == (1, "2G", 5.0, 4)
 
 
 def test_yaml_says_the_same_and_its_recursion_is_one_line(tmp_path):
@@ -49,16 +56,6 @@ def test_yaml_says_the_same_and_its_recursion_is_one_line(tmp_path):
     assert (entry.name, entry.source, entry.set) == ("monday", ["drives/monday"], ["a=1"])
     with pytest.raises(ReconError, match=r"expand to too many|not a table"):
         read_jobs(write(tmp_path, "job: &a\n- *a\n", "yaml"))
-
-
-def test_what_a_batch_says_stands_before_what_a_job_says(tmp_path):
-    limits = {"threads": 1, "memory": "2G", "timeout_s": 5.0, "retries": 4}
-    listed = read_jobs(write(tmp_path, FULL)).with_limits(["x=1"], ["--poses=p"], **limits)
-    monday, pair = listed.job
-    assert monday.set == ["x=1", "odometry.method=visual"]
-    assert monday.options == ["--poses=p", "--no-mesh"]
-    assert (monday.threads, monday.memory, monday.timeout_s, monday.retries) == (2, "4G", 60, 0)
-    assert (pair.threads, pair.memory, pair.timeout_s, pair.retries) == (1, "2G", 5.0, 4)
 
 
 def test_what_a_batch_was_begun_with_is_read_as_it_was_written(tmp_path):

@@ -59,16 +59,13 @@ def test_what_is_much_worse_than_usual_is_remarked(name, values, remarks):
     assert {n: one.remark for n, one in enumerate(results) if one.remark} == remarks
 
 
-def test_jobs_of_other_commands_or_settings_are_not_compared():
+def test_jobs_of_each_command_are_judged_by_their_first_accuracy_and_among_themselves():
     for changes in ("swept", "command"):
         results = [
             JobResult(replace(job(f"j{n}"), **{changes: {"w": w}}), DONE, {"ate_m": 10.0**w})
             for n, w in enumerate([0, 0, 0, 0, 1, 1, 1, 1])
         ]
         assert [one.remark for one in compare(results)] == [""] * 8
-
-
-def test_jobs_of_each_command_are_judged_by_their_first_accuracy():
     drive = {"trajectory.t_rel_percent": 0.5, "points": 7.0}
     pair = {"disparity.bad.2.0": 9.0, "valid_percent": 80.0, "points": 7.0}
     assert accuracies([pair, drive, {}]) == ["trajectory.t_rel_percent", "disparity.bad.2.0"]

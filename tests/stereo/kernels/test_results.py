@@ -4,7 +4,6 @@ import math
 
 import numba
 import numpy as np
-import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -16,7 +15,7 @@ from recon.stereo.kernels import refine
 from recon.stereo.kernels.finish import average_opposite, find_speckles
 from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.points import MIN_SPREAD, Maps, PointRules, Points, make_points
-from recon.stereo.kernels.refine import Refined, Rules, refine_minima, refined_in, reject
+from recon.stereo.kernels.refine import Refined, Rules, refine_minima, refined_in
 
 RULES = Rules(8, 0, 0.0, 0, left_right=1, window_pixels=25, sigma_floor_px=0.1)
 
@@ -26,15 +25,6 @@ def refine_all(minima: Minima, texture: np.ndarray, rules: Rules) -> Refined:
     refined = refined_in(np.empty(refine.REFINED_BYTES * minima.winner.size, np.uint8), *shape)
     refine_minima(minima, texture.astype(np.float32), rules, 0, len(texture), refined)
     return refined
-
-
-def one_pixel(costs: tuple[int, int, int, int]) -> Minima:
-    """A row of eight pixels whose candidate 3 won with ``costs``."""
-    return Minima(
-        winner=np.full((1, 8), 3, np.uint16),
-        costs=np.tile(np.array(costs, np.uint16)[:, None, None], (1, 1, 8)),
-        right_winner=np.full((1, 8), 3, np.uint16),
-    )
 
 
 @st.composite
@@ -110,32 +100,7 @@ def test_results_lie_within_their_bounds(case):
     assert (np.abs(refined.values[kept] - whole) <= 0.5).all()
 
 
-def test_vertex_of_two_slopes_is_found_and_confidence_is_the_odds_of_margin_and_noise():
-    assert all(getattr(refine, r.name) == r for r in set(Reason) - {Reason.SPECKLE, Reason.EDGE})
-    # Costs of |d - 3.25| · 40 + 10 at 2, 3 and 4.
-    refined = refine_all(one_pixel((20, 60, 40, 100)), np.ones((1, 8)), RULES._replace(odds=3.0))
-    value, confidence, _, reason = (part[0, 5].item() for part in refined)
-    assert (value, reason) == (3.25, Reason.VALID)
-    margin = (100 - 20) / (25 + 20)
-    # Slope 40, vertex 10, 25 pixels; the floor is 0.1.
-    sigma_px = np.hypot(0.1, 0.5 * np.pi * 10 / (40 * 5))
-    odds = 3 * (margin / sigma_px**3) ** 0.5
-    assert confidence / (1 - confidence) == pytest.approx(odds, rel=1e-5)  # float32
-
-
-def test_rejected_pixels_have_nothing_left_but_a_reason():
-    refined = refine_all(one_pixel((2, 6, 6, 20)), np.ones((1, 8)), RULES)
-    mask = np.arange(8)[None] >= 6
-    reject(mask, int(Reason.SPECKLE), refined)
-    np.testing.assert_array_equal(refined.reason == Reason.SPECKLE, mask)
-    assert np.isnan(refined.values[mask]).all()
-    assert np.isnan(refined.sigma_px[mask]).all()
-    assert (refined.confidence[mask] == 0).all()
-    assert np.isfinite(refined.values[0, 5])
-
-
 def refine_minima_reference(minima: Minima, texture: Float32, rules: Rules) -> Refined:
-    """Return all rows of `recon.stereo.kernels.refine.refine_minima`."""
     reason = _reasons(minima, texture, rules)
     keep = reason == Reason.VALID
     best, before, after, second = minima.costs.astype(np.float64)
@@ -224,7 +189,6 @@ def average_reference(values: Float32, radius: int, largest_step: float) -> Floa
 
 
 def average(values: Float32, radius: int = 3, largest_step: float = 1.0) -> Float32:
-    """All rows, in two strips."""
     averages, middle = np.full_like(values, -1.0), len(values) // 2
     for first, end in ((0, middle), (middle, len(values))):
         average_opposite(values, radius, largest_step, first, end, averages)
@@ -245,14 +209,6 @@ def test_slope_with_holes_stays_as_it_is(across, down, holes):
     # float32 values below 28: the slope's own rounding, and 24 pairs added up.
     rounding = (2 + 26) * 2.0**-24 * 28
     np.testing.assert_allclose(average(slope, largest_step=5.0), slope, rtol=0, atol=rounding)
-
-
-def test_noise_shrinks_by_the_root_of_the_number_of_pixels_and_steps_stay_sharp():
-    noise = np.random.default_rng(1).normal(30, 0.1, (60, 80)).astype(np.float32)
-    pixels = 25  # of a chessboard of 7 by 7
-    assert average(noise)[3:-3, 3:-3].std() < 1.2 * 0.1 / math.sqrt(pixels)
-    step = np.repeat(np.float32([10, 20]), 8)[None].repeat(9, axis=0)
-    np.testing.assert_array_equal(average(step), step)
 
 
 def speckles_reference(values: Float32, largest_step: float, smallest_size: int) -> Bool:
@@ -340,7 +296,6 @@ Index = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 def make_points_reference(maps: Maps, rules: PointRules) -> Points:
-    """Reference implementation of `recon.stereo.kernels.points.make_points`, all pixels at once."""
     rows, columns = np.nonzero(_candidates(maps, rules))
     with np.errstate(divide="ignore"):
         z = (rules.fb / (maps.values[rows, columns].astype(np.float64) + rules.doffs)).astype("f4")
@@ -364,7 +319,6 @@ def make_points_reference(maps: Maps, rules: PointRules) -> Points:
 
 
 def _candidates(maps: Maps, rules: PointRules) -> Bool:
-    """Return bool (H, W), pixels on the raster that have a disparity."""
     with np.errstate(invalid="ignore"):
         candidates = maps.values.astype(np.float64) + rules.doffs > 0
     if maps.usable.size:

@@ -15,12 +15,7 @@ onnx = pytest.importorskip("onnx", reason="the package onnx builds the network: 
 pytest.importorskip("onnxruntime", reason="extra onnx: pip install 'recon[onnx]'")
 
 
-def write_network(
-    path: Path,
-    inputs: list[str],
-    nodes: list[tuple[list[str], str, str]],
-    shape: tuple[int | None, ...] = (1, 1, None, None),
-) -> Path:
+def write_network(path, inputs, nodes, shape=(1, 1, None, None)):
     """A network of simple nodes, (inputs, output, operator), with inputs of a declared shape."""
     helper, number = onnx.helper, onnx.TensorProto.FLOAT
     graph = helper.make_graph(

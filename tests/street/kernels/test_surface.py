@@ -12,15 +12,11 @@ from recon.street.kernels.surface import (
     SurfaceTable,
     describe_hits,
     fractal_noise,
-    lattice_values,
     value_noise,
 )
 
 
-def describe_hits_reference(
-    table: SurfaceTable, faces: np.ndarray, origin: np.ndarray, directions: np.ndarray, pixel: float
-) -> SurfaceHits:
-    """Return what `describe_hits` does, in plain numpy and all points at once."""
+def describe_hits_reference(table, faces, origin, directions, pixel):
     plane = table.normal[faces]
     along = (directions * plane).sum(axis=1)
     depth = ((table.anchor[faces] - origin) * plane).sum(axis=1) / along
@@ -72,33 +68,7 @@ def test_kernel_equals_reference(seed, n, pixel):
         np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-7, err_msg=name)
 
 
-def _look(z: float, origin: list[float], ray: list[float], pixel: float) -> SurfaceHits:
-    """Look at the plane at depth z, with u along x and v along y."""
-    normal, anchor, to_uv = np.array([[0.0, 0, 1]]), np.array([[0.0, 0, z]]), np.eye(2, 3)[None]
-    wall = SurfaceTable(anchor, normal, to_uv, np.zeros((1, 2)), np.zeros((1, 3, 3)), normal)
-    place, rays = np.array(origin, float), np.array([ray], float)
-    return describe_hits(wall, np.zeros(1, np.int32), place, rays, pixel)
-
-
-def test_a_footprint_is_square_straight_on_and_smeared_by_the_inverse_cosine_on_a_slant():
-    hits = _look(8.0, [0, 0, 0], [0, 0, 1], 1 / 400)
-    assert np.allclose(hits.xyz, [[0.0, 0.0, 8.0]])
-    assert np.allclose([hits.width[0], *hits.spread[0]], 8.0 / 400)
-    assert np.allclose(hits.smear, 0.0)
-    assert np.allclose(hits.normal, [[0, 0, -1]])
-    assert np.allclose(_look(5.0, [0, 0, 9], [-0.1, 0, -1], 0.01).normal, [[0, 0, 1]])
-    # 60° from the normal: the footprint is twice as long as it is wide.
-    hits = _look(4.0, [0, 0, 0], [np.sqrt(3.0), 0, 1], 0.01)
-    assert np.allclose(np.hypot(hits.width, np.linalg.norm(hits.smear)), 2.0 * hits.width)
-    assert np.allclose(hits.smear[0, 1:], 0.0)
-    grazing = _look(1.0, [0, 0, 0], [1e5, 0, 1], 0.001)
-    ratio = np.linalg.norm(grazing.smear) / grazing.width[0]
-    assert MAX_STRETCH - 1.0 < ratio <= MAX_STRETCH
-    assert grazing.width[0] > 0.001
-
-
 def fractal_noise_reference(xyz, smear, width, wavelength, octaves, gain, seed) -> np.ndarray:
-    """Return what `fractal_noise` does, in plain numpy and one point at a time."""
     turn = np.array([[2.0, 3.0, 6.0], [6.0, 2.0, -3.0], [3.0, -6.0, 2.0]]) / 7.0
     amplitudes = gain ** np.arange(octaves)
     out = np.empty(len(width))
@@ -153,12 +123,3 @@ def test_noise_has_mean_zero_a_spread_that_shrinks_with_the_footprint_and_a_patt
     assert not _plain_noise(50, 1.1).any()  # wider than the coarsest blotch
     # 3000 independent pairs correlate by 0.02 (one sigma).
     assert abs(np.corrcoef(noise, _plain_noise(3000, 1e-4, 2_000_000))[0, 1]) < 0.1
-
-
-def test_lattice_values_fill_their_range_evenly():
-    index = np.arange(-5000, 5000)
-    values = lattice_values(index, index * 0, index * 0 + 4, 1)
-    assert values.min() >= -1.0
-    assert values.max() < 1.0
-    # 10 bins of 1000 ± 30 (one sigma).
-    assert (np.abs(np.histogram(values, 10, (-1, 1))[0] - 1000) < 150).all()
