@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.values import PointCloud, TriangleMesh
+from recon.core.values import PointCloud
 from recon.report.scene import (
     T_UPRIGHT_CAMERA,
     Scene,
@@ -50,15 +50,6 @@ def test_coloured_cloud_can_also_be_shown_by_height(cloud):
     assert "#7a0402" in scale[-1]  # … to dark red
     plain = PointCloud(cloud.xyz, frame="map")
     assert len(plot_scene(Scene(np.eye(4), plain))["layout"]["meta"]) == 1
-
-
-def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(cloud, mesh):
-    both = plot_scene(Scene(np.eye(4), cloud, mesh))["data"]
-    grey = TriangleMesh(mesh.vertices, mesh.faces)
-    (alone,) = plot_scene(Scene(np.eye(4), None, grey))["data"]
-    assert [trace["type"] for trace in (*both, alone)] == ["scatter3d", "mesh3d", "mesh3d"]
-    assert [both[1]["visible"], alone["visible"]] == ["legendonly", True]
-    assert alone["color"] == "#b8c4ce"
 
 
 def test_axes_have_true_proportion_whatever_lies_far_away(cloud):

@@ -1,7 +1,5 @@
 """The name of a calibration file tells its format, in which a refined rig comes back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +24,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_refined_rig_comes_back_from_the_format_that_a_name_asks_for(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_refined_rig_comes_back_from_the_format_that_a_name_asks_for(tmp_path, name):
     # As far off as the lenses of KITTI, with prisms.
     values = RigFault(CAMERA).sigmas * np.random.default_rng(1).normal(size=22) * 0.5
     rig = without_fault(CAMERA, turns_of(CAMERA, SETTINGS), values)
@@ -45,6 +41,6 @@ def test_a_refined_rig_comes_back_from_the_format_that_a_name_asks_for(
 
 
 @pytest.mark.parametrize("name", ["rig", "rig.txt", "rig.yaml.bak"])
-def test_a_name_of_no_format_is_refused_with_those_that_are(name: str) -> None:
+def test_a_name_of_no_format_is_refused_with_those_that_are(name):
     with pytest.raises(SettingsError, match=r"tells its format.*camchain\.yaml kalibr's"):
         form_of(Path(name))

@@ -14,8 +14,7 @@ from recon.core.geometry import se3
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import OCCUPIED
 from recon.core.values.camera import project, unproject
-from recon.street import shapes
-from recon.street.materials import ROAD_HALF_M, both, stripe, stripes, tile_joints
+from recon.street import materials, shapes
 from recon.street.path import LANE_M, R_STREET_LEVEL, camera_poses, centre_line
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
@@ -348,7 +347,7 @@ def test_laps_around_a_block_are_the_same_and_nothing_stands_on_the_road(block):
     standing = corners[(corners[:, 2] > 0.3) & (corners[:, 2] < 2.5), :2]
     gap = np.linalg.norm(standing[:, None] - road.xy_m[None, ::8], axis=2).min(axis=1)
     # Parked cars fill the outer 2 m of each side of the road.
-    assert gap.min() > ROAD_HALF_M - 2.3
+    assert gap.min() > materials.ROAD_HALF_M - 2.3
     middle = road.loop_m - CORNER_M * math.pi / 4  # of the last corner
     inner = road.points(np.array([middle]), np.array([9.0]))[0]
     walls = corners[corners[:, 2] > 5.0, :2]
@@ -412,20 +411,28 @@ def test_equal_settings_give_the_streets_and_images_that_they_gave_before(shape,
     assert [_weighed(part) for part in parts[4:]] == pytest.approx(figures[4:], abs=0.05)
 
 
+COLOURS = {
+    "ASPHALT": 0.234404253, "PAVING": 0.23802291, "KERB": 0.244669357, "PLASTER": 0.243072672,
+    "BRICK": 0.229733535, "GLASS": 0.486158922, "DOOR": 0.224088528, "ROOF": 0.225974683,
+    "CAR_PAINT": 0.24223622, "CAR_GLASS": 0.162575411, "LEAVES": 0.22693827, "METAL": 0.247969724,
+    "POSTER": 0.221870245,
+}  # fmt: skip
+
+
+def test_places_have_the_colours_of_their_material_that_they_had_before():
+    rng = np.random.default_rng(1)
+    uv, spread = rng.uniform(0, 12, (2000, 2)), rng.uniform(0.001, 0.05, (2000, 2))
+    own = (rng.uniform(0, 8, 2000), rng.normal(0, 0.3, 2000), rng.uniform(0.2, 0.8, (2000, 3)))
+    part = np.arange(2000, dtype=np.int32) // 100
+    places = materials.Patch(uv, spread, *uv.T, *spread.T, *own, part)
+    found = {kind.name: _weighed(recipe(places)) for kind, recipe in materials.RECIPES.items()}
+    assert found == pytest.approx(COLOURS, abs=2e-9)
+
+
 @given(st.floats(-20, 20), st.floats(0.2, 5), st.floats(0.05, 0.95), st.floats(0.01, 9))
 def test_stripes_are_the_mean_over_the_footprint(x, period, share, w):
     fine = x + w * ((np.arange(4000) + 0.5) / 4000 - 0.5)
     expected = ((fine % period) < share * period).mean()
-    got = stripes(np.array([x]), period, share * period, np.array([w]))[0]
+    got = materials.stripes(np.array([x]), period, share * period, np.array([w]))[0]
     # 4000 samples place each stripe's edge to w/4000; there are at most 2·(9 / 0.2 + 1) edges.
     assert got == pytest.approx(expected, abs=0.03)
-
-
-def test_stripes_and_joints_cover_their_share_of_an_area():
-    x = np.array([-0.1, 0.1, 0.4, 0.6])
-    assert np.allclose(stripe(x, 0.0, 0.5, np.zeros(4)), [0, 1, 1, 0])
-    assert stripe(np.array([0.5]), 0.0, 0.5, np.array([0.2]))[0] == pytest.approx(0.5)
-    uv = np.random.default_rng(0).uniform(0, 100, (50, 2))
-    got = tile_joints(uv, (0.5, 0.25), 0.05, np.full((50, 2), 40.0))
-    # 10 % of the columns, 20 % of the rows, the crossings once.
-    assert np.allclose(got, both(np.array(0.1), np.array(0.2)), atol=0.01)
