@@ -8,8 +8,6 @@ writes there were to ``$COUNT``. A live drive leaves no frame out here and is co
 so that its writes, too, are the same every time.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

@@ -1,8 +1,5 @@
 """A small drive with ground truth, mapped once."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,14 +12,14 @@ from recon.commands.map_options import MapOptions
 from recon.sources import synthetic
 from recon.street.settings import StreetScene
 from tests.scenery.figures import leave_figures_blank
-from tests.scenery.film import RIG, Film, film
+from tests.scenery.film import RIG, film
 from tests.scenery.made_once import made_once
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 
 
 @pytest.fixture(scope="session", autouse=True)
-def streets_built_once() -> Iterator[None]:
+def streets_built_once():
     """Let sources of equal settings share their street, which takes seconds to lay out."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("build_street", "StreetCamera"):
@@ -31,18 +28,18 @@ def streets_built_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def no_figures(blank_figures: None) -> None:
+def no_figures(blank_figures):
     """Draw the figures of reports only where a command runs in a process of its own."""
 
 
 @pytest.fixture(scope="session")
-def street_film() -> Film:
+def street_film():
     """A drive whose places are recognised, rendered once."""
     return film(StreetScene(frames=12, seed=1, **RIG))
 
 
 @pytest.fixture(scope="session")
-def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_demo(tmp_path_factory):
     """The folder of a run; it must not be changed."""
     config = load_config(None, [f"street.{key}={value}" for key, value in SMALL_STREET.items()])
 

@@ -1,7 +1,5 @@
 """Runs that are broken off, and what they leave."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -39,14 +37,12 @@ def broken(mode: str, at: int, out: Path, *words: object) -> subprocess.Complete
 
 
 def count_writes(out: Path, *words: object) -> int:
-    """Run a command to its end, and count its writes."""
     done = broken("count", 0, out, *words)
     assert done.returncode == 0, done.stderr
     return int(Path(f"{out}.count").read_text())
 
 
 def begun(out: Path) -> bool:
-    """Whether a run has committed what it was started with."""
     try:
         with Map.open(out / STATE) as unfinished:
             return len(unfinished.sessions) > 0
@@ -70,6 +66,5 @@ def summary_of(folder: Path) -> dict[str, Any]:
 
 
 def all_files(folder: Path) -> dict[str, bytes]:
-    """All files below a folder, hidden ones too."""
     files = (path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}

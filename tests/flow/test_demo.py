@@ -1,17 +1,19 @@
-"""The whole pipeline on the rendered street, compared with ground truth."""
-
-from __future__ import annotations
+"""The whole pipeline on the rendered street, compared with ground truth, and the examples."""
 
 import json
+import runpy
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.flow.runs import RECON, summary_of
+from tests.flow.runs import RECON, ROOT, summary_of
+from tests.scenery.kitti import street_drive
 
+Made = tuple[Path, dict[str, Any]]
 # Three quarters of the size that users see: it shows the same in half the time.
 SIZE = ("street.width_px=480", "street.height_px=180", "street.focal_px=270")
 PRODUCTS = {
@@ -22,7 +24,7 @@ PRODUCTS = {
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def demo(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo") / "run"
     words = ["demo", "--frames", "12", "--out", str(out), *(f"--set={size}" for size in SIZE)]
     done = subprocess.run([*RECON, *words, "--json"], capture_output=True, check=False)
@@ -30,9 +32,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return out, json.loads(done.stdout)
 
 
-def test_every_product_is_there_and_the_summary_is_what_was_printed(
-    demo: tuple[Path, dict[str, Any]],
-) -> None:
+def test_every_product_and_the_printed_summary_is_there(demo):
     out, printed = demo
     files = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert files >= PRODUCTS
@@ -48,9 +48,7 @@ def test_every_product_is_there_and_the_summary_is_what_was_printed(
     assert (R @ [0, -1, 0])[2] > 0.99
 
 
-def test_path_map_and_occupancy_are_where_they_really_are(
-    demo: tuple[Path, dict[str, Any]],
-) -> None:
+def test_path_map_and_occupancy_are_where_they_are(demo):
     _, summary = demo
     # Exact geometry and mild noise: far better than the 1 % asked for on real drives, but not 0.
     assert 0.0 < summary["trajectory"]["t_rel_percent"] < 0.7
@@ -58,10 +56,35 @@ def test_path_map_and_occupancy_are_where_they_really_are(
     assert (summary["frames"], summary["frames_not_trusted"]) == (12, 0)
     assert summary["map"]["f_score"] > 0.8
     assert 0.0 < summary["map"]["median_m"] < 0.1
-    # A short drive; longer ones of several streets stand in test_occupancy.py.
+    # A short drive; longer ones of several streets stand in test_export_run.py.
     found = summary["occupancy"]
     assert found["least_frames"] == 3
     assert 0.9 < found["voxels"]["precision"] < 1
     assert 0.9 < found["voxels"]["recall"] < 1
     assert 0.8 < found["grid"]["iou_occupied"] < 1
     assert 0.95 < found["grid_exact"]["iou_free"] < 1
+
+
+EXAMPLES = {
+    "01_one_pair.py": ("% of the pixels have a disparity", ["cloud.ply"]),
+    "02_map_a_drive.py": (
+        "position error",
+        ["trajectory_kitti.txt", "map/cloud.ply", "map/grid.yaml", "map/octomap.bt"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_prints_and_writes_what_it_says(name, tmp_path, monkeypatch, capsys):
+    said, files = EXAMPLES[name]
+    words = [str(tmp_path / "out")]
+    if "drive" in name:
+        words.insert(0, str(street_drive(tmp_path / "drive", 6)))
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+    assert said in capsys.readouterr().out
+    assert all((tmp_path / "out" / file).stat().st_size > 0 for file in files)
+
+
+def test_every_example_is_tested():
+    assert {path.name for path in (ROOT / "examples").glob("*.py")} == EXAMPLES.keys()

@@ -4,8 +4,6 @@ A motorway with next to nothing on it: lines that look alike wherever the camera
 rail, grey asphalt, sky. kiss-icp stands still on it and is sure of that.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,29 +29,23 @@ from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source
 from recon.stereo.match.registry import make_matcher
 from tests.flow.runs import summary_of
-from tests.scenery.kitti import street_drive
 from tests.sources import drives
 
+Pairs = list[RectifiedPair]
 CAMERA = RectifiedCamera(260.0, 199.5, 60.5, 199.5, 0.54, 400, 130)
 HEIGHT_M = 1.65
 TEXELS_PER_M = 40.0
 
 
-def _grain() -> np.ndarray:
-    rng = np.random.default_rng(1)
-    fine, coarse = (
-        cv2.GaussianBlur(rng.normal(size=(1024, 1024)), (0, 0), size) for size in (1.5, 12.0)
-    )
-    return (0.7 * fine / fine.std() + 0.7 * coarse / coarse.std()).astype(np.float32)
-
-
-GRAIN = _grain()
+RNG = np.random.default_rng(1)
+FINE, COARSE = (
+    cv2.GaussianBlur(RNG.normal(size=(1024, 1024)), (0, 0), size) for size in (1.5, 12.0)
+)
+GRAIN = (0.7 * FINE / FINE.std() + 0.7 * COARSE / COARSE.std()).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Road:
-    """How the road is seen."""
-
     grain: float  # standard deviation of the asphalt, grey values
     step_m: float  # way from frame to frame
     dark: tuple[int, ...] = ()  # frames in which next to no light is left
@@ -65,7 +57,7 @@ class Road:
         )
         return np.linalg.matrix_power(step, index)
 
-    def pairs(self, frames: Iterable[int]) -> list[RectifiedPair]:
+    def pairs(self, frames: Iterable[int]) -> Pairs:
         return [self.pair(index) for index in frames]
 
     def pair(self, index: int) -> RectifiedPair:
@@ -123,14 +115,11 @@ BODY = make_transform(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0
 
 
 @pytest.fixture(scope="module")
-def seen() -> list[RectifiedPair]:
-    """Ten frames of a road with texture."""
+def seen():
     return ROAD.pairs(range(10))
 
 
-def map_drive(
-    pairs: Iterable[RectifiedPair], folder: Path, *settings: str, baseline: float = 1, **more: Any
-) -> MapRun:
+def map_drive(pairs, folder, *settings, baseline=1, **more):
     """Map pairs as a drive in KITTI's layout, with a calibration that may be wrong."""
     frames = [replace(pair, index=index) for index, pair in enumerate(pairs)]
     drives.write_kitti(frames, CAMERA, folder / "drive")
@@ -141,7 +130,6 @@ def map_drive(
 
 
 def doubted(run: MapRun) -> list[int]:
-    """Indices of the frames whose pose is not trusted."""
     return [index for index, record in enumerate(run.mapped.health) if not record.ok]
 
 
@@ -156,9 +144,7 @@ def dimmed(pair: RectifiedPair, factor: float) -> RectifiedPair:
     return replace(pair, left=left, right=right)
 
 
-def test_a_drive_that_cannot_be_mapped_says_why_and_leaves_nothing(
-    seen: list[RectifiedPair], tmp_path: Path
-) -> None:
+def test_a_drive_without_a_map_says_why(seen, tmp_path):
     swapped = [replace(pair, left=pair.right, right=pair.left) for pair in seen[:3]]
     with pytest.raises(MappingError, match=r"the map is empty \(got 7 of 8 poses are not to be"):
         map_drive(BARE.pairs(range(8)), tmp_path / "bare")
@@ -179,7 +165,7 @@ def body_path(change: Callable[[np.ndarray], np.ndarray] = np.copy) -> Trajector
     return Trajectory(poses, 0.1 * np.arange(10))
 
 
-def test_a_prior_in_body_axes_is_recognised(seen: list[RectifiedPair], tmp_path: Path) -> None:
+def test_a_prior_in_body_axes_is_recognised(seen, tmp_path):
     run = map_drive(seen, tmp_path, prior=body_path())
     assert not doubted(run)
     told = run.summary["prior"]
@@ -188,25 +174,18 @@ def test_a_prior_in_body_axes_is_recognised(seen: list[RectifiedPair], tmp_path:
     assert off_m(run, ROAD, 9) < ALLOWED_M
 
 
-def random(positions: np.ndarray) -> np.ndarray:
-    return positions + np.random.default_rng(1).uniform(-100, 100, positions.shape)
-
-
 @pytest.mark.parametrize(
     ("axes", "change"),
-    [("camera", np.copy), ("auto", lambda xyz: 1e3 * xyz), ("body", lambda xyz: 1e-3 * xyz),
-     ("auto", random)],
-)  # fmt: skip
-def test_a_prior_that_contradicts_the_images_is_refused(
-    seen: list[RectifiedPair], tmp_path: Path, axes: str, change: Callable[..., np.ndarray]
-) -> None:
+    [("camera", np.copy), ("auto", lambda xyz: 1e3 * xyz), ("body", lambda xyz: 1e-3 * xyz)],
+)
+def test_a_prior_that_contradicts_the_images_is_refused(seen, tmp_path, axes, change):
     with pytest.raises(RegistrationError, match="the prior does not fit what the cameras see"):
         map_drive(seen, tmp_path, f"odometry.prior.axes={axes}", prior=body_path(change))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("grain", [1.0, 25.0])
-def test_a_confident_wrong_path_is_not_believed(grain: float) -> None:
+def test_a_confident_wrong_path_is_not_believed(grain):
     """kiss-icp reports no motion and full confidence, with or without texture on the road."""
     matcher, odometry = make_matcher("sad"), make_odometry("kiss")
     pairs = Road(grain=grain, step_m=0.8).pairs(range(5))
@@ -216,7 +195,7 @@ def test_a_confident_wrong_path_is_not_believed(grain: float) -> None:
     assert not any(result.health.ok for result in results[1:])
 
 
-def test_a_road_with_texture_is_believed_where_it_is_seen(tmp_path: Path) -> None:
+def test_a_road_with_texture_is_believed_where_it_is_seen(tmp_path):
     """Two dark frames and two that the camera shook through; sight comes back between them.
 
     The first sharp frame after a blurred one has nothing that looks like it to be compared with.
@@ -229,24 +208,13 @@ def test_a_road_with_texture_is_believed_where_it_is_seen(tmp_path: Path) -> Non
     assert len(run.cloud) > 1000
 
 
-def test_frames_that_are_missing_and_a_jump_of_the_exposure_are_bridged(
-    seen: list[RectifiedPair], tmp_path: Path
-) -> None:
+def test_missing_frames_and_a_jump_of_exposure_are_bridged(seen, tmp_path):
     run = map_drive([*seen[:4], *seen[7:9], dimmed(seen[9], 0.5)], tmp_path)
     assert run.warnings == ()
     assert off_m(run, ROAD, 9) < ALLOWED_M
 
 
-def test_rows_that_are_off_by_five_pixels_are_reported(tmp_path: Path) -> None:
-    drive = street_drive(tmp_path / "drive", 2, 400)
-    for path in (drive / "image_1").glob("*.png"):
-        cv2.imwrite(str(path), np.roll(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 5, axis=0))
-    options = MapOptions(audit=False, out=tmp_path / "out", mesh=False)
-    run = run_map(open_source(drive), load_config(), options)
-    assert any("the right image is 5 px too low" in line for line in run.warnings)
-
-
-def test_one_frame_makes_a_map(seen: list[RectifiedPair], tmp_path: Path) -> None:
+def test_one_frame_makes_a_map(seen, tmp_path):
     run = map_drive(seen[:1], tmp_path)
     np.testing.assert_array_equal(run.mapped.trajectory.T_world_camera, np.eye(4)[None])
     # The camera does not see the ground that it stands on.
@@ -255,9 +223,7 @@ def test_one_frame_makes_a_map(seen: list[RectifiedPair], tmp_path: Path) -> Non
     assert (tmp_path / "out" / "map" / "grid.yaml").is_file()
 
 
-def test_where_nothing_says_how_a_drive_went_on_another_submap_begins(
-    seen: list[RectifiedPair], tmp_path: Path
-) -> None:
+def test_where_nothing_says_how_a_drive_went_on_another_submap_begins(seen, tmp_path):
     pairs = [*seen[:2], dimmed(seen[2], 0), *seen[3:6], *ROAD.pairs(range(60, 64))]
     run = map_drive(pairs, tmp_path)
     assert doubted(run) == [2, 6]
@@ -266,7 +232,7 @@ def test_where_nothing_says_how_a_drive_went_on_another_submap_begins(
 
 
 @pytest.fixture(scope="module")
-def runs(seen: list[RectifiedPair], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(seen, tmp_path_factory):
     """A run that ends on a bare road, and one that does not, of the same road."""
     root = tmp_path_factory.mktemp("runs")
     bad = map_drive([*seen[:8], *BARE.pairs(range(10, 14))], root / "bad")
@@ -284,9 +250,7 @@ def _said(summary: dict[str, Any], out: Path) -> str:
     return str(summary["warnings"][0])
 
 
-def test_every_later_command_says_that_poses_were_not_to_be_trusted(
-    runs: Path, tmp_path: Path
-) -> None:
+def test_every_later_command_says_that_poses_are_doubted(runs, tmp_path):
     bad, good = runs / "bad" / "out", runs / "good" / "out"
     cloud, path, rules = good / "map" / "cloud.ply", "trajectory_tum.txt", TrajectoryRules()
     out = {name: tmp_path / name for name in ("export", "mesh", "occupancy", "found")}
@@ -306,9 +270,7 @@ def test_every_later_command_says_that_poses_were_not_to_be_trusted(
         assert line.startswith("PATH AND MAP ARE NOT TO BE TRUSTED: the poses of 4 of 12")
 
 
-def test_a_merged_map_says_which_of_its_drives_is_not_to_be_trusted(
-    runs: Path, tmp_path: Path
-) -> None:
+def test_a_merged_map_says_which_drive_is_doubted(runs, tmp_path):
     out, parts = tmp_path / "merged", [runs / name / "out" for name in ("good", "bad")]
     merged = run_merge(parts, options=MapOptions("merge", out, mesh=False))
     assert _said(merged, out).startswith("session 1 (drive): PATH AND MAP ARE NOT TO BE")

@@ -1,16 +1,14 @@
-"""`recon live` makes the map of `recon map` where it keeps up, from a drive or two cameras."""
+"""`recon live` maps as `recon map` does where it keeps up; `recon localize` says where it is."""
 
-from __future__ import annotations
-
+import csv
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from recon.commands.config import ReconConfig, load_config
+from recon.commands.config import load_config
 from recon.commands.localize import run_live
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
@@ -25,11 +23,12 @@ from recon.run.work import Silent
 from recon.sources import live
 from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings
-from recon.sources.source import DerivedSource, StereoSource
+from recon.street.settings import StreetScene
 from tests.commands.test_cameras import FakeCamera
-from tests.flow.runs import summary_of
+from tests.flow.runs import all_files, summary_of
 from tests.hostile.refusals import assert_refused, run
-from tests.scenery.film import Film
+from tests.scenery.film import RIG, film
+from tests.scenery.kitti import write_kitti
 from tests.scenery.patience import be_patient
 from tests.sources import drives
 
@@ -39,54 +38,44 @@ Play = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def street(street_film: Film) -> Film:
+def street(street_film):
     return street_film.taken(slice(0, 8))
 
 
 @pytest.fixture(scope="module")
-def mapped(street: Film, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mapped(street, tmp_path_factory):
     out = tmp_path_factory.mktemp("mapped") / "run"
     run_map(street, load_config(), MapOptions(out=out, mesh=False, audit=False))
     return out
 
 
 @pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However slow the machine is, nothing is left out."""
+def patient(monkeypatch):
     be_patient(monkeypatch)
 
 
 class Watch(Silent):
-    """Keeps the frames that are done."""
-
-    def __init__(self) -> None:
-        self.steps: list[FrameResult] = []
-
-    def on_step(self, step: FrameResult) -> None:
-        self.steps.append(step)
+    steps: list[FrameResult]
 
 
 @pytest.fixture
-def watch() -> Watch:
-    return Watch()
+def watch():
+    watch = Watch()
+    watch.steps = []
+    watch.on_step = watch.steps.append
+    return watch
 
 
 @pytest.fixture
-def play(tmp_path: Path, watch: Watch) -> Play:
-    """Play a drive into ``tmp_path/live``; its summary."""
-
-    def play_drive(
-        source: StereoSource, config: ReconConfig | None = None, rate: float = 10.0, **options: Any
-    ) -> dict[str, Any]:
+def play(tmp_path, watch):
+    def play_drive(source, config=None, rate=10.0, **options):
         into = MapOptions("live", tmp_path / "live", mesh=False, progress=watch)
         return run_live(source, config or load_config(), into, rate=rate, **options)
 
     return play_drive
 
 
-def test_a_drive_that_is_kept_up_with_gives_the_same_map(
-    street: Film, mapped: Path, patient: None, play: Play, tmp_path: Path
-) -> None:
+def test_a_drive_that_is_kept_up_with_gives_the_same_map(street, mapped, patient, play, tmp_path):
     """But for the poses, which rest on features alone."""
     summary, usual = play(street), summary_of(mapped)
     assert summary["points"] == pytest.approx(usual["points"], rel=0.05)
@@ -100,8 +89,8 @@ def test_a_drive_that_is_kept_up_with_gives_the_same_map(
 
 
 def test_a_machine_that_is_much_too_slow_has_poses_and_is_told_why_there_is_no_map(
-    street: Film, play: Play, watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+    street, play, watch, monkeypatch, tmp_path
+):
     def of_the_first(self: MapBehind, late: Any, last: object) -> None:
         self._map_frame(*late, late[0].index == 0)
 
@@ -116,41 +105,29 @@ def test_a_machine_that_is_much_too_slow_has_poses_and_is_told_why_there_is_no_m
     assert not (tmp_path / "live" / "summary.json").exists()
 
 
-class _WithGap(DerivedSource):
-    """A street whose second image comes an hour after the first."""
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def frames(self, start: int = 0):
-        for pair in self.source.frames(start):
-            late_s = 3600.0 if pair.index else 0.0
-            yield replace(pair, timestamp_s=pair.timestamp_s + late_s)
-
-
 def test_a_drive_ends_when_it_is_told_to_and_its_map_is_completed(
-    street: Film, patient: None, play: Play, watch: Watch, tmp_path: Path
-) -> None:
+    street, patient, play, watch, tmp_path
+):
     with pytest.raises(SourceError, match="stopped before its first frame"):
         play(street, stopped=lambda: True)
     assert not (tmp_path / "live").exists()
     assert play(street, stopped=lambda: len(watch.steps) >= 5)["frames"] == 5
     assert (tmp_path / "live" / "map" / "cloud.ply").is_file()
     watch.steps.clear()
-    # A gap at the beginning is not waited for.
-    assert play(_WithGap(street), rate=1.0, stopped=lambda: bool(watch.steps))["frames"] == 1
+    # A gap at the beginning, of an hour, is not waited for.
+    late = street.taken(slice(0, 2))
+    late.frames = lambda start=0: (replace(p, timestamp_s=3600.0 * p.index) for p in late.pairs)
+    assert play(late, rate=1.0, stopped=lambda: bool(watch.steps))["frames"] == 1
 
 
-def test_a_drive_is_found_in_a_map_while_it_arrives(
-    street: Film, mapped: Path, patient: None, play: Play, tmp_path: Path
-) -> None:
+def test_a_drive_is_found_in_a_map_while_it_arrives(street, mapped, patient, play, tmp_path):
     summary = play(street, map_path=mapped)
     assert summary["frames_tracking"] + summary["frames_coasting"] >= 7
     assert summary["live"]["frames_arrived"] == 8
     assert (tmp_path / "live" / "states.csv").is_file()
 
 
-def test_what_cannot_be_played_is_refused(street: Film, play: Play) -> None:
+def test_what_cannot_be_played_is_refused(street, play):
     with pytest.raises(SettingsError, match="the points that kiss-icp needs"):
         play(street, load_config(None, ["odometry.method=kiss"]))
     for rate in (0.0, -1.0, float("nan"), float("inf")):
@@ -159,16 +136,13 @@ def test_what_cannot_be_played_is_refused(street: Film, play: Play) -> None:
 
 
 @pytest.fixture(scope="module")
-def videos(street_film: Film, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two video files that stand in for cameras."""
+def videos(street_film, tmp_path_factory):
     folder = tmp_path_factory.mktemp("videos")
     grey = street_film.taken(slice(None), lambda image: image[..., 1].copy())
     return drives.write_two_videos(grey.pairs, grey.calibration, folder)
 
 
-def test_two_cameras_are_mapped(
-    videos: Path, street_film: Film, patient: None, tmp_path: Path
-) -> None:
+def test_cameras_are_mapped(videos, street_film, patient, tmp_path):
     out, names = tmp_path / "run", [videos / name for name in ("left.avi", "right.avi")]
     done = run("live", *names, "--calib", videos / "calib.txt", "--rate", "5", "--out", out)
     assert done.code == 0, done.err
@@ -182,25 +156,20 @@ def test_two_cameras_are_mapped(
     assert (out / "map" / "cloud.ply").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("{}/left.avi {}/right.avi", "--calib"),
-        ("{}/left.avi none.avi --calib {}/calib.txt", "camera cannot be opened"),
-        ("/dev/video99 --calib {}/calib.txt", "camera cannot be opened"),
-        ("99 --calib {}/calib.txt", "camera cannot be opened"),
-        ("nothing", "folder does not exist"),
-    ],
-)
-def test_what_is_no_camera_is_refused_in_one_line(
-    videos: Path, tmp_path: Path, words: str, said: str
-) -> None:
+@pytest.mark.parametrize(("words", "said"), [
+    ("{}/left.avi {}/right.avi", "--calib"),
+    ("{}/left.avi none.avi --calib {}/calib.txt", "camera cannot be opened"),
+    ("/dev/video99 --calib {}/calib.txt", "camera cannot be opened"),
+    ("99 --calib {}/calib.txt", "camera cannot be opened"),
+    ("nothing", "folder does not exist"),
+])  # fmt: skip
+def test_what_is_no_camera_is_refused(videos, tmp_path, words, said):
     names = words.replace("{}", str(videos)).split()
     assert_refused(run("live", *names, "--out", tmp_path / "run", "--quiet"), said)
     assert not (tmp_path / "run").exists()
 
 
-def test_pairs_of_cameras_are_numbered_and_keep_the_time_they_were_taken() -> None:
+def test_pairs_of_cameras_are_numbered_and_keep_the_time_they_were_taken():
     stamps_s = [5.0, 5.1, 5.2, 5.3, 5.4]
     cameras = (FakeCamera("0", stamps_s), FakeCamera("2", [t + 0.004 for t in stamps_s[:4]]))
     source = CameraSource(cameras, RecordingSettings(frames=2), SMALL)
@@ -211,15 +180,12 @@ def test_pairs_of_cameras_are_numbered_and_keep_the_time_they_were_taken() -> No
         list(LiveSource(source, rate=None))
 
 
-def test_cameras_are_numbers_devices_and_files_with_a_calibration_of_their_size(
-    videos: Path, tmp_path: Path
-) -> None:
+def test_cameras_are_numbers_devices_and_files_of_one_size(videos, tmp_path):
     assert [is_camera(name) for name in ("0", "rtsp://host/left", "/dev/video9")] == [True] * 3
     assert [is_camera(name) for name in (str(tmp_path), "rides/today")] == [False] * 2
     devices = [str(videos / "left.avi"), str(videos / "right.avi")]
     numbers = SourceSettings(focal_px=300, baseline_m=0.2)
     with open_camera_source(devices, CaptureSettings(), numbers) as source:
-        assert isinstance(source.calibration, RectifiedCamera)
         assert (source.calibration.focal_px, source.calibration.baseline_m) == (300, 0.2)
     wrong = SourceSettings(calibration=str(tmp_path / "calib.txt"))
     (tmp_path / "calib.txt").write_text(
@@ -228,3 +194,84 @@ def test_cameras_are_numbers_devices_and_files_with_a_calibration_of_their_size(
     )
     with pytest.raises(CalibrationError, match="size"):
         open_camera_source(devices, CaptureSettings(), wrong).__enter__()
+
+
+@pytest.fixture(scope="module")
+def drive(street_film, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drive")
+    write_kitti(street_film, folder)
+    (folder / "empty").mkdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def even_map(drive, tmp_path_factory):
+    """Of the even frames, at known poses; with a damaged copy of the map."""
+    out = tmp_path_factory.mktemp("map") / "run"
+    words = ("--stride", "2", "--poses", drive / "poses.txt", "--no-mesh", "--quiet")
+    done = run("map", drive, *words, "--out", out)
+    assert done.code == 0, done.err
+    content = bytearray((out / "map" / "map.recon").read_bytes())
+    for place in range(len(content) // 3, len(content), 4096):
+        content[place] ^= 255
+    (out.parent / "damaged.recon").write_bytes(content)
+    return out
+
+
+def test_files_are_left_and_the_map_as_it_was(drive, even_map, tmp_path):
+    before, out = all_files(even_map), tmp_path / "found"
+    done = run("localize", drive, "--map", even_map, "--start", "1", "--stride", "2", "-o", out)
+    assert done.code == 0, done.err
+    assert all_files(even_map) == before
+    summary = summary_of(out)
+    states = list(csv.DictReader((out / "states.csv").open()))
+    tracked = [row for row in states if row["state"] == "tracking"]
+    assert summary["frames"] == len(states) == 6
+    assert summary["frames_tracking"] == len(tracked) >= 5
+    assert summary["first_fix_frame"] == int(tracked[0]["frame"]) <= 1
+    path = read_tum(out / "trajectory_tum.txt")
+    assert len(path) == len(read_tum(out / "trajectory_map_base_tum.txt")) == len(tracked)
+    place = [float(tracked[0][axis]) for axis in ("x_m", "y_m", "z_m")]
+    assert place == pytest.approx(path.positions_m[0], abs=1e-6)
+    assert float(tracked[0]["sigma_x_m"]) > 0
+    assert float(tracked[0]["cov_x_x"]) == pytest.approx(float(tracked[0]["sigma_x_m"]) ** 2)
+    assert "In the map" in (out / "report.html").read_text()
+
+
+def test_the_map_file_alone_will_do(drive, even_map, tmp_path):
+    words = ("--map", even_map / "map" / "map.recon", "--json", "--end", "4", "--out", tmp_path)
+    assert run("localize", drive, *words).code == 0
+    assert summary_of(tmp_path)["frames_tracking"] >= 3
+
+
+def test_a_drive_elsewhere_gets_a_warning_and_no_pose(even_map, tmp_path):
+    write_kitti(film(StreetScene(frames=3, seed=7, **RIG)), tmp_path / "other")
+    done = run("localize", tmp_path / "other", "--map", even_map, "--out", tmp_path / "found")
+    assert done.code == 0
+    assert "not found in the map" in done.err
+    summary = summary_of(tmp_path / "found")
+    assert (summary["frames_tracking"], summary["first_fix_frame"]) == (0, None)
+    assert (tmp_path / "found" / "trajectory_tum.txt").read_text() == ""
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    ("{drive} --map missing", "missing"),
+    ("{drive} --map {drive}", "map.recon"),
+    ("{drive} --map {drive}/calib.txt", "not a map of recon"),
+    ("{drive} --map {map} --start 1,2", "--start"),
+    ("{drive} --map {map} --start here", "--start"),
+    ("{drive} --map {map} --start nan,0,0", "--start"),
+    ("{drive} --map {map} --start 900,0,0", "near the start pose"),
+    ("{drive} --map {map} --out {map}", "would replace"),
+    ("{drive} --map {map} --start 500", "500"),
+    ("{drive}/empty --map {map}", "empty"),
+    ("{drive} --map {map}/../damaged.recon --end 4", "damaged.recon"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused_in_one_line(
+    drive, even_map, tmp_path, monkeypatch,
+    words, said,
+):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    done = run("localize", *words.format(drive=drive, map=even_map).split(), "--quiet")
+    assert_refused(done, said)
+    assert list(tmp_path.iterdir()) == []

@@ -1,7 +1,5 @@
 """Loops around a block are closed, interrupted or not; a repetitive street gives no false loop."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -22,6 +20,7 @@ from tests.scenery.film import Film, film
 
 pytestmark = pytest.mark.slow
 
+Closed = tuple[Path, MapRun]
 SIDE_M, STEP_M = 60.0, 1.5
 LAP_M = 4 * SIDE_M - 8 * CORNER_M + 2 * math.pi * CORNER_M
 
@@ -46,12 +45,12 @@ def _content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def block() -> Film:
+def block():
     return _film(path="block", block_m=(SIDE_M, SIDE_M), frames=162)
 
 
 @pytest.fixture(scope="module")
-def closed(block: Film, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapRun]:
+def closed(block, tmp_path_factory):
     """Folder and run of the drive; the map is rebuilt without matching again."""
     folder = tmp_path_factory.mktemp("closed")
     match = FrameReconstructor.reconstruct_rectified
@@ -63,10 +62,9 @@ def closed(block: Film, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     return folder, run
 
 
-def test_a_drive_around_a_block_closes_to_a_fifth_of_a_percent(closed: tuple[Path, MapRun]) -> None:
+def test_a_drive_around_a_block_closes_to_a_fifth_of_a_percent(closed):
     folder, run = closed
     truth = run.errors.true_path
-    assert truth is not None
     before_m, after_m = (
         np.linalg.norm(read_tum(folder / name).positions_m[-1] - truth.positions_m[-1])
         for name in ("trajectory_odometry_tum.txt", "trajectory_tum.txt")
@@ -86,9 +84,7 @@ def test_a_drive_around_a_block_closes_to_a_fifth_of_a_percent(closed: tuple[Pat
     assert run.warnings == ()
 
 
-def test_a_drive_that_was_broken_off_after_its_loops_closes_in_the_same_way(
-    block: Film, closed: tuple[Path, MapRun], tmp_path: Path
-) -> None:
+def test_a_drive_broken_off_closes_the_same_way(block, closed, tmp_path):
     with pytest.raises(KeyboardInterrupt, match="--resume"):
         _run(block, tmp_path, breaks=len(block) - 6)
     run = _run(block, tmp_path, resume=True)
@@ -97,9 +93,7 @@ def test_a_drive_that_was_broken_off_after_its_loops_closes_in_the_same_way(
     assert run.summary["loops"] == closed[1].summary["loops"]
 
 
-def test_a_street_that_repeats_itself_is_mapped_as_if_nobody_looked_for_loops(
-    tmp_path: Path,
-) -> None:
+def test_a_street_that_repeats_itself_is_mapped_without_loops(tmp_path):
     drive = _film(path="straight", repeat_m=40.0, frames=56)
     looked = _run(drive, tmp_path / "looked")
     _run(drive, tmp_path / "off", "loops.enabled=false")

@@ -1,7 +1,5 @@
 """Drives are merged, added to a run and taken out of it, whole or not at all."""
 
-from __future__ import annotations
-
 import shutil
 from functools import cache
 from pathlib import Path
@@ -42,7 +40,7 @@ def part(first: int, frames: int = FRAMES) -> SourcePart:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory):
     """Runs of two drives that overlap; a third one is elsewhere. They must not be changed."""
     folder = tmp_path_factory.mktemp("runs")
     drives = {"first": part(0), "second": part(FIRST), "elsewhere": street(9, 5)}
@@ -52,19 +50,18 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def merged(runs: Path) -> Path:
+def merged(runs):
     options = MapOptions("merge", runs / "merged", mesh=False)
     run_merge([runs / name for name in ("first", "second", "elsewhere")], None, options)
     return runs / "merged"
 
 
 @pytest.fixture
-def run(runs: Path, tmp_path: Path) -> Path:
-    """A run of the first drive that may be changed."""
+def run(runs, tmp_path):
     return Path(shutil.copytree(runs / "first", tmp_path / "run"))
 
 
-def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path) -> None:
+def test_drives_that_share_places_are_linked_and_others_stay_apart(merged):
     found = summary_of(merged)
     assert [drive["linked"] for drive in found["sessions"]] == [True, True, False]
     assert found["links"]["pairs"].keys() == {"0-1"}
@@ -78,7 +75,7 @@ def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path)
     assert not (merged / "sessions/2").exists()
 
 
-def test_one_run_is_held_at_measured_positions(runs: Path, tmp_path: Path) -> None:
+def test_one_run_is_held_at_measured_positions(runs, tmp_path):
     before = read_trajectory(runs / "first/trajectory_tum.txt")
     longer_m = 1.01 * before.positions_m @ AXES_MAP_WORLD.T
     np.savetxt(tmp_path / "gnss.txt", np.column_stack([before.timestamps_s, longer_m]))
@@ -93,7 +90,7 @@ def test_one_run_is_held_at_measured_positions(runs: Path, tmp_path: Path) -> No
     assert "From measured positions" in page
 
 
-def test_the_folder_of_a_merged_map_is_a_run_like_others(merged: Path, tmp_path: Path) -> None:
+def test_the_folder_of_a_merged_map_is_a_run_like_others(merged, tmp_path):
     for name in ("map/cloud.ply", "map/removed.ply", "map/octomap.bt", "report.html"):
         assert (merged / name).is_file()
     run_occupancy(merged, out=tmp_path / "again")
@@ -105,7 +102,7 @@ def test_the_folder_of_a_merged_map_is_a_run_like_others(merged: Path, tmp_path:
         assert sum(len(tile.cloud) for tile in map_.tiles()) > 1000
 
 
-def test_a_drive_is_added_to_a_run_and_taken_out_again(run: Path, runs: Path) -> None:
+def test_a_drive_is_added_to_a_run_and_taken_out_again(run, runs):
     (run / "notes.txt").write_text("mine")
     before = all_files(run.parent)
     with pytest.raises(FormatError, match=r"^film 0 to 10: the map has this"):
@@ -122,9 +119,7 @@ def test_a_drive_is_added_to_a_run_and_taken_out_again(run: Path, runs: Path) ->
     assert [p.name for p in run.parent.iterdir()] == [run.name]
 
 
-def test_a_drive_is_taken_out_of_a_map_that_began_with_chosen_frames(
-    merged: Path, tmp_path: Path
-) -> None:
+def test_a_drive_is_taken_out_of_a_map_of_chosen_frames(merged, tmp_path):
     run = Path(shutil.copytree(merged, tmp_path / "run"))
     chosen = load_config(run / "config.yaml", [f"source.end={FRAMES}"]).model_dump(mode="json")
     (run / "config.yaml").write_text(yaml.safe_dump(chosen))
@@ -134,7 +129,7 @@ def test_a_drive_is_taken_out_of_a_map_that_began_with_chosen_frames(
 
 
 @pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.merge.place_map"])
-def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) -> None:
+def test_what_fails_before_the_end_leaves_the_run_as_it_was(run, at):
     before, short = all_files(run.parent), part(FIRST, frames=4)
     with patch(at, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
         run_map_into(run, short, None, OPTIONS)
@@ -150,21 +145,16 @@ def _refused(*words: str | Path) -> str:
     return " ".join(done.err.replace("\u2502", " ").split())
 
 
-@pytest.mark.parametrize(
-    ("second", "message"),
-    [
-        ("missing", "does not contain a finished run"),
-        ("first", "the same run twice"),
-        ("copy", "has this drive already"),
-        ("pair", "the run made no map"),
-        ("coarse", "voxels of different sizes"),
-        ("newer", "newer version of recon"),
-        ("odd", "odd/map/map.recon: content cannot be read (got KeyError: 'grain')"),
-    ],
-)
-def test_what_cannot_be_merged_is_one_line(
-    runs: Path, tmp_path: Path, second: str, message: str
-) -> None:
+@pytest.mark.parametrize(("second", "message"), [
+    ("missing", "does not contain a finished run"),
+    ("first", "the same run twice"),
+    ("copy", "has this drive already"),
+    ("pair", "the run made no map"),
+    ("coarse", "voxels of different sizes"),
+    ("newer", "newer version of recon"),
+    ("odd", "odd/map/map.recon: content cannot be read (got KeyError: 'grain')"),
+])  # fmt: skip
+def test_a_wrong_merge_is_one_line(runs, tmp_path, second, message):
     other = runs / "first" if second == "first" else tmp_path / second
     if second not in ("missing", "first"):
         shutil.copytree(runs / ("first" if second == "copy" else "second"), other)
@@ -186,24 +176,19 @@ def test_what_cannot_be_merged_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("merge RUN", "nothing to merge"),
-        ("merge RUN OTHER --out OTHER", "would replace the run"),
-        ("map x --into RUN --resume OTHER", "--into changes RUN"),
-        ("map x --into RUN --out OTHER", "--into changes RUN"),
-        ("map x --into RUN --remove 0", "maps no SOURCE"),
-        ("map --remove 0", "--into"),
-        ("map --into RUN --remove 5", "no such session"),
-        ("map --into RUN --remove 0", "only this session"),
-        ("map --into RUN --remove 0 --end 3", "no effect here"),
-        ("map x --into nowhere", "does not contain a finished run"),
-    ],
-)
-def test_options_that_say_nothing_together_are_one_line(
-    runs: Path, arguments: str, message: str
-) -> None:
+@pytest.mark.parametrize(("arguments", "message"), [
+    ("merge RUN", "nothing to merge"),
+    ("merge RUN OTHER --out OTHER", "would replace the run"),
+    ("map x --into RUN --resume OTHER", "--into changes RUN"),
+    ("map x --into RUN --out OTHER", "--into changes RUN"),
+    ("map x --into RUN --remove 0", "maps no SOURCE"),
+    ("map --remove 0", "--into"),
+    ("map --into RUN --remove 5", "no such session"),
+    ("map --into RUN --remove 0", "only this session"),
+    ("map --into RUN --remove 0 --end 3", "no effect here"),
+    ("map x --into nowhere", "does not contain a finished run"),
+])  # fmt: skip
+def test_options_that_contradict_are_one_line(runs, arguments, message):
     places = {"RUN": str(runs / "first"), "OTHER": str(runs / "second")}
     before = all_files(runs / "first")
     assert message in _refused(*(places.get(part, part) for part in arguments.split()))

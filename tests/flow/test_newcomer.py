@@ -1,7 +1,5 @@
 """From two uncalibrated cameras to a metric cloud: the commands of a newcomer, in order."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -10,14 +8,14 @@ import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import apply
-from recon.core.values import CameraIntrinsics, StereoCalibration
+from recon.core.values import CameraIntrinsics
 from recon.core.values.board import parse_board
 from recon.io.images.image import write_image
 from recon.io.models.ply import read_ply
 from recon.stereo.rectify.lens import rays_of
 from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
 from tests.hostile.refusals import run
-from tests.scenery.boards import Lens, board_rig, place_boards, render_views
+from tests.scenery.boards import board_rig, place_boards, render_views
 
 BOARD = "chess:9x6:25mm"
 # Two walls that meet in a corner, in the left camera's axes: normal and distance.
@@ -44,17 +42,6 @@ def photograph(camera: CameraIntrinsics, T_left_camera: np.ndarray) -> np.ndarra
     return np.asarray(grey).astype(np.uint8)
 
 
-def take_images(folder: Path, rig: StereoCalibration) -> None:
-    board = parse_board(BOARD)
-    pairs = render_views(rig, board, place_boards(rig, board, 12, seed=4))
-    poses = (np.eye(4), np.linalg.inv(rig.T_right_left))
-    pairs.append((photograph(rig.left, poses[0]), photograph(rig.right, poses[1])))
-    for number, pair in enumerate(pairs):
-        for side, image in zip(("left", "right"), pair, strict=True):
-            name = "room" if number == 12 else f"board{number:02d}"
-            write_image(folder / f"{side}_{name}.png", image)
-
-
 def recon(*arguments: str | Path) -> dict[str, object]:
     done = run(*arguments, "--json")
     assert done.code == 0, done.err
@@ -63,12 +50,17 @@ def recon(*arguments: str | Path) -> dict[str, object]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("lens", "form"),
-    [("radtan", "recon"), ("rational", "ros"), ("fisheye", "opencv")],
+    ("lens", "form"), [("radtan", "recon"), ("rational", "ros"), ("fisheye", "opencv")]
 )
-def test_images_of_a_board_lead_to_a_cloud_in_metres(tmp_path: Path, lens: Lens, form: str) -> None:
-    rig = board_rig(lens, 480, 360)
-    take_images(tmp_path, rig)
+def test_images_of_a_board_lead_to_a_cloud_in_metres(tmp_path, lens, form):
+    rig, board = board_rig(lens, 480, 360), parse_board(BOARD)
+    pairs = render_views(rig, board, place_boards(rig, board, 12, seed=4))
+    poses = (np.eye(4), np.linalg.inv(rig.T_right_left))
+    pairs.append((photograph(rig.left, poses[0]), photograph(rig.right, poses[1])))
+    for number, pair in enumerate(pairs):
+        for side, image in zip(("left", "right"), pair, strict=True):
+            name = "room" if number == 12 else f"board{number:02d}"
+            write_image(tmp_path / f"{side}_{name}.png", image)
     recon("board", BOARD, "--out", tmp_path / "board.pdf")
     calibrated = recon(
         "calibrate", tmp_path / "left_board*.png", tmp_path / "right_board*.png", "--board", BOARD,

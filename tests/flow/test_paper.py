@@ -1,10 +1,7 @@
 """`recon paper` on small scenes of our own in Middlebury's layout."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +19,12 @@ from tests.hostile import refusals
 from tests.scenery.middlebury import CAMERA, write_scene
 from tests.scenery.planes import slanted_pair, step_pair
 
+Made = tuple[Path, dict[str, Any]]
 PER_METHOD = ("disparity.pfm", "depth.pfm", "disparity_colour.png", "cloud.ply", "cloud_ascii.ply")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def coarse_figures() -> Iterator[None]:
+def coarse_figures():
     """Draw few facets and few pixels: matplotlib takes most of the time of these tests for them."""
     draw = Figure.savefig
     with pytest.MonkeyPatch.context() as patch:
@@ -36,7 +34,7 @@ def coarse_figures() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scenes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trainingQ")
     write_scene(folder / "ArtL", step_pair(CAMERA, 1.3, 2.0, 20.0, seed=1))
     write_scene(folder / "Jadeplant", slanted_pair(CAMERA, 1.6, (0.3, 0.0), seed=2))
@@ -45,7 +43,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def run(scenes, tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "run"
     options = ("--as-printed", "--set", "paper.patches_px=[3,7,11]", "--json")
     done = refusals.run("paper", scenes, *options, "--out", out)
@@ -53,7 +51,7 @@ def run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, d
     return out, json.loads(done.out)
 
 
-def test_every_product_is_there(run: tuple[Path, dict[str, Any]]) -> None:
+def test_every_product_is_there(run):
     out, _ = run
     expected = {"report.html", "summary.json", "run.json", "config.yaml"}
     for folder in ("experiment_2_ArtL", "experiment_3_Jadeplant", "experiment_4_Pipes"):
@@ -69,7 +67,7 @@ def test_every_product_is_there(run: tuple[Path, dict[str, Any]]) -> None:
     assert np.allclose(binary.xyz, text.xyz, rtol=1e-5)  # text has fewer digits
 
 
-def test_only_the_corrected_method_has_the_right_depth(run: tuple[Path, dict[str, Any]]) -> None:
+def test_only_the_corrected_method_has_the_right_depth(run):
     out, summary = run
     for experiment in summary["experiments"].values():
         depth = {name: one["depth"] for name, one in experiment["methods"].items()}
@@ -97,9 +95,7 @@ def test_only_the_corrected_method_has_the_right_depth(run: tuple[Path, dict[str
     assert np.allclose(depths[known], 10 * 0.2 / disparity[known], rtol=1e-6)
 
 
-def test_its_configuration_gives_the_same_figures(
-    scenes: Path, run: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_its_configuration_gives_the_same_figures(scenes, run, tmp_path):
     printed = run[1]["experiments"]
     assert summary_of(run[0])["experiments"] == printed
     config = load_config(run[0] / "config.yaml", ["paper.as_printed=false"])
@@ -110,7 +106,7 @@ def test_its_configuration_gives_the_same_figures(
             assert one[kind] == {"corrected": printed[number][kind]["corrected"]}
 
 
-def test_a_scene_without_truth_is_reconstructed_and_told(scenes: Path, tmp_path: Path) -> None:
+def test_a_scene_without_truth_is_reconstructed_and_told(scenes, tmp_path):
     copy = Path(shutil.copytree(scenes, tmp_path / "scenes"))
     (copy / "ArtL" / "disp0GT.pfm").unlink()
     options = ("--set", "paper.patches_px=[5]", "--out", tmp_path / "out", "--json")
@@ -124,9 +120,7 @@ def test_a_scene_without_truth_is_reconstructed_and_told(scenes: Path, tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "named"), [((), "RECON_DATA"), (("scenes",), "Jadeplant, Pipes")]
 )
-def test_missing_scenes_are_reported_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], named: str
-) -> None:
+def test_missing_scenes_are_reported_in_one_line(tmp_path, monkeypatch, arguments, named):
     monkeypatch.delenv("RECON_DATA", raising=False)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenes" / "ArtL").mkdir(parents=True)

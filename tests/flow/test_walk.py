@@ -1,7 +1,5 @@
 """The page that follows one pair names the files that a pair really goes through."""
 
-from __future__ import annotations
-
 import re
 import sys
 import threading
@@ -29,47 +27,32 @@ FOLLOWED = 5
 """The pair that is followed: features, submap and a keyframe are there by then."""
 
 
-def is_walked(path: Path) -> bool:
-    """Whether a file counts: kernels, values and settings are what the others use."""
-    beside = {"kernels", "values"} & set(path.parts)
-    return not beside and path.name not in {"settings.py", "__init__.py"}
-
-
-class Tracer:
-    """Notes the files of recon whose functions are called in any thread while it is on."""
-
-    def __init__(self) -> None:
-        self.on = False
-        self.files: set[Path] = set()
-
-    def __call__(self, frame: FrameType, event: str, _: Any) -> None:
-        if self.on and event == "call" and frame.f_code.co_name != "<module>":
-            path = Path(frame.f_code.co_filename)
-            if path.is_relative_to(CODE):
-                self.files.add(path.relative_to(CODE.parent))
-
-
 def walked(street_film: Film, folder: Path) -> set[str]:
-    """Files entered from the reading of one pair to the commit after it."""
-    tracer = Tracer()
+    entered, on = set(), False
     write_kitti(street_film, folder / "drive")
     read, commit = ImageSource.frames, MapFile.commit
 
+    def trace(frame: FrameType, event: str, _: Any) -> None:
+        if on and event == "call" and frame.f_code.co_name != "<module>":
+            entered.add(frame.f_code.co_filename)
+
     def frames(self: ImageSource, start: int = 0) -> Iterator[StereoPair]:
+        nonlocal on
         pairs = read(self, start)
         for index in range(len(self)):
-            tracer.on |= index == FOLLOWED
+            on |= index == FOLLOWED
             yield next(pairs)
 
     def committed(self: MapFile) -> None:
+        nonlocal on
         commit(self)
-        tracer.on = False
+        on = False
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ImageSource, "frames", frames)
         patch.setattr(MapFile, "commit", committed)
-        threading.setprofile(tracer)
-        sys.setprofile(tracer)
+        threading.setprofile(trace)
+        sys.setprofile(trace)
         try:
             config = load_config(None, ["checkpoints.every_frames=8"])
             options = MapOptions(out=folder / "out", audit=False, mesh=False)
@@ -77,20 +60,17 @@ def walked(street_film: Film, folder: Path) -> set[str]:
         finally:
             sys.setprofile(None)
             threading.setprofile(None)
-    return {path.as_posix() for path in tracer.files if is_walked(path)}
+    paths = (path for path in map(Path, entered) if path.is_relative_to(CODE))
+    files = [path.relative_to(CODE.parent) for path in paths]
+    # Kernels, values and settings are what the others use.
+    beside = {"kernels", "values", "settings.py", "__init__.py"}
+    return {path.as_posix() for path in files if not beside & {*path.parts}}
 
 
-def named() -> set[str]:
-    """Files that the page names on the way."""
+def test_the_page_names_the_files_that_a_pair_enters(street_film, tmp_path):
+    files = walked(street_film, tmp_path)
     page = (CODE.parent / "docs" / "architecture.md").read_text()
     section = page.partition("## The walk of one pair")[2].partition("\n## ")[0]
     steps = section.partition("### From its reading to its commit")[2].partition("\n### ")[0]
-    return set(re.findall(r"`(recon/[\w/]+\.py)`", steps))
-
-
-def test_the_page_names_the_few_files_that_a_pair_goes_through(
-    street_film: Film, tmp_path: Path
-) -> None:
-    files = walked(street_film, tmp_path)
-    assert named() == files
+    assert set(re.findall(r"`(recon/[\w/]+\.py)`", steps)) == files
     assert 15 < len(files) <= MOST_FILES

@@ -1,7 +1,5 @@
 """What workers do ends as if nothing had happened, whatever dies on the way."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import signal
@@ -38,7 +36,6 @@ def slow(test: Callable[..., None]) -> Callable[..., None]:
 
 
 def below(client: Client, *words: str) -> list[psutil.Process]:
-    """The processes that a client has started and whose command line has one of the words."""
     found = []
     for process in psutil.Process(client.pid).children(recursive=True):
         try:
@@ -63,7 +60,6 @@ def assert_gone(processes: list[psutil.Process]) -> None:
 
 
 def ended(*words: object, code: int = 0) -> dict[str, Any]:
-    """Run a command to its end; its summary."""
     done = subprocess.run([*RECON, *map(str, words), "--json"], capture_output=True, check=False)
     assert done.returncode == code, done.stderr
     return dict(json.loads(done.stdout))
@@ -79,8 +75,6 @@ def content_of_jobs(out: Path) -> dict[str, bytes]:
 
 
 class Batches:
-    """Drives and a pair, and the results of an undisturbed batch."""
-
     def __init__(self, folder: Path) -> None:
         self.folder, self.jobs = folder, folder / "jobs.toml"
         settings = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]
@@ -103,7 +97,6 @@ class Batches:
         return ["batch", self.jobs, "--out", out, *options]
 
     def begin(self, out: Path, program: Sequence[str] = RECON, **streams: int) -> Client:
-        """Begin a batch; returns when its first job runs."""
         client = subprocess.Popen([*program, *map(str, self.words(out)), "--json"], **streams)
         wait_until(lambda: below(client, JOB), client, "first job")
         return client
@@ -115,14 +108,12 @@ class Batches:
 
 
 @pytest.fixture(scope="module")
-def batches(tmp_path_factory: pytest.TempPathFactory) -> Batches:
+def batches(tmp_path_factory):
     return Batches(tmp_path_factory.mktemp("batches"))
 
 
 @slow
-def test_workers_and_jobs_that_are_killed_at_random_change_nothing(
-    batches: Batches, tmp_path: Path
-) -> None:
+def test_workers_and_jobs_killed_at_random_change_nothing(batches, tmp_path):
     rng, kills, out = np.random.default_rng(0), 0, tmp_path / "out"
     client = batches.begin(out, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     while client.poll() is None and kills < KILLS:
@@ -140,9 +131,7 @@ def test_workers_and_jobs_that_are_killed_at_random_change_nothing(
 
 
 @slow
-def test_a_client_that_is_killed_leaves_no_process_and_what_is_missing_is_done(
-    batches: Batches, tmp_path: Path
-) -> None:
+def test_a_killed_client_leaves_no_process_and_can_resume(batches, tmp_path):
     out = tmp_path / "out"
     client = batches.begin(out, **QUIET)
     # One drive is done, another is being mapped.
@@ -159,7 +148,7 @@ def test_a_client_that_is_killed_leaves_no_process_and_what_is_missing_is_done(
 
 
 @slow
-def test_an_interrupted_batch_says_how_to_go_on(batches: Batches, tmp_path: Path) -> None:
+def test_an_interrupted_batch_says_how_to_go_on(batches, tmp_path):
     out = tmp_path / "out"
     # Whoever runs the tests in the background has them ignore SIGINT.
     start = (
@@ -177,9 +166,7 @@ def test_an_interrupted_batch_says_how_to_go_on(batches: Batches, tmp_path: Path
 
 
 @slow
-def test_a_job_that_fails_by_its_input_is_reported_and_the_exit_code_is_1(
-    batches: Batches, tmp_path: Path
-) -> None:
+def test_a_job_that_fails_by_its_input_is_reported(batches, tmp_path):
     sources = [batches.folder / "scene", tmp_path / "nowhere"]
     words = ["batch", "pair", *sources, "--out", tmp_path / "out"]
     summary = ended(*words, "--workers", "1", code=1)
@@ -192,7 +179,7 @@ def test_a_job_that_fails_by_its_input_is_reported_and_the_exit_code_is_1(
 
 
 @slow
-def test_the_first_failure_ends_a_batch_that_fails_fast(batches: Batches, tmp_path: Path) -> None:
+def test_the_first_failure_ends_a_batch_that_fails_fast(batches, tmp_path):
     sources = [tmp_path / "nowhere", *(batches.folder / f"drive{n}" for n in range(DRIVES))]
     words, out = ["batch", "map", *sources, "--option=--no-mesh", "--out"], tmp_path / "out"
     fast = ended(*words, out, "--workers", "1", "--fail-fast", code=1)
@@ -201,25 +188,22 @@ def test_the_first_failure_ends_a_batch_that_fails_fast(batches: Batches, tmp_pa
     assert counts(ended("batch", "--resume", out, "--workers", "1", code=1)) == [DRIVES, 1, 0]
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("batch jobs.toml", "file does not exist"),
-        ("batch mapp a", "unknown command"),
-        ("batch map", "there is no source"),
-        ("batch map a ./a", "two jobs have one name"),
-        ("batch map a --option=--no-such", "No such option"),
-        ("batch --resume nowhere", "holds no batch"),
-        ("map DRIVE --workers 2 --poses DRIVE/poses.txt", "--poses or --prior is mapped in one"),
-        ("map DRIVE --workers 2 --prior DRIVE/prior.txt", "--poses or --prior is mapped in one"),
-        ("map DRIVE --workers 2 --set occupancy.keep_rays=false", "joined by their rays"),
-        ("map DRIVE --scheduler nonsense", "nonsense: the scheduler cannot be reached"),
-        ("map DRIVE --workers 2", "pip install 'recon[cluster]'"),
-    ],
-)
+@pytest.mark.parametrize(("words", "told"), [
+    ("batch jobs.toml", "file does not exist"),
+    ("batch mapp a", "unknown command"),
+    ("batch map", "there is no source"),
+    ("batch map a ./a", "two jobs have one name"),
+    ("batch map a --option=--no-such", "No such option"),
+    ("batch --resume nowhere", "holds no batch"),
+    ("map DRIVE --workers 2 --poses DRIVE/poses.txt", "--poses or --prior is mapped in one"),
+    ("map DRIVE --workers 2 --prior DRIVE/prior.txt", "--poses or --prior is mapped in one"),
+    ("map DRIVE --workers 2 --set occupancy.keep_rays=false", "joined by their rays"),
+    ("map DRIVE --scheduler nonsense", "nonsense: the scheduler cannot be reached"),
+    ("map DRIVE --workers 2", "pip install 'recon[cluster]'"),
+])  # fmt: skip
 def test_what_cannot_be_asked_of_workers_is_refused_before_anything_runs(
-    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, told: str
-) -> None:
+    short, tmp_path, monkeypatch, words, told
+):
     monkeypatch.chdir(tmp_path)
     if "pip" in told:
         monkeypatch.setitem(sys.modules, "distributed", None)
@@ -228,14 +212,14 @@ def test_what_cannot_be_asked_of_workers_is_refused_before_anything_runs(
 
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def short(tmp_path_factory):
     drive = street_drive(tmp_path_factory.mktemp("short"), 3, 128)
     lines = (f"{n} 0 0 0 0 0 0 1\n" for n in range(-1, 9))
     (drive / "prior.txt").write_text("".join(lines))
     return drive
 
 
-def test_options_that_say_nothing_together_are_wrong_usage(tmp_path: Path) -> None:
+def test_options_that_say_nothing_together_are_wrong_usage(tmp_path):
     scheduler = ["--scheduler", "tcp://127.0.0.1:9"]
     for words in (["--workers", "2", *scheduler], ["--into", "run", *scheduler]):
         assert run("map", tmp_path, *words).code == 2
@@ -267,13 +251,12 @@ def cluster(folder: Path, small: Path | None = None) -> Iterator[list[Client]]:
 
 
 def in_small_disk(line: list[str], folder: Path) -> list[str]:
-    """Give a worker a small disk of its own in place of a folder."""
     mount = f"mount -t tmpfs -o size=512k tmpfs {shlex.quote(str(folder))} && exec "
     return ["unshare", "--mount", "sh", "-c", mount + shlex.join(line)]
 
 
 @slow
-def test_a_job_whose_disk_is_full_is_done_by_another_worker(tmp_path: Path) -> None:
+def test_a_job_whose_disk_is_full_is_done_by_another_worker(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     try:
@@ -294,7 +277,7 @@ def test_a_job_whose_disk_is_full_is_done_by_another_worker(tmp_path: Path) -> N
 
 
 @slow
-def test_a_scheduler_that_is_killed_is_one_line_and_another_one_finishes(tmp_path: Path) -> None:
+def test_a_scheduler_that_is_killed_is_one_line_and_another_one_finishes(tmp_path):
     drives = [str(street_drive(tmp_path / f"drive{n}", 16, seed=n)) for n in range(2)]
     out = tmp_path / "out"
     with cluster(tmp_path / "first") as (scheduler, *workers):
@@ -320,8 +303,6 @@ def test_a_scheduler_that_is_killed_is_one_line_and_another_one_finishes(tmp_pat
 
 
 class Pieces:
-    """A drive, mapped in one piece and by two workers."""
-
     def __init__(self, folder: Path) -> None:
         self.drive = street_drive(folder / "drive", 84, 192, smooth_edges=True)
         self.whole, self.pieces = folder / "whole", folder / "pieces"
@@ -357,12 +338,12 @@ def keys(tree: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def pieces(tmp_path_factory: pytest.TempPathFactory) -> Pieces:
+def pieces(tmp_path_factory):
     return Pieces(tmp_path_factory.mktemp("pieces"))
 
 
 @slow
-def test_a_run_in_pieces_has_the_form_of_one_in_one_piece(pieces: Pieces) -> None:
+def test_a_run_in_pieces_has_the_form_of_one_in_one_piece(pieces):
     whole, found = pieces.summaries
     assert keys(found) == keys(whole)
     assert set(content(pieces.pieces)) == set(content(pieces.whole))
@@ -371,16 +352,13 @@ def test_a_run_in_pieces_has_the_form_of_one_in_one_piece(pieces: Pieces) -> Non
     # In pictures this small, drift is mostly chance: `benchmarks/fleet.py long` compares it.
     assert all(one["trajectory"]["t_rel_percent"] < 2 for one in pieces.summaries)
     with Map.open(pieces.pieces) as map_:
-        assert len(map_.sessions) == 1
-        assert len(map_.session()) == 84
+        assert (len(map_.sessions), len(map_.session())) == (1, 84)
     record = json.loads((pieces.pieces / "run.json").read_text())
     assert [(one["first"], one["last"]) for one in record["pieces"]] == [(0, 42), (22, 84)]
 
 
 @slow
-def test_a_piece_whose_process_is_killed_goes_on_and_nothing_changes(
-    pieces: Pieces, tmp_path: Path
-) -> None:
+def test_a_piece_that_is_killed_goes_on_to_the_same_files(pieces, tmp_path):
     client = pieces.interrupted(tmp_path / "out")
     below(client, JOB)[0].kill()
     _, told = client.communicate()
@@ -391,9 +369,7 @@ def test_a_piece_whose_process_is_killed_goes_on_and_nothing_changes(
 
 
 @slow
-def test_a_client_that_is_killed_leaves_what_resume_goes_on_with(
-    pieces: Pieces, tmp_path: Path
-) -> None:
+def test_a_killed_client_leaves_what_can_be_resumed(pieces, tmp_path):
     client = pieces.interrupted(tmp_path / "out")
     left = below(client, "recon", "spawn")
     client.kill()

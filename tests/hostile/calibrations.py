@@ -1,9 +1,5 @@
 """Valid calibration files of all formats, and what can be wrong with them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
 OURS: Final = """\
@@ -137,37 +133,3 @@ EXPANDING: Final = (
     "l0: &l0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]",
     *(f"l{n}: &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]" for n in range(1, 10)),
 )
-
-#: Bytes that replace the content of a calibration file.
-CONTENT: Final[dict[str, Callable[[bytes], bytes]]] = {
-    "empty": lambda content: b"",
-    "one NUL": lambda content: b"\0",
-    "NUL bytes at the end": lambda content: content + b"\0" * 100,
-    "a NUL byte inside": lambda content: content[:20] + b"\0" + content[20:],
-    "half": lambda content: content[: len(content) // 2],
-    "UTF-16": lambda content: content.decode().encode("utf-16"),
-    "Latin-1": lambda content: content + "# é\n".encode("latin-1"),
-    "random bytes": lambda content: bytes(range(256)) * 8,
-    "a PNG": lambda content: b"\x89PNG\r\n\x1a\n" + bytes(200),
-    "5 MB of spaces": lambda content: content + b" " * 5_000_000,
-    "tabs for spaces": lambda content: content.replace(b" ", b"\t"),
-    "5000 digits for every 50": lambda content: content.replace(b"50", b"5" * 5000),
-    "words for every 50": lambda content: content.replace(b"50", b"fifty"),
-    "nan for every 50": lambda content: content.replace(b"50", b"nan"),
-    "1e-300 for every 50": lambda content: content.replace(b"50", b"1e-300"),
-    "1e300 for every 50": lambda content: content.replace(b"50", b"1e300"),
-    "all digits Arabic": lambda content: (
-        content.decode().translate({48 + n: 0x660 + n for n in range(10)}).encode()
-    ),
-    "lines swapped end to end": lambda content: b"\n".join(content.split(b"\n")[::-1]),
-    "commas dropped": lambda content: content.replace(b",", b"").replace(b";", b""),
-}
-
-
-def write_valid(folder: Path, kind: str) -> Path:
-    """Write a valid file of a format (the two of CameraInfo) and return its path."""
-    name, text = VALID[kind]
-    (folder / name).write_text(text)
-    if kind == "camera-info":
-        (folder / "rig_left.yaml").write_text(CAMERA_INFO.replace("SHIFT", "0"))
-    return folder / name

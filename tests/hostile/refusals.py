@@ -1,7 +1,5 @@
 """Runs commands on hostile input and checks how they refuse it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -19,8 +17,6 @@ from recon.core.errors import ReconError
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended."""
-
     code: int
     out: str
     err: str

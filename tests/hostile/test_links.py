@@ -3,8 +3,6 @@
 Files outside of a folder, of which ``outside`` has one, stay as they are in all of these tests.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -30,8 +28,7 @@ EXPORT: Final = ("export", "run", "--to", "cloud", "--out", "evil")
 
 
 @pytest.fixture
-def outside(here: Path) -> Path:
-    """A folder of somebody's, with one file."""
+def outside(here):
     folder = here / "outside"
     folder.mkdir()
     (folder / "file").write_text("precious")
@@ -57,20 +54,15 @@ def evil(record: object = None) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("link", "target"),
-    [
-        ("sub", ""),  # before a stale file
-        ("map", ""),
-        ("map/deep/er", ""),
-        (".partial", ""),
-        (".partial/.lock", "lock"),
-        ("config.yaml", "file"),
-    ],
-)
-def test_no_link_below_a_result_folder_is_followed(
-    link: str, target: str, finished: Path, outside: Path
-) -> None:
+@pytest.mark.parametrize(("link", "target"), [
+    ("sub", ""),  # before a stale file
+    ("map", ""),
+    ("map/deep/er", ""),
+    (".partial", ""),
+    (".partial/.lock", "lock"),
+    ("config.yaml", "file"),
+])  # fmt: skip
+def test_no_link_below_a_result_folder_is_followed(link, target, finished, outside):
     path = evil({"files": ["sub/file"]}) / link
     path.parent.mkdir(parents=True, exist_ok=True)
     path.symlink_to(outside / target)
@@ -80,7 +72,7 @@ def test_no_link_below_a_result_folder_is_followed(
     assert sorted(Path("evil").iterdir()) == before
 
 
-def test_the_result_folder_itself_may_be_a_link(finished: Path) -> None:
+def test_the_result_folder_itself_may_be_a_link(finished):
     (finished.parent / "real").mkdir()
     (finished.parent / "evil").symlink_to("real")
     assert run(*EXPORT).code == 0
@@ -104,9 +96,7 @@ READERS: Final = (
 
 @pytest.mark.parametrize("command", READERS)
 @pytest.mark.parametrize("link", ["map", "map/map.recon"])
-def test_a_run_that_leads_elsewhere_is_not_read(
-    command: str, link: str, finished: Path, good_state: Path
-) -> None:
+def test_a_run_that_leads_elsewhere_is_not_read(command, link, finished, good_state):
     Path("drive").symlink_to(good_state / "drive")
     shutil.copytree(finished, "other")
     place = finished / link
@@ -117,9 +107,7 @@ def test_a_run_that_leads_elsewhere_is_not_read(
     assert not Path("out").exists()
 
 
-def test_an_unfinished_run_that_leads_elsewhere_is_not_resumed(
-    interrupted: Path, outside: Path
-) -> None:
+def test_an_unfinished_run_elsewhere_is_not_resumed(interrupted, outside):
     state = interrupted / ".partial" / ".state"
     shutil.move(state, outside / "state")
     state.symlink_to(outside / "state")
@@ -128,7 +116,7 @@ def test_an_unfinished_run_that_leads_elsewhere_is_not_resumed(
     assert (outside / "state" / "map.recon").read_bytes() == before
 
 
-def test_a_batch_that_leads_elsewhere_is_not_resumed(here: Path, outside: Path) -> None:
+def test_a_batch_that_leads_elsewhere_is_not_resumed(here, outside):
     (here / "batch").mkdir()
     (here / "batch" / "job").symlink_to(outside)
     plan = {"folder": str(here), "job": [{"name": "job", "command": "demo"}]}
@@ -137,7 +125,7 @@ def test_a_batch_that_leads_elsewhere_is_not_resumed(here: Path, outside: Path) 
     assert content(outside) == {"file": "precious"}
 
 
-def test_the_folder_in_which_a_merge_is_made_leads_nowhere(finished: Path, outside: Path) -> None:
+def test_the_folder_in_which_a_merge_is_made_leads_nowhere(finished, outside):
     shutil.copytree(finished, "other")
     Path(".out.partial").symlink_to(outside)
     run("merge", "run", "other", "--out", "out", "--quiet")
@@ -153,23 +141,18 @@ RECORDS: Final = {
     "an empty name": '{"files": [""]}',
     "a long name": json.dumps({"files": ["x" * 5000]}),
     "a table": '{"files": {"a": 1}}',
-    "deep": "[" * 100_000,
-    "a list": "[]",
-    "1": "1",
-    "nothing": "",
     "deep files": '{"files":' + "[" * 100_000,
-    "a NUL": "\0",
 }
 
 
 @pytest.mark.parametrize("record", RECORDS)
-def test_a_folder_whose_record_is_none_is_refused(record: str, finished: Path) -> None:
+def test_a_folder_whose_record_is_none_is_refused(record, finished):
     (evil() / "run.json").write_text(RECORDS[record])
     assert_refused(run(*EXPORT), "evil/run.json")
     assert [path.name for path in Path("evil").iterdir()] == ["run.json"]
 
 
-def test_folders_and_outside_files_in_a_list_of_files_stay(finished: Path, outside: Path) -> None:
+def test_folders_and_outside_files_in_a_list_of_files_stay(finished, outside):
     listed = ["sub", ".", "..", "../outside/file", str(outside / "file"), "run.json/x"]
     (evil({"files": listed}) / "sub").mkdir()
     assert run(*EXPORT).code == 0
@@ -201,7 +184,7 @@ TAKERS: Final[dict[str, Callable[[Path], object]]] = {
 
 @pytest.mark.parametrize("loop", ["loop", "loop/deep/er"])
 @pytest.mark.parametrize("taker", TAKERS)
-def test_a_loop_of_links_is_refused_in_python_too(taker: str, loop: str, here: Path) -> None:
+def test_a_loop_of_links_is_refused_in_python_too(taker, loop, here):
     Path("loop").symlink_to("loop")
     assert refusal(lambda: TAKERS[taker](Path(loop))) is not None
     assert [path.name for path in here.iterdir()] == ["loop"]
@@ -215,9 +198,7 @@ DOWN: Final = f".partial/{PART}"
     "link",
     ["middlebury-2014", PART, ".partial", DOWN, f"{DOWN}/Pipes-perfect.zip", f"{DOWN}/files"],
 )
-def test_no_link_below_a_folder_of_data_sets_is_followed(
-    link: str, here: Path, outside: Path
-) -> None:
+def test_no_link_among_data_sets_is_followed(link, here, outside):
     path = here / "data" / link
     path.parent.mkdir(parents=True)
     path.symlink_to(outside)
@@ -228,7 +209,7 @@ def test_no_link_below_a_folder_of_data_sets_is_followed(
 
 
 @pytest.mark.parametrize("link", ["middlebury-2014", PART, f"{PART}/deep"])
-def test_data_that_lead_elsewhere_are_not_verified(link: str, here: Path) -> None:
+def test_data_that_lead_elsewhere_are_not_verified(link, here):
     place = here / "real" / PART
     (place / "deep").mkdir(parents=True)
     (place / RECORD).write_text('{"files": {}}')
@@ -253,7 +234,7 @@ TARGETS: Final[dict[str, Callable[[Path], None]]] = {
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_a_mended_calibration_replaces_no_input_and_no_device(drive: Path, target: str) -> None:
+def test_a_mended_calibration_replaces_no_input_and_no_device(drive, target):
     Path("config.yaml").write_text("matching: {matcher: sad}\n")
     Path("between").symlink_to("drive/image_0/000001.png")
     TARGETS[target](Path("target.yaml"))
@@ -264,13 +245,13 @@ def test_a_mended_calibration_replaces_no_input_and_no_device(drive: Path, targe
 
 
 @pytest.mark.parametrize("name", ["drive/calib.txt", "", ".", "drive/times.txt"])
-def test_a_mended_calibration_is_a_file_of_its_own(drive: Path, name: str) -> None:
+def test_a_mended_calibration_is_a_file_of_its_own(drive, name):
     before = state(drive)
     assert_refused(run("audit", "drive", "--mend", name, "--quiet"), name)
     assert state(drive) == before
 
 
-def test_a_calibration_replaces_no_picture_of_the_board(pair: tuple[Path, Path]) -> None:
+def test_a_calibration_replaces_no_picture_of_the_board(pair):
     Path("rig_left.yaml").hardlink_to("left.png")
     before = state(pair[0].parent)
     board = ("--board", "chess:9x6:25mm", "--report", "report")
@@ -281,14 +262,14 @@ def test_a_calibration_replaces_no_picture_of_the_board(pair: tuple[Path, Path])
     assert state(pair[0].parent) == before
 
 
-def test_a_board_is_not_printed_into_a_device(here: Path) -> None:
+def test_a_board_is_not_printed_into_a_device(here):
     Path("board.pdf").symlink_to(os.devnull)
     assert_refused(run("board", "chess:9x6:25mm"), "board.pdf: ", "a device")
     assert Path("board.pdf").is_symlink()
 
 
 @pytest.mark.parametrize("name", ["map/grid.pgm", "run.json"])
-def test_a_drawing_replaces_no_file_of_the_run(finished: Path, name: str) -> None:
+def test_a_drawing_replaces_no_file_of_the_run(finished, name):
     before = state(finished)
     command = ("evaluate", "occupancy", "run", "--picture", f"run/{name}")
     assert_refused(run(*command), f"run/{name}", "would replace an input")
@@ -305,9 +286,7 @@ MADE_OF: Final = {
 
 @pytest.mark.parametrize("command", MADE_OF)
 @pytest.mark.parametrize("out", ["run", "linked"])
-def test_results_do_not_replace_the_files_that_they_are_made_of(
-    command: str, out: str, finished: Path, good_state: Path
-) -> None:
+def test_results_replace_no_input(command, out, finished, good_state):
     Path("drive").symlink_to(good_state / "drive")
     shutil.copytree(finished, "linked")
     for name in ("map/cloud.ply", "trajectory_tum.txt"):
@@ -318,7 +297,7 @@ def test_results_do_not_replace_the_files_that_they_are_made_of(
     assert state(Path(out)) == before
 
 
-def test_results_do_not_replace_what_is_no_regular_file(finished: Path) -> None:
+def test_results_do_not_replace_what_is_no_regular_file(finished):
     shutil.copytree(finished, "other")
     Path("other/map/cloud.ply").unlink()
     os.mkfifo("other/map/cloud.ply")

@@ -1,7 +1,5 @@
 """Run folders from elsewhere, altered on the way: finished runs and interrupted ones."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -45,19 +43,12 @@ RECORDS: Final[dict[str, Alter]] = {
 }
 POSES: Final[dict[str, Any]] = {
     "null": None,
-    "a word": "eye",
     "ragged": [[1, 0], [0]],
-    "3x3": np.eye(3).tolist(),
     "of words": [["a"] * 4] * 4,
-    "of NaN": [[float("nan")] * 4] * 4,
     "with infinity": moved(float("inf")),
-    "of zeros": np.zeros((4, 4)).tolist(),
     "mirrored": np.diag([1.0, 1.0, -1.0, 1.0]).tolist(),
-    "scaled": np.diag([2.0, 2.0, 2.0, 1.0]).tolist(),
     "projective": (np.eye(4) + np.eye(4)[[3, 2, 1, 0]]).tolist(),
     "1e7 m off": moved(1e7),
-    "1e30 m off": moved(1e30),
-    "1e308 m off": moved(1e308),
     "of huge integers": [[10**400] * 4] * 4,
 }
 COMMANDS: Final = {
@@ -69,16 +60,14 @@ COMMANDS: Final = {
 
 @pytest.mark.parametrize("change", RECORDS)
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_altered_record_is_refused(command: str, change: str, finished: Path) -> None:
+def test_an_altered_record_is_refused(command, change, finished):
     RECORDS[change](finished / "run.json")
     assert_refused(run(*COMMANDS[command]), "run")
     assert not Path("out").exists()
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_an_altered_pose_is_refused_where_the_record_alone_has_it(
-    pose: str, finished: Path
-) -> None:
+def test_an_altered_pose_of_the_record_alone_is_refused(pose, finished):
     (finished / "map" / "map.recon").unlink()
     record = json.loads((finished / "run.json").read_text())
     (finished / "run.json").write_text(json.dumps({**record, "T_map_world": POSES[pose]}))
@@ -102,16 +91,14 @@ CONFIGS: Final = (
 
 
 @pytest.mark.parametrize("text", CONFIGS, ids=lambda text: text.decode("latin-1")[:40])
-def test_an_altered_configuration_is_refused(text: bytes, finished: Path) -> None:
+def test_an_altered_configuration_is_refused(text, finished):
     replaced(text)(finished / "config.yaml")
     assert_refused(run(*COMMANDS["occupancy"]), "config.yaml")
     assert not Path("out").exists()
 
 
 @pytest.mark.parametrize("command", ["occupancy", "mesh"])
-def test_a_run_with_settings_of_another_version_is_to_be_mapped_again(
-    command: str, finished: Path
-) -> None:
+def test_a_run_of_an_older_version_is_to_be_mapped_again(command, finished):
     replaced(b"inspection: {every: 50}\n")(finished / "config.yaml")
     assert_refused(run(*COMMANDS[command]), "map the drive again")
     assert not Path("out").exists()
@@ -158,7 +145,6 @@ def spoil(*names: str, value: Any) -> Callable[[dict[str, Any]], None]:
     return change
 
 
-NAN_POSE: Final = np.full((4, 4), np.nan)
 FILES: Final[dict[str, Alter]] = {
     "empty": replaced(b""),
     "cut in the header": cut(0.0001),
@@ -171,33 +157,22 @@ MAPS: Final[dict[str, Alter]] = {
     **FILES,
     "rays missing": record("rays", None),
     "rays empty": record("rays", dict.clear),
-    "NaN as grain": record("rays", spoil("grain", "cell_m", value=float("nan"))),
-    "unit of 1e300 m": record("rays", spoil("grain", "unit_m", value=1e300)),
     "negative unit": record("rays", spoil("grain", "unit_m", value=-1.0)),
-    "infinite range": record("rays", spoil("grain", "max_range_m", value=float("inf"))),
     "rays of another type": record("rays", every_array(lambda a: a.astype(np.float64))),
-    "fewer rays than counts": record("rays", spoil("count", value=np.zeros(1, np.uint8))),
-    "path of words": record("frames", spoil("T_world_camera", value="eye")),
-    "path of NaN": record("frames", every_array(lambda a: a * np.nan)),
-    "path far off": record("frames", every_array(lambda a: a * 1e30)),
     "path no rotation": record("frames", every_array(np.ones_like)),
     "health missing": record("frames", spoil("health", value={})),
     "path missing": record("frames", None),
     "axes missing": record("axes", None),
-    "axes NaN": record("axes", spoil("T_map_world", value=NAN_POSE)),
     "axes far off": record("axes", spoil("T_map_world", value=np.array(moved(1e30)))),
     "session missing": record("session", None),
-    "session a word": record("session", spoil("frames", value={})),
     "submap missing": record("submap", None),
-    "submap empty": record("submap", dict.clear),
     "entry missing": record("submap_entry", None),
     "entry beyond the frames": record("submap_entry", spoil("frames", value=10**6)),
-    "entry of words": record("submap_entry", spoil("frames", value="many")),
 }
 
 
 @pytest.mark.parametrize("change", MAPS)
-def test_an_altered_map_is_refused(change: str, finished: Path) -> None:
+def test_an_altered_map_is_refused(change, finished):
     MAPS[change](finished / "map" / "map.recon")
     assert_refused(run(*COMMANDS["occupancy"]), "map.recon")
     assert not Path("out").exists()
@@ -228,7 +203,7 @@ STARTS: Final[dict[str, Alter]] = {
 
 
 @pytest.mark.parametrize("change", STARTS)
-def test_an_altered_start_is_refused(change: str, interrupted: Path) -> None:
+def test_an_altered_start_is_refused(change, interrupted):
     STARTS[change](interrupted / STATE / STARTED)
     assert_refused(run("map", "--resume", interrupted, "--quiet"))
     assert not (interrupted / "run.json").exists()
@@ -244,41 +219,33 @@ def state(change: Callable[[dict[str, Any]], None]) -> Alter:
 CHECKPOINTS: Final[dict[str, Alter]] = {
     "an empty tree": state(dict.clear),
     "no mapper": state(spoil("mapper", value=None)),
-    "mapper is a list": state(spoil("mapper", value=[1, 2])),
     "seconds are a word": state(spoil("seconds", value="many")),
     "all arrays NaN": state(every_array(lambda a: a * np.nan if a.dtype.kind == "f" else a)),
-    "all arrays infinite": state(every_array(lambda a: a + np.inf if a.dtype.kind == "f" else a)),
     "all arrays empty": state(every_array(lambda a: a.ravel()[:0])),
-    "all arrays flat": state(every_array(np.ravel)),
     "all arrays double": state(every_array(lambda a: a.astype(np.float64) * 1.0 + 0.5)),
     "all arrays integers": state(every_array(lambda a: np.zeros(a.shape, np.int64))),
-    "all arrays lists": state(every_array(lambda a: [1, 2])),
-    "map pose NaN": record("axes", spoil("T_map_world", value=NAN_POSE)),
     "map pose scaled": record("axes", spoil("T_map_world", value=2 * np.eye(4))),
-    "map pose far": record("axes", spoil("T_map_world", value=np.array(moved(1e30)))),
-    "map pose a word": record("axes", spoil("T_map_world", value="eye")),
-    "odometry null": state(spoil("mapper", "odometry", value=None)),
     "odometry of bytes": state(spoil("mapper", "odometry", value=np.zeros(9, np.uint8))),
-    "odometry pose NaN": state(spoil(*VISUAL, "motion", "T_world_camera", value=NAN_POSE)),
-    "odometry time a word": state(spoil(*VISUAL, "seen_s", value="late")),
+    "odometry pose NaN": state(
+        spoil(*VISUAL, "motion", "T_world_camera", value=np.full((4, 4), np.nan))
+    ),
     "odometry points flat": state(spoil(*VISUAL, "window", "xyz_world", value=np.zeros(5))),
     "frames of words": record("frames", spoil("times_s", value="many")),
     "frames missing": record("frames", None),
     "a submap missing in between": record("submap_entry", None),
-    "builder a list": state(spoil("mapper", "builder", value=[])),
     "builder empty": state(spoil("mapper", "builder", value={})),
 }
 
 
 @pytest.mark.parametrize("change", CHECKPOINTS)
-def test_an_altered_checkpoint_is_refused(change: str, interrupted: Path) -> None:
+def test_an_altered_checkpoint_is_refused(change, interrupted):
     CHECKPOINTS[change](interrupted / STATE / STARTED)
     assert_refused(run("map", "--resume", interrupted, "--quiet"), "--resume")
     assert not (interrupted / "run.json").exists()
     assert (interrupted / STATE / STARTED).exists()
 
 
-def test_the_interrupted_run_can_be_resumed(interrupted: Path) -> None:
+def test_the_interrupted_run_can_be_resumed(interrupted):
     ended = run("map", "--resume", interrupted, "--quiet")
     assert ended.code == 0, ended.err
     assert (interrupted / "run.json").exists()

@@ -1,8 +1,5 @@
 """Limits, signals, streams and bugs that a command meets, and options that nobody means."""
 
-from __future__ import annotations
-
-import ast
 import os
 import re
 import resource
@@ -11,7 +8,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -35,7 +31,7 @@ PROGRAM: Final = f"PYTHONPATH={Path(recon.__file__).parents[1]} {sys.executable}
 
 
 @pytest.mark.parametrize("output", ["--help >&-", "--version > /dev/full", "--help | head -1"])
-def test_an_output_that_takes_nothing_is_no_bug(output: str) -> None:
+def test_an_output_that_takes_nothing_is_no_bug(output):
     done = subprocess.run(
         ["bash", "-o", "pipefail", "-c", f"{PROGRAM} {output}"], capture_output=True, check=False
     )
@@ -46,35 +42,28 @@ def test_an_output_that_takes_nothing_is_no_bug(output: str) -> None:
 
 
 @pytest.mark.parametrize("threads", ["0", "-1", "many", "", "\u0661"])
-def test_a_number_of_threads_that_is_none_is_refused(
-    threads: str, monkeypatch: pytest.MonkeyPatch, here: Path
-) -> None:
+def test_a_number_of_threads_that_is_none_is_refused(threads, monkeypatch, here):
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
     assert_refused(run("map", "drive"), "NUMBA_NUM_THREADS")
 
 
 @pytest.mark.parametrize("limit_mb", [200, 900, 1500])
-def test_too_little_address_space_is_said_before_libraries_are_loaded(
-    limit_mb: int, monkeypatch: pytest.MonkeyPatch, here: Path
-) -> None:
+def test_too_little_address_space_is_said_before_libraries_are_loaded(limit_mb, monkeypatch, here):
     monkeypatch.setattr(resource, "getrlimit", lambda which: (limit_mb * 1_000_000, -1))
     assert_refused(run("map", "drive"), "ulimit -v", f"{limit_mb} MB", "at least 2500 MB")
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "capture 99999999999999999999 1 --out out",
-        "capture calib.txt calib.txt --out out",
-        "datasets fetch euroc --address http://[::1",
-        "mesh cloud.ply --out loop",
-        "localize drive --map loop --out out",
-        "merge loop loop --out out",
-        "map drive --out loop --resume loop",
-        "merge run --georeference gnss.txt --antenna=1e300,0,0 --out out",
-    ],
-)
-def test_a_value_that_nobody_means_is_refused(command: str, drive: Path) -> None:
+@pytest.mark.parametrize("command", [
+    "capture 99999999999999999999 1 --out out",
+    "capture calib.txt calib.txt --out out",
+    "datasets fetch euroc --address http://[::1",
+    "mesh cloud.ply --out loop",
+    "localize drive --map loop --out out",
+    "merge loop loop --out out",
+    "map drive --out loop --resume loop",
+    "merge run --georeference gnss.txt --antenna=1e300,0,0 --out out",
+])  # fmt: skip
+def test_a_value_that_nobody_means_is_refused(command, drive):
     Path("loop").symlink_to("loop")
     Path("calib.txt").write_text("P0: 1 0 0 0\n")
     Path("gnss.txt").write_text("0 0 0 0\n1 1 0 0\n")
@@ -99,9 +88,7 @@ CAMERAS: Final = {
 
 @pytest.mark.parametrize("command", ["pair", "map", "audit", "live"])
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_a_camera_that_nobody_has_is_refused(
-    camera: str, command: str, pair: tuple[Path, Path]
-) -> None:
+def test_an_odd_camera_is_refused(camera, command, pair):
     source = pair if command == "pair" else ("drive",)
     for image in pair:
         (folder := Path("drive", image.stem)).mkdir(parents=True)
@@ -112,7 +99,7 @@ def test_a_camera_that_nobody_has_is_refused(
     assert not Path("out").exists()
 
 
-def test_a_full_disk_at_the_beginning_leaves_nothing(here: Path) -> None:
+def test_a_full_disk_at_the_beginning_leaves_nothing(here):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
     try:
@@ -126,7 +113,7 @@ def test_a_full_disk_at_the_beginning_leaves_nothing(here: Path) -> None:
     assert list(here.iterdir()) == []
 
 
-def test_a_demo_that_cannot_be_resumed_does_not_advise_it(here: Path) -> None:
+def test_a_demo_that_cannot_be_resumed_does_not_advise_it(here):
     config = load_config(None, [f"street.{key}={value}" for key, value in DRIVE.items()])
     config = config.model_copy(update={"memory": config.memory.model_copy(update={"limit_mb": 1})})
     options = MapOptions(command="demo", out=here / "out", audit=False, mesh=False)
@@ -140,7 +127,7 @@ SURROUNDINGS: Final = os.environ | {"PYTHONPATH": str(Path(recon.__file__).paren
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_run_that_is_ended_by_a_signal_leaves_nothing(here: Path, number: int) -> None:
+def test_a_run_that_is_ended_by_a_signal_leaves_nothing(here, number):
     """As during `recon map --into`, whose new folder stands beside the old one."""
     script = f"""
 import signal, time
@@ -168,7 +155,7 @@ cli.main()
     assert list(here.iterdir()) == []
 
 
-def test_a_signal_that_comes_where_exceptions_are_lost_comes_again() -> None:
+def test_a_signal_that_comes_where_exceptions_are_lost_comes_again():
     """As in the callback of a weak reference, in one of some ten runs."""
     script = """
 import signal, time, weakref
@@ -195,7 +182,7 @@ cli.main()
     assert b"ignored" not in done.stderr
 
 
-def test_a_damaged_record_is_named_by_the_map_that_it_is_copied_from(here: Path) -> None:
+def test_a_damaged_record_is_named_by_the_map_that_it_is_copied_from(here):
     with Store.create(here / "damaged") as store, Store.create(here / "new") as new:
         store.put("kind", 0, {"a": 1})
         store._database.execute("UPDATE record SET checksum = checksum + 1")
@@ -203,83 +190,51 @@ def test_a_damaged_record_is_named_by_the_map_that_it_is_copied_from(here: Path)
             store.copy("kind", new)
 
 
-@pytest.fixture
-def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+BUGS: Final = (
+    ValueError("two\nlines"),
+    KeyError("x"),
+    TypeError("bad"),
+    RecursionError("deep"),
+    ModuleNotFoundError("No module named 'recon.nothing'", name="recon.nothing"),
+    ImportError("cannot import name 'nothing' from 'recon'", name="recon"),
+)
+LACKING: Final = (
+    ModuleNotFoundError("No module named 'cv2'", name="cv2"),
+    ImportError("libGL.so.1: cannot open shared object file"),
+    ImportError("cannot import name 'x' from 'reconnect'", name="reconnect"),
+)
 
 
-def _break_the_matcher(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+@pytest.mark.parametrize("error", [*BUGS, *LACKING])
+@pytest.mark.parametrize("folder", ["tmp", "nonexistent"])
+def test_a_bug_in_matching_is_reported_and_no_fault_of_the_file(pair, monkeypatch, error, folder):
     class Broken:
         def match(self, pair: object) -> None:
             raise error
 
+    Path("tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(Path(folder).absolute()))
     monkeypatch.setitem(registry.MATCHERS, "sad", lambda *_: Broken())
-
-
-@pytest.mark.usefixtures("scratch")
-@pytest.mark.parametrize(
-    "error",
-    [
-        ValueError("two\nlines"),
-        KeyError("x"),
-        TypeError("bad"),
-        RecursionError("deep"),
-        ModuleNotFoundError("No module named 'recon.nothing'", name="recon.nothing"),
-        ImportError("cannot import name 'nothing' from 'recon'", name="recon"),
-    ],
-)
-def test_a_bug_in_matching_is_no_fault_of_the_file(
-    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    _break_the_matcher(monkeypatch, error)
     ended = run("disparity", *pair, "--quiet", "--out", "out")
-    assert ended.code == 3
-    assert ended.out == ""
+    assert not Path("out").exists()
+    if error in LACKING:
+        assert_refused(ended, str(error), "recon doctor")
+        return
+    assert (ended.code, ended.out) == (3, "")
     (line,) = ended.lines
     found = re.fullmatch(r"error: internal error \((.*)\), please report: (\S+)", line)
-    assert found is not None, line
-    assert found[1].startswith(type(error).__name__)
-    told = Path(found[2]).read_text()
-    assert "Traceback" in told
-    assert "in match" in told
-    assert not Path("out").exists()
-
-
-@pytest.mark.usefixtures("scratch")
-def test_a_bug_is_reported_without_a_folder_for_temporary_files(
-    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _break_the_matcher(monkeypatch, ValueError("bad"))
-    monkeypatch.setattr(tempfile, "tempdir", "/nonexistent")
-    ended = run("disparity", *pair, "--quiet", "--out", "out")
-    assert ended.code == 3
-    assert len(ended.lines) == 1
-    assert "TMPDIR" in ended.lines[0]
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        ModuleNotFoundError("No module named 'cv2'", name="cv2"),
-        ImportError("libGL.so.1: cannot open shared object file"),
-        ImportError("cannot import name 'x' from 'reconnect'", name="reconnect"),
-    ],
-)
-def test_a_package_that_cannot_be_imported_is_no_bug(
-    pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    _break_the_matcher(monkeypatch, error)
-    ended = run("disparity", *pair, "--quiet", "--out", "out")
-    assert_refused(ended, str(error), "recon doctor")
-    assert not Path("out").exists()
+    if folder == "nonexistent":
+        assert "TMPDIR" in line
+    else:
+        assert found[1].startswith(type(error).__name__)
+        assert re.search(r"(?s)Traceback.*in match", Path(found[2]).read_text())
 
 
 @pytest.mark.parametrize(
     "command",
     ["cv2 pair a b", "numba map drive", "open3d mesh cloud.ply", "rich settings", "typer --help"],
 )
-def test_a_command_names_the_package_that_it_lacks(command: str, here: Path) -> None:
+def test_a_command_names_the_package_that_it_lacks(command, here):
     package, *words = command.split()
     lacking = (
         f"import sys; sys.modules[{package!r}] = None; from recon.__main__ import main; "
@@ -290,58 +245,16 @@ def test_a_command_names_the_package_that_it_lacks(command: str, here: Path) -> 
     assert_refused(Ended(done.returncode, done.stdout.decode(), done.stderr.decode()), package)
 
 
-def test_a_missing_package_is_no_fault_of_the_file_that_is_read(here: Path) -> None:
+def test_a_missing_package_is_no_fault_of_the_file_that_is_read(here):
     with pytest.raises(ModuleNotFoundError), reading(here / "file"):
         raise ModuleNotFoundError("No module named 'cv2'", name="cv2")
 
 
-_FORBIDDEN: Final = frozenset(
-    {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
-)
-_UNSAFE_YAML: Final = frozenset(
-    {"load", "load_all", "full_load", "unsafe_load", "full_load_all", "unsafe_load_all"}
-)
-_RUNS_TEXT: Final = frozenset({"eval", "exec", "compile", "__import__"})
-_ROOT: Final = Path(recon.__file__).parent
-
-
-def dangers(tree: ast.AST) -> Iterator[str]:
-    """What could run code that a file contains."""
-    for node in ast.walk(tree):
-        match node:
-            case ast.Import(names=names):
-                yield from (n.name for n in names if n.name.partition(".")[0] in _FORBIDDEN)
-            case ast.ImportFrom(module=str(module)) if module.partition(".")[0] in _FORBIDDEN:
-                yield module
-            case ast.keyword(arg="allow_pickle", value=value):
-                if not (isinstance(value, ast.Constant) and value.value is False):
-                    yield "allow_pickle"
-            case ast.Attribute(value=ast.Name(id="yaml"), attr=attr) if attr in _UNSAFE_YAML:
-                yield f"yaml.{attr}"
-            case ast.Attribute(value=ast.Name(id="torch"), attr="load"):
-                yield "torch.load"
-            case ast.Call(func=ast.Name(id=name)) if name in _RUNS_TEXT:
-                yield name
-
-
-def test_no_module_can_run_what_it_reads() -> None:
-    found = {path: list(dangers(ast.parse(path.read_text()))) for path in _ROOT.rglob("*.py")}
-    assert len(found) > 200
-    assert {path: names for path, names in found.items() if names} == {}
-
-
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import pickle",
-        "from pickle import loads",
-        "import os, marshal as m",
-        "np.load(f, allow_pickle=True)",
-        "np.load(f, allow_pickle=allowed)",
-        "yaml.load(text)",
-        "yaml.unsafe_load(text)",
-        "eval(text)",
-    ],
-)
-def test_the_search_finds_what_it_looks_for(code: str) -> None:
-    assert list(dangers(ast.parse(code)))
+def test_no_module_can_run_what_it_reads():
+    modules = "pickle|marshal|shelve|dill|joblib"
+    danger = (
+        rf"import.*({modules})|allow_pickle=[^F]|yaml\.\w*(?<!safe_)load|torch\.load|[^.\w]eval\("
+    )
+    files = [*Path(recon.__file__).parent.rglob("*.py")]
+    assert len(files) > 200
+    assert not [path for path in files if re.search(danger, path.read_text())]

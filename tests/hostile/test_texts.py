@@ -1,10 +1,7 @@
 """Hostile calibrations, settings and documents: refused in one line that names the file."""
 
-from __future__ import annotations
-
 import resource
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -21,55 +18,28 @@ from recon.map.settings import DriveSettings
 from recon.run.run import Run
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
-from tests.hostile.calibrations import (
-    CONTENT,
-    EXPANDING,
-    KALIBR,
-    NUMBERS,
-    OPENCV,
-    OURS,
-    VALID,
-    deep,
-    replace_one,
-    write_valid,
-)
+from tests.hostile.calibrations import EXPANDING, KALIBR, NUMBERS, OPENCV, OURS, deep, replace_one
 from tests.hostile.conftest import DRIVE
 from tests.hostile.refusals import assert_refused, refusal, run, run_apart
-from tests.scenery.bounds import Number, numbers_of
+from tests.scenery.bounds import numbers_of
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 LEVELS: Final = 20_000
 
 
 def refusal_of(path: Path) -> str | None:
-    """The line that refuses a calibration, which must name it."""
     line = refusal(lambda: read_calibration(path, 48, 32))
     assert line is None or path.stem.split("_")[0] in line
     return line
 
 
-@pytest.mark.parametrize("change", CONTENT)
-@pytest.mark.parametrize("kind", VALID)
-def test_spoiled_content_is_refused_or_harmless(kind: str, change: str, tmp_path: Path) -> None:
-    path = write_valid(tmp_path, kind)
-    assert refusal_of(path) is None
-    path.write_bytes(CONTENT[change](path.read_bytes()))
-    refusal_of(path)
-
-
 @pytest.mark.parametrize("number", NUMBERS)
-@pytest.mark.parametrize(
-    ("name", "text", "old"),
-    [
-        *(("rig.yaml", OURS, old) for old in ("48", "50.0", "0.1", "1\n")),
-        *(("chain.yaml", KALIBR, old) for old in ("50.0", "48", "-0.1", "[48, 32]", "radtan")),
-        *(("stereo.yml", OPENCV, old) for old in ("48", "50.", "-0.1", "rows: 3")),
-    ],
-    ids=lambda value: value if len(value) < 10 else "",
-)
-def test_a_hostile_number_raises_nothing_but_our_errors(
-    name: str, text: str, old: str, number: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("name", "text", "old"), [
+    *(("rig.yaml", OURS, old) for old in ("48", "50.0", "0.1", "1\n")),
+    *(("chain.yaml", KALIBR, old) for old in ("50.0", "48", "-0.1", "[48, 32]", "radtan")),
+    *(("stereo.yml", OPENCV, old) for old in ("48", "50.", "-0.1", "rows: 3")),
+], ids=lambda value: value if len(value) < 10 else "")  # fmt: skip
+def test_a_hostile_number_raises_nothing_but_our_errors(name, text, old, number, tmp_path):
     path = tmp_path / name
     path.write_text(replace_one(text, old, NUMBERS[number] + "\n" * old.endswith("\n")))
     line = refusal_of(path)
@@ -78,7 +48,7 @@ def test_a_hostile_number_raises_nothing_but_our_errors(
 
 
 @pytest.mark.parametrize("nesting", deep(1))
-def test_deep_nesting_is_refused(nesting: str, tmp_path: Path) -> None:
+def test_deep_nesting_is_refused(nesting, tmp_path):
     path, text = tmp_path / "rig.yaml", deep(LEVELS)[nesting]
     path.write_text(text)
     assert refusal_of(path)
@@ -89,13 +59,13 @@ def test_deep_nesting_is_refused(nesting: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("nesting", ["opencv yaml lists", "opencv xml", "opencv json"])
-def test_very_deep_nesting_does_not_end_the_process(nesting: str, pair: tuple[Path, Path]) -> None:
+def test_very_deep_nesting_does_not_end_the_process(nesting, pair):
     Path("rig.yml").write_text(deep(200_000)[nesting])
     assert_refused(run_apart("pair", *pair, "--calib", "rig.yml", "--out", "out"), "rig.yml")
     assert not Path("out").exists()
 
 
-def test_what_is_more_than_any_calibration_is_not_read(tmp_path: Path) -> None:
+def test_what_is_more_than_any_calibration_is_not_read(tmp_path):
     path = tmp_path / "rig.yaml"
     path.write_text("\n".join([*EXPANDING, replace_one(KALIBR, "[50.0, 50.0, 24.0, 16.0]", "*l9")]))
     assert "aliases" in (refusal_of(path) or "")
@@ -107,7 +77,7 @@ def test_what_is_more_than_any_calibration_is_not_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["pair", "disparity", "rectify", "map", "audit"])
-def test_every_command_names_the_file(command: str, pair: tuple[Path, Path], drive: Path) -> None:
+def test_every_command_names_the_file(command, pair, drive):
     Path("rig.yaml").write_text(OURS.replace("48", "!!int abc"))
     inputs = pair if command in {"pair", "disparity", "rectify"} else (drive,)
     out = () if command == "audit" else ("--out", "out")
@@ -117,7 +87,7 @@ def test_every_command_names_the_file(command: str, pair: tuple[Path, Path], dri
 
 @pytest.mark.parametrize("number", sorted(set(NUMBERS) - {"minus 1e300", "null"}))
 @pytest.mark.parametrize("setting", ["matching.sad.window_px", "source.tolerance_s", "matching"])
-def test_a_hostile_value_of_a_setting_is_refused(setting: str, number: str) -> None:
+def test_a_hostile_value_of_a_setting_is_refused(setting, number):
     assert refusal(lambda: load_config(None, [f"{setting}={NUMBERS[number]}"]))
 
 
@@ -126,32 +96,14 @@ def test_a_hostile_value_of_a_setting_is_refused(setting: str, number: str) -> N
     ["", ".", "..", "a" * 5000, ".".join("a" * 5000), "\0", "matching.", ".matching", "é.²", "[1]"],
     ids=["empty", "dot", "dots", "long", "deep", "NUL", "dot last", "dot first", "letters", "list"],
 )
-def test_a_hostile_name_of_a_setting_is_refused(key: str) -> None:
+def test_a_hostile_name_of_a_setting_is_refused(key):
     assert refusal(lambda: load_config(None, [f"{key}=1"]))
-
-
-@pytest.mark.parametrize("change", CONTENT)
-def test_a_spoiled_configuration_is_refused_or_harmless(change: str, tmp_path: Path) -> None:
-    content = b"matching:\n  sad: {window_px: 9, ndisp: 50}\nmesh: {max_depth: 8}\n"
-    (tmp_path / "c.yaml").write_bytes(CONTENT[change](content))
-    line = refusal(lambda: load_config(tmp_path / "c.yaml"))
-    assert line is None or "c.yaml" in line
-
-
-@pytest.mark.parametrize(
-    "value",
-    ["2020-13-45", "!!int abc", "1" * 5000, "[" * 20_000, "&a [*a]", "\udc80", "*b"],
-    ids=["date", "tag", "digits", "nested", "alias", "surrogate", "unknown"],
-)
-def test_the_option_is_named(value: str, pair: tuple[Path, Path]) -> None:
-    ended = run("disparity", *pair, "--set", f"matching.sad.window_px={value}")
-    assert_refused(ended, "window_px")
 
 
 @pytest.mark.parametrize(
     "command", ["pair", "map", "audit", "rectify", "paper", "demo", "calibrate", "mesh"]
 )
-def test_every_command_names_the_option(command: str, pair: tuple[Path, Path]) -> None:
+def test_every_command_names_the_option(command, pair):
     inputs = {
         "pair": (*pair, "--calib", "rig.yaml"),
         "map": (".",),
@@ -166,14 +118,14 @@ def test_every_command_names_the_option(command: str, pair: tuple[Path, Path]) -
 
 
 @pytest.mark.parametrize("threads", ["1000000", "99999999999999999999"])
-def test_more_threads_than_cores_are_harmless(threads: str, pair: tuple[Path, Path]) -> None:
+def test_more_threads_than_cores_are_harmless(threads, pair):
     ended = run("disparity", *pair, "--threads", threads, "--quiet", "--out", "out")
     assert ended.code in {0, 1}
     assert len(ended.lines) <= 1
 
 
 @pytest.mark.parametrize("limit", ["1e3", "-1G", "²G", "1" * 5000, "0.0", "G", "nan", "inf"])
-def test_a_hostile_memory_limit_is_refused(limit: str, here: Path) -> None:
+def test_a_hostile_memory_limit_is_refused(limit, here):
     ended = run("map", here, "--memory-limit", limit)
     assert ended.code in {1, 2}
     assert len(ended.lines[-1]) < 6000
@@ -181,17 +133,14 @@ def test_a_hostile_memory_limit_is_refused(limit: str, here: Path) -> None:
 
 
 @pytest.mark.parametrize("number", ["1_0", "\u0661\u0662"])
-@pytest.mark.parametrize(
-    "option",
-    [
-        "pair left.png right.png --threads",
-        "pair left.png right.png --focal",
-        "map drive --focal",
-        "evaluate disparity a.pfm b.pfm --scale",
-        "piece plan",
-    ],
-)
-def test_an_option_takes_decimals_alone_for_numbers(option: str, number: str, here: Path) -> None:
+@pytest.mark.parametrize("option", [
+    "pair left.png right.png --threads",
+    "pair left.png right.png --focal",
+    "map drive --focal",
+    "evaluate disparity a.pfm b.pfm --scale",
+    "piece plan",
+])  # fmt: skip
+def test_an_option_takes_decimals_alone_for_numbers(option, number, here):
     """Wrong usage, as is any other text that is no number; but a file may be named so."""
     ended = run(*option.split(), number)
     assert ended.code == 2
@@ -228,9 +177,7 @@ READERS: Final = {
 
 @pytest.mark.parametrize("text", TEXTS)
 @pytest.mark.parametrize("reader", READERS)
-def test_a_document_that_is_none_is_refused(
-    reader: str, text: str, drive: Path, pair: tuple[Path, Path]
-) -> None:
+def test_a_document_that_is_none_is_refused(reader, text, drive, pair):
     name, command = READERS[reader]
     Path("one").mkdir()
     Path("one/run.json").write_text('{"command": "pair"}')
@@ -242,7 +189,7 @@ def test_a_document_that_is_none_is_refused(
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_measured_positions_that_are_none_are_refused(text: str, finished: Path) -> None:
+def test_measured_positions_that_are_none_are_refused(text, finished):
     pytest.importorskip("laspy")
     Path("gnss.txt").write_bytes(TEXTS[text])
     words = ("export", "run", "--to", "las", "--georeference", "gnss.txt", "--antenna=0,0,0")
@@ -250,19 +197,18 @@ def test_measured_positions_that_are_none_are_refused(text: str, finished: Path)
     assert not Path("out").exists()
 
 
-MATCHERS: Final = ("sad", "sgm", "opencv")
 BOUNDED: Final = [one for one in numbers_of(DriveSettings) if "onnx" not in one.name]
 # Of address space, for a drive of three small frames that takes a twentieth of it by default.
 MORE_BYTES: Final = 4_000_000_000
 
 
 @pytest.fixture(scope="module")
-def street() -> SyntheticSource:
+def street():
     return SyntheticSource(StreetScene(smooth_edges=False, **{**DRIVE, "frames": 3}))
 
 
 @pytest.fixture
-def little_memory() -> Iterator[None]:
+def little_memory():
     before = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MORE_BYTES, before[1]))
@@ -272,23 +218,16 @@ def little_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def _overrides(number: Number, value: float) -> list[str]:
-    """Return the setting, with whatever makes it matter."""
-    part = number.name.split(".")[1]
-    text = int(value) if number.whole else value
-    matcher = [f"matching.matcher={part}"] if part in MATCHERS else []
-    return [f"{number.name}={text}", *matcher]
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.usefixtures("little_memory")
 @pytest.mark.parametrize("number", BOUNDED, ids=lambda number: number.name)
 @pytest.mark.parametrize("end", ["low", "high"])
-def test_a_setting_at_its_bound_gives_a_map_or_one_line(
-    number: Number, end: str, street: SyntheticSource, tmp_path: Path
-) -> None:
-    overrides, line = _overrides(number, getattr(number, end)), ""
+def test_a_setting_at_its_bound_gives_a_map_or_one_line(number, end, street, tmp_path):
+    value, part, line = getattr(number, end), number.name.split(".")[1], ""
+    overrides = [f"{number.name}={int(value) if number.whole else value}"]
+    if part in ("sad", "sgm", "opencv"):  # whose settings matter to nobody else
+        overrides.append(f"matching.matcher={part}")
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)  # of numpy: of what overflows, or is NaN
         try:
@@ -305,7 +244,7 @@ def test_a_setting_at_its_bound_gives_a_map_or_one_line(
 @pytest.mark.parametrize(
     "setting", ["map_filters.voxel_m=26", "map_filters.radius_m=51", "grid.min_blob_cells=251"]
 )
-def test_margins_beyond_a_tile_are_refused(setting: str) -> None:
+def test_margins_beyond_a_tile_are_refused(setting):
     name = setting.partition("=")[0]
     with pytest.raises(SettingsError, match=f"{name} reaches 5.* m, beyond a tile of 50 m"):
         load_config(None, [setting])

@@ -45,11 +45,16 @@ def _grey(image: UInt8) -> UInt8:
     return np.asarray(np.rint(image @ _BT601), dtype=np.uint8)
 
 
-def _calibration_text(camera: RectifiedCamera) -> str:
-    """P0 and P2 of the left, P1 and P3 of the right camera; grey and colour coincide."""
+def projections(camera: RectifiedCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Projection matrices (3, 4) of the left and the right camera."""
     left = np.hstack([camera.matrix, np.zeros((3, 1))])
     right = left.copy()
     right[0, 2] = camera.cx_right_px
     right[0, 3] = -camera.focal_px * camera.baseline_m
-    rows = (" ".join(f"{value:.12e}" for value in P.ravel()) for P in (left, right, left, right))
+    return left, right
+
+
+def _calibration_text(camera: RectifiedCamera) -> str:
+    """P0 and P2 of the left, P1 and P3 of the right camera; grey and colour coincide."""
+    rows = (" ".join(f"{value:.12e}" for value in P.ravel()) for P in 2 * projections(camera))
     return "".join(f"P{number}: {row}\n" for number, row in enumerate(rows))

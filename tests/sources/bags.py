@@ -1,7 +1,5 @@
 """Writes bags of a drive as recorders do, optionally damaged."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,15 +15,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recon.core.geometry.se3 import quaternion_from_rotation
 from recon.core.values import RectifiedCamera
-from tests.sources.drives import Pairs, Writer, projections, stamp_ns
+from tests.scenery.kitti import projections
+from tests.sources.drives import Pairs, Writer, stamp_ns
 
 TOPICS = ("/stereo/left/image_rect", "/stereo/right/image_rect")
 
 
 @dataclass(frozen=True)
 class Recording:
-    """How a bag is written."""
-
     kind: str  # ros1, ros2 or mcap
     topics: tuple[str, str] = TOPICS
     compressed: bool = False  # PNG messages
@@ -40,8 +37,6 @@ class Recording:
 
 
 class Recorder:
-    """Writes messages of one bag."""
-
     def __init__(self, writer: Any, how: Recording) -> None:
         self.writer, self.how = writer, how
         self.ros1 = how.kind == "ros1"
@@ -59,7 +54,6 @@ class Recorder:
         self.writer.write(self.connections[topic], recorded_ns, pack(message, kind))
 
     def make(self, kind: str, *values: Any, **fields: Any) -> Any:
-        """Return a message of a type such as ``geometry_msgs/Pose``."""
         return self.store.types[kind.replace("/", "/msg/")](*values, **fields)
 
     def header(self, stamp_ns: int, frame_id: str = "cam") -> Any:
@@ -86,7 +80,6 @@ class Recorder:
         return self.make(f"geometry_msgs/{point}", *T[:3, 3].tolist()), turn
 
     def odometry(self, stamp_ns: int, T: np.ndarray) -> Any:
-        """Pose of ``base_link`` in ``odom``."""
         zero = self.make("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0)
         pose = self.make("geometry_msgs/Pose", *self.place(T))
         twist = self.make("geometry_msgs/Twist", zero, zero)
@@ -104,10 +97,7 @@ class Recorder:
     def transforms(self, *parts: Any) -> Any:
         return self.make("tf2_msgs/TFMessage", transforms=list(parts))
 
-    def camera_infos(
-        self, stamp_ns: int, camera: RectifiedCamera, topics: tuple[str, str] = TOPICS
-    ) -> None:
-        """Write the cameras of two topics of images, beside them."""
+    def camera_infos(self, stamp_ns, camera, topics=TOPICS):
         roi = self.make(
             "sensor_msgs/RegionOfInterest",
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
@@ -157,5 +147,4 @@ def write_bag(pairs: Pairs, camera: RectifiedCamera, folder: Path, how: Recordin
 
 
 def bag(**how: Any) -> Writer:
-    """Return what writes bags in this way."""
     return lambda pairs, camera, folder: write_bag(pairs, camera, folder, Recording(**how))

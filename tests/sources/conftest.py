@@ -1,7 +1,5 @@
 """Drives of a few small images, rendered for nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,7 @@ from tests.sources.drives import FRAMES
 
 
 @pytest.fixture(scope="session")
-def noise() -> list[StereoPair]:
+def noise():
     """Pairs whose content does not matter, but for its being different everywhere."""
     rng = np.random.default_rng(3)
     images = rng.integers(0, 256, (12, 2, 32, 64), dtype=np.uint8)
@@ -18,7 +16,7 @@ def noise() -> list[StereoPair]:
 
 
 @pytest.fixture(scope="session")
-def numbered() -> list[StereoPair]:
+def numbered():
     """The grey value of both images is ten times the number of the frame."""
     grey = [np.full((32, 64), 10 * index, np.uint8) for index in range(FRAMES)]
     return [StereoPair(image, image, 0.1 * index, index) for index, image in enumerate(grey)]

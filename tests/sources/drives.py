@@ -1,8 +1,7 @@
 """Writes one drive in every supported layout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,9 @@ import yaml
 
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.images.image import write_image
-from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
+from tests.scenery.film import film
+from tests.scenery.kitti import projections
 
 RATE_HZ = 10.0
 EPOCH_S = 1_600_000_000
@@ -26,25 +26,9 @@ Writer = Callable[[Pairs, RectifiedCamera, Path], Path]
 
 def rendered(frames: int, **settings: Any) -> tuple[Pairs, RectifiedCamera]:
     """Grey pairs of a street, which every layout can store without loss."""
-    source = SyntheticSource(StreetScene(frames=frames, threads=1, **settings))
-    grey = [
-        StereoPair(
-            *(np.asarray(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY)) for p in (pair.left, pair.right)),
-            pair.timestamp_s,
-            pair.index,
-            pair.name,
-        )
-        for pair in source
-    ]
-    return grey, source.calibration
-
-
-def projections(camera: RectifiedCamera) -> tuple[np.ndarray, np.ndarray]:
-    left = np.hstack([camera.matrix, np.zeros((3, 1))])
-    right = left.copy()
-    right[0, 2] = camera.cx_right_px
-    right[0, 3] = -camera.focal_px * camera.baseline_m
-    return left, right
+    drive = film(StreetScene(frames=frames, threads=1, **settings))
+    grey = drive.taken(slice(None), partial(cv2.cvtColor, code=cv2.COLOR_RGB2GRAY))
+    return grey.pairs, grey.calibration
 
 
 def _rows(camera: RectifiedCamera) -> list[str]:
@@ -62,12 +46,7 @@ def stamp_ns(pair: StereoPair) -> int:
     return EPOCH_S * 10**9 + round(pair.timestamp_s * 1e9)
 
 
-def write_images(
-    pairs: Pairs,
-    camera: RectifiedCamera | None,
-    folder: Path,
-    name: Callable[[int, StereoPair], str],
-) -> Path:
+def write_images(pairs, camera, folder, name):
     """Write both images of each pair, under a name by side (0 = left), and ``calib.txt``."""
     for pair in pairs:
         for side, image in enumerate((pair.left, pair.right)):
@@ -145,9 +124,7 @@ def write_folders(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> Path:
     return write_images(pairs, camera, folder, lambda n, pair: f"{sides[n]}{pair.index}")
 
 
-def write_stamped(
-    pairs: Pairs, camera: RectifiedCamera, folder: Path, late_us: int = 2000, lonely: bool = True
-) -> Path:
+def write_stamped(pairs, camera, folder, late_us=2000, lonely=True):
     """Names are timestamps, the right ones are late, and each side has one unpaired image."""
     write_images(
         pairs, camera, folder, lambda n, pair: f"cam{n}/{stamp_ns(pair) // 1000 + n * late_us}"
@@ -176,9 +153,7 @@ def write_side_by_side(pairs: Pairs, camera: RectifiedCamera, folder: Path) -> P
     return write_video(folder / "both.mkv", [np.hstack([p.left, p.right]) for p in pairs])
 
 
-def write_two_videos(
-    pairs: Pairs, camera: RectifiedCamera, folder: Path, end: str = ".avi", fourcc: str = "FFV1"
-) -> Path:
+def write_two_videos(pairs, camera, folder, end=".avi", fourcc="FFV1"):
     write_calib(folder, camera)
     write_video(folder / f"left{end}", [p.left for p in pairs], fourcc)
     write_video(folder / f"right{end}", [p.right for p in pairs], fourcc)

@@ -1,7 +1,5 @@
 """Sources of one's own, parts of a source, rendered streets, and drives that arrive live."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,13 +15,11 @@ from recon.core.errors import FormatError, SourceError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.map.localize.sequence import localize_sequence
 from recon.rig.audit.audit import audit_source
-from recon.sources.kitti import open_kitti
 from recon.sources.live import LiveSource
 from recon.sources.source import SourcePart, StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene, StreetSettings
 from tests.scenery.film import RIG, Film, film
-from tests.scenery.kitti import write_kitti
 from tests.scenery.patience import LONG_S
 
 
@@ -41,11 +37,11 @@ class Own(recon.StereoSource):
 
 
 @pytest.fixture(scope="module")
-def own() -> Own:
+def own():
     return Own(film(StreetScene(frames=3, seed=1, **RIG)))
 
 
-def test_a_subclass_is_mapped_and_has_defaults_for_the_rest(own: Own) -> None:
+def test_a_subclass_is_mapped_and_has_defaults_for_the_rest(own):
     mapped = recon.map_sequence(own, recon.load_config())
     assert len(mapped.trajectory) == 3
     assert repr(own) == "Own(Own, pairs: 3, a source)"
@@ -55,7 +51,7 @@ def test_a_subclass_is_mapped_and_has_defaults_for_the_rest(own: Own) -> None:
     assert [own.lines(count) for count in (2, 3, 4)] == [None, [0, 1, 2], [0, 1, 2]]
 
 
-def test_a_part_has_the_pairs_of_its_range(own: Own) -> None:
+def test_a_part_has_the_pairs_of_its_range(own):
     part = SourcePart(own, 1, 3, lead=1)
     assert repr(part) == "SourcePart(Own 1 to 2, pairs: 2, a source)"
     assert ([p.index for p in part], [p.index for p in part.frames(1)]) == ([1, 2], [2])
@@ -74,21 +70,19 @@ CALLS: dict[str, Callable[[Any], Any]] = {
 
 @pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize("other", [Path("drive"), SimpleNamespace(frames=list, name="mine")])
-def test_anything_else_is_refused_in_one_line(call: str, other: Any) -> None:
+def test_anything_else_is_refused_in_one_line(call, other):
     with pytest.raises(SourceError, match=r"subclass of recon\.StereoSource") as refused:
         CALLS[call](other)
     assert type(other).__name__ in str(refused.value)
 
 
 @pytest.fixture(scope="module")
-def street() -> SyntheticSource:
+def street():
     scene = StreetSettings(frames=3, seed=6, width_px=160, height_px=80, focal_px=90.0)
     return SyntheticSource(scene)
 
 
-def test_a_street_gives_pairs_in_order_a_pose_for_each_and_surfaces(
-    street: SyntheticSource,
-) -> None:
+def test_a_street_gives_pairs_in_order_poses_and_surfaces(street):
     pairs, truth = list(street), street.truth
     assert repr(street) == "SyntheticSource(synthetic street 6, pairs: 3, a rendered street)"
     assert [pair.index for pair in pairs] == [0, 1, 2]
@@ -103,22 +97,6 @@ def test_a_street_gives_pairs_in_order_a_pose_for_each_and_surfaces(
     one, two = street.disparity_truth(1), street.frame(1).truth
     assert np.array_equal(one.values, two.values, equal_nan=True)
     assert np.array_equal(one.nonocc, two.nonocc)
-
-
-@pytest.mark.parametrize("grey", [True, False])
-def test_the_kitti_source_reads_the_same_street(
-    street: SyntheticSource, tmp_path: Path, grey: bool
-) -> None:
-    write_kitti(street, tmp_path / "drive", grey=grey)
-    assert (tmp_path / "drive" / "image_0").exists() == grey
-    kitti = open_kitti(tmp_path / "drive")
-    assert len(kitti) == 3
-    for name in ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m"):
-        assert getattr(kitti.calibration, name) == pytest.approx(getattr(street.calibration, name))
-    true = street.trajectory.T_world_camera
-    assert np.allclose(kitti.truth.trajectory.T_world_camera, true, atol=1e-9)
-    if not grey:
-        assert np.array_equal(next(kitti.frames(2)).left, street.camera.pair(2).left)
 
 
 GREY = np.zeros((16, 16), np.uint8)
@@ -147,7 +125,7 @@ class Recording(StereoSource):
             raise self.error
 
 
-def test_who_keeps_up_gets_every_pair() -> None:
+def test_who_keeps_up_gets_every_pair():
     recording = Recording(6)
     recording.go.set()
     live = LiveSource(recording, rate=2.0)
@@ -160,7 +138,7 @@ def test_who_keeps_up_gets_every_pair() -> None:
     assert len(pairs) + figures["frames_dropped"] == 6
 
 
-def test_who_is_slow_gets_the_newest_and_is_told_what_was_dropped() -> None:
+def test_who_is_slow_gets_the_newest_and_is_told_what_was_dropped():
     recording = Recording(10)
     live = LiveSource(recording, rate=1e9)
     pairs = live.frames()
@@ -180,29 +158,7 @@ def test_who_is_slow_gets_the_newest_and_is_told_what_was_dropped() -> None:
     assert [text.split()[0] for text in live.warnings()] == ["1", "8"]
 
 
-def test_pairs_of_cameras_are_due_when_they_were_taken() -> None:
-    class Camera(Recording):
-        def frames(self, start: int = 0) -> Iterator[StereoPair]:
-            yield StereoPair(GREY, GREY, time.monotonic() - 0.05, 0)
-
-    live = LiveSource(Camera(1), rate=None)
-    for _ in live:
-        live.note_located(0)
-    assert 50 <= live.figures()["live"]["latency_ms"]["p50"] < 1000 * LONG_S
-    assert live.figures()["live"]["rate"] is None
-    assert live.description == "a recording"
-
-
-def test_a_drive_ends_when_it_is_told_to() -> None:
-    stop, recording = Event(), Recording(3)  # after the first pair it gives none
-    pairs = LiveSource(recording, stopped=stop.is_set).frames()
-    next(pairs)
-    stop.set()
-    assert list(pairs) == []
-    recording.go.set()
-
-
-def test_the_time_from_arrival_to_result_is_measured_of_drives_that_are_played() -> None:
+def test_the_time_from_arrival_to_result_is_measured_of_drives_that_are_played():
     live = LiveSource(Recording(1))
     assert live.figures()["live"]["latency_ms"] == {"p50": None, "p95": None, "max": None}
     assert live.warnings() == []
@@ -213,7 +169,7 @@ def test_the_time_from_arrival_to_result_is_measured_of_drives_that_are_played()
     assert 20 <= latency_ms["p50"] <= latency_ms["p95"] <= latency_ms["max"]
 
 
-def test_an_error_of_the_recording_is_raised_where_pairs_are_taken() -> None:
+def test_an_error_of_the_recording_is_raised_where_pairs_are_taken():
     recording = Recording(2, FormatError("truncated"))
     recording.go.set()
     with pytest.raises(FormatError, match="truncated"):
