@@ -1,9 +1,8 @@
 """Drives along a wall, seen by a camera that is put on it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -40,7 +39,6 @@ TRUE = poses(0.0), poses(12.0, 0.05), poses(5.0, -0.04)
 
 
 def wall(T_true: Float64, seed: int) -> PointCloud:
-    """What a camera at a true pose sees of the wall, camera axes."""
     rng = np.random.default_rng(seed)
     z = T_true[2, 3] + rng.uniform(1, 8, 600)
     points = np.stack([np.full(600, WALL_M), rng.uniform(-1, 1, 600), z], axis=1)
@@ -55,16 +53,10 @@ def wall(T_true: Float64, seed: int) -> PointCloud:
 
 
 def drive(
-    map_: Map,
-    true: Float64,
-    seed: int,
-    name: str = "wall",
-    drift: float = 0.0,
-    first: int = 0,
-    noise: int = 0,
-    health: Mapping[int, OdometryHealth] | None = None,
+    map_: Map, true: Float64, seed: int, name: str = "wall", drift: float = 0.0, first: int = 0,
+    noise: int = 0, health: Mapping[int, OdometryHealth] = MappingProxyType({}),
     config: ReconConfig = CONFIG,
-) -> Session:
+) -> Session:  # fmt: skip
     """Map a drive whose own world begins with its first camera; ``drift`` stretches its path.
 
     ``health`` of some frames is not good; where a stretch ends, a submap does.
@@ -73,7 +65,7 @@ def drive(
     session = map_.begin(SessionInfo(name, "of a test", len(true), config.model_dump(mode="json")))
     session.set_axes(T_MAP_WORLD, CAMERA)
     builder = SubmapBuilder(config.submaps, config.fusion, config.occupancy, T_MAP_WORLD)
-    records = [(health or {}).get(frame, OdometryHealth()) for frame in range(len(true))]
+    records = [health.get(frame, OdometryHealth()) for frame in range(len(true))]
     for frame, T_true in enumerate(true):
         T = invert(true[0]) @ T_true
         T[:3, 3] *= 1 + drift
@@ -89,9 +81,7 @@ def drive(
     return session
 
 
-def links_between(
-    one: int, other: int, true: tuple[Float64, Float64], off_m: float = 0.0
-) -> list[Link]:
+def links_between(one: int, other: int, true: tuple[Float64, ...], off_m: float = 0) -> list[Link]:
     """Places that two drives saw, where their paths are side by side."""
     found = []
     for last in range(0, FRAMES, 3):
@@ -119,23 +109,19 @@ def off_m(map_: Map, number: int) -> float:
 
 
 def cloud_of(tiles: Tiles) -> PointCloud:
-    """All points, in order of their places."""
     cloud = join_clouds(tile.cloud for tile in tiles)
     return cloud.select(np.lexsort(cloud.xyz.T))
 
 
 def voxels_of(tiles: Tiles) -> OccupancyVoxels:
-    """All voxels, in order."""
     return in_order(join_voxels((tile.voxels for tile in tiles), tiles.resolution_m))
 
 
 def in_order(voxels: OccupancyVoxels) -> OccupancyVoxels:
-    """Voxels in order of their keys."""
     return voxels.select(np.lexsort(voxels.keys.T))
 
 
 def assert_same_voxels(ours: OccupancyVoxels, theirs: OccupancyVoxels, atol: float = 0.0) -> None:
-    """Equal keys and log-odds, in whatever order."""
     ours, theirs = in_order(ours), in_order(theirs)
     np.testing.assert_array_equal(ours.keys, theirs.keys)
     np.testing.assert_allclose(ours.log_odds, theirs.log_odds, rtol=0, atol=atol)

@@ -1,7 +1,5 @@
 """A drive in the map: poses that are doubted, matching behind poses, and loops."""
 
-from __future__ import annotations
-
 import math
 import time
 from threading import Event
@@ -13,13 +11,7 @@ import pytest
 
 from recon.core.errors import MappingError, OutputError, RegistrationError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
-from recon.core.values import (
-    Disparity,
-    PointCloud,
-    RectifiedCamera,
-    RectifiedPair,
-    Trajectory,
-)
+from recon.core.values import Disparity, PointCloud, RectifiedCamera, RectifiedPair, Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.drive import drive_loops
 from recon.map.drive.drive import MapBehind
@@ -50,12 +42,12 @@ def doubts(film: Film, poses: Float64) -> tuple[str, ...]:
 
 
 @pytest.fixture(scope="module")
-def street() -> Film:
+def street():
     return film(StreetScene(frames=8, seed=1, **RIG))
 
 
 @pytest.mark.parametrize("T_there_world", [np.eye(4), T_SURVEY_WORLD])
-def test_right_poses_are_not_doubted(street: Film, T_there_world: Float64) -> None:
+def test_right_poses_are_not_doubted(street, T_there_world):
     assert doubts(street, T_there_world @ street.trajectory.T_world_camera) == ()
     assert doubts(street.taken(slice(0, 1)), np.eye(4)[None]) == ()
     with pytest.raises(RegistrationError, match="fewer known poses than frames"):
@@ -69,13 +61,13 @@ def scaled(poses: Float64) -> Float64:
 
 
 @pytest.mark.parametrize("change", [scaled, invert, lambda poses: poses[::-1].copy()])
-def test_poses_that_contradict_the_images_are_doubted(street: Film, change) -> None:
+def test_poses_that_contradict_the_images_are_doubted(street, change):
     (line,) = doubts(street, change(street.trajectory.T_world_camera))
     assert "contradict what the cameras see" in line
     assert "standard deviations off" in line
 
 
-def test_poses_of_a_body_are_recognised(street: Film) -> None:
+def test_poses_of_a_body_are_recognised(street):
     poses = T_BODY_CAMERA @ street.trajectory.T_world_camera @ invert(T_BODY_CAMERA)
     (line,) = doubts(street, poses)
     assert "as those of a body" in line
@@ -106,7 +98,7 @@ def _waiting(index: int) -> tuple[RectifiedPair, OdometryResult]:
     return pair, OdometryResult(np.eye(4), OdometryHealth())
 
 
-def test_of_frames_that_wait_the_newest_is_matched() -> None:
+def test_of_frames_that_wait_the_newest_is_matched():
     live = Live()
     behind = MapBehind(live, live.map)
     behind.add(_waiting(0))
@@ -120,7 +112,7 @@ def test_of_frames_that_wait_the_newest_is_matched() -> None:
     assert live.unmatched == 3
 
 
-def test_the_first_frame_is_matched_however_late_it_is() -> None:
+def test_the_first_frame_is_matched_however_late_it_is():
     live = Live()
     live.go.set()
     behind = MapBehind(live, live.map)
@@ -132,7 +124,7 @@ def test_the_first_frame_is_matched_however_late_it_is() -> None:
     assert live.done == [(0, True), (1, False), (2, True)]
 
 
-def test_what_goes_wrong_is_raised_where_frames_are_added() -> None:
+def test_what_goes_wrong_is_raised_where_frames_are_added():
     def fail(*_: object) -> None:
         raise MappingError("no")
 
@@ -182,13 +174,11 @@ def _circle(share: float = 0.0) -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[ReconstructedFrame]:
+def frames():
     return [_frame(k) for k in range(FRAMES)]
 
 
-def _watch(
-    frames, path: Trajectory, store: Store | None = None, upto: int = FRAMES, committed: int = 0
-) -> LoopWatch:
+def _watch(frames, path, store=None, upto=FRAMES, committed=0):
     store = store or Store.temporary()
     watch = LoopWatch(Keyframes(store))
     for number, (frame, T) in enumerate(zip(frames[:upto], path.T_world_camera, strict=False)):
@@ -201,7 +191,7 @@ def _watch(
 
 
 @pytest.fixture(scope="module")
-def closed(frames) -> DriveLoops:
+def closed(frames):
     path = _circle(0.01)
     return _watch(frames, path).close(path)
 
@@ -246,8 +236,7 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
         resumed.add(frame, T, trusted=True)
 
     loops = resumed.close(path)
-    assert _pairs(loops) == _pairs(closed)
-    assert loops.figures() == closed.figures()
+    assert (_pairs(loops), loops.figures()) == (_pairs(closed), closed.figures())
     assert np.array_equal(
         loops.closure.trajectory.T_world_camera, closed.closure.trajectory.T_world_camera
     )

@@ -1,6 +1,4 @@
-"""Axes on the ground, the flat grid above it, and the space that a vehicle took up."""
-
-from __future__ import annotations
+"""Axes on the ground, its surface, the flat grid above it, and the space that a vehicle took up."""
 
 import math
 
@@ -13,10 +11,11 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyV
 from recon.core.values.grid import log_odds
 from recon.map.builders import OccupancyBuilder, OccupancySettings
 from recon.map.ground import grid as grid_file
-from recon.map.ground.axes import AxesSettings, GroundPlane, base_axes, estimate_ground, map_axes
+from recon.map.ground import surface as ground_file
+from recon.map.ground.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
-from recon.map.ground.surface import GroundSurface
+from recon.map.ground.surface import GroundSettings, GroundSurface, add_floors, find_floors
 from recon.map.occupancy.part import OccupancyPart, free_part, join_occupancy
 from tests.map.walls import T_MAP_WORLD
 
@@ -64,7 +63,7 @@ def _slanted_scene() -> OccupancyVoxels:
     return _voxels((columns, 2.0), (columns + np.array([0, 0, 2]), -1.0), (box, 2.0))
 
 
-def test_a_box_on_slanted_ground_is_occupied_and_the_ground_is_not() -> None:
+def test_a_box_on_slanted_ground_is_occupied_and_the_ground_is_not():
     grid = _flatten(_slanted_scene(), _ground(SLOPE))
     assert _cell(grid, 15.5, 2.5) == OCCUPIED
     assert (grid.cells == OCCUPIED).sum() == 25
@@ -73,27 +72,25 @@ def test_a_box_on_slanted_ground_is_occupied_and_the_ground_is_not() -> None:
     assert _cell(_flatten(_slanted_scene(), _ground(0.0)), 19.0, -3.0) == OCCUPIED
 
 
-def test_the_grid_is_the_right_way_round() -> None:
+def test_the_grid_is_the_right_way_round():
     # One obstacle at x = 3, y = -1: row 0 has the smallest y.
     grid = _flatten(
         _voxels(*_road((0, -2), (4, 2)), (_box((3, -1, -1), (3.6, -0.4, 0)), 2.0)), _ground()
     )
-    assert grid.origin_m == pytest.approx((0.0, -2.0))
-    assert grid.cells.shape == (20, 20)
+    assert (grid.origin_m, grid.cells.shape) == (pytest.approx((0.0, -2.0)), (20, 20))
     rows, columns = np.nonzero(grid.cells == OCCUPIED)
     assert (rows.min(), rows.max()) == (5, 7)
     assert (columns.min(), columns.max()) == (15, 17)
 
 
-def test_unknown_stays_unknown() -> None:
+def test_unknown_stays_unknown():
     seen = _road((0, 0), (2, 4))
     above = (_box((2, 0, 0.0), (4, 4, 0.2)), -1.0)
     undecided = (_box((4, 0, -1.0), (5, 4, -0.6)), 0.1)
     grid = _flatten(_voxels(*seen, above, undecided), _ground())
     assert _cell(grid, 1.0, 2.0) == FREE
     # Free only at 1.6 m above ground, as behind a parked car that is looked over.
-    assert _cell(grid, 3.0, 2.0) == UNKNOWN
-    assert _cell(grid, 4.5, 2.0) == UNKNOWN
+    assert (_cell(grid, 3.0, 2.0), _cell(grid, 4.5, 2.0)) == (UNKNOWN, UNKNOWN)
     assert (grid.cells != OCCUPIED).all()
     # A parked car whose sides gave no match: the road below it is seen, nothing above it.
     below = (_box((2, 0, -1.6), (4, 2, -1.4)), 2.0)
@@ -107,22 +104,17 @@ def test_unknown_stays_unknown() -> None:
     assert (_flatten(low, _ground()).cells == FREE).all()
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "setting", "cells"),
-    [
-        ((1, 0, 1.0), (2, 4, 1.4), {"max_height_m": 3.0}, 100),  # a bridge above the band
-        ((1, 1, -1), (1.2, 1.4, -0.6), {"min_blob_cells": 1}, 2),  # a speck
-    ],
-)
-def test_what_is_driven_under_or_taken_for_noise_is_a_setting(
-    low: tuple, high: tuple, setting: dict[str, float], cells: int
-) -> None:
+@pytest.mark.parametrize(("low", "high", "setting", "cells"), [
+    ((1, 0, 1.0), (2, 4, 1.4), {"max_height_m": 3.0}, 100),  # a bridge above the band
+    ((1, 1, -1), (1.2, 1.4, -0.6), {"min_blob_cells": 1}, 2),  # a speck
+])  # fmt: skip
+def test_what_is_driven_under_or_taken_for_noise_is_a_setting(low, high, setting, cells):
     voxels = _voxels(*_road((0, 0), (4, 4)), (_box(low, high), 2.0))
     assert (_flatten(voxels, _ground()).cells == FREE).all()
     assert (_flatten(voxels, _ground(), **setting).cells == OCCUPIED).sum() == cells
 
 
-def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch):
     # The wall at x = 2 is sure; behind it the hits of an uncertain depth, then nothing.
     wall = (_box((2, 0, -1.0), (2.2, 4, -0.6)), 2.0)
     behind = (_box((2.2, 0, -1.0), (3.4, 4, -0.6)), 0.01)
@@ -137,30 +129,22 @@ def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch: pytest.MonkeyPatc
     assert (_flatten(voxels, _ground()).cells[10] == OCCUPIED).sum() == 4
 
 
-def test_what_was_hit_before_a_wall_does_not_make_it_thicker() -> None:
+def test_what_was_hit_before_a_wall_makes_it_no_thicker_but_is_not_free_either():
     wall = (_box((2.4, 0, -1.0), (2.6, 4, -0.6)), 2.0)
-    before = (_box((2.0, 0, -1.0), (2.4, 4, -0.6)), 0.01)
-    grid = _flatten(_voxels(*_road((0, 0), (2, 4)), wall, before), _ground())
-    # The cell beside the free road may hold nothing; the next one touches no free cell.
-    row = grid.cells[10]
-    assert row[9:13].tolist() == [FREE, UNKNOWN, OCCUPIED, OCCUPIED]
-    free = (_box((2.0, 0, -1.0), (2.4, 4, -0.8)), -1.0)
-    grid = _flatten(_voxels(*_road((0, 0), (2, 4)), wall, free), _ground())
-    assert grid.cells[10, 9:13].tolist() == [FREE, FREE, FREE, OCCUPIED]
+    for road_m, low, high, value, row in (
+        # The cell beside the free road may hold nothing; the next one touches no free cell.
+        (2.0, -1.0, -0.6, 0.01, [FREE, UNKNOWN, OCCUPIED, OCCUPIED]),
+        (2.0, -1.0, -0.8, -1.0, [FREE, FREE, FREE, OCCUPIED]),
+        # A cell of a free road that was hit low is not free.
+        (2.4, -1.0, -0.8, 0.1, [FREE, FREE, UNKNOWN, OCCUPIED]),
+        (2.4, -0.4, -0.2, 0.1, [FREE, FREE, FREE, OCCUPIED]),
+    ):
+        before = (_box((2.0, 0, low), (2.4, 4, high)), value)
+        grid = _flatten(_voxels(*_road((0, 0), (road_m, 4)), wall, before), _ground())
+        assert grid.cells[10, 9:13].tolist() == row
 
 
-def test_a_cell_beside_an_obstacle_that_was_hit_low_is_not_free() -> None:
-    wall = (_box((2.4, 0, -1.0), (2.6, 4, -0.6)), 2.0)
-    low, high = ((_box((2.0, 0, z), (2.4, 4, z + 0.2)), 0.1) for z in (-1.0, -0.4))
-    road = _road((0, 0), (2.4, 4))
-    grids = [_flatten(_voxels(*road, wall, hit), _ground()) for hit in (low, high)]
-    assert [grid.cells[10, 9:13].tolist() for grid in grids] == [
-        [FREE, FREE, UNKNOWN, OCCUPIED],
-        [FREE, FREE, FREE, OCCUPIED],
-    ]
-
-
-def test_undecided_voxels_are_dropped() -> None:
+def test_undecided_voxels_are_dropped():
     values = np.array([2.0, 0.3, 0.1, -0.4, -0.8], np.float32)
     voxels = OccupancyVoxels(np.arange(15, dtype=np.int32).reshape(5, 3), values, 0.2)
     # 0.55 and 0.35 are log-odds of 0.20 and -0.62: one look is not enough for free.
@@ -169,14 +153,14 @@ def test_undecided_voxels_are_dropped() -> None:
     assert kept.keys[:, 0].tolist() == [0, 3, 12]
 
 
-def test_impossible_requests_are_refused() -> None:
+def test_impossible_requests_are_refused():
     with pytest.raises(MappingError, match="nothing was observed"):
         _flatten(_voxels((np.zeros((0, 3)), 0.0)), _ground())
     with pytest.raises(MappingError, match="band of the grid is empty"):
         _flatten(_slanted_scene(), _ground(), min_height_m=2.0, max_height_m=1.0)
 
 
-def test_the_ground_is_as_thick_as_what_is_seen_below_it_but_not_as_deep_as_a_hole() -> None:
+def test_the_ground_is_as_thick_as_what_is_seen_below_it_but_not_as_deep_as_a_hole():
     road = _box((0, -2, -1.6), (4, 2, -1.4)), 2.0
     low, hole = ((_box((0, -2, z), (4, 0, z + 0.2)), 2.0) for z in (-1.8, -2.4))
     unsure = _box((0, -2, -2.0), (4, 2, -1.8)), 0.05
@@ -205,7 +189,7 @@ def _through(path: np.ndarray, trusted: list[bool] | None = None) -> DrivenPath:
     return DrivenPath.through(path, sure, np.arange(len(path)), 0.1)
 
 
-def test_a_vehicle_takes_up_its_width_from_the_ground_to_the_camera() -> None:
+def test_a_vehicle_takes_up_its_width_from_the_ground_to_the_camera():
     keys = sweep(_line(), _road_of(), 1.0, CELL_M)
     centres = (keys + 0.5) * CELL_M
     assert len(np.unique(keys, axis=0)) == len(keys)
@@ -223,7 +207,7 @@ def test_a_vehicle_takes_up_its_width_from_the_ground_to_the_camera() -> None:
     assert len(sweep(_line(), _road_of(drops_m=1.7), 1.0, CELL_M)) > 0
 
 
-def test_a_path_is_filled_in_between_trusted_poses_alone() -> None:
+def test_a_path_is_filled_in_between_trusted_poses_alone():
     path = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], float)
     whole = _through(path)
     assert np.diff(whole.points_m[:, 0]) == pytest.approx(np.full(40, 0.1))
@@ -235,7 +219,7 @@ def test_a_path_is_filled_in_between_trusted_poses_alone() -> None:
     assert _through(np.zeros((5, 3))).submap.tolist() == [0, 1, 2, 3, 4]
 
 
-def test_cars_and_walkers_drive_and_drones_do_not() -> None:
+def test_cars_and_walkers_drive_and_drones_do_not():
     steps = np.arange(200)
     walker = 1.5 + 0.05 * np.sin(steps)
     assert is_driven(walker, 1.5)
@@ -254,18 +238,14 @@ def _part_of(clouds: list[np.ndarray]) -> OccupancyPart:
     return builder.part()
 
 
-def _plate(z_m: float) -> np.ndarray:
-    """A car's rear at depth z, 0.1 to 1.4 m above the road."""
-    x, y = np.meshgrid(np.arange(-0.8, 0.8, 0.04), np.arange(0.2, 1.5, 0.04))
-    return np.stack([x.ravel(), y.ravel(), np.full(x.size, z_m)], axis=1)
-
-
 def _flat(parts: list[OccupancyPart]) -> OccupancyGrid:
     return flatten(join_occupancy(parts).voxels(CELL_M), _road_of(), GridSettings())
 
 
-def test_what_drove_off_before_the_vehicle_came_leaves_no_trace() -> None:
-    before = _part_of([_plate(3.1)] * 6)
+def test_what_drove_off_before_the_vehicle_came_leaves_no_trace():
+    # A car's rear, 0.1 to 1.4 m above the road.
+    x, y = np.meshgrid(np.arange(-0.8, 0.8, 0.04), np.arange(0.2, 1.5, 0.04))
+    before = _part_of([np.stack([x.ravel(), y.ravel(), np.full(x.size, 3.1)], axis=1)] * 6)
     assert _cell(_flat([before]), 3.1, 0.1) == OCCUPIED
     passed = free_part(sweep(_line(), _road_of(), 1.8, CELL_M), EMPTY)
     after = _flat([before, passed])
@@ -278,25 +258,17 @@ def test_what_drove_off_before_the_vehicle_came_leaves_no_trace() -> None:
     assert _cell(_flat([before, narrow]), 3.1, 0.6) == OCCUPIED
 
 
-def test_what_hangs_above_the_camera_stays() -> None:
+def test_what_hangs_above_the_camera_stays():
     # A robot 0.5 m high under a table of 0.75 m: whether others fit below it says the height band.
     low = _line() - np.array([0, 0, HEIGHT_M - 0.5])
     x, z = np.meshgrid(np.arange(-0.5, 0.5, 0.04), np.arange(2.0, 3.0, 0.04))
     table = np.stack([x.ravel(), np.full(x.size, HEIGHT_M - 0.75), z.ravel()], axis=1)
     parts = [_part_of([table] * 6), free_part(sweep(low, _road_of(), 1.0, CELL_M), EMPTY)]
-    assert _cell(_flat(parts), 2.5, 0.1) == OCCUPIED
-    assert _cell(_flat(parts), 0.5, 0.1) == FREE
-
-
-def test_the_base_is_on_the_ground_below_the_camera() -> None:
-    T = base_axes(T_MAP_WORLD, 1.65)
-    # A point on the road, 1.65 m below a level camera and 10 m ahead.
-    assert apply(T, np.array([[0.0, 1.65, 10.0]])) == pytest.approx(np.array([[10.0, 0.0, 0.0]]))
-    assert base_axes(T_MAP_WORLD, None)[:3, 3].tolist() == [0, 0, 0]
+    assert (_cell(_flat(parts), 2.5, 0.1), _cell(_flat(parts), 0.5, 0.1)) == (OCCUPIED, FREE)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 2.0, 10.0])
-def test_with_its_origin_on_the_ground_the_map_starts_at_zero(tilt_deg: float) -> None:
+def test_with_its_origin_on_the_ground_the_map_starts_at_zero(tilt_deg):
     normal = exp_so3(np.array([np.deg2rad(tilt_deg), 0.0, 0.0])) @ np.array([0.0, -1.0, 0.0])
     ground = GroundPlane(normal, 1.5)
     T = map_axes(ground, AxesSettings(origin="ground"))
@@ -322,14 +294,8 @@ def _street(pitch_deg: float, roll_deg: float = 0.0, height: float = 1.5) -> Poi
     return PointCloud((xyz @ turn.T).astype(np.float32))
 
 
-def test_map_axes_are_forward_left_up() -> None:
-    T = map_axes(None, AxesSettings())
-    right_down_forward = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
-    assert apply(T, right_down_forward).tolist() == [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
-
-
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (2.0, -1.0), (12.0, 0.0), (-8.0, 6.0)])
-def test_the_ground_is_found_among_walls_and_boxes(pitch: float, roll: float) -> None:
+def test_the_ground_is_found_among_walls_and_boxes(pitch, roll):
     street = _street(pitch, roll)
     plane = estimate_ground(street)
     # 6000 points with 1 cm of noise fix a plane much better than this.
@@ -350,10 +316,186 @@ def test_the_ground_is_found_among_walls_and_boxes(pitch: float, roll: float) ->
         assert abs(T[1, 2]) < 0.03
 
 
-def test_walls_ceilings_and_nothing_are_no_ground() -> None:
+def test_walls_ceilings_and_nothing_are_no_ground():
     rng = np.random.default_rng(1)
     x, y = rng.uniform(-5, 5, 8000), rng.uniform(-2, 2, 8000)
     wall = np.stack([x, y, np.full(8000, 6.0)], 1)
     ceiling = np.stack([x, np.full(8000, -1.5), rng.uniform(4, 15, 8000)], 1)
     for xyz in (wall, ceiling, np.zeros((0, 3))):
         assert estimate_ground(PointCloud(xyz.astype(np.float32))) is None
+
+
+CAMERA_M = 1.6
+PATH = np.stack([np.arange(0, 60, 1.0), np.zeros(60), np.zeros(60)], axis=1)
+
+
+def _slope(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A hill along the drive, and a road that hangs to the side."""
+    return 2.0 * np.sin(x / 15) + 0.05 * y
+
+
+def _hill(seed: int = 0, n: int = 60_000) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 60, n), rng.uniform(-12, 12, n)
+    return np.stack([x, y, _slope(x, y) + rng.normal(0, 0.03, n)], axis=1)
+
+
+def _path() -> np.ndarray:
+    path = PATH.copy()
+    path[:, 2] = _slope(path[:, 0], path[:, 1]) + CAMERA_M
+    return path
+
+
+def _surface(points: np.ndarray, **settings: float) -> GroundSurface:
+    cloud = PointCloud(points.astype(np.float32), frame="map")
+    return ground_file.estimate_ground_surface(cloud, _path(), GroundSettings(**settings))
+
+
+@pytest.mark.parametrize(("points", "path", "words"), [
+    (PointCloud(np.zeros((0, 3), np.float32), frame="world"), PATH, "map axes"),
+    (PointCloud(np.zeros((0, 3), np.float32), frame="map"), PATH[:0], "path is empty"),
+])  # fmt: skip
+def test_wrong_input_is_refused(points, path, words):
+    with pytest.raises(MappingError, match=words):
+        ground_file.estimate_ground_surface(points, path, GroundSettings())
+
+
+def _error(surface: GroundSurface, half_width: float = 10.0) -> np.ndarray:
+    rng = np.random.default_rng(9)
+    x, y = rng.uniform(1, 59, 3000), rng.uniform(-half_width, half_width, 3000)
+    return surface.height_at(np.stack([x, y], axis=1)) - _slope(x, y)
+
+
+def test_slopes_are_followed():
+    surface = _surface(_hill())
+    assert surface.camera_height_m == pytest.approx(CAMERA_M, abs=0.03)
+    # Slope up to 13 % and 25 points per cell: what is left is smoothing over curvature.
+    assert np.abs(_error(surface)).max() < 0.1
+    given = _surface(_hill(), camera_height_m=CAMERA_M)
+    assert given.camera_height_m == CAMERA_M
+    assert np.abs(_error(given)).max() < 0.1
+    cloud = PointCloud(_hill().astype(np.float32), frame="map")
+    of_one_frame = ground_file.estimate_ground_surface(cloud, _path()[30:31], GroundSettings())
+    height_m = float(_slope(np.array(33.0), np.array(2.0)))
+    assert of_one_frame.height_at(np.array([[33.0, 2.0]]))[0] == pytest.approx(height_m, abs=0.1)
+
+
+def test_what_is_beyond_the_reach_or_has_no_ground_is_unknown():
+    surface = _surface(_hill(), reach_m=5.0)
+    assert np.isnan(surface.height_at(np.array([[30.0, 9.0], [1e4, -1e4]]))).all()
+    nothing = _surface(np.zeros((0, 3)))
+    assert np.isnan(nothing.heights_m).all()
+    assert math.isnan(nothing.camera_height_m)
+
+
+def test_boxes_and_walls_do_not_lift_the_ground():
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(10, 16, 20_000), rng.uniform(3, 6, 20_000)
+    roof = np.stack([x, y, _slope(x, y) + 1.5], axis=1)
+    x = rng.uniform(0, 60, 40_000)
+    wall = np.stack([x, np.full(40_000, 9.0), _slope(x, 9.0) + rng.uniform(0, 4, 40_000)], axis=1)
+    clear = _hill()
+    under = (clear[:, 0] > 10) & (clear[:, 0] < 16) & (clear[:, 1] > 3) & (clear[:, 1] < 6)
+    surface = _surface(np.vstack([clear[~under], roof, wall]))
+    # The foot of the wall lies within the window and lifts its own cells a little.
+    assert np.abs(_error(surface, half_width=7.5)).max() < 0.15
+
+
+def test_normals_tell_the_ground_from_the_rest():
+    ground = _hill(n=20_000)
+    hedge = ground + np.array([0, 0, 0.25])
+    normals = np.zeros((40_000, 3), np.float32)
+    normals[:20_000, 2] = 1
+    normals[20_000:, 1] = 1
+    cloud = PointCloud(np.vstack([ground, hedge]).astype(np.float32), normals=normals, frame="map")
+    surface = ground_file.estimate_ground_surface(cloud, _path(), GroundSettings())
+    assert np.abs(_error(surface)).max() < 0.15
+    without = _surface(np.vstack([ground, hedge]))
+    assert np.abs(np.nanmean(_error(without))) > 2 * abs(np.nanmean(_error(surface)))
+
+
+def test_heights_are_carried_over_small_gaps_alone(monkeypatch):
+    points = _hill()
+    small = (np.abs(points[:, 1]) > 3) & (np.abs(points[:, 1]) < 5)
+    assert np.isfinite(_error(_surface(points[~small]))).all()
+    large = np.abs(points[:, 1]) > 3
+    monkeypatch.setattr(ground_file, "_MAX_GAP_M", 2.0)
+    surface = _surface(points[~large])
+    assert np.isnan(surface.height_at(np.array([[30.0, 9.5], [30.0, -9.5]]))).all()
+    assert np.isfinite(surface.height_at(np.array([[30.0, 2.0], [30.0, -2.0]]))).all()
+
+
+def test_height_is_linear_between_centres_of_cells():
+    surface = GroundSurface(np.array([[0.0, 1.0], [2.0, np.nan]]), 1.0, (10.0, 20.0))
+    places = np.array([[10.5, 20.5], [11.0, 20.5], [10.5, 21.0], [11.5, 21.5], [10.0, 20.0]])
+    heights = surface.height_at(places)
+    assert heights[:3].tolist() == [0.0, 0.5, 1.0]
+    assert math.isnan(heights[3])
+    assert heights[4] == 0.0  # outside of the centres: the nearest cell's
+
+
+EDGE_M = 0.2
+NONE = np.zeros((0, 3), np.float32)
+NOTHING = PointCloud(NONE, normals=NONE, frame="map")
+
+
+def _columns(x: range, y: range, heights: dict[int, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Voxels with log-odds by height, the same in every column."""
+    keys = [(i, j, k) for i in x for j in y for k in heights]
+    return np.array(keys, np.int32), np.tile(list(heights.values()), len(x) * len(y))
+
+
+def _joined(*parts: tuple[np.ndarray, np.ndarray]) -> OccupancyVoxels:
+    keys, values = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return OccupancyVoxels(keys, values.astype(np.float32), EDGE_M)
+
+
+ROAD = _columns(range(20), range(5), {-8: 2.0, -7: -1.0, -6: -1.0})
+WALL = _columns(range(20), range(5, 6), dict.fromkeys(range(-8, 4), 2.0))
+
+
+def test_floors_are_occupied_voxels_below_free_ones():
+    added = add_floors(NOTHING, find_floors(_joined(ROAD, WALL)))
+    none = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), EDGE_M)
+    assert len(find_floors(none)) == len(add_floors(NOTHING, find_floors(none))) == 0
+    assert (len(added), added.xyz[:, 2]) == (100, pytest.approx(-7.5 * EDGE_M))
+    assert added.xyz[:, 1].max() < 1.0
+    assert (added.normals == [0, 0, 1]).all()
+
+
+def test_a_floor_may_share_its_evidence_with_the_voxel_above():
+    undecided = _columns(range(5), range(5), {-8: 2.0, -7: 0.1, -6: -1.0})
+    thick = _columns(range(10, 15), range(5), {-8: 2.0, -7: 2.0, -6: -1.0})
+    unknown = _columns(range(20, 25), range(5), {-8: 2.0})
+    added = add_floors(NOTHING, find_floors(_joined(undecided, thick, unknown)))
+    heights = {x0: added.xyz[np.floor(added.xyz[:, 0]) == x0, 2] for x0 in (0, 2, 4)}
+    assert (heights[0], heights[2]) == (pytest.approx(-7.5 * EDGE_M), pytest.approx(-6.5 * EDGE_M))
+    assert len(heights[4]) == 0
+
+
+def test_cells_that_the_cloud_measures_are_left_to_it():
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(0, 2, 200), rng.uniform(0, 1, 200), np.full(200, -1.62)])
+    up = np.tile(np.array([0, 0, 1], np.float32), (200, 1))
+    cloud = PointCloud(xyz.astype(np.float32), normals=up, frame="map")
+    added = add_floors(cloud, find_floors(_joined(ROAD)))
+    assert added.xyz[200:, 0].min() > 2.0
+    # Points on a wall measure no ground.
+    sideways = PointCloud(cloud.xyz, normals=up[:, [2, 0, 1]], frame="map")
+    assert add_floors(sideways, find_floors(_joined(ROAD))).xyz[200:, 0].min() < 1.0
+
+
+def test_the_ground_reaches_as_far_as_the_voxels(monkeypatch):
+    path = np.array([[0.5, 0.5, 0.0], [2.0, 0.5, 0.0]])
+    long = _columns(range(100), range(-5, 10), {-8: 2.0, -7: -1.0})
+    near = np.column_stack([np.random.default_rng(1).uniform(0, 2, (300, 2)), np.full(300, -1.5)])
+    cloud = PointCloud(near.astype(np.float32), frame="map")
+    place = np.array([[18.0, 0.5]])
+    monkeypatch.setattr(ground_file, "_MAX_GAP_M", 2.0)
+    settings = GroundSettings()
+    assert np.isnan(
+        ground_file.estimate_ground_surface(cloud, path, settings).height_at(place)
+    ).all()
+    floor = add_floors(cloud, find_floors(_joined(long)))
+    height = ground_file.estimate_ground_surface(floor, path, settings).height_at(place)
+    assert height == pytest.approx(-7.5 * EDGE_M, abs=0.01)

@@ -1,7 +1,5 @@
 """Reference implementations of the kernels of the map, with cells in a dictionary."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import product
@@ -22,9 +20,7 @@ Clamped = tuple[float, float, float]
 """Sum, low, high: stands for ``x → min(max(x + sum, low), high)``."""
 
 
-def measure_points_reference(
-    xyz: Array, sigma: Array, confidence: Array, T: Array, max_range: float, margin: float
-) -> tuple[Array, Array]:
+def measure_points_reference(xyz, sigma, confidence, T, max_range, margin):
     """Ends of rays (N, 3) and values (N, 4), as `recon.map.kernels.raycast.measure_points` says."""
     scale = np.linalg.norm(T[0, :3])
     metres = np.linalg.norm(xyz, axis=1)
@@ -36,9 +32,7 @@ def measure_points_reference(
     return ends, np.stack([spread, free, confidence, near.astype(float)], axis=1)
 
 
-def limit_points_reference(
-    xyz: Array, sigma: Array, max_range: float, beyond: float, margin: float
-) -> tuple[Array, Array]:
+def limit_points_reference(xyz, sigma, max_range, beyond, margin):
     """Points (N, 3) and deviations (N,), as `recon.map.kernels.raycast.limit_points` says."""
     length = np.linalg.norm(xyz, axis=1)
     shrink = np.where(length <= max_range, 1.0, beyond / np.maximum(length, 1e-30))
@@ -98,15 +92,12 @@ def _ray(rays: Rays, n: int, spread: float) -> Iterator[tuple[Cell, float]]:
 
 
 def _below(value: float, mean: float, sigma: float) -> float:
-    """Share of a normal distribution below ``value``."""
     if sigma <= 0:
         return float(value > mean)
     return 0.5 * (1.0 + math.erf((value - mean) / (sigma * math.sqrt(2.0))))
 
 
-def apply_evidence_reference(
-    log_odds: dict[Cell, float], evidence: dict[Cell, float], lowest: float, highest: float
-) -> None:
+def apply_evidence_reference(log_odds, evidence, lowest, highest):
     """Add a frame's evidence to the log-odds of a map and clamp: what a part stands for."""
     for cell, change in evidence.items():
         log_odds[cell] = min(max(log_odds.get(cell, 0.0) + change, lowest), highest)
@@ -147,7 +138,6 @@ def is_crossed(cell: Cell, points: dict[Cell, tuple[float, Array]]) -> bool:
 
 
 def cells_of(blocks: ClampedBlocks) -> dict[Cell, Clamped]:
-    """Sum, low and high of each observed cell."""
     rows = observed_rows(blocks)
     corner = np.repeat(unpack_keys(rows.blocks) * 8, np.diff(rows.starts), axis=0)
     local = np.stack(np.unravel_index(rows.cells, (8, 8, 8)), axis=1)
@@ -156,6 +146,5 @@ def cells_of(blocks: ClampedBlocks) -> dict[Cell, Clamped]:
 
 
 def log_odds_of(blocks: ClampedBlocks) -> dict[Cell, float]:
-    """Log-odds of each observed cell, as of one drive."""
     cells = cells_of(blocks).items()
     return {cell: min(max(change, low), high) for cell, (change, low, high) in cells}

@@ -1,7 +1,5 @@
 """Occupancy from noisy clouds: cells that are hit, freed, kept and clamped."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -16,7 +14,6 @@ from recon.core.values import OccupancyVoxels, PointCloud
 from recon.map import builders as occupancy
 from recon.map.builders import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
 from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.occupancy.part import OccupancyPart
 
 Cell = tuple[int, int, int]
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
@@ -24,7 +21,7 @@ HERE = np.eye(4)
 
 
 @pytest.fixture(autouse=True)
-def _every_point_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def _every_point_counts(monkeypatch):
     """One point is enough for a ray, so that single ones can be followed."""
     monkeypatch.setattr(occupancy, "_MIN_POINTS", 1)
 
@@ -34,9 +31,7 @@ def _cells(voxels: OccupancyVoxels) -> dict[Cell, float]:
     return dict(zip(keys, voxels.log_odds.tolist(), strict=True))
 
 
-def _part(
-    *frames: tuple[PointCloud, np.ndarray], T_map_world: np.ndarray = HERE, **settings: float
-) -> OccupancyPart:
+def _part(*frames, T_map_world=HERE, **settings):
     builder = OccupancyBuilder(OccupancySettings(**settings), T_map_world)
     for cloud, T in frames:
         builder.integrate(cloud, T)
@@ -60,7 +55,7 @@ def _noisy(xyz: np.ndarray, error: float, rng: np.random.Generator) -> PointClou
     return PointCloud((xyz * scale[:, None]).astype("f4"), sigma_m=sigma.astype("f4"))
 
 
-def test_a_point_ahead_lies_forward_in_the_map() -> None:
+def test_a_point_ahead_lies_forward_in_the_map():
     T = make_transform(exp_so3(np.array([0, math.pi / 2, 0])), np.array([10.0, 0, 0]))
     turned = _map((_points((0.1, 0.1, 5.1)), T))
     # Looking along +x from x = 10: the point lies at x = 15.1, z = -0.1.
@@ -74,7 +69,7 @@ def test_a_point_ahead_lies_forward_in_the_map() -> None:
     assert not _map()
 
 
-def test_log_odds_follow_the_settings_and_their_clamps() -> None:
+def test_log_odds_follow_the_settings_and_their_clamps():
     cloud = _points((0.1, 0.1, 5.1))
     half = replace(cloud, confidence=np.float32([0.5]))
     for clouds, share, hit, miss in (
@@ -85,7 +80,7 @@ def test_log_odds_follow_the_settings_and_their_clamps() -> None:
         assert cells[0, 0, 10] == pytest.approx(share * math.log(miss / (1 - miss)), rel=1e-5)
 
 
-def test_free_space_ends_before_an_uncertain_point_and_at_the_range() -> None:
+def test_free_space_ends_before_an_uncertain_point_and_at_the_range():
     cells = _map((_points((0.1, 0.1, 10.1), sigma=0.5), HERE))
     # 10.1 - 2 · 0.5 = 9.1 m lies in cell 45, which is not wholly free.
     assert max(cell[2] for cell, value in cells.items() if value < 0) == 44
@@ -96,7 +91,7 @@ def test_free_space_ends_before_an_uncertain_point_and_at_the_range() -> None:
     assert 47 <= max(cell[2] for cell in cells) <= 49
 
 
-def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma(monkeypatch):
     # A wall 1 m to the right, seen at a flat angle by points whose error is that of stereo.
     rng, frames = np.random.default_rng(0), []
     for step in range(30):
@@ -105,7 +100,6 @@ def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma(monkeypatch: pytest.M
         frames.append((cloud, make_transform(np.eye(3), np.array([0, 0, 0.3 * step]))))
 
     def kept() -> float:
-        """Share of the wall's cells, well inside, that are occupied."""
         cells = _map(*frames)
         wall = [cells.get((5, j, k), 0.0) for j in range(-4, 4) for k in range(30, 70)]
         return float(np.mean(np.array(wall) > 0))
@@ -128,7 +122,7 @@ def _wall_ahead(frames: int, error: float) -> list[tuple[PointCloud, np.ndarray]
     return seen
 
 
-def test_a_wall_seen_often_is_thin_and_has_no_holes() -> None:
+def test_a_wall_seen_often_is_thin_and_has_no_holes():
     part = _part(*_wall_ahead(20, 0.002))
     thin, thick = (_cells(each.voxels(0.2)) for each in (part, replace(part, points=None)))
     layers = [
@@ -144,7 +138,7 @@ def test_a_wall_seen_often_is_thin_and_has_no_holes() -> None:
     assert free[0] == free[1]
 
 
-def test_what_was_looked_through_does_not_bend_a_surface() -> None:
+def test_what_was_looked_through_does_not_bend_a_surface():
     # A board one voxel before the wall, taken away; then the wall.
     rng = np.random.default_rng(1)
     xyz = np.stack([*rng.uniform(-1, 1, (2, 3000)), np.full(3000, 11.9)], 1).astype(np.float32)
@@ -154,13 +148,13 @@ def test_what_was_looked_through_does_not_bend_a_surface() -> None:
     assert {cell[2] for cell in left if abs(cell[1]) < 4} == {60}
 
 
-def test_lone_points_start_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lone_points_start_no_ray(monkeypatch):
     cloud = _points((0.1, 0.1, 5.1), (0.11, 0.1, 5.1), (2.1, 0.1, 5.1))
     monkeypatch.setattr(occupancy, "_MIN_POINTS", 2)
     assert [cell for cell, value in _map((cloud, HERE)).items() if value > 0] == [(0, 0, 25)]
 
 
-def test_cells_agree_with_those_of_octomap() -> None:
+def test_cells_agree_with_those_of_octomap():
     # What differs by design: we aim at the mean of the points of an end cell, OctoMap at its
     # centre. So here every point is the centre of a cell.
     rng = np.random.default_rng(3)
@@ -190,18 +184,13 @@ SETTINGS = OccupancySettings(resolution_m=0.2, max_range_m=20.0)
 POSE = make_transform(np.eye(3), np.array([0.11, 0.09, 0.1]))  # no ray along an edge of cells
 
 
-@pytest.mark.parametrize(
-    ("cloud", "T", "words"),
-    [
-        (PointCloud(np.zeros((1, 3), np.float32), frame="world"), HERE, "camera axes"),
-        (_points((math.nan, 0, 1)), HERE, "not finite"),
-        (_points((0, 0, 1)), np.full((4, 4), math.nan), "not finite"),
-        (_points((0, 0, 1)), make_transform(np.eye(3), np.array([1e9, 0, 0])), "too far"),
-    ],
-)
-def test_frames_that_would_spoil_the_map_are_refused(
-    cloud: PointCloud, T: np.ndarray, words: str
-) -> None:
+@pytest.mark.parametrize(("cloud", "T", "words"), [
+    (PointCloud(np.zeros((1, 3), np.float32), frame="world"), HERE, "camera axes"),
+    (_points((math.nan, 0, 1)), HERE, "not finite"),
+    (_points((0, 0, 1)), np.full((4, 4), math.nan), "not finite"),
+    (_points((0, 0, 1)), make_transform(np.eye(3), np.array([1e9, 0, 0])), "too far"),
+])  # fmt: skip
+def test_frames_that_spoil_a_map_are_refused(cloud, T, words):
     with pytest.raises(MappingError, match=words):
         _map((cloud, T))
     if T is HERE:
@@ -210,14 +199,13 @@ def test_frames_that_would_spoil_the_map_are_refused(
 
 
 def _signs(cloud: PointCloud, resolution_m: float = 0.2) -> list[set[Cell]]:
-    """The cells that are occupied, and those that are free."""
     settings = {"resolution_m": resolution_m, "max_range_m": 20.0}
     seen = _part((cloud, POSE), **settings).voxels(resolution_m)
     signs = (seen.log_odds > 0, seen.log_odds < 0)
     return [{tuple(key) for key in seen.keys[which].tolist()} for which in signs]
 
 
-def test_there_is_one_ray_for_each_cube_and_it_counts_its_sure_points() -> None:
+def test_there_is_one_ray_for_each_cube_and_it_counts_its_sure_points():
     xyz = np.float32([[0.02, 0.02, 5.02], [0.06, 0.04, 5.06], [0.32, 0.02, 5.02], [1, 0, 5]])
     rays = thin_rays(PointCloud(xyz, confidence=np.float32([1, 1, 0.5, 0])), SETTINGS)
     order = np.argsort(rays.count)
@@ -232,7 +220,7 @@ def test_there_is_one_ray_for_each_cube_and_it_counts_its_sure_points() -> None:
 
 
 @pytest.mark.parametrize("resolution_m", [0.2, 0.5])
-def test_a_map_of_rays_is_the_map_of_the_points(resolution_m: float) -> None:
+def test_a_map_of_rays_is_the_map_of_the_points(resolution_m):
     rng = np.random.default_rng(0)
     sigma = rng.uniform(0.05, 0.3, 40_000).astype(np.float32)
     xyz = np.column_stack([rng.uniform(-4, 4, (40_000, 2)), 12.0 + rng.normal(0, sigma)])
@@ -247,9 +235,7 @@ def test_a_map_of_rays_is_the_map_of_the_points(resolution_m: float) -> None:
 
 @pytest.mark.parametrize("depth_m", [20.5, 24.0, 60.0, 3000.0])
 @pytest.mark.parametrize("sigma_m", [0.0, 0.5, 4.0])
-def test_points_out_of_range_free_what_they_freed_and_hit_nothing(
-    depth_m: float, sigma_m: float
-) -> None:
+def test_points_out_of_range_free_cells_and_hit_nothing(depth_m, sigma_m):
     xyz = (np.float32([[0.013, 0.017, 1.0], [0.1, -0.05, 1.0]]) * np.float32(depth_m)).astype("f4")
     cloud = PointCloud(xyz, sigma_m=np.full(2, sigma_m, np.float32))
     _, ours = _signs(cloud)
@@ -260,7 +246,7 @@ def test_points_out_of_range_free_what_they_freed_and_hit_nothing(
 
 
 @pytest.mark.parametrize("max_range_m", [5.0, 25.0, 120.0, 1000.0])
-def test_the_farthest_point_has_a_place(max_range_m: float) -> None:
+def test_the_farthest_point_has_a_place(max_range_m):
     settings = SETTINGS.model_copy(update={"max_range_m": max_range_m})
     corner = np.float32([[1, -1, 1], [-1, 1, 1], [0, 0, 1]]) * np.float32(2 * max_range_m)
     length = np.linalg.norm(thin_rays(PointCloud(corner), settings).cloud().xyz, axis=1)

@@ -1,7 +1,5 @@
 """The store of a map: equal to a dictionary, whole after a kill, clear about bad files."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -79,9 +77,7 @@ def _reopened(path: Path) -> Store:
 
 @settings(max_examples=60)
 @given(steps=STEPS)
-def test_any_sequence_of_changes_commits_and_kills_equals_a_dictionary(
-    steps: list[tuple[Any, ...]], tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_any_sequence_of_changes_commits_and_kills_equals_a_dictionary(steps, tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "map.recon"
     store, now, kept = Store.create(path, cache_bytes=500), {}, {}
     for what, *args in steps:
@@ -112,13 +108,13 @@ def test_any_sequence_of_changes_commits_and_kills_equals_a_dictionary(
 
 @settings(max_examples=100)
 @given(tree=TREES, compress=st.booleans())
-def test_any_tree_is_read_as_it_was_put(tree: dict[str, Any], compress: bool) -> None:
+def test_any_tree_is_read_as_it_was_put(tree, compress):
     with Store.temporary() as store:
         store.put("any", 1, tree, compress=compress)
         assert _same(tree, store.read("any", 1))
 
 
-def test_large_arrays_shrink_and_keep_their_order_of_axes() -> None:
+def test_large_arrays_shrink_and_keep_their_order_of_axes():
     smooth = np.cumsum(np.ones((5000, 3), np.int16), axis=0, dtype=np.int16)
     turned = np.asfortranarray(np.eye(4))
     with Store.temporary() as store:
@@ -132,14 +128,14 @@ def test_large_arrays_shrink_and_keep_their_order_of_axes() -> None:
 @pytest.mark.parametrize(
     "value", [{1: 2}, {"a": object()}, {"a": np.array([object()])}, {"a": {1}}]
 )
-def test_what_no_file_can_hold_is_refused_before_anything_is_written(value: Any) -> None:
+def test_what_no_file_can_hold_is_refused_before_anything_is_written(value):
     with Store.temporary() as store:
         with pytest.raises(TypeError):
             store.put("any", 1, value)
         assert store.keys("any") == []
 
 
-def test_a_reader_sees_whole_commits_while_another_program_writes(tmp_path: Path) -> None:
+def test_a_reader_sees_whole_commits_while_another_program_writes(tmp_path):
     path = tmp_path / "map.recon"
     with Store.create(path) as writer:
         writer.put("rays", 0, _record(1))
@@ -177,7 +173,7 @@ for number in range(10_000):
 
 
 @pytest.mark.parametrize("seen", [0, 3, 9])
-def test_a_killed_program_leaves_its_last_commit(tmp_path: Path, seen: int) -> None:
+def test_a_killed_program_leaves_its_last_commit(tmp_path, seen):
     path = tmp_path / "map.recon"
     program = subprocess.Popen([sys.executable, "-c", _WRITER, str(path)], stdout=subprocess.PIPE)
     while int(program.stdout.readline()) < seen:
@@ -211,7 +207,7 @@ store.close()
 """
 
 
-def test_a_full_disk_at_a_commit_leaves_the_one_before(tmp_path: Path) -> None:
+def test_a_full_disk_at_a_commit_leaves_the_one_before(tmp_path):
     path = tmp_path / "map.recon"
     command = [sys.executable, "-c", _FULL, str(path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
@@ -251,9 +247,7 @@ FILES = {
 
 @pytest.mark.parametrize("kind", FILES)
 @pytest.mark.parametrize("read_only", [False, True])
-def test_files_of_others_are_refused_with_one_line(
-    tmp_path: Path, kind: str, read_only: bool
-) -> None:
+def test_files_of_others_are_refused(tmp_path, kind, read_only):
     path = tmp_path / "map.recon"
     FILES[kind](path)
     with pytest.raises(FormatError) as caught:
@@ -265,9 +259,7 @@ def test_files_of_others_are_refused_with_one_line(
 
 @settings(max_examples=60)
 @given(place=st.floats(0, 1), bit=st.integers(0, 7), cut=st.booleans())
-def test_a_damaged_file_is_refused_or_gives_what_was_put(
-    place: float, bit: int, cut: bool, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_a_damaged_file_is_refused_or_gives_what_was_put(place, bit, cut, tmp_path_factory):
     path = tmp_path_factory.mktemp("damaged") / "map.recon"
     with Store.create(path) as store:
         for number in range(5):
@@ -286,7 +278,7 @@ def test_a_damaged_file_is_refused_or_gives_what_was_put(
         assert str(path) in str(error)  # noqa: PT017
 
 
-def test_a_missing_record_is_named(tmp_path: Path) -> None:
+def test_a_missing_record_is_named(tmp_path):
     with Store.create(tmp_path / "map.recon") as store:
         with pytest.raises(FormatError, match=r"lacks a record.*rays 7"):
             store.get("rays", 7)
@@ -297,9 +289,7 @@ def test_a_missing_record_is_named(tmp_path: Path) -> None:
 
 
 @given(sizes=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 40)), max_size=40))
-def test_the_cache_stays_within_its_limit_and_returns_what_was_made(
-    sizes: list[tuple[int, int]],
-) -> None:
+def test_the_cache_keeps_its_limit_and_what_was_made(sizes):
     cache, made = Cache(1000), {}
     for key, count in sizes:
         size = made.get(key, count)
@@ -312,7 +302,7 @@ def test_the_cache_stays_within_its_limit_and_returns_what_was_made(
     assert cache.nbytes == 0
 
 
-def test_values_used_last_stay_in_the_cache() -> None:
+def test_values_used_last_stay_in_the_cache():
     cache, made = Cache(2000), []
     for key in "abaca":
         cache.get(key, lambda key=key: made.append(key) or np.zeros(800, np.uint8))
