@@ -98,12 +98,17 @@ def test_icp_finds_the_motion_between_two_samples_of_a_corner(away_m):
     assert share > 0.9
 
 
-def test_clouds_that_are_too_far_apart_for_icp_are_reported():
+def test_clouds_and_occupancies_that_cannot_be_compared_are_reported():
     with pytest.raises(RegistrationError, match="no corresponding points"):
         icp(corner(0), corner(1) + 100, (2.0, 0.5))
     xyz = corner(2)
     xyz.flags.writeable = False
     assert icp(xyz, xyz, (1.0,))[1] == 1.0
+    coarse = OccupancyGrid(np.zeros((2, 2), np.int8), 0.4, (0.0, 0.0))
+    with pytest.raises(EvaluationError, match="different resolutions"):
+        evaluate_occupancy(voxels(WALL), coarse, TRUTH)
+    with pytest.raises(EvaluationError, match="no surface was seen in enough frames"):
+        evaluate_occupancy(voxels(WALL), TRUTH.grid, seen(frames=2))
 
 
 EDGE_M = 0.2
@@ -190,11 +195,3 @@ def test_intersection_over_union_on_paper_counts_seen_cells_wherever_the_grid_li
     part = OccupancyGrid(CELLS[:, 45:], EDGE_M, (9.0, -2.0))
     found = evaluate_occupancy(voxels(WALL), part, replace(TRUTH, seen=ahead)).grid_exact
     assert (found.iou_occupied, found.unknown, found.cells) == pytest.approx((1.0, 5 / 20, 400))
-
-
-def test_occupancies_that_cannot_be_compared_are_refused():
-    coarse = OccupancyGrid(np.zeros((2, 2), np.int8), 0.4, (0.0, 0.0))
-    with pytest.raises(EvaluationError, match="different resolutions"):
-        evaluate_occupancy(voxels(WALL), coarse, TRUTH)
-    with pytest.raises(EvaluationError, match="no surface was seen in enough frames"):
-        evaluate_occupancy(voxels(WALL), TRUTH.grid, seen(frames=2))

@@ -133,17 +133,12 @@ def test_path_of_any_length_is_drawn(frames, T_map_world):
         picture(figures.drift_figure(one, path))
 
 
-def test_grid_is_drawn_with_and_without_path_and_without_any_known_cell(
-    grid, trajectory, T_map_world
-):
+def test_grids_health_and_times_are_drawn_whatever_is_known(grid, trajectory, T_map_world):
     path = figures.seen_from_above(trajectory, T_map_world)
     np.testing.assert_array_equal(path, np.column_stack([np.arange(11), np.zeros(11)]))
     unknown = OccupancyGrid(np.full((4, 5), -1, dtype=np.int8), 0.1, (0.0, 0.0))
     for one, paths in ((grid, {"path": path}), (grid, {}), (unknown, {})):
         picture(figures.grid_figure(one, paths))
-
-
-def test_health_and_times_are_drawn_whatever_was_measured():
     measured = [OdometryHealth(9, 8, 0.2, 0.1)] * 5
     for health in ([], [OdometryHealth()] * 3, [OdometryHealth(ok=False)], measured):
         picture(figures.health_figure(health))

@@ -54,16 +54,13 @@ def csv_rows(found: dict[str, Any]) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(csv_table(found))))
 
 
-def test_a_table_has_a_row_per_matcher_and_a_column_per_figure():
+def test_a_table_has_a_row_per_matcher_and_the_csv_every_scene_mask_and_filling():
     first = tables(summary())["Weighted mean, nonocc, dense"]
     assert " ".join(first[1].split()[:8]) == "sad 40.00 30.00 20.00 10.00 12.50 3.25 3.25"
     assert (first[0].split()[-1], first[1].split()[-1]) == ("seconds", "0.500")
     assert len({line[-4:] for line in first[1:]}) == 1
     for lines in tables(summary(), Table.markdown).values():
         assert len({line.count("|") for line in lines}) == 1
-
-
-def test_csv_has_every_scene_mask_and_filling_and_the_confidence_where_it_is_counted():
     rows = csv_rows(summary())
     assert len(rows) == 2 * 3 * 4
     first = [rows[0][name] for name in ("scene", "depth_median_m", "bad0.5")]

@@ -47,7 +47,7 @@ def test_results_come_in_order(items, count):
     assert list(side_by_side(lambda x: x + 1, items, threads=count)) == after
 
 
-def test_as_many_items_are_worked_on_as_there_are_threads():
+def test_as_many_items_are_worked_on_as_there_are_threads_and_threads_as_cores():
     # Each waits for the other: one thread alone would wait for ever.
     both = threading.Barrier(2, timeout=LONG_S)
 
@@ -56,6 +56,9 @@ def test_as_many_items_are_worked_on_as_there_are_threads():
         return item
 
     assert list(side_by_side(meet, range(4), threads=2)) == [0, 1, 2, 3]
+    cores, before = available_cores(), cv2.getNumThreads()
+    assert [use_threads(1), use_threads(None), use_threads(cores + 3)] == [1, cores, cores]
+    cv2.setNumThreads(before)
 
 
 @pytest.mark.parametrize(
@@ -132,12 +135,6 @@ def test_jobs_behind_are_done_in_order_one_at_a_time():
     behind.wait()
     behind.begin(partial(int, "no number"))
     behind.abandon()
-
-
-def test_no_more_threads_are_used_than_there_are_cores():
-    cores, before = available_cores(), cv2.getNumThreads()
-    assert [use_threads(1), use_threads(None), use_threads(cores + 3)] == [1, cores, cores]
-    cv2.setNumThreads(before)
 
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))

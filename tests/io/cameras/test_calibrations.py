@@ -100,12 +100,18 @@ def test_kalibr_refuses_a_lens_that_it_has_no_name_for(tmp_path, lens):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_opencv_file_refuses_two_models(tmp_path):
+def test_two_models_in_an_opencv_file_and_what_is_no_calibration_are_refused(tmp_path):
     mixed = StereoCalibration(rig("fisheye").left, rig("radtan").right, T_RIGHT_LEFT)
     with pytest.raises(CalibrationError, match="two lens models"):
         write_opencv_calibration(tmp_path / "mixed.yml", mixed)
     write_recon_calibration(tmp_path / "mixed.yaml", mixed)
     assert read_recon_calibration(tmp_path / "mixed.yaml").left.model == "fisheye"
+    (tmp_path / "notes.txt").write_text("f = 700\n")
+    with pytest.raises(FormatError, match=r"notes\.txt: not.*KITTI.*Middlebury.*OpenCV"):
+        read_calibration(tmp_path / "notes.txt", 640, 480)
+    (tmp_path / "h.yaml").write_text("note: up to scale\nwidth_px: 64\nH_left:\n- [1, 0, 0]\n")
+    with pytest.raises(CalibrationError, match=r"h\.yaml: .*no depth.*recon disparity"):
+        read_calibration(tmp_path / "h.yaml", 64, 48)
 
 
 def test_a_kalibr_chain_as_its_wiki_prints_it_is_read(tmp_path):
@@ -174,15 +180,6 @@ def test_a_header_of_opencv_does_not_hide_the_format(tmp_path, write):
         path.write_text("%YAML:1.0\n---\n" + path.read_text())
     path = min(tmp_path.iterdir())
     assert isinstance(read_calibration(path, 640, 480), StereoCalibration)
-
-
-def test_what_is_no_calibration_gets_a_list_of_what_is_understood(tmp_path):
-    (tmp_path / "notes.txt").write_text("f = 700\n")
-    with pytest.raises(FormatError, match=r"notes\.txt: not.*KITTI.*Middlebury.*OpenCV"):
-        read_calibration(tmp_path / "notes.txt", 640, 480)
-    (tmp_path / "h.yaml").write_text("note: up to scale\nwidth_px: 64\nH_left:\n- [1, 0, 0]\n")
-    with pytest.raises(CalibrationError, match=r"h\.yaml: .*no depth.*recon disparity"):
-        read_calibration(tmp_path / "h.yaml", 64, 48)
 
 
 # What consumers of the files compute by equations of their own, without our readers.
@@ -299,15 +296,12 @@ def test_files_of_opencv_are_read_under_all_usual_names(tmp_path, suffix, names)
     np.testing.assert_array_equal(read.T_right_left, T_RIGHT_LEFT)
 
 
-def test_millimetres_become_metres_and_taken_for_metres_are_noticed(tmp_path):
+def test_opencv_files_in_millimetres_and_with_extrinsics_beside_them_are_read(tmp_path):
     path = write_nodes(tmp_path / "stereo.yml", **NODES, **{**POSE, "T": T_MM})
     read = read_opencv_calibration(path, size_px=(640, 480), metres_per_unit=0.001)
     np.testing.assert_allclose(read.T_right_left, T_RIGHT_LEFT, rtol=1e-14)
     with pytest.raises(CalibrationError, match=r"stereo\.yml: baseline is impl.*got 120\.\d+ m"):
         read_opencv_calibration(path, size_px=(640, 480))
-
-
-def test_extrinsics_beside_the_intrinsics_are_found_and_are_no_kitti_file(tmp_path):
     path = write_nodes(tmp_path / "intrinsics.yml", **NODES)
     beside = tmp_path / "extrinsics.yml"
     write_nodes(beside, **POSE, P1=np.eye(3, 4), P2=np.eye(3, 4))

@@ -191,13 +191,21 @@ def test_pfm_gives_back_every_bit(tmp_path_factory, values):
     np.testing.assert_array_equal(read, values)
 
 
-def test_unknown_is_inf_in_a_pfm_and_rows_run_upwards(tmp_path):
+def test_unknown_disparities_of_pfm_kittis_and_eight_bits_and_their_scales(tmp_path):
     write_pfm(tmp_path / "a.pfm", np.array([[np.nan, 1.0], [2.0, 3.0]], dtype=np.float32))
     content = (tmp_path / "a.pfm").read_bytes()
     assert content.startswith(b"Pf\n2 2\n-1.0\n")
     assert np.frombuffer(content[-16:], "<f4").tolist() == [2.0, 3.0, np.inf, 1.0]
     with pytest.raises(ShapeError, match="got float64"):
         write_pfm(tmp_path / "a.pfm", np.zeros((2, 2)))
+    write_disparity_png(tmp_path / "a.png", np.array([[NAN, 0, 1, 200.5]], dtype=np.float32))
+    levels = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert (levels.dtype, levels.tolist()) == (np.uint16, [[0, 1, 256, 51328]])
+    write_image(tmp_path / "b.pgm", np.array([[0, 1, 240]], dtype=np.uint8))
+    values = read_disparity_png(tmp_path / "b.pgm", scale=16)
+    np.testing.assert_array_equal(values, np.array([[NAN, 1 / 16, 15]], "f4"))
+    with pytest.raises(FormatError, match=r"b\.pgm: disparity image has 8 bits"):
+        read_disparity_png(tmp_path / "b.pgm")
 
 
 @pytest.mark.parametrize(
@@ -222,17 +230,6 @@ def test_disparity_comes_back_within_half_a_level_and_nan_as_nan(tmp_path_factor
     read = read_disparity_png(path)
     np.testing.assert_array_equal(np.isnan(read), np.isnan(values))
     np.testing.assert_allclose(read, values, rtol=0, atol=0.5 / 256 + 1e-5)
-
-
-def test_a_disparity_image_is_kittis_or_of_eight_bits_and_a_scale(tmp_path):
-    write_disparity_png(tmp_path / "a.png", np.array([[NAN, 0, 1, 200.5]], dtype=np.float32))
-    levels = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
-    assert (levels.dtype, levels.tolist()) == (np.uint16, [[0, 1, 256, 51328]])
-    write_image(tmp_path / "b.pgm", np.array([[0, 1, 240]], dtype=np.uint8))
-    values = read_disparity_png(tmp_path / "b.pgm", scale=16)
-    np.testing.assert_array_equal(values, np.array([[NAN, 1 / 16, 15]], "f4"))
-    with pytest.raises(FormatError, match=r"b\.pgm: disparity image has 8 bits"):
-        read_disparity_png(tmp_path / "b.pgm")
 
 
 @pytest.mark.parametrize("value", [-0.1, 256.0])

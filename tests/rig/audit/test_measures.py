@@ -133,7 +133,7 @@ def test_speed_is_that_of_the_rig_and_scales_with_the_baseline():
     assert measures.measure_speed(left[:10], right[:10], later[:10], CAMERA) is None
 
 
-def test_repeats_are_counted_apart_from_frozen_cameras():
+def test_repeats_are_counted_apart_from_frozen_cameras_and_the_worst_finding_decides():
     images = [texture(seed) for seed in range(8)]
     counter = measures.RepeatCounter()
     for left, right in ((0, 0), (1, 0), (2, 0), (3, 0), (4, 4), (4, 4), (5, 5)):
@@ -142,9 +142,6 @@ def test_repeats_are_counted_apart_from_frozen_cameras():
     counter.restart()
     counter.add(images[5], images[5])
     assert counter.both == 1
-
-
-def test_the_verdict_is_that_of_the_worst_finding():
     small, large = Finding("gain", False, "dark"), Finding("rows", True, "off")
     assert verdict_of([]) == "good"
     assert verdict_of([small]) == "usable"

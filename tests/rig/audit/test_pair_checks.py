@@ -45,20 +45,21 @@ def good_run(pair, tmp_path_factory):
     return run_pair(given, SETTINGS, out=out, formats=("glb",), progress=progress), out, told
 
 
-def test_images_that_show_nothing_are_refused_and_leave_nothing(pair, tmp_path):
+def test_images_that_show_nothing_no_point_or_two_things_are_told(pair, tmp_path):
     assert run(pair, tmp_path / "good").warnings == ()
     dark = replace(pair, right=np.zeros_like(pair.right))
     with pytest.raises(MatchingError, match=r"^left\.png: no pixel .* right camera shows nothing"):
         run(dark, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_pair_without_a_point_is_refused_with_its_depths(pair, tmp_path):
     settings = load_config(None, ["cloud.max_range_m=1"], PAIR_DEFAULTS)
     # 300 px and 0.1 m at 12 px: 2.5 m.
     with pytest.raises(MappingError, match=r"the cloud is empty .* at 2\.\d+ to 2\.5 m.* to 1 m"):
         run_pair(PairInput(pair, CAMERA), settings, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]))
+    (said,) = run(other, tmp_path / "out").warnings
+    assert said.startswith("only ")
+    assert "same moment" in said
 
 
 def test_the_same_image_twice_is_refused_as_such(pair, tmp_path):
@@ -72,13 +73,6 @@ def test_the_same_image_twice_is_refused_as_such(pair, tmp_path):
         with pytest.raises(MatchingError, match=r"^left\.png: left and right are the same image"):
             run_disparity(given, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_images_of_two_things_are_said_to_be_hardly_a_pair(pair, tmp_path):
-    other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]))
-    (said,) = run(other, tmp_path / "out").warnings
-    assert said.startswith("only ")
-    assert "same moment" in said
 
 
 @pytest.mark.parametrize(

@@ -56,16 +56,13 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(text, lens):
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.12
 
 
-def test_corners_of_a_large_image_are_found_in_a_small_copy_and_refined_in_it():
+def test_corners_are_found_in_a_small_copy_of_a_large_image_and_on_half_of_a_charuco_board():
     board, (view, left, _) = parse_board(CHESS), rendered(CHESS)[0]
     seen = find_board(np.kron(left, np.ones((4, 4), np.uint8)), board)
     truth = (view.left_px + 0.5) * 4 - 0.5
     found = orient_like(truth, seen.pixels, board.inner)
     # Four times the pixels: an error of 0.12 of the small ones.
     assert np.sqrt(np.mean(np.sum((found - truth) ** 2, axis=1))) < 0.5
-
-
-def test_a_charuco_board_that_is_half_covered_is_used_in_part():
     board = parse_board(CHARUCO)
     view, left, _ = rendered(CHARUCO)[0]
     covered = left.copy()
