@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map import run_map
+from recon.commands.map import refine_drive, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.values import StereoPair
@@ -21,7 +21,6 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
-from recon.odometry.rig.refine import refine_rig
 from recon.report.map_page import write_localize_page
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
@@ -59,8 +58,7 @@ def run_localize(
         folder = map_path if map_path.is_dir() else None
         inputs = [*source.files, map_path if folder is None else folder / MAP_FILE]
         run.check_targets(inputs)
-        with run.stage("rig"):
-            rig = refine_rig(source, config, config.rig)
+        rig = refine_drive(source, config, run, map_.known_rig(source.calibration))
         source = rig.applied(source)
         workspace = Workspace(map_, run.watch, run.threads)
         drive = localize_sequence(source, workspace, config, start=start, progress=options.progress)

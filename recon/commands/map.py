@@ -27,7 +27,7 @@ from recon.map.map import Map
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import health_warnings
-from recon.odometry.rig.refine import RefinedRig, refine_rig
+from recon.odometry.rig.refine import KnownRig, RefinedRig, refine_rig
 from recon.report.map_page import map_content
 from recon.report.page import write_page
 from recon.rig.audit.audit import quick_warnings
@@ -106,6 +106,7 @@ def run_map(
         options.begin(run, source, config) as map_,
     ):
         rig = refine_drive(source, config, run)
+        map_.session().set_rig(rig)
         source = rig.applied(source)
         if options.known_poses is not None and rig.refined:
             poses = rig.poses(options.known_poses, config.rectification)
@@ -142,10 +143,12 @@ def run_map(
 RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of the run
 
 
-def refine_drive(source: StereoSource, config: ReconConfig, run: Run) -> RefinedRig:
+def refine_drive(
+    source: StereoSource, config: ReconConfig, run: Run, known: KnownRig | None = None
+) -> RefinedRig:
     """Refine the rig of a drive; the folder of the run gets its calibration."""
     with run.stage("rig"):
-        rig = refine_rig(source, config, config.rig)
+        rig = refine_rig(source, config, config.rig, known)
         if rig.refined:
             write_recon_calibration(run.path(RIG_FILE), rig.calibration)
         return rig

@@ -15,7 +15,7 @@ import numpy as np
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.export import REMADE
-from recon.commands.map import map_drive
+from recon.commands.map import map_drive, refine_drive
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, ReconError, SettingsError
 from recon.export.make import make
@@ -27,9 +27,11 @@ from recon.map.map import Map
 from recon.map.sessions.copying import check_session, copy_sessions, read_all
 from recon.map.sessions.joining import doubts_of_lengths, join_new
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
-from recon.map.sessions.placed import place_map
+from recon.map.sessions.placed import place_map, settings_of
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
+from recon.map.store.session import Session
+from recon.odometry.rig.refine import RefinedRig
 from recon.report.map_page import write_joined_page
 from recon.run.finished import command_of_map, refuse_as_target
 from recon.run.run import Run, WholeRun
@@ -100,8 +102,11 @@ def run_map_into(
     def fill(run: Run, map_: Map) -> list[int]:
         _copied(folder / MAP_FILE, map_, settings)
         kept = run.state("kept.recon")
+        rig = refine_drive(source, settings, run, map_.known_rig(source.calibration))
         with Map.create(run.state("drive.recon")) as drive:
-            check_map(map_drive(source, settings, options, run, drive), source.name)
+            mapped = map_drive(rig.applied(source), settings, options, run, drive)
+            check_map(mapped, source.name)
+            mapped.session.set_rig(rig)
             keep_map(drive, kept)
         try:
             return _copied(kept, map_, settings)
@@ -156,7 +161,7 @@ def _make_joined(
         made = make(Order(map_, placed, run, settings.mesh), options.products)
         axes = {"T_map_world": map_.first.T_map_world.tolist()}
         summary = {**_figures(map_), **made.figures, **axes}
-        summary["warnings"] = [*left_out, *_warnings(map_), *made.warnings]
+        summary["warnings"] = [*left_out, *_warnings(map_), *_of_rigs(map_, new), *made.warnings]
         export_sessions(map_, run)
         with run.report(summary):
             write_joined_page(map_, made, summary, run)
@@ -183,6 +188,7 @@ def _figures(map_: Map) -> dict[str, Any]:
                 "frames_not_trusted": int((~session.trusted).sum()),
                 "frames_placed": int(placed.get(session.number, np.zeros(0)).sum()),
                 "positions": len(session.fixes),
+                "rig": None if (rig := _rig_of(session)) is None else rig.figures(),
             }
             for session in map_.sessions
         ],
@@ -190,6 +196,23 @@ def _figures(map_: Map) -> dict[str, Any]:
         "positions_misfit_rms_m": misfit_rms_m(map_),
         "faces": 0,
     }
+
+
+def _rig_of(session: Session) -> RefinedRig | None:
+    """Return what a drive showed of its rig, if anything."""
+    rig = session.rig
+    return None if rig is None else rig.described(settings_of(session).rectification)
+
+
+def _of_rigs(map_: Map, numbers: Sequence[int]) -> list[str]:
+    """Return what the user should know of the rigs of some drives."""
+    rigs = [(number, _rig_of(map_.session(number))) for number in numbers]
+    return [
+        f"session {number}: {line}"
+        for number, rig in rigs
+        if rig is not None
+        for line in rig.warnings()
+    ]
 
 
 def _warnings(map_: Map) -> list[str]:

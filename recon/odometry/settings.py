@@ -39,8 +39,8 @@ class RigSettings(Settings):
     """Whether the calibration is refined by what the motion of a drive shows."""
 
     refine: bool = True
-    """Use the rig as the drive shows it: how the right camera is turned, its focal length, and what
-    both lenses bend. off = the calibration as it is."""
+    """Use the rig as the drive shows it, or an earlier drive of its map: how the right camera is
+    turned, its focal length, and what both lenses bend. off = the calibration as it is."""
 
 
 class OdometrySettings(Settings):

@@ -7,10 +7,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from recon.core.errors import FormatError
+from recon.core.values import StereoCalibration
 from recon.map.drive.mapper import FrameResult
 from recon.map.map import Map
+from recon.odometry.rig.fault import NAMES
+from recon.odometry.rig.fit import FittedFault
+from recon.odometry.rig.refine import RefinedRig
 from recon.run.work import Silent
+from recon.stereo.rectify.row_alignment import correct_rig
 
 ROOT = Path(__file__).parents[2]
 RECON = [sys.executable, "-m", "recon"]
@@ -68,3 +75,14 @@ def summary_of(folder: Path) -> dict[str, Any]:
 def all_files(folder: Path) -> dict[str, bytes]:
     files = (path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def keep_turned_rig(path: Path) -> StereoCalibration:
+    """Give the first drive of a map a rig whose right camera is turned; it is returned."""
+    with Map.open(path, read_only=False) as map_:
+        camera, size = map_.session().camera, len(NAMES)
+        turned = correct_rig(camera, np.array([0.0, 1e-3, 0.0, 0.0]), np.eye(3))
+        fitted = FittedFault(np.zeros(size), np.eye(size), 1.0, 12)
+        map_.session().set_rig(RefinedRig(camera, turned, camera, fitted))
+        map_.commit()
+    return turned

@@ -1,6 +1,7 @@
 """`recon live` maps as `recon map` does where it keeps up; `recon localize` says where it is."""
 
 import csv
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -25,7 +26,7 @@ from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings
 from recon.street.settings import StreetScene
 from tests.commands.test_cameras import FakeCamera
-from tests.flow.runs import all_files, summary_of
+from tests.flow.runs import all_files, keep_turned_rig, summary_of
 from tests.hostile.refusals import assert_refused, run
 from tests.scenery.film import RIG, film
 from tests.scenery.kitti import write_kitti
@@ -238,10 +239,15 @@ def test_files_are_left_and_the_map_as_it_was(drive, even_map, tmp_path):
     assert "In the map" in (out / "report.html").read_text()
 
 
-def test_the_map_file_alone_will_do(drive, even_map, tmp_path):
-    words = ("--map", even_map / "map" / "map.recon", "--json", "--end", "4", "--out", tmp_path)
+def test_the_map_file_alone_will_do_and_its_rig_is_begun_with(drive, even_map, tmp_path):
+    file, out = shutil.copy(even_map / "map" / "map.recon", tmp_path), tmp_path / "out"
+    keep_turned_rig(file)
+    words = ("--map", file, "--json", "--end", "4", "--out", out)
     assert run("localize", drive, *words).code == 0
-    assert summary_of(tmp_path)["frames_tracking"] >= 3
+    summary = summary_of(out)
+    assert summary["frames_tracking"] >= 3
+    assert summary["rig"]["begun_with"].startswith("session 0 (")
+    assert (out / "rig.yaml").is_file()
 
 
 def test_a_drive_elsewhere_gets_a_warning_and_no_pose(even_map, tmp_path):

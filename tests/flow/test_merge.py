@@ -21,7 +21,7 @@ from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.sources.source import SourcePart
 from recon.street.settings import StreetScene
-from tests.flow.runs import all_files, summary_of
+from tests.flow.runs import all_files, keep_turned_rig, summary_of
 from tests.hostile import refusals
 from tests.scenery.film import RIG, Film, film
 
@@ -117,6 +117,16 @@ def test_a_drive_is_added_to_a_run_and_taken_out_again(run, runs):
         assert (run / name).read_bytes() == (runs / "first" / name).read_bytes()
     assert (run / "notes.txt").read_text() == "mine"
     assert [p.name for p in run.parent.iterdir()] == [run.name]
+
+
+def test_a_drive_that_is_added_begins_with_the_rig_of_the_last_one(run):
+    turned = keep_turned_rig(run)
+    added = run_map_into(run, part(FIRST), None, OPTIONS)
+    assert [drive["rig"]["refined"] for drive in added["sessions"]] == [True, True]
+    assert (run / "rig.yaml").is_file()
+    with Map.open(run) as map_:
+        found = map_.session(1).rig.calibration
+    np.testing.assert_array_equal(found.T_right_left, turned.T_right_left)
 
 
 def test_a_drive_is_taken_out_of_a_map_of_chosen_frames(merged, tmp_path):

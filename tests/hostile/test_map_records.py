@@ -4,7 +4,7 @@ import struct
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,10 +25,14 @@ from recon.map.store.session import ALONE, BENT, SessionInfo
 from recon.map.store.trees import Link
 from recon.map.submaps import Submap
 from recon.odometry.protocol import OdometryHealth
+from recon.odometry.rig.fault import NAMES
+from recon.odometry.rig.fit import FittedFault
+from recon.odometry.rig.refine import RefinedRig
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import Fixes
 from recon.places.keyframe import Keyframe
 from recon.places.loop import Loop
+from recon.stereo.rectify.row_alignment import as_raw
 from tests.hostile.refusals import refusal
 
 FRAMES: Final = 3
@@ -47,7 +51,12 @@ def write_map(path: Path) -> None:
 
 def _add_drive(map_: Map) -> None:
     session = map_.begin(SessionInfo("drive", "of a test", FRAMES))
-    session.set_axes(np.eye(4), RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12, 8))
+    camera = RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12, 8)
+    session.set_axes(np.eye(4), camera)
+    fitted = FittedFault(np.zeros(len(NAMES)), np.eye(len(NAMES)), 1.0, 12)
+    raw = as_raw(camera)
+    lens = replace(raw.left, distortion=np.full(5, 0.01))
+    session.set_rig(RefinedRig(camera, replace(raw, left=lens, right=lens), camera, fitted))
     grain, ones = ray_grain(OccupancySettings()), np.ones(4, np.uint8)
     rays = RayCloud(np.ones((4, 3), np.int16), ones.astype(np.float16), ones, ones, grain.unit_m)
     for frame in range(FRAMES):
@@ -74,7 +83,7 @@ def read_map(path: Path) -> None:
         _ = map_.doubts, map_.links, list(MapViews(map_))
         for session in map_.sessions:
             _ = session.camera, session.fixes, session.trajectory, session.corrections()
-            _ = session.loops, session.state()
+            _ = session.loops, session.state(), session.rig
             _ = [session.rays(frame)[0].cloud() for frame in range(session.ray_frames)]
             _ = [stored.keyframe.xyz(session.camera) for stored in session.keyframes]
             join_fused(submap.fused for submap in session.submaps).cloud(0.1, 1)
@@ -157,7 +166,8 @@ def accepted(records: tuple[Store, Path], kind: str, key: Key, spoiled: Any) -> 
 
 
 KINDS: Final = (
-    "session", "axes", "frames", "loops", "keyframe", "rays", "submap", "submap_entry", "links",
+    "session", "axes", "rig", "frames", "loops", "keyframe", "rays", "submap", "submap_entry",
+    "links",
 )  # fmt: skip
 
 

@@ -19,12 +19,12 @@ from recon.map.store.finished import check_rays
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Key
 from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
-from recon.map.store.trees import FRAMES, RAYS
+from recon.map.store.trees import FRAMES, RAYS, RIG
 from recon.map.submaps import Submap
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.places import path_lengths
 
-_KINDS: Final = (SESSION, AXES, FRAMES, LOOPS, KEYFRAME, RAYS, SUBMAP, ENTRY)
+_KINDS: Final = (SESSION, AXES, RIG, FRAMES, LOOPS, KEYFRAME, RAYS, SUBMAP, ENTRY)
 
 
 def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = ()) -> list[int]:

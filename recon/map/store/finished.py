@@ -16,7 +16,7 @@ from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import AXES, KEYFRAME, LOOPS, Session
-from recon.map.store.trees import RAYS
+from recon.map.store.trees import RAYS, RIG
 from recon.map.submaps import Submap
 
 
@@ -99,7 +99,7 @@ def keep_map(mapped: MapFile, path: Path) -> None:
                 new.add_frame(T_world_camera, time_s, session.health[number])
             for submap in session.submaps:
                 new.submaps.add(replace(submap, occupancy=_nothing()), compress=True)
-        for kind in (AXES, LOOPS, KEYFRAME, RAYS):
+        for kind in (AXES, RIG, LOOPS, KEYFRAME, RAYS):
             mapped.store.copy(kind, kept.store)
         kept.commit()
 

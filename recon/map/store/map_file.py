@@ -13,13 +13,14 @@ from typing_extensions import Self
 from recon.core.errors import FormatError, MappingError
 from recon.core.geometry.se3 import invert
 from recon.core.text import counted
-from recon.core.values import RectifiedCamera, Trajectory
+from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Bool, Float64, Int64
 from recon.io.files import StrPath, reading
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
 from recon.map.store.trees import LINKS, Link
 from recon.odometry.health import doubt_about, name_frames, stretches
+from recon.odometry.rig.refine import KnownRig
 from recon.places.detector import KnownPlaces, KnownView
 from recon.run.directory import refuse_links
 
@@ -87,6 +88,11 @@ class MapFile:
         raise FormatError(
             "the map has no such session", where=self.store.name, got=number, expected=known
         )
+
+    def known_rig(self, given: Rig) -> KnownRig | None:
+        """Return what the last drive of a rig with this calibration showed of it, if any did."""
+        found = (session.rig for session in reversed(self.sessions))
+        return next((rig for rig in found if rig is not None and rig.is_of(given)), None)
 
     def T_world_session(self, session: Session) -> Float64:
         """Return float64 (4, 4), from the world of a linked drive to that of the map."""

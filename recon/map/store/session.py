@@ -19,17 +19,21 @@ from recon.map.store.trees import (
     FRAMES,
     RAY_BYTES,
     RAYS,
+    RIG,
     frames_in,
     frames_record,
     loop_in,
     path_of,
     rays_in,
     rays_record,
+    rig_in,
+    rig_record,
     value_in,
 )
 from recon.map.submaps import Submap
 from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
+from recon.odometry.rig.refine import KnownRig, RefinedRig
 from recon.places.closure import Closure
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import NO_FIXES, Fixes
@@ -166,6 +170,21 @@ class Session:
         """Keep the axes of the map, and the camera."""
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
         self._store.put(AXES, self.number, content)
+
+    @property
+    def rig(self) -> KnownRig | None:
+        """What the drive showed of its rig; None if nothing is known."""
+        if not self._store.has(RIG, self.number):
+            return None
+        with reading(self._store.name):
+            name = f"session {self.number} ({self.info.source})"
+            return rig_in(self._store.read(RIG, self.number), name)
+
+    def set_rig(self, rig: RefinedRig) -> None:
+        """Keep what the drive showed of its rig, for later drives, if it showed anything."""
+        if rig.fitted is not None:
+            content = rig_record(rig.given, rig.calibration, rig.fitted)
+            self._store.put(RIG, self.number, content)
 
     def add_frame(self, T_world_camera: Float64, time_s: float, health: OdometryHealth) -> None:
         """Add the pose of the next frame."""

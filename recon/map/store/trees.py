@@ -16,10 +16,23 @@ from pydantic import TypeAdapter, ValidationError
 
 from recon.core.errors import FormatError, ShapeError
 from recon.core.geometry.se3 import check_rigid
-from recon.core.values import RayCloud, RayGrain, Trajectory
+from recon.core.values import (
+    CameraIntrinsics,
+    RayCloud,
+    RayGrain,
+    RectifiedCamera,
+    Rig,
+    StereoCalibration,
+    Trajectory,
+    check_size,
+)
 from recon.core.values.arrays import Float64, UInt8, array_in, frozen_array
 from recon.odometry.protocol import OdometryHealth
+from recon.odometry.rig.fault import active
+from recon.odometry.rig.fit import FittedFault
+from recon.odometry.rig.refine import KnownRig
 from recon.places.loop import Loop
+from recon.stereo.rectify.row_alignment import as_raw
 
 Bytes = bytes | bytearray | memoryview
 _RAW: Final = "raw"
@@ -266,6 +279,37 @@ def _zigzag(steps: NDArray[np.int16]) -> NDArray[np.uint16]:
 
 def _unzigzag(codes: NDArray[np.uint16]) -> NDArray[np.int16]:
     return ((codes >> 1) ^ -(codes & 1)).view(np.int16)
+
+
+RIG: Final = "rig"
+
+
+def rig_record(given: Rig, calibration: Rig, fitted: FittedFault) -> dict[str, Any]:
+    """Return what a drive showed of its rig as a tree of arrays and plain values."""
+    parts = {"given": given, "calibration": calibration, "fitted": fitted}
+    return {name: asdict(part) for name, part in parts.items()}
+
+
+def rig_in(content: Mapping[str, Any], name: str) -> KnownRig | None:
+    """Return the rig in what `rig_record` gave; None if another version fitted other parameters."""
+    given, calibration = (_calibration_in(content[key]) for key in ("given", "calibration"))
+    size = as_raw(given).left
+    check_size(calibration, size.width_px, size.height_px, "calibration")
+    shown, tree = active(given), content["fitted"]
+    count = len(array_in(tree, "values", np.float64, (None,)))
+    covariance = array_in(tree, "covariance", np.float64, (count, count))
+    if count != len(shown):
+        return None
+    if np.linalg.eigvalsh(covariance[np.ix_(shown, shown)])[0] <= 0.0:
+        raise FormatError("a rig of the map has an impossible covariance")
+    return KnownRig(given, calibration, value_in(FittedFault, tree), name)
+
+
+def _calibration_in(tree: Mapping[str, Any]) -> Rig:
+    if "T_right_left" not in tree:
+        return value_in(RectifiedCamera, tree)
+    left, right = (value_in(CameraIntrinsics, tree[side]) for side in ("left", "right"))
+    return StereoCalibration(left, right, tree["T_right_left"])
 
 
 LINKS: Final = "links"

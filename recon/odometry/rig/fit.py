@@ -44,8 +44,16 @@ class FittedFault:
     windows: int
 
 
-def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> FittedFault:
+def fit_fault(
+    tracks: Sequence[StereoTracks],
+    fault: RigFault,
+    active: Bool,
+    before: FittedFault | None = None,
+) -> FittedFault:
     """Fit the ``active`` parameters to windows of tracks; the others are 0.
+
+    What an earlier drive of the same rig knew ``before`` counts as windows of this one in which the
+    rig has no fault, as far as this drive does not contradict it.
 
     Features of a window err together. By how much windows contradict each other beyond what their
     features let expect, what they know counts less.
@@ -56,6 +64,7 @@ def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> 
     sigmas = fault.sigmas[active]
     prior, scatter = np.diag(1.0 / sigmas**2), 1.0
     values, windows = np.zeros(len(active)), [part.window for part in tracks]
+    held = np.zeros_like(prior)  # of what was known before
     tried, stepped = list[Float64](), list[Float64]()
 
     def linearised(part: StereoTracks, window: TrackWindow) -> tuple[TrackWindow, _System]:
@@ -71,15 +80,18 @@ def fit_fault(tracks: Sequence[StereoTracks], fault: RigFault, active: Bool) -> 
         H = np.stack([system.H for _, system in found])[:, active][:, :, active]
         g = np.stack([system.g for _, system in found])[:, active]
         total = _information(H.sum(axis=0), sigmas)
-        step = np.linalg.solve(
-            total / scatter + prior, g.sum(axis=0) / scatter - prior @ values[active]
-        )
+        seen, pull = total / scatter, g.sum(axis=0) / scatter
+        if before is not None:
+            known = before.covariance[np.ix_(active, active)]
+            held = _not_contradicted(known, seen, pull + seen @ values[active]) - prior
+            held = _information(held, sigmas)
+        step = np.linalg.solve(seen + held + prior, pull - (held + prior) @ values[active])
         tried, stepped = [*tried, values[active]][-_RECALLED:], [*stepped, step][-_RECALLED:]
-        values[active] = _accelerated(tried, stepped, total / scatter + prior)
+        values[active] = _accelerated(tried, stepped, seen + held + prior)
         scatter = _scatter(total + prior, total, g - H @ step)
     covariance = np.zeros((len(active),) * 2)
-    covariance[np.ix_(active, active)] = np.linalg.inv(total / scatter + prior)
-    values[active] = shrink(values[active], total / scatter, sigmas)
+    covariance[np.ix_(active, active)] = np.linalg.inv(total / scatter + held + prior)
+    values[active] = shrink(values[active], total / scatter + held, sigmas)
     return FittedFault(values, covariance, scatter, len(tracks))
 
 
@@ -88,6 +100,24 @@ def _information(H: Float64, sigmas: Float64) -> Float64:
     D, V = np.linalg.eigh(sigmas[:, None] * (0.5 * (H + H.T)) * sigmas)
     shown = np.where(_ROUNDING * D.max(initial=0.0) < D, D, 0.0)
     return np.asarray((V * shown) @ V.T / np.outer(sigmas, sigmas))
+
+
+def _not_contradicted(known: Float64, H: Float64, g: Float64) -> Float64:
+    """Return the information (P, P) of a covariance that a drive may contradict.
+
+    ``H`` (P, P) is the information of the drive and ``g`` (P,) its gradient where the parameters
+    are as was known. Each direction was known as much worse as makes what is seen likely.
+
+    Ref: Efron and Morris, "Stein's estimation rule and its competitors", 1973 (empirical Bayes).
+    """
+    root = np.linalg.cholesky(known)
+    D, V = np.linalg.eigh(root.T @ H @ root)
+    squared = (V.T @ (root.T @ g)) ** 2  # of a rig that has not changed, D² + D
+    usual = np.maximum(D, 0.0) ** 2
+    most = np.maximum(squared - D, usual)
+    share = np.divide(usual, most, where=most > 0.0, out=np.ones_like(D))
+    axes = np.linalg.solve(root.T, V)
+    return np.asarray((axes * share) @ axes.T)
 
 
 def _accelerated(tried: Sequence[Float64], steps: Sequence[Float64], metric: Float64) -> Float64:

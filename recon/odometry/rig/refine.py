@@ -9,7 +9,8 @@ ECMR 2021.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import json
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -81,6 +82,7 @@ class RefinedRig:
     fitted: FittedFault | None = None  # None: too short a drive, or it was not asked for
     changes: tuple[RigChange, ...] = ()  # at `DEPTHS_M`
     sigma_px: float = float("nan")  # of the mean disparity
+    begun_with: str | None = None  # the drive whose rig this one began with
 
     @property
     def refined(self) -> bool:
@@ -134,6 +136,7 @@ class RefinedRig:
         percent = [self.depth_percent(change) for change in self.changes]
         figures = {
             "refined": self.refined,
+            "begun_with": self.begun_with,
             "windows": self.fitted.windows,
             **{f"{n}_deg": float(np.degrees(x)) for n, x in zip(TURN[:3], values, strict=False)},
             "focal_percent": -100.0 * float(values[3]),
@@ -166,47 +169,79 @@ class RefinedRig:
         """Return what the user should know of a rig that is far off."""
         if not self.wrong_at(DEPTHS_M[0]):
             return []
-        used = "used is the rig that the motion shows (--set rig.refine=off keeps the calibration)"
+        shows = "the motion shows" if self.begun_with is None else f"{self.begun_with} showed"
+        used = f"used is the rig that {shows} (--set rig.refine=off keeps the calibration)"
         return [f"the rig is not as calibrated: {self.describe(DEPTHS_M[0])}; {used}"]
 
 
-def refine_rig(source: StereoSource, config: StereoSettings, rig: RigSettings) -> RefinedRig:
+@dataclass(frozen=True, eq=False)
+class KnownRig:
+    """What a drive showed of its rig, for later drives of the same one."""
+
+    given: Rig
+    calibration: Rig  # the refined one; that given where the drive showed nothing else
+    fitted: FittedFault
+    name: str = ""  # of the drive
+
+    def is_of(self, given: Rig) -> bool:
+        """Return whether this is the rig with that calibration, to the last bit."""
+        rigs = (self.given, given)
+        one, other = (json.dumps(asdict(rig), default=np.ndarray.tolist) for rig in rigs)
+        return one == other
+
+    def described(self, settings: RectificationSettings) -> RefinedRig:
+        """Return the rig with how it differs from the one given."""
+        return _described(self.given, self.calibration, self.fitted, settings)
+
+
+def refine_rig(
+    source: StereoSource, config: StereoSettings, rig: RigSettings, known: KnownRig | None = None
+) -> RefinedRig:
     """Refine the rig of a drive by its motion, before it is mapped.
 
     A few windows of frames, from all over the drive, show how the right camera is turned, how long
     its focal length is, and what both lenses bend; see `recon.odometry.rig.fault`. Where a drive
-    shows little the calibration stays. Drives of less than 36 frames, and live ones, are not
-    refined.
+    shows little the calibration stays, or what is ``known`` by an earlier drive of the rig. Drives
+    of less than 36 frames, and live ones, are not refined: they take that as it is.
     """
     given = source.calibration
-    start = Rectifier(given, config.rectification)
-    found = RefinedRig(given, given, start.camera)
+    begun = Rectifier(given, config.rectification)
+    found = RefinedRig(given, given, begun.camera)
+    if rig.refine and known is not None:
+        found = replace(known.described(config.rectification), begun_with=known.name)
+        begun = Rectifier(found.calibration, config.rectification)
     if not rig.refine or source.live or len(source) < MIN_WINDOWS * FRAMES:
         return found
-    values = np.zeros(len(NAMES))
-    refined, values[: len(TURN)] = _with_rows_aligned(source, given, start)
+    values = np.zeros(len(NAMES)) if known is None else known.fitted.values.copy()
+    refined, turn = _with_rows_aligned(source, found.calibration, begun)
+    values[: len(TURN)] += turn
+    # A rig that has turned since is not as it was known.
+    before = None if known is None or turn.any() else known.fitted
     for _ in range(_PASSES):
         reconstructor = FrameReconstructor(refined, config)
         tracks = track_stretches(source, reconstructor)
         if len(tracks) < MIN_WINDOWS:
             return found
         camera = reconstructor.camera
-        fitted = fit_fault(tracks, RigFault(camera), active(refined))
+        fitted = fit_fault(tracks, RigFault(camera), active(refined), before)
         values += fitted.values
-        before, turns = refined, turns_of(refined, config.rectification)
-        refined = without_fault(before, turns, fitted.values)
-        change = compare_rigs(before, refined, DEPTHS_M[-1], config.rectification)
+        last, turns = refined, turns_of(refined, config.rectification)
+        refined, before = without_fault(last, turns, fitted.values), None
+        change = compare_rigs(last, refined, DEPTHS_M[-1], config.rectification)
         if change.moved_px < _FAR_OFF_PX:
             break
-    changes = tuple(compare_rigs(given, refined, z, config.rectification) for z in DEPTHS_M)
-    return RefinedRig(
-        given,
-        refined if changes[-1].moved_px > _LEAST_PX else given,
-        start.camera,
-        replace(fitted, values=values),
-        changes,
-        _mean_sigma(camera, fitted),
-    )
+    described = _described(given, refined, replace(fitted, values=values), config.rectification)
+    return replace(described, begun_with=found.begun_with)
+
+
+def _described(
+    given: Rig, refined: Rig, fitted: FittedFault, settings: RectificationSettings
+) -> RefinedRig:
+    """Return a rig with how it differs from the one given, which it is if nothing does."""
+    camera = turns_of(given, settings).camera
+    changes = tuple(compare_rigs(given, refined, z, settings) for z in DEPTHS_M)
+    rig = refined if changes[-1].moved_px > _LEAST_PX else given
+    return RefinedRig(given, rig, camera, fitted, changes, _mean_sigma(camera, fitted))
 
 
 def compare_rigs(

@@ -1,6 +1,6 @@
 """What a session of a map keeps comes back as it was, also from the map of a finished run."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from recon.core.values import PointCloud, RayCloud, RayGrain, RectifiedCamera
 from recon.map.fusion import join_fused
 from recon.map.map import Map
 from recon.map.occupancy.part import join_occupancy
+from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.joining import path_up_to
 from recon.map.sessions.placed import PlacedSubmaps
 from recon.map.store.finished import keep_map
@@ -18,9 +19,13 @@ from recon.map.store.map_file import MapViews
 from recon.map.store.session import Session, SessionInfo
 from recon.map.store.trees import Link
 from recon.odometry.protocol import OdometryHealth
+from recon.odometry.rig.fault import NAMES
+from recon.odometry.rig.fit import FittedFault
+from recon.odometry.rig.refine import RefinedRig
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 from recon.places.loop import Loop
+from recon.stereo.rectify.row_alignment import as_raw
 from tests.map.walls import CAMERA, CONFIG, drives
 
 GRAIN = RayGrain(0.1, 0.1 / 64, 25.0)
@@ -205,3 +210,30 @@ def test_submaps_move_with_their_middle_frames():
     session.set_loops({"closed": [], "refused": [], "T_world_camera": bent})
     for entry, T in zip(session.submaps.entries, session.corrections(), strict=True):
         np.testing.assert_allclose(T @ path[entry.middle], bent[entry.middle], atol=1e-9)
+
+
+def test_the_rig_of_a_drive_is_known_to_later_ones_of_the_same_calibration(tmp_path):
+    raw, count = as_raw(CAMERA), len(NAMES)
+    other = replace(CAMERA, baseline_m=2.0)
+    with Map.create(tmp_path / "map.recon") as made:
+        for number, (given, found) in enumerate(
+            [(CAMERA, other), (CAMERA, raw), (raw, raw), (other, other)]
+        ):
+            session = made.begin(SessionInfo(f"drive {number}"))
+            _fill(session, number, number + 2)
+            session.set_axes(np.eye(4), CAMERA)
+            fitted = FittedFault(np.arange(count) / 7, np.eye(count) / (1 + number), 1.5, 12)
+            session.set_rig(RefinedRig(given, found, CAMERA, fitted))
+        session = made.begin(SessionInfo("not asked"))
+        _fill(session, 7, 9)
+        session.set_rig(RefinedRig(raw, raw, CAMERA))
+        assert session.rig is None
+        made.commit()
+        with Map.temporary() as kept:
+            copy_sessions(made, kept, without=[3])
+            known = kept.known_rig(replace(CAMERA))
+            assert (known.name, known.given) == ("session 1 (drive 1)", CAMERA)
+            np.testing.assert_equal(asdict(known.calibration), asdict(raw))
+            np.testing.assert_equal(known.fitted.covariance, np.eye(count) / 2)
+            assert kept.known_rig(as_raw(CAMERA)).name == "session 2 (drive 2)"
+            assert kept.known_rig(other) is None

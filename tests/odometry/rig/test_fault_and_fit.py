@@ -179,6 +179,18 @@ def test_rows_meet_with_the_lenses_that_are_found_and_nothing_is_invented_by_noi
     assert all((np.linalg.eigvalsh(drive.covariance) > 0).all() for drive in drives)
 
 
+def test_what_an_earlier_drive_knew_counts_as_far_as_nothing_contradicts_it():
+    first, alone = fitted(TURN), fitted(NONE, 500)
+    windows = [tracks(NONE, 500 + k) for k in range(WINDOWS)]
+    both = fit_fault(windows, FAULT, ALL, first)
+    shares = np.sqrt(np.diag(both.covariance) / np.diag(alone.covariance))
+    assert 0.6 < np.median(shares) < 0.95
+    assert rms(off_px(NONE, both.values)).max() < 0.05
+    moved, turned = fault(yaw=2e-3), [tracks(fault(yaw=2e-3), k) for k in range(WINDOWS)]
+    found = fit_fault(turned, FAULT, ALL, first)
+    assert rms(off_px(moved, found.values)).max() < 0.1 * rms(off_px(moved, NONE)).max()
+
+
 def test_directions_that_a_drive_shows_well_stay_and_others_become_zero():
     sigmas = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
     H = np.diag([1e6, 1e6, 1.0, 100.0, 0.0])

@@ -10,7 +10,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, Rig, StereoPair, Trajectory
-from recon.odometry.rig.refine import RefinedRig, RigChange, compare_rigs, refine_rig
+from recon.odometry.rig.refine import KnownRig, RefinedRig, RigChange, compare_rigs, refine_rig
 from recon.odometry.settings import RigSettings
 from recon.sources.live import LiveSource
 from recon.sources.source import SourcePart, StereoSource
@@ -73,6 +73,14 @@ def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
     drive = rig.applied(source)
     assert drive.calibration is rig.calibration
     assert (len(drive), drive.name) == (len(source), source.name)
+    # Later drives that are live, or too short, begin with it and end with it.
+    known = KnownRig(rig.given, rig.calibration, rig.fitted, "session 0 (film)")
+    for later in (LiveSource(source), SourcePart(source, 0, 5)):
+        again = refine_rig(later, CONFIG, AUTO, known)
+        assert again.applied(later).calibration is rig.calibration
+        assert again.figures() == {**figures, "begun_with": "session 0 (film)"}
+        assert "session 0 (film) showed" in again.warnings()[0]
+    assert not refine_rig(source, CONFIG, RigSettings(refine=False), known).refined
 
 
 def test_a_clean_street_keeps_its_calibration(street):
