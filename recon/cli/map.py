@@ -239,7 +239,8 @@ def live(
     A recording is played at its time stamps. The pose of each frame comes first;
     matching follows as far as there is time. Where even poses take too long,
     frames are dropped. summary.json counts both, and the time from an image to
-    its pose. Ctrl-C ends the drive, and its map is completed.
+    its pose. Ctrl-C ends the drive, and its map is completed. With --map, the rig
+    is as the last drive of the map with the same calibration showed it.
 
     Examples:
       recon live 0 2 --calib stereo.yaml
@@ -287,6 +288,7 @@ def localize(
     tracked against its features and surfaces. Frames are searching (no pose),
     tracking (the map confirms the pose), coasting (the pose is by odometry alone,
     for some metres at most) or lost (no pose any more). The map is not changed.
+    The rig begins as the last drive of the map with its calibration showed it.
 
     Examples:
       recon localize rides/today --map outputs/map/latest

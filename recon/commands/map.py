@@ -120,7 +120,7 @@ def run_map(
         with run.stage("compare"):
             given = options.known_poses is not None
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
-        doubts = [*rig.warnings(), *_warnings(source, mapped)]
+        doubts = [*rig.warnings(findings), *_warnings(source, mapped)]
         warnings = [*findings, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options), rig=rig.figures())

@@ -62,7 +62,12 @@ def field_figure(change: RigChange, size_px: tuple[int, int]) -> bytes:
 
 def _off_rows(found: Json) -> list[tuple[str, str, str]]:
     """Return what was wrong with what the rig given saw: figure, value, standard deviation."""
-    off = found["disparity_px"]
+    off, time = found["disparity_px"], found["right_late"]
+    late = (
+        []
+        if time["sigma"] is None
+        else [("right images, later", f"{time['frames']:+.2f} frames", f"{time['sigma']:.2f}")]
+    )
     depths = (
         (f"depth at {depth} m", f"{of['mean']:+.1f} %", f"{of['sigma']:.1f} %")
         if of["mean"] is not None
@@ -74,6 +79,7 @@ def _off_rows(found: Json) -> list[tuple[str, str, str]]:
         ("disparity, rms over the image", f"{off['rms']:.2f} px", NOT_KNOWN),
         *depths,
         ("rows, rms over the image", f"{found['rows_px']:.2f} px", NOT_KNOWN),
+        *late,
     ]
 
 

@@ -10,6 +10,7 @@ ECMR 2021.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
@@ -44,6 +45,8 @@ _LEAST_PX: Final = 0.05  # no matcher sees less; images are not warped for it
 _FIELD: Final = (16, 8)  # places across and down the image at which rigs are compared
 MOST_DEPTH_PERCENT: Final = 2.0
 """Error of the depth from which the rig given is called wrong."""
+MOST_LATE: Final = 0.1  # frames from which right images are said to be late
+LATER: Final = "after the left ones"  # in what is said of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +86,7 @@ class RefinedRig:
     changes: tuple[RigChange, ...] = ()  # at `DEPTHS_M`
     sigma_px: float = float("nan")  # of the mean disparity
     begun_with: str | None = None  # the drive whose rig this one began with
+    period_s: float = float("nan")  # of frames; NaN = not known
 
     @property
     def refined(self) -> bool:
@@ -124,6 +128,16 @@ class RefinedRig:
         percent = self.rms_percent(depth_m)
         return percent > MOST_DEPTH_PERCENT and self.changes[0].rms_px > 2.0 * self.sigma_px
 
+    @property
+    def late(self) -> str:
+        """By how much right images are taken later than left ones, in words; "" if hardly."""
+        fitted = self.fitted
+        if fitted is None or not abs(fitted.late) > max(MOST_LATE, 4.0 * fitted.late_sigma):
+            return ""
+        frames = f"{fitted.late:+.2f} ± {1.96 * fitted.late_sigma:.2f} frames"
+        known = np.isfinite(self.period_s)
+        return frames + (f" ({1e3 * self.period_s * fitted.late:+.0f} ms)" if known else "")
+
     def figures(self) -> dict[str, Any]:
         """Return what differs, ready for ``summary.json``; parameters in radians and shares.
 
@@ -146,6 +160,11 @@ class RefinedRig:
                 "rms": self.changes[-1].rms_px,
             },
             "rows_px": self.changes[-1].rows_rms_px,
+            "right_late": {
+                "frames": self.fitted.late,
+                "sigma": self.fitted.late_sigma,
+                "seconds": self.period_s * self.fitted.late,
+            },
             "depth_percent": {
                 f"{change.depth_m:g}": {"mean": mean, "sigma": sigma}
                 for change, (mean, sigma) in zip(self.changes, percent, strict=True)
@@ -165,13 +184,16 @@ class RefinedRig:
         depth = f"by {self.rms_percent(depth_m):.0f} % at {depth_m:.0f} m"
         return f"disparities are {off} off, {near.rms_px:.2f} px rms over the image, depth {depth}"
 
-    def warnings(self) -> list[str]:
-        """Return what the user should know of a rig that is far off."""
+    def warnings(self, known: Sequence[str] = ()) -> list[str]:
+        """Return what the user should know of a rig, and does not from lines that are ``known``."""
+        late = f"right images are taken {self.late} {LATER}: what moves is seen at a wrong depth, "
+        late += "which no calibration mends; trigger both cameras together"
+        lines = [late] if self.late and not any(LATER in line for line in known) else []
         if not self.wrong_at(DEPTHS_M[0]):
-            return []
+            return lines
         shows = "the motion shows" if self.begun_with is None else f"{self.begun_with} showed"
         used = f"used is the rig that {shows} (--set rig.refine=off keeps the calibration)"
-        return [f"the rig is not as calibrated: {self.describe(DEPTHS_M[0])}; {used}"]
+        return [f"the rig is not as calibrated: {self.describe(DEPTHS_M[0])}; {used}", *lines]
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +215,12 @@ class KnownRig:
         """Return the rig with how it differs from the one given."""
         return _described(self.given, self.calibration, self.fitted, settings)
 
+    def begun(self, settings: RectificationSettings) -> RefinedRig:
+        """Return what another drive of the rig begins with, whose cameras run anew."""
+        rig, none = self.described(settings), float("nan")
+        fitted = replace(self.fitted, late=none, late_sigma=none)
+        return replace(rig, fitted=fitted, begun_with=self.name)
+
 
 def refine_rig(
     source: StereoSource, config: StereoSettings, rig: RigSettings, known: KnownRig | None = None
@@ -208,7 +236,7 @@ def refine_rig(
     begun = Rectifier(given, config.rectification)
     found = RefinedRig(given, given, begun.camera)
     if rig.refine and known is not None:
-        found = replace(known.described(config.rectification), begun_with=known.name)
+        found = known.begun(config.rectification)
         begun = Rectifier(found.calibration, config.rectification)
     if not rig.refine or source.live or len(source) < MIN_WINDOWS * FRAMES:
         return found
@@ -231,7 +259,9 @@ def refine_rig(
         if change.moved_px < _FAR_OFF_PX:
             break
     described = _described(given, refined, replace(fitted, values=values), config.rectification)
-    return replace(described, begun_with=found.begun_with)
+    steps_s = np.zeros(0) if source.stamps_s is None else np.diff(source.stamps_s)
+    period_s = float(np.median(steps_s)) if len(steps_s) else float("nan")
+    return replace(described, begun_with=found.begun_with, period_s=period_s)
 
 
 def _described(

@@ -156,7 +156,7 @@ def _figures(measured: Measured) -> dict[str, Any]:
         "features": len(geometry.features),
         "swapped_share": plain(geometry.swapped_share),
         "lag_frames": geometry.lag,
-        "time_skew_frames": None if geometry.skew is None else geometry.skew[0],
+        "time_skew_frames": None if measured.skew is None else measured.skew[0],
         "baseline_m": camera.baseline_m,
         "focal_px": camera.focal_px,
         "field_of_view_deg": camera.field_of_view_deg,

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.text import counted
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
-from recon.odometry.rig.refine import RefinedRig
+from recon.odometry.rig.refine import LATER, MOST_LATE, RefinedRig
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample
 from recon.rig.settings import AuditedSettings
@@ -30,7 +30,6 @@ _SHARPNESS_RATIO: Final = 0.65  # one camera counts as blurred below, relative t
 _SHARPNESS: Final = 0.14  # both cameras count as blurred below this sharpness
 _REPEATED_SHARE: Final = 0.02  # share of repeated frames that is still accepted
 _FROZEN_FRAMES: Final = 3  # repeats in a row from which one camera counts as frozen
-_SKEW_FRAMES: Final = 0.1  # time skew between the cameras above which it is reported, in frames
 _NEAR_SHARE: Final = 0.02  # share of features beyond the disparity range that is accepted
 _FAR_PX: Final = 1.5  # a scene with a smaller median disparity is too far for the baseline
 _MAX_SPEED_M_PER_S: Final = 70.0  # a higher apparent speed means that the baseline is wrong
@@ -54,8 +53,8 @@ _TEXTS: Final = {
     "swapped": "left and right are swapped: {percent:.0f} % of the near features are farther right "
     "in the right image; exchange --left and --right (or un-mirror the images)",
     "lag": "the {late} camera is {frames} late; {in_step}",
-    "skew": "the right images are taken {skew:+.2f} frames after the left ones; trigger both "
-    "cameras together, or drive slowly",
+    "skew": f"the right images are taken {{skew:+.2f}} frames {LATER}; trigger both cameras "
+    "together, or drive slowly",
     "features": "too few features match between left and right ({matched} matched) to check the "
     "geometry: the images show too little texture, or different scenes",
     "rows": "rows of left and right are not aligned: {rows.rms_px:.2f} px rms, mean "
@@ -95,6 +94,12 @@ class Measured:
     gaps: Gaps
     rig: RefinedRig | None  # None if it was not measured
 
+    @property
+    def skew(self) -> tuple[float, float] | None:
+        """Frames by which right images are late, and the standard error: by motion, else rows."""
+        fitted = None if self.rig is None else self.rig.fitted
+        return self.geometry.skew if fitted is None else (fitted.late, fitted.late_sigma)
+
 
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
     """Return good without findings, not usable with a fatal one, else usable."""
@@ -109,7 +114,7 @@ def find_faults(measured: Measured, config: AuditedSettings, reach_px: int | Non
     found = [
         *_of_images(sample, config.matching.matcher),
         *_of_series(sample, measured.gaps),
-        *_of_geometry(measured.geometry, measured.source),
+        *_of_geometry(measured),
         *_of_rig(measured.rig, measured.geometry.disparity_px),
         *_of_range(measured.geometry.disparity_px, reach_px, camera),
         *_of_calibration(sample, rig, camera, config.audit.baseline_m),
@@ -161,12 +166,13 @@ def _of_series(sample: Sample, gaps: Gaps) -> Found:
         yield "gaps", {"places": counted(gaps.count, "place"), "gaps": gaps}
 
 
-def _of_geometry(geometry: Geometry, source: StereoSource) -> Found:
-    swapped, lag, skew = geometry.swapped_share, geometry.lag, geometry.skew
+def _of_geometry(measured: Measured) -> Found:
+    geometry, skew = measured.geometry, measured.skew
+    swapped, lag = geometry.swapped_share, geometry.lag
     if swapped >= _SWAPPED_SHARE:
         yield "swapped", {"percent": 100 * swapped}
     if lag:
-        shift = source.shift_of(lag)
+        shift = measured.source.shift_of(lag)
         in_step = f"--set source.shift_frames={shift} pairs the images that belong together"
         yield (
             "lag",
@@ -176,7 +182,7 @@ def _of_geometry(geometry: Geometry, source: StereoSource) -> Found:
                 "in_step": "pair the images by timestamp" if shift is None else in_step,
             },
         )
-    elif skew is not None and abs(skew[0]) > max(_SKEW_FRAMES, 4 * skew[1]):
+    elif skew is not None and abs(skew[0]) > max(MOST_LATE, 4 * skew[1]):
         yield "skew", {"skew": skew[0]}
     rows = geometry.alignment
     if rows is None and geometry.pairs:

@@ -57,18 +57,24 @@ def seen(xyz: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def tracks(values: np.ndarray, seed: int) -> StereoTracks:
-    """Points on a street, seen from six poses by a rig with a fault."""
+def step(frames: float) -> np.ndarray:
+    """How a camera moves on in a curve."""
+    turn = exp_so3(np.array([0.0, 0.01 * frames, 0.0]))
+    return make_transform(turn, np.array([0.005 * frames**2, 0.0, frames]))
+
+
+def tracks(values: np.ndarray, seed: int, late: float = 0.0) -> StereoTracks:
+    """Points on a street, seen from six poses by a rig with a fault, the right image late."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(6.0, 60.0, POINTS)
     aside, up = rng.uniform([[-0.7], [-0.2]], [[0.7], [0.2]], (2, POINTS)) * depth
     xyz = np.column_stack([aside, up, depth])
-    step = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 1.0]))
-    poses = np.stack([np.linalg.matrix_power(step, k) for k in range(FRAMES)])
+    poses = np.stack([np.linalg.matrix_power(step(1.0), k) for k in range(FRAMES)])
     uvd, right_uv = (np.full((FRAMES, POINTS, size), np.nan) for size in (3, 2))
     for k, T in enumerate(poses):
-        near = apply(invert(T), xyz)
-        left, right = (at + rng.normal(0.0, NOISE_PX, at.shape) for at in seen(near, values))
+        left, _ = seen(apply(invert(T), xyz), values)
+        _, right = seen(apply(invert(T @ step(late)), xyz), values)
+        left, right = (at + rng.normal(0.0, NOISE_PX, at.shape) for at in (left, right))
         inside = ((left > 0) & (left < [CAMERA.width_px, CAMERA.height_px])).all(axis=1)
         uvd[k, inside] = np.column_stack([left, left[:, 0] - right[:, 0]])[inside]
         right_uv[k, inside] = right[inside]
@@ -175,6 +181,7 @@ def test_rows_meet_with_the_lenses_that_are_found_and_nothing_is_invented_by_noi
     assert found.windows == WINDOWS
     assert 1.0 <= found.scatter < 2.0
     drives = [fitted(NONE, 100 * n) for n in range(3)]
+    assert all(abs(drive.late) < 0.01 for drive in drives)
     assert max(rms(off_px(NONE, drive.values)).max() for drive in drives) < 0.05
     assert all((np.linalg.eigvalsh(drive.covariance) > 0).all() for drive in drives)
 
@@ -189,6 +196,14 @@ def test_what_an_earlier_drive_knew_counts_as_far_as_nothing_contradicts_it():
     moved, turned = fault(yaw=2e-3), [tracks(fault(yaw=2e-3), k) for k in range(WINDOWS)]
     found = fit_fault(turned, FAULT, ALL, first)
     assert rms(off_px(moved, found.values)).max() < 0.1 * rms(off_px(moved, NONE)).max()
+
+
+@pytest.mark.parametrize(("late", "values"), [(0.2, NONE), (-0.4, TURN)], ids=["alone", "turned"])
+def test_late_right_images_are_told_apart_from_a_turned_camera(late: float, values: np.ndarray):
+    found = fit_fault([tracks(values, k, late) for k in range(WINDOWS)], FAULT, ALL)
+    assert found.late == pytest.approx(late, abs=0.1 * abs(late))
+    assert found.late_sigma < 0.02
+    assert rms(off_px(values, found.values)).max() < 0.1
 
 
 def test_directions_that_a_drive_shows_well_stay_and_others_become_zero():
