@@ -34,8 +34,8 @@ _ROUNDING: Final = 1e-9  # share of the best known direction below which one is 
 _RECALLED: Final = 4  # last rounds that the next one learns from
 _ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the right image
 _IN_STEP: Final = 0.02
-"""Frames by which right images may seem late where one trigger takes both: lenses that bend in ways
-that are not fitted look like 0.004 on real drives. Others are as near to it once in 25 times."""
+"""Frames by which right images may seem late where one trigger takes both: on drives with one it is
+0.005 at most. Cameras that run freely are as near to each other once in 25 times."""
 _LATE_SIGMA: Final = 12.0**-0.5
 """Frames by which right images are late, standard deviation beforehand: cameras that run freely are
 paired with the nearest image, at any time within half a frame before or after."""
