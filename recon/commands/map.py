@@ -26,7 +26,7 @@ from recon.map.drive.sequence import MappedSequence, check_map, map_sequence
 from recon.map.map import Map
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
-from recon.odometry.health import health_warnings
+from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
 from recon.odometry.rig.refine import KnownRig, RefinedRig, refine_rig
 from recon.report.map_page import map_content
 from recon.report.page import write_page
@@ -106,7 +106,8 @@ def run_map(
         options.begin(run, source, config) as map_,
     ):
         rig = refine_drive(source, config, run)
-        map_.session().set_rig(rig)
+        if config.rig.refine:
+            map_.session().set_rig(rig)
         source = rig.applied(source)
         if options.known_poses is not None and rig.refined:
             poses = rig.poses(options.known_poses, config.rectification)
@@ -120,10 +121,11 @@ def run_map(
         with run.stage("compare"):
             given = options.known_poses is not None
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
-        doubts = [*rig.warnings(findings), *_warnings(source, mapped)]
+        drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_share)
+        doubts = [*rig.warnings(findings), *_warnings(source, mapped, drift)]
         warnings = [*findings, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
-        result.summary.update(_summary(source, result, warnings, options), rig=rig.figures())
+        result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         with run.stage("write"):
             export_paths(map_.first, made.camera_height_m, run)
             keep_map(map_, run.path(MAP_FILE))
@@ -168,21 +170,27 @@ def map_drive(
     )
 
 
-def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
+def _warnings(
+    source: StereoSource, mapped: MappedSequence, drift: ExpectedDrift | None
+) -> list[str]:
     return [
         *source.warnings(),
         *health_warnings(mapped.health),
-        *(() if mapped.expected_drift is None else mapped.expected_drift.warnings()),
+        *(() if drift is None else drift.warnings()),
         *(() if mapped.prior is None else mapped.prior.warnings()),
         *(() if mapped.loops is None else mapped.loops.warnings()),
     ]
 
 
 def _summary(
-    source: StereoSource, result: MapRun, warnings: list[str], options: MapOptions
+    source: StereoSource,
+    result: MapRun,
+    warnings: list[str],
+    options: MapOptions,
+    drift: ExpectedDrift | None,
 ) -> dict[str, Any]:
     mapped, errors, given = result.mapped, result.errors, options.known_poses is not None
-    frames, drift, prior = len(mapped.trajectory), mapped.expected_drift, mapped.prior
+    frames, prior = len(mapped.trajectory), mapped.prior
     known = {"trajectory": errors.path, "map": errors.surface, "occupancy": errors.occupancy}
     return {
         "odometry": "known poses" if given else mapped.config.odometry.method,

@@ -106,7 +106,8 @@ def run_map_into(
         with Map.create(run.state("drive.recon")) as drive:
             mapped = map_drive(rig.applied(source), settings, options, run, drive)
             check_map(mapped, source.name)
-            mapped.session.set_rig(rig)
+            if settings.rig.refine:
+                mapped.session.set_rig(rig)
             keep_map(drive, kept)
         try:
             return _copied(kept, map_, settings)

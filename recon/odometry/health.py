@@ -135,11 +135,16 @@ class ExpectedDrift:
 
 
 def expected_drift(
-    path: Trajectory, health: Sequence[OdometryHealth], camera: RectifiedCamera
+    path: Trajectory,
+    health: Sequence[OdometryHealth],
+    camera: RectifiedCamera,
+    rig_share: float | None = None,
 ) -> ExpectedDrift | None:
     """How far a path by odometry may be off; None where no motion was measured.
 
-    Frames without a trusted pose do not count: `health_warnings` names them.
+    ``rig_share`` is the standard deviation of its length that the drive leaves to the rig, as a
+    share; None = nothing is known of the rig, it counts as calibrated well. Frames without a
+    trusted pose do not count: `health_warnings` names them.
     """
     steps_m = np.linalg.norm(np.diff(path.positions_m, axis=0), axis=1)
     figures = np.array([(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]])
@@ -149,8 +154,9 @@ def expected_drift(
     if not length_m > 0.0:
         return None
     scale_px, sigma_m, sigma_deg = figures[known].T
-    share = _scale_share(scale_px, camera)
-    rig = float(np.hypot(steps_m[known] @ share / length_m, RIG_BASELINE))
+    if rig_share is None:
+        rig_share = float(steps_m[known] @ _scale_share(scale_px, camera) / length_m)
+    rig = float(np.hypot(rig_share, RIG_BASELINE))
     step_m = length_m / float(known.sum())
     random = _random_share(step_m, length_m, sigma_m, np.deg2rad(sigma_deg))
     rests_on_px = length_m / float(steps_m[known] @ (1.0 / scale_px))

@@ -40,7 +40,8 @@ class RigSettings(Settings):
 
     refine: bool = True
     """Use the rig as the drive shows it, or an earlier drive of its map: how the right camera is
-    turned, its focal length, and what both lenses bend. off = the calibration as it is."""
+    turned, its focal length, and what both lenses bend. off = the calibration as it is: what
+    the drive shows is only said."""
 
 
 class OdometrySettings(Settings):

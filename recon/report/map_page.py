@@ -41,7 +41,7 @@ def map_content(
     """Return what the page of a drive shows: map and path, the rig, and a frame of it in full."""
     session, truth = map_.first, errors.true_path
     path, health, T_map_world = session.trajectory, session.health, session.T_map_world
-    drift = expected_drift(path, health, session.camera)
+    drift = expected_drift(path, health, session.camera, rig.length_share)
     radius_share = 0.0 if drift is None else drift.radius_share
     pairs = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
     true_path = {} if truth is None else {"true path": truth}

@@ -82,7 +82,7 @@ def keep_turned_rig(path: Path) -> StereoCalibration:
     with Map.open(path, read_only=False) as map_:
         camera, size = map_.session().camera, len(NAMES)
         turned = correct_rig(camera, np.array([0.0, 1e-3, 0.0, 0.0]), np.eye(3))
-        fitted = FittedFault(np.zeros(size), np.eye(size), 1.0, 12)
+        fitted = FittedFault(np.zeros(size), np.eye(size), np.zeros(size), 1.0, 12)
         map_.session().set_rig(RefinedRig(camera, turned, camera, fitted))
         map_.commit()
     return turned

@@ -106,7 +106,8 @@ def rig(pair):
     camera, values = pair.camera, np.zeros(len(NAMES))
     values[:4] = np.radians(0.1), np.radians(-0.5), 0.0, 0.01
     values[4] = -RigFault(camera).sigmas[4]
-    fitted = FittedFault(values, np.diag((0.1 * RigFault(camera).sigmas) ** 2), 1.0, 12)
+    covariance = np.diag((0.1 * RigFault(camera).sigmas) ** 2)
+    fitted = FittedFault(values, covariance, np.zeros(len(NAMES)), 1.0, 12)
     off_px = np.linspace(-2.0, -1.0, 32).reshape(4, 8)
     off_px[0, 0] = np.nan
     changes = tuple(RigChange(z, off_px, np.full((4, 8), 0.25)) for z in DEPTHS_M)

@@ -272,7 +272,7 @@ def test_the_rig_is_tabulated_where_it_was_fitted(drive):
     ]  # fmt: skip
     assert rows(shown["Lenses"])[0] == ("k1", "-1.00 ± 0.10", "+0.00 ± 0.10")
     drive.rig = replace(drive.rig, calibration=drive.rig.given)
-    assert "The motion shows no other rig" in map_html(drive)
+    assert "recon map uses the rig as calibrated" in map_html(drive)
     drive.rig.fitted.covariance[4:] = 0.0  # lenses that cannot be corrected
     assert "Lenses" not in blocks(map_html(drive))
     drive.rig = replace(drive.rig, fitted=None)

@@ -36,7 +36,6 @@ from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
-from recon.odometry.health import ExpectedDrift, expected_drift
 from recon.odometry.protocol import OdometryHealth
 from recon.run.work import SILENT, Progress, serial_algebra
 from recon.sources.source import StereoSource, check_source
@@ -125,11 +124,6 @@ class MappedSequence:
     def voxels(self) -> OccupancyVoxels:
         """The whole 3-D occupancy, map axes; for long drives, see `tiles`."""
         return join_voxels((tile.voxels for tile in self.tiles), self.tiles.resolution_m)
-
-    @cached_property
-    def expected_drift(self) -> ExpectedDrift | None:
-        """How far the path may be off; None where no motion was measured."""
-        return expected_drift(self.trajectory, self.health, self.camera)
 
 
 def map_sequence(

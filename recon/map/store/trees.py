@@ -298,6 +298,7 @@ def rig_in(content: Mapping[str, Any], name: str) -> KnownRig | None:
     shown, tree = active(given), content["fitted"]
     count = len(array_in(tree, "values", np.float64, (None,)))
     covariance = array_in(tree, "covariance", np.float64, (count, count))
+    array_in(tree, "stretch", np.float64, (count,))
     if count != len(shown):
         return None
     if np.linalg.eigvalsh(covariance[np.ix_(shown, shown)])[0] <= 0.0:

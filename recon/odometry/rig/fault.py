@@ -32,6 +32,8 @@ was ever calibrated: they only matter where a drive shows nothing."""
 
 LENS_SIGMA_PX: Final = 1.0  # of what each term of a lens moves at the corners, beforehand
 _UNBENDING: Final = 5  # rounds; each adds at least a digit where lenses are usable
+_WEIGHINGS: Final = 10  # rounds in which the spread of faults is found, to a few per cent
+_ROUNDING: Final = 1e-9  # parameters shown below which none is
 _GRID: Final = (24, 16)  # places in the image, across and down, at which lenses are fitted
 
 
@@ -190,8 +192,13 @@ def _relensed(
     return replace(after, distortion=distortion)
 
 
-def shrink(values: Float64, H: Float64, sigmas: Float64) -> Float64:
+def shrink(
+    values: Float64, H: Float64, sigmas: Float64, spread: float = 1.0
+) -> tuple[Float64, Float64, float]:
     """Return parameters (P,) moved to 0 in directions that the drive does not show.
+
+    Beside them the mean squares (P, P) of their errors, of which what is moved is part, and the
+    variance of faults, in that expected and at least ``spread``, by those that are shown.
 
     Each direction, whitened by the prior, is shrunk by its own certainty: not at all where the
     drive fixes it well, to 0 where it is within its standard deviation. ``H`` (P, P) is the
@@ -205,7 +212,35 @@ def shrink(values: Float64, H: Float64, sigmas: Float64) -> Float64:
     # What the drive alone says is z (1 + D) / D, with a variance of 1 / D: its share by chance.
     shown = (D > 0.0) & (z != 0.0)
     chance = np.divide(D, (z * (1.0 + D)) ** 2, where=shown, out=np.ones_like(D))
-    return np.asarray(sigmas * (V @ (np.maximum(0.0, 1.0 - chance) * z)))
+    kept = sigmas * (V @ (np.maximum(0.0, 1.0 - chance) * z))
+    told = (H + np.diag(1.0 / sigmas**2)) @ values
+    spread = _spread(told, H, sigmas, spread)
+    likely, covariance = _widened(told, H, sigmas, spread)
+    return kept, covariance + np.outer(likely - kept, likely - kept), spread
+
+
+def _widened(told: Float64, H: Float64, sigmas: Float64, spread: float) -> tuple[Float64, Float64]:
+    """Return parameters (P,) and their covariance where lenses may bend more than expected."""
+    variance = sigmas**2
+    variance[len(TURN) :] *= spread
+    covariance = np.linalg.inv(H + np.diag(1.0 / variance))
+    return covariance @ told, np.asarray(covariance)
+
+
+def _spread(told: Float64, H: Float64, sigmas: Float64, least: float) -> float:
+    """Return the variance of what lenses bend, in that expected, that makes ``told`` likeliest.
+
+    Where they are worse than expected in directions that the drive shows, they are in others, too.
+
+    Ref: MacKay, "Bayesian interpolation", 1992.
+    """
+    spread, lens = least, slice(len(TURN), None)
+    for _ in range(_WEIGHINGS if len(sigmas) > len(TURN) else 0):
+        values, covariance = _widened(told, H, sigmas, spread)
+        shown = 1.0 - np.diag(covariance)[lens] / (spread * sigmas[lens] ** 2)
+        bent = np.sum((values[lens] / sigmas[lens]) ** 2)
+        spread = max(least, float(bent / max(shown.sum(), _ROUNDING)))
+    return spread
 
 
 def active(rig: Rig) -> Bool:

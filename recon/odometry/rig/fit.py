@@ -29,7 +29,8 @@ from recon.odometry.rig.fault import Places, RigFault, shrink
 from recon.odometry.rig.tracks import THREADS, StereoTracks
 from recon.run.work import serial_algebra, side_by_side
 
-_ROUNDS: Final = 8  # times that all windows are adjusted, without the fault as known by then
+_ROUNDS: Final = 32  # times at most that all windows are adjusted, without the fault as known then
+_LAST_STEP: Final = 0.5  # length of a step, in standard deviations, after which there is no other
 _ROUNDING: Final = 1e-9  # share of the best known direction below which one is not known at all
 _RECALLED: Final = 4  # last rounds that the next one learns from
 _ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the right image
@@ -46,11 +47,13 @@ class FittedFault:
     """The parameters (P,) of a fault, and what is known of them."""
 
     values: Float64
-    covariance: Float64  # (P, P)
+    covariance: Float64  # (P, P), mean squares of their errors, by shrinking as well
+    stretch: Float64  # (P,), by what share the path becomes longer with each
     scatter: float  # how much more windows contradict each other than their features say, 1 or more
     windows: int
     late: float = 0.0  # frames by which right images are taken later than left ones
     late_sigma: float = float("nan")
+    spread: float = 1.0  # variance of what lenses bend, in that expected beforehand, 1 or more
 
 
 def fit_fault(
@@ -58,6 +61,7 @@ def fit_fault(
     fault: RigFault,
     active: Bool,
     before: FittedFault | None = None,
+    spread: float = 1.0,
 ) -> FittedFault:
     """Fit the ``active`` parameters to windows of tracks; the others are 0.
 
@@ -65,7 +69,8 @@ def fit_fault(
     fitted with them.
 
     What an earlier drive of the same rig knew ``before`` counts as windows of this one in which the
-    rig has no fault, as far as this drive does not contradict it.
+    rig has no fault, as far as this drive does not contradict it. ``spread`` is that of an earlier
+    fit to this one: of what it left, the well known part is gone.
 
     Features of a window err together. By how much windows contradict each other beyond what their
     features let expect, what they know counts less.
@@ -100,32 +105,35 @@ def fit_fault(
             known[:-1, :-1] = before.covariance[np.ix_(active[:-1], active[:-1])]
             held = _not_contradicted(known, seen, pull + seen @ values[active]) - prior
             held = _information(held, sigmas)
-        step = np.linalg.solve(seen + held + prior, pull - (held + prior) @ values[active])
+        shown = seen + held
+        step = np.linalg.solve(shown + prior, pull - (held + prior) @ values[active])
         tried, stepped = [*tried, values[active]][-_RECALLED:], [*stepped, step][-_RECALLED:]
-        values[active] = _accelerated(tried, stepped, seen + held + prior)
+        values[active] = _accelerated(tried, stepped, shown + prior)
         scatter = _scatter(total + prior, total, g - H @ step)
-    shown, covariance = active[:-1], np.zeros((len(active) - 1,) * 2)
-    own, known, late, sigma = _stated(values[active], total / scatter + held, sigmas)
-    values[:-1][shown], covariance[np.ix_(shown, shown)] = own, known
-    return FittedFault(values[:-1], covariance, scatter, len(tracks), late, sigma)
+        if step @ (shown + prior) @ step < _LAST_STEP**2:
+            break
+    rig, covariance = active[:-1], np.zeros((len(active) - 1,) * 2)
+    own, known, late, sigma = _without_late(values[active], shown, sigmas)
+    values[:-1][rig], covariance[np.ix_(rig, rig)], spread = shrink(own, known, sigmas[:-1], spread)
+    stretch = _stretch(found)[:-1]
+    count = len(tracks)
+    return FittedFault(values[:-1], covariance, stretch, scatter, count, late, sigma, spread)
 
 
-def _stated(
+def _without_late(
     values: Float64, shown: Float64, sigmas: Float64
 ) -> tuple[Float64, Float64, float, float]:
-    """Return the parameters as far as they are ``shown``, and their covariance; the last one apart.
+    """Return the parameters but the last one, and their information; that one apart.
 
-    This is by how many frames right images are late, with its standard deviation. Where it is next
+    It is by how many frames right images are late, with its standard deviation. Where it is next
     to nothing, cameras have one trigger, and the others are stated as if it were nothing.
     """
     known = shown + np.diag(1.0 / sigmas**2)
-    covariance = np.linalg.inv(known)
-    late, sigma, count = float(values[-1]), float(np.sqrt(covariance[-1, -1])), len(values) - 1
+    late, sigma = float(values[-1]), float(np.sqrt(np.linalg.inv(known)[-1, -1]))
+    rig, shared = shown[:-1, :-1], known[:-1, -1]
     if abs(late) < max(_IN_STEP, 2.0 * sigma):
-        values = values[:-1] + np.linalg.solve(known[:-1, :-1], known[:-1, -1]) * late
-        shown, sigmas, covariance = shown[:-1, :-1], sigmas[:-1], np.linalg.inv(known[:-1, :-1])
-    known = np.asarray(covariance[:count, :count], np.float64)
-    return shrink(values, shown, sigmas)[:count], known, late, sigma
+        return values[:-1] + np.linalg.solve(known[:-1, :-1], shared) * late, rig, late, sigma
+    return values[:-1], rig - np.outer(shared, shared) / known[-1, -1], late, sigma
 
 
 def _information(H: Float64, sigmas: Float64) -> Float64:
@@ -159,9 +167,9 @@ def _accelerated(tried: Sequence[Float64], steps: Sequence[Float64], metric: Flo
     Ref: Walker and Ni, "Anderson acceleration for fixed-point iterations", 2011.
     """
     x, step = tried[-1], steps[-1]
-    if len(tried) == 1:
-        return np.asarray(x + step)
     whiten = np.linalg.cholesky(metric).T
+    if len(tried) == 1 or np.diff(np.linalg.norm(whiten @ np.transpose(steps), axis=0))[-1] > 0.0:
+        return np.asarray(x + step)  # nothing to learn from, or it led astray
     by_step = np.diff(steps, axis=0).T
     share = np.linalg.lstsq(whiten @ by_step, whiten @ step, rcond=None)[0]
     return np.asarray(x + step - (np.diff(tried, axis=0).T + by_step) @ share)
@@ -192,6 +200,16 @@ def _in_time(places: Places, window: TrackWindow, camera: RectifiedCamera, late:
     return Places(places.left_uv, places.right_uv - moved @ to_right.T, by_left, by_right)
 
 
+def _stretch(found: Sequence[tuple[TrackWindow, _System]]) -> Float64:
+    """Return by what share the path of all windows becomes longer with each parameter (P,)."""
+    ends = [window.T_world_camera[[0, -1]] for window, _ in found]
+    # In the axes of the last frame.
+    path_m = np.stack([last[:3, :3].T @ (last[:3, 3] - first[:3, 3]) for first, last in ends])
+    lengths_m = np.linalg.norm(path_m, axis=1)
+    moved = np.stack([system.moved for _, system in found])
+    return np.asarray(np.einsum("kpi,ki->p", moved, path_m / lengths_m[:, None]) / lengths_m.sum())
+
+
 def _seen(window: TrackWindow, part: StereoTracks, places: Places) -> TrackWindow:
     """Return a window with the features where they are without the fault."""
     disparity = places.left_uv[..., :1] - places.right_uv[..., :1]
@@ -203,13 +221,14 @@ class _System(NamedTuple):
 
     H: Float64  # (P, P)
     g: Float64  # (P,)
+    moved: Float64  # (P, 3), by what the last camera moves with each parameter, in its own axes
 
 
 def _system(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _System:
     """Return the normal equations of a further correction, poses and points eliminated."""
     normal = normal_equations(window, camera)
     shared = _of_places(window, places, camera)
-    rows = _of_rows(places)
+    H_rows, g_rows = _of_rows(places)
     frames, points = window.uvd.shape[:2]
     size, parameters = 6 * (frames - 1), places.by_left.shape[-1]
     # The correction follows the poses, of which the first is fixed, as one more block.
@@ -219,14 +238,15 @@ def _system(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _Sy
         S[at, at], g[at] = normal.H_pose[k], normal.g_pose[k]
         S[at, size:] = shared.H_pose[k]
         S[size:, at] = shared.H_pose[k].T
-    S[size:, size:], g[size:] = shared.H + rows.H, shared.g + rows.g
+    S[size:, size:], g[size:] = shared.H + H_rows, shared.g + g_rows
     of_poses = normal.H_cross[1:].transpose(1, 0, 2, 3).reshape(points, size, 3)
     cross = np.concatenate([of_poses, shared.H_point], axis=1)
     folded = cross @ np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
     S -= np.tensordot(folded, cross, axes=((0, 2), (0, 2)))
     g -= np.tensordot(folded, normal.g_point, axes=((0, 2), (0, 1)))
     share = np.linalg.solve(S[:size, :size] + bundle.RIDGE * np.eye(size), S[:size, size:]).T
-    return _System(S[size:, size:] - share @ S[:size, size:], g[size:] - share @ g[:size])
+    H, g = S[size:, size:] - share @ S[:size, size:], g[size:] - share @ g[:size]
+    return _System(H, g, -share[:, -6:-3])
 
 
 class _Shared(NamedTuple):
@@ -238,7 +258,7 @@ class _Shared(NamedTuple):
     H_point: Float64
 
 
-def _of_rows(places: Places) -> _System:
+def _of_rows(places: Places) -> tuple[Float64, Float64]:
     """Return normal equations of the row errors (W, N), which neither pose nor depth changes."""
     error = places.right_uv[..., 1] - places.left_uv[..., 1]
     residual = np.nan_to_num(error) / _ROW_SIGMA_PX
@@ -247,7 +267,7 @@ def _of_rows(places: Places) -> _System:
     J = by.reshape(residual.size, -1)
     weighed = weight.reshape(-1, 1) * J
     # A correction moves the observed row: it is to take the error away.
-    return _System(weighed.T @ J, -weighed.T @ residual.ravel())
+    return weighed.T @ J, -weighed.T @ residual.ravel()
 
 
 def _of_places(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _Shared:

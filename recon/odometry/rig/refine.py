@@ -80,9 +80,9 @@ class RefinedRig:
     """The rig of a drive as given, and as the drive shows it."""
 
     given: Rig
-    calibration: Rig  # the refined one; that given where the drive shows nothing else
+    calibration: Rig  # to be used: that given where the drive shows no other, or it is to be kept
     camera: RectifiedCamera  # rectified views of the rig given
-    fitted: FittedFault | None = None  # None: too short a drive, or it was not asked for
+    fitted: FittedFault | None = None  # None: nothing was measured
     changes: tuple[RigChange, ...] = ()  # at `DEPTHS_M`
     sigma_px: float = float("nan")  # of the mean disparity
     begun_with: str | None = None  # the drive whose rig this one began with
@@ -90,8 +90,20 @@ class RefinedRig:
 
     @property
     def refined(self) -> bool:
-        """Whether the drive shows another rig than was given."""
+        """Whether another rig than was given is used."""
         return self.calibration is not self.given
+
+    @property
+    def length_share(self) -> float | None:
+        """Standard deviation of the length of the path that is left to the rig used, as a share.
+
+        Without the baseline, which no motion shows; None if nothing was measured.
+        """
+        if self.fitted is None:
+            return None
+        by, squares = self.fitted.stretch, self.fitted.covariance
+        kept = 0.0 if self.refined else float(by @ self.fitted.values)
+        return float(np.hypot(np.sqrt(by @ squares @ by), kept))
 
     def applied(self, source: StereoSource) -> StereoSource:
         """Return the drive with the refined rig."""
@@ -193,6 +205,7 @@ class RefinedRig:
             return lines
         shows = "the motion shows" if self.begun_with is None else f"{self.begun_with} showed"
         used = f"used is the rig that {shows} (--set rig.refine=off keeps the calibration)"
+        used = used if self.refined else "used is the calibration as it is"
         return [f"the rig is not as calibrated: {self.describe(DEPTHS_M[0])}; {used}", *lines]
 
 
@@ -230,19 +243,21 @@ def refine_rig(
     A few windows of frames, from all over the drive, show how the right camera is turned, how long
     its focal length is, and what both lenses bend; see `recon.odometry.rig.fault`. Where a drive
     shows little the calibration stays, or what is ``known`` by an earlier drive of the rig. Drives
-    of less than 36 frames, and live ones, are not refined: they take that as it is.
+    of less than 36 frames, and live ones, are not refined: they take that as it is. If
+    ``rig.refine`` is off, the calibration stays, and what the drive shows is only said.
     """
-    given = source.calibration
+    given, known = source.calibration, known if rig.refine else None
     begun = Rectifier(given, config.rectification)
     found = RefinedRig(given, given, begun.camera)
-    if rig.refine and known is not None:
+    if known is not None:
         found = known.begun(config.rectification)
         begun = Rectifier(found.calibration, config.rectification)
-    if not rig.refine or source.live or len(source) < MIN_WINDOWS * FRAMES:
+    if source.live or len(source) < MIN_WINDOWS * FRAMES:
         return found
     values = np.zeros(len(NAMES)) if known is None else known.fitted.values.copy()
     refined, turn = _with_rows_aligned(source, found.calibration, begun)
     values[: len(TURN)] += turn
+    spread = 1.0
     # A rig that has turned since is not as it was known.
     before = None if known is None or turn.any() else known.fitted
     for _ in range(_PASSES):
@@ -251,8 +266,8 @@ def refine_rig(
         if len(tracks) < MIN_WINDOWS:
             return found
         camera = reconstructor.camera
-        fitted = fit_fault(tracks, RigFault(camera), active(refined), before)
-        values += fitted.values
+        fitted = fit_fault(tracks, RigFault(camera), active(refined), before, spread)
+        values, spread = values + fitted.values, fitted.spread
         last, turns = refined, turns_of(refined, config.rectification)
         refined, before = without_fault(last, turns, fitted.values), None
         change = compare_rigs(last, refined, DEPTHS_M[-1], config.rectification)
@@ -261,6 +276,8 @@ def refine_rig(
     described = _described(given, refined, replace(fitted, values=values), config.rectification)
     steps_s = np.zeros(0) if source.stamps_s is None else np.diff(source.stamps_s)
     period_s = float(np.median(steps_s)) if len(steps_s) else float("nan")
+    if not rig.refine:
+        described = replace(described, calibration=given)
     return replace(described, begun_with=found.begun_with, period_s=period_s)
 
 

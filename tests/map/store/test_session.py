@@ -222,7 +222,9 @@ def test_the_rig_of_a_drive_is_known_to_later_ones_of_the_same_calibration(tmp_p
             session = made.begin(SessionInfo(f"drive {number}"))
             session.add_frame(_pose(number), 0.0, OdometryHealth())
             session.set_axes(np.eye(4), CAMERA)
-            fitted = FittedFault(np.arange(count) / 7, np.eye(count) / (1 + number), 1.5, 12)
+            fitted = FittedFault(
+                np.arange(count) / 7, np.eye(count) / (1 + number), np.ones(count), 1.5, 12
+            )
             session.set_rig(RefinedRig(given, found, CAMERA, fitted))
         session = made.begin(SessionInfo("not asked"))
         session.add_frame(_pose(7), 0.0, OdometryHealth())

@@ -10,7 +10,7 @@ import pytest
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.core.values.camera import project
-from recon.odometry.pose import TrackWindow
+from recon.odometry.pose import TrackWindow, adjust
 from recon.odometry.rig.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.refine import compare_rigs
@@ -76,6 +76,8 @@ def tracks(values: np.ndarray, seed: int, late: float = 0.0) -> StereoTracks:
         _, right = seen(apply(invert(T @ step(late)), xyz), values)
         left, right = (at + rng.normal(0.0, NOISE_PX, at.shape) for at in (left, right))
         inside = ((left > 0) & (left < [CAMERA.width_px, CAMERA.height_px])).all(axis=1)
+        near = apply(invert(T), xyz)
+        inside &= np.abs(near[:, 0]) < near[:, 2]  # a lens may fold what is outside into the image
         uvd[k, inside] = np.column_stack([left, left[:, 0] - right[:, 0]])[inside]
         right_uv[k, inside] = right[inside]
     start = xyz + rng.normal(0.0, 0.02, xyz.shape) * depth[:, None] * [0, 0, 1]
@@ -86,14 +88,16 @@ def fitted(values: np.ndarray, first: int = 0, shown: np.ndarray = ALL) -> Fitte
     return fit_fault([tracks(values, first + k) for k in range(WINDOWS)], FAULT, shown)
 
 
+V, U = np.mgrid[20:350:8j, 150:1050:12j]
+RAYS = np.stack([(U - CAMERA.cx_px) / 700, (V - CAMERA.cy_px) / 700, np.ones(U.shape)], -1)
+XYZ = 25.0 * RAYS.reshape(-1, 3)
+
+
 def off_px(values: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Rows and disparities (N, 2) that a rig is off by when a fault was found in it."""
-    v, u = np.mgrid[20:350:8j, 150:1050:12j]
-    rays = np.stack([(u - CAMERA.cx_px) / 700, (v - CAMERA.cy_px) / 700, np.ones(u.shape)], -1)
-    xyz = 25.0 * rays.reshape(-1, 3)
-    places = FAULT.correct(*seen(xyz, values), found)
+    places = FAULT.correct(*seen(XYZ, values), found)
     off = places.left_uv - places.right_uv
-    return np.column_stack([off[:, 1], off[:, 0] - project(xyz, CAMERA)[2]])
+    return np.column_stack([off[:, 1], off[:, 0] - project(XYZ, CAMERA)[2]])
 
 
 def rms(off: np.ndarray) -> np.ndarray:
@@ -206,19 +210,55 @@ def test_late_right_images_are_told_apart_from_a_turned_camera(late: float, valu
     assert rms(off_px(values, found.values)).max() < 0.1
 
 
+@pytest.mark.slow
+def test_intervals_hold_of_40_rigs_with_lenses_three_times_worse_than_expected():
+    rng, held, sigmas = np.random.default_rng(0), [], 3.0 * FAULT.sigmas
+    sigmas[:4] *= 0.1
+    places = FAULT.correct(*seen(XYZ, NONE), NONE)
+    by = (places.by_left - places.by_right)[:, 0]
+    for number in range(40):
+        values = sigmas * rng.normal(size=len(NAMES))
+        found = fitted(values, 100 * number)
+        sigma_px = np.sqrt(np.einsum("ni,ij,nj->n", by, found.covariance, by))
+        held.append(np.abs(off_px(values, found.values)[:, 1]) <= 1.96 * sigma_px)
+    # Noise is a third of what features are expected to have, so nearly all hold.
+    assert 0.88 <= np.mean(held) <= 0.99
+
+
 def test_directions_that_a_drive_shows_well_stay_and_others_become_zero():
     sigmas = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
     H = np.diag([1e6, 1e6, 1.0, 100.0, 0.0])
-    values = np.array([0.5, -1.0, 0.4, 0.3, 0.7])
-    found = shrink(values, H, sigmas)
+    values = np.array([0.5, -1.0, 0.4, 0.3, 0.0])
+    found, *_ = shrink(values, H, sigmas)
     np.testing.assert_allclose(found[:2], values[:2], rtol=1e-4)
-    # 0.8 of its standard deviations, 3.03 of them, and one of which the drive says nothing.
+    # 0.8 of its standard deviations, and 3.03 of them.
     assert found[2] == found[4] == 0.0
     assert found[3] == pytest.approx(0.3 * (1 - 1 / 3.03**2), rel=1e-6)
-    assert not shrink(np.zeros(5), H, sigmas).any()
+    assert not shrink(np.zeros(5), H, sigmas)[0].any()
     # Two parameters of which only the sum is known share what is shown of it.
-    both = shrink(np.array([0.2, 0.2]), 1e6 * np.ones((2, 2)), np.ones(2))
+    both, *_ = shrink(np.array([0.2, 0.2]), 1e6 * np.ones((2, 2)), np.ones(2))
     np.testing.assert_allclose(both, 0.2, rtol=1e-4)
+
+
+def test_what_is_left_out_and_lenses_worse_than_expected_are_part_of_the_error():
+    values, H = np.array([0.5, 0.4, 0.3, 0.2, 3.0, 0.0]), np.diag([1e6, 1.0, 100.0, 0.0, 1e4, 0.0])
+    found, squares, spread = shrink(values * (np.diag(H) > 0), H, np.ones(6))
+    # Of the lenses the drive shows one term, three times as large as expected.
+    assert spread == pytest.approx(9.0, rel=1e-3)
+    expected = [1e-6, 0.5 + 0.4**2, 1 / 101 + (0.3 - found[2]) ** 2, 1.0, 1e-4, 9.0]
+    np.testing.assert_allclose(np.diag(squares), expected, rtol=2e-3)
+    assert shrink(np.zeros(6), H, np.ones(6), 4.0)[2] == 4.0
+    assert shrink(np.zeros(4), np.zeros((4, 4)), np.ones(4))[2] == 1.0
+
+
+@pytest.mark.parametrize("values", [fault(yaw=2e-4), fault(zoom=-5e-4), 0.1 * LENSES])
+def test_a_path_becomes_longer_with_a_fault_as_is_said(values):
+    windows = [tracks(values, k) for k in range(WINDOWS)]
+    found = fit_fault(windows, FAULT, ALL)
+    paths = [adjust(part.window, CAMERA).T_world_camera[-1, :3, 3] for part in windows]
+    longer = 1.0 - np.linalg.norm(paths, axis=1).mean() / (FRAMES - 1)
+    assert abs(longer) > 3e-4
+    assert found.stretch @ values == pytest.approx(longer, rel=0.2)
 
 
 def with_lens(**changes: object) -> StereoCalibration:

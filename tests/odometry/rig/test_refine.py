@@ -17,19 +17,21 @@ from recon.sources.live import LiveSource
 from recon.sources.source import SourcePart, StereoSource
 from recon.stereo.rectify.rectifier import turns_of
 from recon.stereo.rectify.row_alignment import correct_rig
+from recon.street.render import StreetCamera
 from recon.street.settings import StreetScene
+from recon.street.street import build_street
 from tests.rig.audit import faults
 from tests.scenery.film import Film, film
 
 CONFIG = load_config()
 AUTO = RigSettings()
 FRAMES = 36  # as few as are refined
+SIZE = {"width_px": 400, "height_px": 136, "focal_px": 225.0, "smooth_edges": False}
 
 
 @pytest.fixture(scope="module")
 def street():
-    size = {"width_px": 400, "height_px": 136, "focal_px": 225.0, "smooth_edges": False}
-    return film(StreetScene(frames=FRAMES, seed=3, **size))
+    return film(StreetScene(frames=FRAMES, seed=3, **SIZE))
 
 
 def turned_rig(camera, yaw_deg=0.0, enlarged=1.0, pitch_deg=0.0):
@@ -54,6 +56,10 @@ def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
     rig = refine_rig(source, CONFIG, AUTO)
     assert rig.refined
     assert rig.calibration.baseline_m == pytest.approx(street.calibration.baseline_m, rel=1e-9)
+    # A rig that is to be kept is as far off as it was, and that is in the length of the path.
+    kept = replace(rig, calibration=rig.given)
+    assert rig.length_share < kept.length_share
+    assert "used is the calibration as it is" in kept.warnings()[0]
     left = off(true, rig.calibration)
     # Noise, and what is shrunk of a turn that lenses may share: three standard deviations.
     assert left.rms_px < 0.25 * planted.rms_px
@@ -97,8 +103,7 @@ def test_a_clean_street_keeps_its_calibration(street):
 
 @pytest.mark.slow
 def test_cameras_that_are_not_in_step_do_not_look_turned():
-    size = {"width_px": 400, "height_px": 136, "focal_px": 225.0, "smooth_edges": False}
-    slow = film(StreetScene(frames=2 * FRAMES, seed=3, speed_m_per_frame=0.5, **size))
+    slow = film(StreetScene(frames=2 * FRAMES, seed=3, speed_m_per_frame=0.5, **SIZE))
     late = [replace(one, right=two.right) for one, two in pairwise(slow.pairs)][::2]
     rig = refine_rig(
         Film(late, slow.calibration, slow.trajectory.T_world_camera[::2]), CONFIG, AUTO
@@ -113,7 +118,7 @@ def test_cameras_that_are_not_in_step_do_not_look_turned():
 
 @pytest.mark.parametrize(
     ("short", "live", "refine"),
-    [(True, False, True), (False, True, True), (False, False, False)],
+    [(True, False, True), (False, True, True), (True, False, False)],
     ids=["too short", "live", "off"],
 )
 def test_what_is_not_to_be_refined_is_not_read(street, *, short, live, refine):
@@ -135,6 +140,24 @@ def test_a_drive_that_shows_nothing_keeps_its_calibration(street, drive):
     still = Film(FRAMES * street.pairs[:1], street.calibration, street.trajectory.T_world_camera)
     rig = refine_rig({"black": black, "standing still": still}[drive], CONFIG, AUTO)
     assert (rig.refined, rig.figures()) == (False, {"refined": False})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["far things", "turning on the spot"])
+def test_nothing_is_invented_where_motion_shows_little(drive):
+    baseline_m = 0.1 if drive == "far things" else 0.54
+    world = build_street(StreetScene(frames=FRAMES, seed=3, baseline_m=baseline_m, **SIZE))
+    if drive == "turning on the spot":
+        turns = [
+            make_transform(exp_so3(np.array([0, 0.035 * k, 0])), np.zeros(3)) for k in range(FRAMES)
+        ]
+        world = replace(world, T_street_camera=world.T_street_camera[0] @ np.stack(turns))
+    camera, poses = StreetCamera(world), world.trajectory.T_world_camera
+    seen = Film([camera.pair(k) for k in range(FRAMES)], world.camera, poses)
+    rig = refine_rig(seen, CONFIG, AUTO)
+    assert off(world.camera, rig.calibration).moved_px <= 0.05
+    # Of how long the path is, little is known, and that is said.
+    assert rig.length_share is None or rig.length_share > 0.02
 
 
 def test_depth_behind_infinity_is_said_and_can_be_stored(street):
