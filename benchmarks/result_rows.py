@@ -96,6 +96,17 @@ def intervals(found: Found) -> Rows:
     }
 
 
+def rig_intervals(found: Found) -> Rows:
+    one = found["streets"]
+    held = {name: 100 * share for name, share in one["held"].items()}
+    return {
+        f"{len(one['drives'])} rendered drives": {
+            **held,
+            "not recovered": 100 * one["not_recovered"],
+        }
+    }
+
+
 def occupancy(found: Found) -> Rows:
     return {f"street {seed}": one for seed, one in found["streets"]["streets"].items()}
 

@@ -235,6 +235,12 @@ TABLES: Final[dict[str, Table]] = {
         | {"error over stated deviation, rms": "{:.2f}"},
         rows_of.intervals,
     ),
+    "rig-intervals": Table(
+        {"streets": "python benchmarks/rig_intervals.py --drives 40 --json"},
+        dict.fromkeys(("corner", "left", "right", "top", "centre", "mean"), "{:.0f} %")
+        | dict.fromkeys(("yaw", "parameters", "length", "not recovered"), "{:.0f} %"),
+        rows_of.rig_intervals,
+    ),
     "matching": Table(
         {
             f"{n} thread{'s'[: n - 1]}": f"python benchmarks/matching.py --json --threads {n}"
