@@ -68,8 +68,8 @@ PACKAGES: Final[Mapping[str, str]] = {
     "numpy": "numpy", "llvmlite": "llvmlite", "numba": "numba", "opencv-python-headless": "cv2",
     "open3d": "open3d", "kiss-icp": "kiss_icp", "pymeshlab": "pymeshlab", "pillow": "PIL",
     "jinja2": "jinja2", "matplotlib": "matplotlib", "plotly": "plotly", "pydantic": "pydantic",
-    "typer": "typer", "rich": "rich", "pyyaml": "yaml", "threadpoolctl": "threadpoolctl",
-    "typing-extensions": "typing_extensions",
+    "typer": "typer", "rich": "rich", "pyyaml": "yaml", "scipy": "scipy",
+    "threadpoolctl": "threadpoolctl", "typing-extensions": "typing_extensions",
     **({} if sys.version_info >= (3, 11) else {"tomli": "tomli"}),
 }  # fmt: skip
 #: Shared library -> Debian or Ubuntu package that provides it.

@@ -16,14 +16,15 @@ from recon.core.geometry.alignment import pose_between
 from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.places.fixes import Held, PoseEdge, optimise_poses
+from recon.places.fixes import Held
 from recon.places.loop import Loop
 from recon.places.places import Drift, drift_over
+from recon.places.pose_graph import PoseEdge, optimise_poses
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
 _KEPT: Final = 0.25  # least weight of a loop that is believed
 _NODE_M: Final = 5.0  # path between two nodes of the graph
-_MAX_NODES: Final = 400  # longer drives get nodes farther apart: time is cubic
+_MAX_NODES: Final = 4000  # longer drives get nodes farther apart; so many take some seconds
 _LOOP_SIGMA_M: Final = 0.05  # standard deviation of a loop that more matches do not improve
 _LOOP_SHARE: Final = 0.03
 """Standard deviation that is added per distance between its two frames: features that moved farther

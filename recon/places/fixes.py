@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
-from recon.core.errors import RegistrationError, ShapeError
+from recon.core.errors import ShapeError
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Float64, Int32, freeze, frozen_array
+from recon.core.values.arrays import Float64, Int32, frozen_array
+from recon.places.pose_graph import PoseEdge
 
 _NO_TURN: Final = 1e-9  # information of a rotation that was not measured; the optimiser needs some
 
@@ -89,65 +89,3 @@ class Held:
 def _placed(T: Float64, offset_m: Float64) -> Float64:
     """Return offsets (N, 3) by as many transforms (N, 4, 4)."""
     return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], offset_m) + T[:, :3, 3])
-
-
-@dataclass(frozen=True, eq=False)
-class PoseEdge:
-    """Relative pose constraint between two nodes."""
-
-    first: int  # index of one node
-    last: int  # index of the other node
-    T_first_last: Float64  # (4, 4)
-    # float64 (6, 6), information matrix of a step (translation in metres, rotation vector in
-    # radians)
-    information: Float64
-    doubtful: bool = False  # whether the edge may be an outlier, which the optimiser may switch off
-
-    def __post_init__(self) -> None:
-        freeze(self, "T_first_last", np.float64, (4, 4))
-        freeze(self, "information", np.float64, (6, 6))
-
-
-def optimise_poses(
-    T_world_node: Float64, edges: Sequence[PoseEdge], half_chi2: float
-) -> tuple[Float64, Float64]:
-    """Optimise a pose graph whose first node is fixed: its poses, and the weight of each edge.
-
-    ``half_chi2`` is the misfit at which the weight of a doubtful edge has dropped to a quarter.
-
-    Ref: Choi, Zhou, Koltun, "Robust reconstruction of indoor scenes", CVPR 2015.
-    """
-    registration = o3d.pipelines.registration
-    graph = registration.PoseGraph()
-    for T in T_world_node:
-        graph.nodes.append(registration.PoseGraphNode(np.array(T)))
-    for edge in edges:
-        graph.edges.append(_edge(edge))
-    # Open3D scales its line process by the mean of what it assumes to be a number of points.
-    scale = float(np.mean([edge.information[2, 2] for edge in edges]))
-    option = registration.GlobalOptimizationOption(
-        max_correspondence_distance=1.0,
-        edge_prune_threshold=0.0,
-        preference_loop_closure=half_chi2 / scale,
-        reference_node=0,
-    )
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        registration.global_optimization(
-            graph,
-            registration.GlobalOptimizationLevenbergMarquardt(),
-            registration.GlobalOptimizationConvergenceCriteria(),
-            option,
-        )
-    poses = np.array([node.pose for node in graph.nodes])
-    if not np.isfinite(poses).all():
-        raise RegistrationError("the pose graph has no solution")
-    return poses, np.array([edge.confidence for edge in graph.edges])
-
-
-def _edge(edge: PoseEdge) -> Any:
-    # Open3D's steps begin with the rotation, ours with the translation.
-    order = [3, 4, 5, 0, 1, 2]
-    information = np.array(edge.information)[np.ix_(order, order)]
-    return o3d.pipelines.registration.PoseGraphEdge(
-        edge.last, edge.first, np.array(edge.T_first_last), information, edge.doubtful
-    )

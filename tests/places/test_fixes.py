@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.core.errors import ShapeError
 from recon.core.geometry.alignment import fit_points
-from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, log_so3, make_transform
+from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 from recon.places.closure import DrivePath, JoinedDrives, join_drives
-from recon.places.fixes import NO_FIXES, Fixes, Held, PoseEdge, optimise_poses
+from recon.places.fixes import NO_FIXES, Fixes, Held
 from recon.places.places import path_lengths
 
 T_SURVEY_WORLD = make_transform(exp_so3(np.array([0.1, 2.0, -0.3])), np.array([30.0, -8.0, 5.0]))
@@ -78,45 +77,3 @@ def test_positions_that_no_drift_explains_are_not_believed(truth: Trajectory) ->
 def test_a_drive_without_positions_is_held_by_nothing(truth: Trajectory) -> None:
     T_world_node = np.tile(np.eye(4), (4, 1, 1))
     assert Held(np.eye(4), [NO_FIXES]).edges([truth], [np.arange(3)], T_world_node) == []
-
-
-def _ahead(metres: float) -> np.ndarray:
-    return make_transform(np.eye(3), np.array([0.0, 0.0, metres]))
-
-
-def test_two_edges_meet_where_their_information_says():
-    edges = [PoseEdge(0, 1, _ahead(k), w * np.eye(6)) for k, w in ((1.0, 3.0), (2.0, 1.0))]
-    poses, _ = optimise_poses(np.stack([np.eye(4), _ahead(1.0)]), edges, 1.0)
-    assert poses[1][:3, 3] == pytest.approx([0.0, 0.0, 1.25], abs=1e-4)
-    assert np.array_equal(poses[0], np.eye(4))
-
-
-@pytest.mark.parametrize("axis", range(6))
-def test_information_counts_in_its_own_direction(axis):
-    """One edge knows one direction well, the other one all directions equally."""
-    step = np.zeros(6)
-    step[axis] = 0.01
-    moved = make_transform(exp_so3(step[3:]), step[:3])
-    sure = np.ones(6)
-    sure[axis] = 1e6
-    edges = [PoseEdge(0, 1, moved, np.diag(sure)), PoseEdge(0, 1, np.eye(4), np.eye(6))]
-    poses, _ = optimise_poses(np.stack([np.eye(4), np.eye(4)]), edges, 1.0)
-    got = np.concatenate([poses[1][:3, 3], log_so3(poses[1][:3, :3])])
-    assert got == pytest.approx(step, abs=1e-4)
-
-
-@pytest.mark.parametrize("chi2", [4.0, 25.0, 400.0])
-def test_a_doubtful_edge_of_that_misfit_counts_a_quarter(chi2):
-    """The stiff edge holds the node 1 m from where the doubtful one wants it."""
-    edges = [
-        PoseEdge(0, 1, np.eye(4), 1e8 * np.eye(6)),
-        PoseEdge(0, 1, _ahead(1.0), chi2 * np.eye(6), doubtful=True),
-    ]
-    _, weights = optimise_poses(np.stack([np.eye(4), np.eye(4)]), edges, chi2)
-    assert weights[1] == pytest.approx(0.25, abs=0.01)
-    assert weights[0] == 1.0
-
-
-def test_an_edge_has_to_be_a_pose():
-    with pytest.raises(ShapeError, match="T_first_last"):
-        PoseEdge(0, 1, np.eye(3), np.eye(6))

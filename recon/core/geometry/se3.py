@@ -66,8 +66,11 @@ def angle_rad(T: NDArray[Any]) -> Float64:
 
 
 def hat(w: NDArray[Any]) -> Float64:
-    """Return the cross-product matrix of a vector (3,)."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    """Return the cross-product matrix of a vector (3,), or of each of a stack (…, 3)."""
+    matrix = np.zeros((*w.shape, 3))
+    matrix[..., [2, 0, 1], [1, 2, 0]] = w
+    matrix[..., [1, 2, 0], [2, 0, 1]] = -w
+    return matrix
 
 
 def exp_so3(w: NDArray[Any]) -> Float64:
@@ -116,11 +119,14 @@ def step_jacobian(xyz: NDArray[Any]) -> Float64:
 
 
 def adjoint(T_a_b: NDArray[Any]) -> Float64:
-    """Return the matrix (6, 6) that turns a step in the axes of b into the same motion in a's."""
-    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
-    matrix = np.zeros((6, 6))
-    matrix[:3, :3] = matrix[3:, 3:] = R
-    matrix[:3, 3:] = hat(t) @ R
+    """Return the matrix that turns a step in the axes of b into the same motion in a's.
+
+    (6, 6) of a transform (4, 4), (…, 6, 6) of a stack.
+    """
+    R, t = T_a_b[..., :3, :3], T_a_b[..., :3, 3]
+    matrix = np.zeros((*T_a_b.shape[:-2], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = R
+    matrix[..., :3, 3:] = hat(t) @ R
     return matrix
 
 

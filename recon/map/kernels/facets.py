@@ -36,7 +36,7 @@ def crossed_cells(cells: Int32, keys: Int64, sums: Float32) -> Bool:
     enter_keys(table, keys)
     spreads = np.zeros((len(cells), 3, 3))
     _measure_spreads(cells, table, sums, spreads)
-    # Not in a kernel: numba takes linear algebra from scipy, which nothing else here needs.
+    # Not in a kernel: numba takes linear algebra from scipy, which takes half a second to load.
     normals = np.ascontiguousarray(np.linalg.eigh(spreads)[1][:, :, 0])
     crossed = np.zeros(len(cells), np.bool_)
     _test_cells(cells, table, sums, normals, crossed)

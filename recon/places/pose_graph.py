@@ -1,0 +1,220 @@
+"""Pose graphs: poses that agree as well as can be with motions measured between them.
+
+**What is off.** An edge measured ``Z = T_first_last``; of poses ``X`` it says that ``E = Z⁻¹ T``,
+with ``T = X_first⁻¹ X_last``, should be the identity. What is off is the step ``e`` of ``E``: its
+translation ``t`` and rotation vector ``φ``, in the axes of the later node as measured. Its
+chi-square is ``eᵀ Ω e``, with the information ``Ω`` of the edge.
+
+**Derivatives.** A pose moves by a step in its own axes, ``X ← X D(v, w)``: ``v`` its translation,
+``exp w`` its rotation. If the later pose moves, ``E`` becomes ``E D``, so that ``t`` changes by
+``R_E v`` and ``φ`` by ``Jr⁻¹(φ) w``. If the earlier one moves, ``E`` becomes ``E (T⁻¹ D⁻¹ T)``, the
+opposite motion in the axes of the later node, which the adjoint gives:
+
+    J_last = diag(R_E, Jr⁻¹(φ)),    J_first = −J_last Ad(T⁻¹),
+    Jr⁻¹(φ) = I + ½ φ× + (1 − ½θ cot ½θ) / θ² (φ×)²,    θ = |φ|.
+
+**Doubtful edges.** They cost ``h χ² / (h + χ²)`` instead of ``χ²`` (Geman and McClure), which is
+what a switch on the edge costs where it is best set. Its slope is the weight ``(1 + χ²/h)⁻²``, a
+quarter at ``χ² = h``.
+
+**Solution.** Levenberg-Marquardt: a node has edges to few others, so the normal equations are
+sparse, and their factors nearly so.
+
+Ref: Barfoot, "State estimation for robotics", 2017, section 7.1 (``Jr⁻¹``, adjoint). Choi, Zhou,
+Koltun, "Robust reconstruction of indoor scenes", CVPR 2015 (switches).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import adjoint, hat, invert
+from recon.core.least_squares import Problem, minimise
+from recon.core.values.arrays import Bool, Float64, freeze
+
+_ROUNDS: Final = 30
+_STILL: Final = 1e-6  # gain of a step, as a share of the cost, that is not worth another one
+_DAMPING: Final = 1e-9
+"""The first, of the diagonal: far below the share by which a chain of thousands resists bending."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEdge:
+    """Relative pose constraint between two nodes."""
+
+    first: int  # index of one node
+    last: int  # index of the other node
+    T_first_last: Float64  # (4, 4)
+    # float64 (6, 6), information matrix of a step (translation in metres, rotation vector in
+    # radians)
+    information: Float64
+    doubtful: bool = False  # whether the edge may be an outlier, which the optimiser may switch off
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_first_last", np.float64, (4, 4))
+        freeze(self, "information", np.float64, (6, 6))
+
+
+def optimise_poses(
+    T_world_node: Float64, edges: Sequence[PoseEdge], half_chi2: float
+) -> tuple[Float64, Float64]:
+    """Optimise a pose graph whose first node is fixed.
+
+    Returns the poses (N, 4, 4), and the weight (E,) of each edge. ``half_chi2`` is the misfit at
+    which that of a doubtful edge has dropped to a quarter. Nodes that no path of edges links to the
+    first one keep their place: of each such part, its first node is fixed.
+
+    Raises:
+        RegistrationError: The graph has no finite solution.
+    """
+    graph = PoseGraph.of(edges, half_chi2, len(T_world_node))
+    if not np.isfinite(graph.cost(T_world_node)):
+        raise RegistrationError("the pose graph has no solution")
+    problem = Problem(graph.cost, graph.linearise, graph.step)
+    poses = minimise(problem, T_world_node, rounds=_ROUNDS, min_gain=_STILL, damping=_DAMPING)
+    return poses, graph.weights(poses)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraph:
+    """The edges of a graph, in arrays."""
+
+    count: int  # of nodes
+    ends: NDArray[np.intp]  # (E, 2), first and last node of each edge
+    T_last_first: Float64  # (E, 4, 4), inverse of the measured motion
+    information: Float64  # (E, 6, 6)
+    half_chi2: Float64  # (E,), infinite where an edge is not doubtful
+
+    @classmethod
+    def of(cls, edges: Sequence[PoseEdge], half_chi2: float, count: int) -> PoseGraph:
+        """Return the graph of some edges between so many nodes."""
+        return cls(
+            count,
+            np.array([(edge.first, edge.last) for edge in edges], np.intp).reshape(-1, 2),
+            invert(np.array([edge.T_first_last for edge in edges]).reshape(-1, 4, 4)),
+            np.array([edge.information for edge in edges]).reshape(-1, 6, 6),
+            np.array([half_chi2 if edge.doubtful else np.inf for edge in edges]),
+        )
+
+    def weights(self, T_world_node: Float64) -> Float64:
+        """Return the weight of each edge, (E,): 1 unless it is doubtful."""
+        return self._weights(self._misfits(T_world_node)[1])
+
+    def cost(self, T_world_node: Float64) -> float:
+        """Return the sum of chi-square, of doubtful edges what is left of it."""
+        _, chi2 = self._misfits(T_world_node)
+        return float(np.sum(chi2 / (1.0 + chi2 / self.half_chi2)))
+
+    def linearise(self, T_world_node: Float64) -> tuple[Float64, Float64]:
+        """Return normal matrix (E, 12, 12) and half the gradient (E, 12) of each edge.
+
+        The 12 are steps of its first and of its last node.
+        """
+        T = self._motions(T_world_node)
+        steps, chi2 = self._misfits(T_world_node)
+        J_last = np.zeros((len(T), 6, 6))
+        J_last[:, :3, :3] = (self.T_last_first @ T)[:, :3, :3]
+        J_last[:, 3:, 3:] = _right_inverse(steps[:, 3:])
+        J = np.concatenate([-J_last @ adjoint(invert(T)), J_last], axis=2)
+        weighted = self._weights(chi2)[:, None, None] * self.information @ J
+        return np.swapaxes(weighted, 1, 2) @ J, np.einsum("eij,ei->ej", weighted, steps)
+
+    def step(
+        self, T_world_node: Float64, linear: tuple[Float64, Float64], damping: float
+    ) -> Float64 | None:
+        """Return poses after a step; None where the damped equations have no solution."""
+        pattern = self._pattern
+        found = pattern.solve(*linear, damping)
+        if found is None:
+            return None
+        steps = np.zeros((self.count, 6))
+        steps[pattern.free] = -found.reshape(-1, 6)
+        moves = np.tile(np.eye(4), (self.count, 1, 1))
+        moves[:, :3, :3] = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
+        moves[:, :3, 3] = steps[:, :3]
+        return np.asarray(T_world_node @ moves)
+
+    @cached_property
+    def _pattern(self) -> _Pattern:
+        return _Pattern.of(self.ends, self.count)
+
+    def _motions(self, T_world_node: Float64) -> Float64:
+        """``T_first_last`` (E, 4, 4) of the poses."""
+        first, last = T_world_node[self.ends.T]
+        return np.asarray(invert(first) @ last)
+
+    def _misfits(self, T_world_node: Float64) -> tuple[Float64, Float64]:
+        """What is off, as steps (E, 6), and its chi-square (E,)."""
+        off = self.T_last_first @ self._motions(T_world_node)
+        turns = Rotation.from_matrix(off[:, :3, :3]).as_rotvec()
+        steps = np.concatenate([off[:, :3, 3], turns], axis=1)
+        return steps, np.einsum("ei,eij,ej->e", steps, self.information, steps)
+
+    def _weights(self, chi2: Float64) -> Float64:
+        return np.asarray((1.0 + chi2 / self.half_chi2) ** -2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pattern:
+    """Where the equations of edges stand in those of the whole graph, column after column."""
+
+    free: Bool  # (N,), nodes that are not fixed
+    indices: NDArray[np.intp]  # (M,), row of each entry
+    indptr: NDArray[np.intp]  # (K + 1,), first entry of each column
+    kept: Bool  # (E, 12, 12), entries of edges that concern no fixed node
+    slots: NDArray[np.intp]  # the entry to which each kept one belongs
+    unknowns: NDArray[np.intp]  # (E, 12), K where the node is fixed
+
+    @classmethod
+    def of(cls, ends: NDArray[np.intp], count: int) -> _Pattern:
+        """Return the pattern of edges (E, 2) between so many nodes."""
+        links = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
+        _, part = connected_components(links, directed=False)
+        free = np.ones(count, np.bool_)
+        free[np.unique(part, return_index=True)[1]] = False
+        size = 6 * int(free.sum())
+        number = np.where(free, 6 * np.cumsum(free) - 6, size)
+        unknowns = np.minimum(number[ends][:, :, None] + np.arange(6), size).reshape(-1, 12)
+        rows, columns = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
+        kept = np.maximum(rows, columns) < size
+        entries, slots = np.unique(columns[kept] * size + rows[kept], return_inverse=True)
+        indptr = np.searchsorted(entries, size * np.arange(size + 1))
+        return cls(free, entries % max(size, 1), indptr, kept, slots, unknowns)
+
+    def solve(self, normal: Float64, gradient: Float64, damping: float) -> Float64 | None:
+        """Return the unknowns (K,) of equations (E, 12, 12) and (E, 12); None = no solution."""
+        size = len(self.indptr) - 1
+        if size == 0:
+            return None
+        right = np.bincount(self.unknowns.ravel(), gradient.ravel(), size + 1)[:size]
+        values = np.bincount(self.slots, normal[self.kept], len(self.indices))
+        matrix = csc_array((values, self.indices, self.indptr), shape=(size, size))
+        diagonal = matrix.diagonal()
+        # A direction of which no edge knows anything stays as it is.
+        matrix.setdiag(diagonal + np.where(diagonal > 0.0, damping * diagonal, 1.0))
+        try:
+            factors = splu(
+                matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError:  # singular
+            return None
+        return np.asarray(factors.solve(right))
+
+
+def _right_inverse(turns: Float64) -> Float64:
+    """Return ``Jr⁻¹`` (N, 3, 3) of rotation vectors (N, 3)."""
+    angle = np.maximum(np.linalg.norm(turns, axis=1), 1e-4)  # below, the factor is 1/12
+    factor = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+    K = hat(turns)
+    return np.asarray(np.eye(3) + 0.5 * K + factor[:, None, None] * (K @ K))
