@@ -8,18 +8,22 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.geometry.alignment import fit_points
+from recon.core.values.camera import project
 from recon.core.geometry.se3 import apply, as_transform, invert, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
-from recon.core.values.camera import project
-from recon.odometry.pose import find_consensus, fit_pose
 
-_ITERATIONS: Final = 500  # RANSAC's samples at most
-_LIMIT_PX: Final = 2.5  # RANSAC's inlier limit
-MIN_INLIERS: Final = 20  # least number of matches that agree in both directions
-_SIGMA_UV_PX: Final = 1.0  # standard deviation of a feature's column or row
-_SIGMA_D_PX: Final = 1.0  # standard deviation of its disparity
+MIN_INLIERS: Final = 15  # least number of matches that agree in both directions
+_LIMIT_SIGMAS: Final = 2.5  # largest distance from where a match should be, in each frame
+_MOST: Final = 300  # matches that are compared with one another, those of the nearest points
+_SEEDS: Final = 6  # matches whose companions are tried
+_ROUGH: Final = 4  # steps of the fit to them
+_FEWEST: Final = 8  # least number of companions
+_SIGMA_D_PX: Final = 1.0  # standard deviation of a disparity
 _STEPS: Final = 15
+_ROUNDS: Final = 3
+_STILL: Final = 1e-5  # metres and radians: a step that ends the fit
 _CAUCHY_SIGMAS: Final = 2.0
 _SHARED: Final = 0.5  # both directions see the same matches, so together they count once
 
@@ -31,10 +35,18 @@ class Seen:
     uvd: Float64  # (N, 3), column, row, disparity
     xyz: Float64  # (N, 3), the same points in camera axes
     camera: RectifiedCamera  # that of the frame
+    sigma_px: float  # standard deviation of a column or row
 
-    def select(self, rows: NDArray[np.bool_]) -> Seen:
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Seen:
         """Return some of the points."""
-        return Seen(self.uvd[rows], self.xyz[rows], self.camera)
+        return Seen(self.uvd[rows], self.xyz[rows], self.camera, self.sigma_px)
+
+    @property
+    def sigma_m(self) -> Float64:
+        """float64 (N,), about how far each point may be off."""
+        depth, camera = self.xyz[:, 2], self.camera
+        along = depth**2 / (camera.focal_px * camera.baseline_m) * _SIGMA_D_PX
+        return np.asarray(np.hypot(along, depth / camera.focal_px * self.sigma_px))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,26 +60,73 @@ class Alignment:
     information: Float64
 
 
-def locate(points: Float64, seen: Seen) -> Float64 | None:
-    """Return the pose of a camera that sees known points, ``T_points_camera``; None = no pose."""
-    uv, camera = seen.uvd[:, :2], seen.camera
-    consensus = find_consensus(
-        points, uv, camera, limit_px=_LIMIT_PX, iterations=_ITERATIONS, min_inliers=MIN_INLIERS
-    )
-    if consensus is None:
-        return None
-    T = fit_pose(points[consensus.agree], uv[consensus.agree], camera)
-    return T if np.isfinite(T).all() else None
+def find_motion(first: Seen, last: Seen) -> Alignment | None:
+    """Return the motion on which most matches agree; None = too few do.
+
+    A motion keeps the distances between points. The companions of a match are those that are as far
+    from it in either frame, within what depth errors explain. Of the matches with most companions
+    each gives a motion; the one that most matches agree with is fitted to them.
+
+    Ref: Leordeanu and Hebert, "A spectral technique for correspondence problems using pairwise
+    constraints", ICCV 2005.
+    """
+    near = np.argsort(first.sigma_m + last.sigma_m, kind="stable")[:_MOST]
+    ones, others = first.select(near), last.select(near)
+    rigid = _keep_distances(ones, others)
+    sigma_m = np.hypot(ones.sigma_m, others.sigma_m)
+    best, T_best = 0, np.eye(4)
+    for seed in np.argsort(-rigid.sum(axis=1), kind="stable")[:_SEEDS]:
+        among = _companions(rigid, int(seed))
+        if len(among) < _FEWEST:
+            continue
+        # Depth errors grow with the square of the distance: the nearer half tells most.
+        surest = among[np.argsort(sigma_m[among], kind="stable")[: max(_FEWEST, len(among) // 2)]]
+        T = fit_points(others.xyz[surest], ones.xyz[surest]).T_to_from
+        T = refine(ones.select(among), others.select(among), T, steps=_ROUGH).T_first_last
+        agreeing = int(agreement(first, last, T).sum())
+        if agreeing > best:
+            best, T_best = agreeing, T
+    return settle(first, last, T_best) if best >= _FEWEST else None
 
 
-def refine(first: Seen, last: Seen, T_first_last: Float64) -> Alignment:
+def settle(first: Seen, last: Seen, T_first_last: Float64) -> Alignment | None:
+    """Fit a motion to the matches that agree with it, until these stay the same; None = too few."""
+    agree = agreement(first, last, T_first_last)
+    for _ in range(_ROUNDS):
+        if agree.sum() < _FEWEST:
+            return None
+        found = refine(first.select(agree), last.select(agree), T_first_last)
+        T_first_last, before = found.T_first_last, agree
+        agree = agreement(first, last, T_first_last)
+        if np.array_equal(agree, before):
+            break
+    return Alignment(T_first_last, agree, found.information)
+
+
+def _keep_distances(first: Seen, last: Seen) -> Bool:
+    """Return bool (N, N), which matches are as far from one another in either frame."""
+    apart = [np.linalg.norm(seen.xyz[:, None] - seen.xyz, axis=2) for seen in (first, last)]
+    variance = first.sigma_m**2 + last.sigma_m**2
+    tolerance = np.sqrt(variance[:, None] + variance)
+    # Points that errors of their depth do not tell apart say nothing of one another.
+    return (np.abs(apart[0] - apart[1]) <= tolerance) & (np.minimum(*apart) > tolerance)
+
+
+def _companions(rigid: Bool, seed: int) -> NDArray[np.intp]:
+    """Return the companions of a match that are companions of at least half of the others."""
+    among = np.flatnonzero(rigid[seed])
+    mutual = rigid[np.ix_(among, among)].sum(axis=1)
+    return np.append(among[2 * mutual >= len(among)], seed)
+
+
+def refine(first: Seen, last: Seen, T_first_last: Float64, *, steps: int = _STEPS) -> Alignment:
     """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights."""
     T = T_first_last
-    for _ in range(_STEPS):
+    for _ in range(steps):
         H, g = _normal_equations(first, last, T)
         step = np.linalg.solve(H + 1e-9 * np.eye(6), -g)
         T = T @ as_transform(step)
-        if np.linalg.norm(step) < 1e-6:
+        if np.linalg.norm(step) < _STILL:
             break
     H, _ = _normal_equations(first, last, T)
     return Alignment(T, agreement(first, last, T), _SHARED * H)
@@ -80,7 +139,8 @@ def agreement(first: Seen, last: Seen, T_first_last: Float64) -> Bool:
     for T, points, seen in both:
         u, v, _ = project(apply(T, points), seen.camera)
         # A point behind the camera has a NaN error, which compares as False.
-        agree &= np.hypot(u - seen.uvd[:, 0], v - seen.uvd[:, 1]) <= _LIMIT_PX
+        off_px = np.hypot(u - seen.uvd[:, 0], v - seen.uvd[:, 1])
+        agree &= off_px <= _LIMIT_SIGMAS * seen.sigma_px
     return agree
 
 
@@ -102,7 +162,7 @@ def _normal_equations(first: Seen, last: Seen, T: Float64) -> tuple[Float64, Flo
 
 def _residuals(xyz: Float64, d_xyz: Float64, seen: Seen) -> tuple[Float64, Float64]:
     """Return whitened residuals (N, 3) and derivatives (N, 3, 6); 0 for points behind a camera."""
-    sigma, camera = np.array([_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX]), seen.camera
+    sigma, camera = np.array([seen.sigma_px, seen.sigma_px, _SIGMA_D_PX]), seen.camera
     front = xyz[:, 2] > 0.1
     z = np.where(front, xyz[:, 2], 1.0)
     f, b = camera.focal_px, camera.baseline_m

@@ -8,20 +8,21 @@ from typing import Final
 import cv2
 import numpy as np
 
-from recon.core.geometry.se3 import angle_rad, apply, invert
+from recon.core.values.camera import project
+from numpy.typing import NDArray
+
+from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.core.values.camera import project
-from recon.places.align import MIN_INLIERS, Alignment, Seen, agreement, locate, refine
-from recon.places.keyframe import Keyframe, points_of
+from recon.places.align import MIN_INLIERS, Alignment, Seen, find_motion, settle
+from recon.places.keyframe import Keyframe, feature_sigma_px, points_of
 from recon.places.loop import Loop
 
 _CELLS: Final = 4
-_MAX_HAMMING: Final = 64  # largest Hamming distance of a match
-_MIN_INLIER_SHARE: Final = 0.3  # least share of the matches that agree
+_MAX_HAMMING: Final = 72  # largest Hamming distance of a match
+_GUIDED_HAMMING: Final = 90  # that of features that are where they should be
+_GUIDED_SIGMAS: Final = 4.0  # how far they may be from there
 _SPREAD_CELLS: Final = 5  # of 4 by 4 cells of each image, how many must hold inliers
-_BOTH_WAYS_M: Final = 0.5  # largest distance between the poses found in either direction
-_BOTH_WAYS_DEG: Final = 2.0  # largest angle between them
 _MAX_SIGMA_M: Final = 0.3  # loops less certain than this in any direction are refused
 _DENSE_TOLERANCE_PX: Final = 1.0
 """Largest difference between a predicted and a seen disparity that agree."""
@@ -52,7 +53,7 @@ def verify(
     determine the motion in all directions. The coarse disparities must agree with it, too.
     """
     cameras = (first_camera or camera, camera)
-    aligned = _aligned(*match_keyframes(first, last, *cameras))
+    aligned = _aligned(Matchable.of(first, cameras[0]), Matchable.of(last, cameras[1]))
     if isinstance(aligned, str):
         return Verdict(None, aligned)
     T, inliers = aligned.T_first_last, int(aligned.agree.sum())
@@ -62,33 +63,73 @@ def verify(
     return Verdict(Loop(first.frame, last.frame, T, aligned.information, inliers, dense))
 
 
-def _aligned(first: Seen, last: Seen) -> Alignment | str:
+def _aligned(first: Matchable, last: Matchable) -> Alignment | str:
     """The motion between the frames, or why it is not verified."""
-    T_there = locate(first.xyz, last)
-    if T_there is None or (T_back := locate(last.xyz, first)) is None:
+    found = find_motion(*_seen(first, last, first.mutual(last)))
+    if found is None:
         return "no common motion"
-    if not _inverse(T_there, T_back):
-        return "there and back differ"
-    agree = agreement(first, last, T_there)
-    among = (first.select(agree), last.select(agree))
-    if int(agree.sum()) < MIN_INLIERS:
+    # Once it is known where features should be, fewer have to be told apart.
+    seen = _seen(first, last, first.guided(last, found.T_first_last))
+    aligned = settle(*seen, found.T_first_last)
+    if aligned is None or int(aligned.agree.sum()) < MIN_INLIERS:
         return "few inliers"
-    aligned = refine(*among, T_there)
-    return _weakness(*among, aligned, agree.size) or aligned
+    if min(_spread(one.select(aligned.agree)) for one in seen) < _SPREAD_CELLS:
+        return "inliers in one corner"
+    if _sigma_m(aligned.information) > _MAX_SIGMA_M:
+        return "motion not fixed"
+    return aligned
 
 
-def match_keyframes(
-    first: Keyframe, last: Keyframe, first_camera: RectifiedCamera, last_camera: RectifiedCamera
-) -> tuple[Seen, Seen]:
-    """Return features that are each other's best match and have a depth in both frames."""
-    ours, theirs = (np.isfinite(k.uvd[:, 2]) for k in (first, last))
-    pairs = _mutual(first.descriptors[ours], last.descriptors[theirs])
-    both = (
-        (first.uvd[ours][pairs[:, 0]], first_camera),
-        (last.uvd[theirs][pairs[:, 1]], last_camera),
+@dataclass(frozen=True, eq=False)
+class Matchable:
+    """The features of a keyframe that have a depth."""
+
+    uvd: Float64  # (N, 3), column, row, disparity
+    xyz: Float64  # (N, 3), in camera axes
+    descriptors: UInt8  # (N, 32)
+    camera: RectifiedCamera
+
+    @staticmethod
+    def of(keyframe: Keyframe, camera: RectifiedCamera) -> Matchable:
+        """Return those of a keyframe."""
+        known = np.isfinite(keyframe.uvd[:, 2])
+        uvd = keyframe.uvd[known].astype(np.float64)
+        return Matchable(uvd, points_of(uvd, camera), keyframe.descriptors[known], camera)
+
+    def mutual(self, other: Matchable) -> NDArray[np.intp]:
+        """Return int (M, 2), features that are each other's best match."""
+        if not len(self.uvd) or not len(other.uvd):
+            return np.zeros((0, 2), np.intp)
+        found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+        pairs = [
+            (match.queryIdx, match.trainIdx)
+            for match in found.match(self.descriptors, other.descriptors)
+            if match.distance <= _MAX_HAMMING
+        ]
+        return np.array(pairs, np.intp).reshape(-1, 2)
+
+    def guided(self, other: Matchable, T_self_other: Float64) -> NDArray[np.intp]:
+        """Return int (M, 2), for features the other's best match near where a motion takes it."""
+        u, v, _ = project(apply(T_self_other, other.xyz), self.camera)
+        radius_px = _GUIDED_SIGMAS * feature_sigma_px(self.camera)
+        with np.errstate(invalid="ignore"):
+            near = np.hypot(self.uvd[:, :1] - u, self.uvd[:, 1:2] - v) <= radius_px
+        rows, columns = np.nonzero(near)
+        bits = np.full(near.shape, 8 * _GUIDED_HAMMING)
+        differ = self.descriptors[rows] ^ other.descriptors[columns]
+        bits[rows, columns] = np.bitwise_count(differ).sum(axis=1)
+        best, best_back = bits.argmin(axis=1), bits.argmin(axis=0)
+        ours = np.flatnonzero(best_back[best] == np.arange(len(best)))
+        ours = ours[bits[ours, best[ours]] <= _GUIDED_HAMMING]
+        return np.column_stack([ours, best[ours]])
+
+
+def _seen(first: Matchable, last: Matchable, pairs: NDArray[np.intp]) -> tuple[Seen, Seen]:
+    ones, others = (
+        Seen(k.uvd[rows], k.xyz[rows], k.camera, feature_sigma_px(k.camera))
+        for k, rows in zip((first, last), pairs.T, strict=True)
     )
-    seen = [Seen(uvd.astype(np.float64), points_of(uvd, camera), camera) for uvd, camera in both]
-    return seen[0], seen[1]
+    return ones, others
 
 
 def dense_agreement(
@@ -153,33 +194,6 @@ def _coarse_points(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
     d = keyframe.coarse[row, column]
     uvd = np.column_stack([column * step + half, row * step + half, d]).astype(np.float64)
     return points_of(uvd, camera)
-
-
-def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
-    """Rows (M, 2) of descriptors that are each other's nearest."""
-    if not len(ours) or not len(theirs):
-        return np.zeros((0, 2), np.intp)
-    found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
-    pairs = [(m.queryIdx, m.trainIdx) for m in found if m.distance <= _MAX_HAMMING]
-    return np.array(pairs, np.intp).reshape(-1, 2)
-
-
-def _inverse(T_there: Float64, T_back: Float64) -> bool:
-    """Whether the two poses are inverse to each other."""
-    around = T_there @ T_back
-    near = float(np.linalg.norm(around[:3, 3])) <= _BOTH_WAYS_M
-    return near and float(np.rad2deg(angle_rad(around))) <= _BOTH_WAYS_DEG
-
-
-def _weakness(first: Seen, last: Seen, aligned: Alignment, matches: int) -> str:
-    """Why the inliers are not enough; "" where they are."""
-    if int(aligned.agree.sum()) < max(MIN_INLIERS, _MIN_INLIER_SHARE * matches):
-        return "few inliers"
-    if min(_spread(seen.select(aligned.agree)) for seen in (first, last)) < _SPREAD_CELLS:
-        return "inliers in one corner"
-    if _sigma_m(aligned.information) > _MAX_SIGMA_M:
-        return "motion not fixed"
-    return ""
 
 
 def _spread(seen: Seen) -> int:
