@@ -58,7 +58,7 @@ class CheckedOdometry:
         result, state = self._odometry.register(frame), self._state
         sight = Sight(frame.pair.left, frame.disparity)
         self._state = CheckedState(sight, result.T_world_camera)
-        if state is None or not result.health.ok:
+        if state is None or not result.health.ok or result.health.begins:
             return result
         T_before_now = invert(state.T_world_camera) @ result.T_world_camera
         views = (state.sight, sight)

@@ -25,20 +25,32 @@ def trusted_poses(health: Sequence[OdometryHealth]) -> Bool:
     return np.array([record.ok for record in health], np.bool_)
 
 
-def stretches(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:
-    """The stretch (N,) of each frame: in one, poses are measured from one another; -1 = untrusted.
+class StretchCounter:
+    """Numbers the stretches of a drive: in one, poses are measured from one another.
 
-    A new one begins after a pose that is not to be trusted, unless that was skipped: where it lies
-    beside the one before is a guess.
+    A new one begins where odometry began anew, and after a pose that is not to be trusted unless it
+    was skipped: where it lies beside the one before is a guess.
     """
-    found, number, lost = [], 0, False
-    for record in health:
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._begun = self._lost = False
+
+    def add(self, record: OdometryHealth) -> int:
+        """Return the stretch of the next frame; -1 = its pose is not to be trusted."""
         if not record.ok:
-            lost |= not record.skipped
-        elif lost:
-            number, lost = number + 1, False
-        found.append(number if record.ok else -1)
-    return np.array(found, np.int64)
+            self._lost |= not record.skipped
+            return -1
+        if self._begun and (self._lost or record.begins):
+            self.number += 1
+        self._begun, self._lost = True, False
+        return self.number
+
+
+def stretches(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:
+    """The stretch (N,) of each frame, by `StretchCounter`."""
+    counter = StretchCounter()
+    return np.array([counter.add(record) for record in health], np.int64)
 
 
 def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:

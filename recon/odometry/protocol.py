@@ -31,6 +31,9 @@ class OdometryHealth:
     # True where later poses are measured past this one, from those before it. After any other pose
     # that is not ok, nothing says where the later ones are.
     skipped: bool = False
+    # True where nothing says where this frame lies beside those before; later ones are measured
+    # from it
+    begins: bool = False
     known: bool = False  # True where the pose was given, not measured: nothing later bends it
     tracks: int = 0  # features followed from the last frame
     inliers: int = 0  # features that agree with the visual motion

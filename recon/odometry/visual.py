@@ -85,8 +85,8 @@ class VisualOdometry:
         """Register the next frame, with the uncertainty of its pose.
 
         Where features cannot be tracked, they are matched over the whole image: after a gap, or
-        once the view is clear again. Where that fails too, a frame with features of its own starts
-        a new window at the predicted pose; a frame without any is skipped, and the next one is
+        once the view is clear again. Where that fails too, a frame with features of its own begins
+        a new path, at the predicted pose; a frame without any is skipped, and the next one is
         matched with the last that was registered.
         """
         state = self._state
@@ -222,15 +222,15 @@ class VisualOdometry:
         prior_motion: Float64 | None,
         what: str = "no motion fits",
     ) -> VisualEstimate:
-        """Continue the motion; a frame with enough features starts a new window."""
+        """Continue the motion; a frame with enough features begins a new path there."""
         begun = self._begin(frame, motion)
         points = len(begun.window.xyz_world)
         sees = points >= MIN_INLIERS
         self._state = begun if sees else replace(state, motion=motion)
         why = f"{what if sees else 'nothing to follow in the image'} ({counted(points, 'feature')})"
         if prior_motion is None or self._prior is None:
-            notes = (f"lost: {why}; the last motion goes on",)
-            health = OdometryHealth(ok=False, skipped=not sees, notes=notes)
+            notes = (f"lost: {why}; {'the path begins anew' if sees else 'skipped'}",)
+            health = OdometryHealth(ok=sees, skipped=not sees, begins=sees, notes=notes)
             return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
         sigma_m, sigma_deg = self._prior.sigmas(prior_motion)
         note = f"carried by the prior: {why}"

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.alignment import fit_points
-from recon.core.values.camera import project
 from recon.core.geometry.se3 import apply, as_transform, invert, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
+from recon.core.values.camera import project
 
 MIN_INLIERS: Final = 15  # least number of matches that agree in both directions
 _LIMIT_SIGMAS: Final = 2.5  # largest distance from where a match should be, in each frame
@@ -109,7 +109,8 @@ def _keep_distances(first: Seen, last: Seen) -> Bool:
     variance = first.sigma_m**2 + last.sigma_m**2
     tolerance = np.sqrt(variance[:, None] + variance)
     # Points that errors of their depth do not tell apart say nothing of one another.
-    return (np.abs(apart[0] - apart[1]) <= tolerance) & (np.minimum(*apart) > tolerance)
+    alike = np.abs(apart[0] - apart[1]) <= tolerance
+    return np.asarray(alike & (np.minimum(*apart) > tolerance))
 
 
 def _companions(rigid: Bool, seed: int) -> NDArray[np.intp]:

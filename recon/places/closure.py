@@ -65,6 +65,9 @@ class DrivePath:
     # float64 (N,), path up to each frame, by `path_lengths`; 0 everywhere where poses are known,
     # which moves the drive as one rigid thing
     path_m: Float64
+    # int64 (N,), the stretch of each frame (`recon.odometry.health.stretches`): odometry says
+    # nothing of what lies between two of them, or of a frame of stretch -1
+    stretch: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +86,11 @@ class JoinedDrives:
     kept: Bool  # (T,), ties that the rest of the graph does not contradict
 
 
-def close_loops(trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop]) -> Closure:
-    """Correct a path by odometry so that its loops close, by `join_drives`.
-
-    ``path_m`` (N,) is the path up to each frame, by `path_lengths`.
-    """
-    ties = [Tie((0, 0), loop) for loop in loops]
-    joined = join_drives([DrivePath(trajectory, path_m)], ties) if ties else None
+def close_loops(path: DrivePath, loops: Sequence[Loop]) -> Closure:
+    """Correct a path by odometry so that its loops close, by `join_drives`."""
+    joined = join_drives([path], [Tie((0, 0), loop) for loop in loops]) if loops else None
     if joined is None:  # a map by odometry alone is better than none
-        return Closure(trajectory, (), tuple(loops))
+        return Closure(path.trajectory, (), tuple(loops))
     closed, refused = (
         tuple(loop for loop, kept in zip(loops, joined.kept, strict=True) if kept == side)
         for side in (True, False)
@@ -104,15 +103,16 @@ def join_drives(
 ) -> JoinedDrives | None:
     """Correct the paths of drives so that their ties hold; None = the ties are not believed.
 
-    The first pose of the first drive is fixed. Nodes are spaced along the paths; odometry edges
-    link each to the next, ties link distant ones. The optimiser may switch ties off. It starts with
-    a tolerance that admits every tie and tightens it step by step, so that a right one is not
-    refused because of the very drift that it corrects. If the ties deform the odometry of a drive
-    more than its drift explains, none is believed.
+    Fixed is the first pose of the longest stretch of the first drive. Nodes are spaced along the
+    paths; odometry edges link each to the next of its stretch, ties link distant ones. The
+    optimiser may switch ties off. It starts with a tolerance that admits every tie and tightens it
+    step by step, so that a right one is not refused because of the very drift that it corrects. If
+    the ties deform the odometry of a drive more than its drift explains, none is believed.
 
     Ref: Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
-    nodes = _spaced(drives)
+    ties_of = [_tied_frames(ties, number) for number in range(len(drives))]
+    nodes = _spaced(drives, ties_of)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
     share = 1.0 if held is None else _USUAL
     chains = [
@@ -121,23 +121,30 @@ def join_drives(
     ]
     edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
     start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
+    parts = [
+        _numbered(d.stretch[own], k) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
+    ]
+    root = _longest(drives[0].stretch)
+    begun = _beside(np.concatenate(start), np.concatenate(parts), root, ties, edges)
+    anchor = int(np.argmax(drives[0].stretch[nodes[0]] == root))
     steps = [edge for chain in chains for edge in chain]
     try:
         if held is None:
-            poses, weights = _solve(np.concatenate(start), steps, edges)
+            poses, weights = _solve(begun, steps, edges, anchor)
         else:
-            poses, weights = _solve_held(drives, nodes, steps, edges, held)
+            poses, weights = _solve_held(drives, nodes, begun, steps, edges, held)
     except RegistrationError:
         return None
     bends = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
     kept = weights >= _KEPT
     if share**2 * max(bends, default=0.0) > _MAX_BEND_CHI2 or (ties and not kept.any()):
         return None
-    parts = [poses[a:b] for a, b in pairwise(begins)]
-    paths = [_bent(*each) for each in zip(drives, nodes, parts, strict=True)]
-    begun = paths[0].T_world_camera.copy()
-    begun[0] = drives[0].trajectory.T_world_camera[0]  # which rounding has moved
-    paths[0] = replace(paths[0], T_world_camera=begun)
+    solved = [poses[a:b] for a, b in pairwise(begins)]
+    paths = [_bent(*each) for each in zip(drives, nodes, solved, strict=True)]
+    fixed = int(nodes[0][anchor])
+    exact = paths[0].T_world_camera.copy()
+    exact[fixed] = drives[0].trajectory.T_world_camera[fixed]  # which rounding has moved
+    paths[0] = replace(paths[0], T_world_camera=exact)
     return JoinedDrives(tuple(paths), kept)
 
 
@@ -157,44 +164,103 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     return float(step @ edge.information @ step)
 
 
-def _spaced(drives: Sequence[DrivePath]) -> list[NDArray[np.intp]]:
-    """Return the frames of each drive that are nodes."""
-    lengths_m = np.array([drive.path_m[-1] for drive in drives])
-    most = _MAX_NODES * lengths_m / max(float(lengths_m.sum()), 1e-9)
-    return [_nodes(drive.path_m, round(limit)) for drive, limit in zip(drives, most, strict=True)]
+def _longest(stretch: NDArray[np.int64]) -> int:
+    """Return the stretch of a drive that has most frames."""
+    return int(np.bincount(stretch + 1, minlength=2)[1:].argmax())
 
 
-def _nodes(path_m: Float64, most: int) -> NDArray[np.intp]:
-    """Return frames at even distances along the path, including the first and the last."""
-    length = float(path_m[-1])
-    if length == 0.0:
+def _numbered(stretch: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
+    """Return the stretches (N,) of a drive, numbered so that no other drive has the same."""
+    return stretch + (drive << 32)
+
+
+def _tied_frames(ties: Sequence[Tie], drive: int) -> list[int]:
+    """Return the frames of a drive that ties are at."""
+    ends = ((one, tie.loop) for tie in ties for one in zip(tie.drives, (0, 1), strict=True))
+    return [(loop.first, loop.last)[end] for (number, end), loop in ends if number == drive]
+
+
+def _spaced(drives: Sequence[DrivePath], tied: Sequence[list[int]]) -> list[NDArray[np.intp]]:
+    """Return the frames of each drive that are nodes: at even distances, and where ties are."""
+    length_m = sum(float(drive.path_m[-1]) for drive in drives)
+    gap_m = max(_NODE_M, 2.0 * length_m / _MAX_NODES)
+    if 2 * sum(map(len, tied)) > _MAX_NODES:
+        tied = [[] for _ in drives]
+    return [_nodes(drive, gap_m, frames) for drive, frames in zip(drives, tied, strict=True)]
+
+
+def _nodes(drive: DrivePath, gap_m: float, tied: list[int]) -> NDArray[np.intp]:
+    """Return frames at even distances along each stretch, its first and last, and those tied."""
+    nodes = [np.array(tied, np.intp)]
+    if drive.stretch.max() < 0:
         return np.zeros(1, np.intp)
-    count = max(2, min(most, math.ceil(length / _NODE_M) + 1))
-    marks = np.searchsorted(path_m, np.linspace(0.0, length, count))
-    return np.unique(np.concatenate([[0], marks, [len(path_m) - 1]]))
+    for number in range(int(drive.stretch.max()) + 1):
+        frames = np.flatnonzero(drive.stretch == number)
+        along_m = drive.path_m[frames] - drive.path_m[frames[0]]
+        if along_m[-1] > 0.0:
+            count = math.ceil(float(along_m[-1]) / gap_m) + 1
+            marks = np.searchsorted(along_m, np.linspace(0.0, along_m[-1], count))
+            nodes.append(frames[np.minimum(marks, len(frames) - 1)])
+        nodes.append(frames[[0]] if along_m[-1] == 0.0 else frames[[0, -1]])
+    chosen = np.unique(np.concatenate(nodes))
+    rigid = drive.path_m[-1] == drive.path_m[0]
+    return chosen[:1] if rigid else chosen
 
 
-def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple[Float64, Float64]:
-    """Return poses of the nodes, and the weights of the loops."""
-    poses, worst = start, max((misfit(edge, start) for edge in ties), default=0.0)
+def _beside(
+    start: Float64,
+    parts: NDArray[np.int64],
+    root: int,
+    ties: Sequence[Tie],
+    edges: Sequence[PoseEdge],
+) -> Float64:
+    """Return poses of nodes with each part where its best tie to those already placed has it."""
+    poses: Float64 = start.copy()
+    placed = {root}
+    surest = sorted(zip(ties, edges, strict=True), key=lambda each: -each[0].loop.inliers)
+    while True:
+        bridges = (
+            edge for _, edge in surest if len({*parts[[edge.first, edge.last]]} & placed) == 1
+        )
+        edge = next(bridges, None)
+        if edge is None:
+            return poses
+        T = poses[edge.first] @ edge.T_first_last @ invert(poses[edge.last])
+        there = int(parts[edge.first]) in placed
+        moved = int(parts[edge.last if there else edge.first])
+        poses[parts == moved] = (T if there else invert(T)) @ poses[parts == moved]
+        placed.add(moved)
+
+
+def _solve(
+    start: Float64, steps: list[PoseEdge], ties: list[PoseEdge], anchor: int = 0
+) -> tuple[Float64, Float64]:
+    """Return poses of the nodes, of which one is fixed, and the weights of the ties."""
+    order = np.arange(len(start))
+    order[[0, anchor]] = order[[anchor, 0]]
+    edges = [
+        replace(edge, first=int(order[edge.first]), last=int(order[edge.last]))
+        for edge in (*steps, *ties)
+    ]
+    worst = max((misfit(edge, start) for edge in ties), default=0.0)
     rounds = math.ceil(math.log(max(worst / _MAX_CHI2, 1.0), _EASING))
+    poses = start[order]
     for k in range(rounds, -1, -1):
-        tolerance = _MAX_CHI2 * _EASING**k
-        poses, weights = optimise_poses(poses, [*steps, *ties], tolerance)
-    return poses, weights[len(steps) :]
+        poses, weights = optimise_poses(poses, edges, _MAX_CHI2 * _EASING**k)
+    return poses[order], weights[len(steps) :]
 
 
 def _solve_held(
     drives: Sequence[DrivePath],
     nodes: Sequence[NDArray[np.intp]],
+    start: Float64,
     steps: list[PoseEdge],
     ties: list[PoseEdge],
     held: Held,
 ) -> tuple[Float64, Float64]:
     """Return poses and weights as `_solve`, with the survey as one more node, which is free."""
     paths = [drive.trajectory for drive in drives]
-    start = [path.T_world_camera[own] for path, own in zip(paths, nodes, strict=True)]
-    poses = np.concatenate([*start, held.T_world_survey[None]])
+    poses = np.concatenate([start, held.T_world_survey[None]])
     for _ in range(_HELD_ROUNDS):
         poses, weights = _solve(poses, [*steps, *held.edges(paths, nodes, poses)], ties)
     return poses[:-1], weights
@@ -207,6 +273,8 @@ def _odometry_edges(
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes), begin):
+        if drive.stretch[first] != drive.stretch[last]:
+            continue
         # Where the camera stands still, 0.1 m keeps the information finite.
         drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1))
         T = invert(poses[first]) @ poses[last]
@@ -233,9 +301,10 @@ def _tie_edge(
 def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int, Float64, float]:
     """Return the node nearest to a frame, ``T_node_frame``, and the path between them."""
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
-    node = int(np.argmin(np.abs(path_m[nodes] - path_m[frame])))
+    away_m = np.abs(path_m[nodes] - path_m[frame])
+    node = int(np.argmin(np.where(drive.stretch[nodes] == drive.stretch[frame], away_m, np.inf)))
     T = invert(poses[nodes[node]]) @ poses[frame]
-    return node, T, abs(float(path_m[nodes[node]] - path_m[frame]))
+    return node, T, float(away_m[node])
 
 
 def _inverse(covariance: Float64) -> Float64:
@@ -247,8 +316,11 @@ def _bent(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> T
     """Return every pose moved with the nodes before and after it, interpolated by distance."""
     old, path_m = drive.trajectory.T_world_camera, drive.path_m
     before = np.searchsorted(nodes, np.arange(len(old)), side="right") - 1
-    before = np.clip(before, 0, max(len(nodes) - 2, 0))
+    before = np.maximum(before, 0)
     after = np.minimum(before + 1, len(nodes) - 1)
+    # A frame whose pose is not known goes on from the last node.
+    same = drive.stretch[nodes[after]] == drive.stretch[nodes[before]]
+    after = np.where(same, after, before)
     new = np.empty_like(old)
     for frame, (i, j) in enumerate(zip(before, after, strict=True)):
         a, b = nodes[i], nodes[j]

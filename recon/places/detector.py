@@ -2,34 +2,42 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float64, freeze
+from recon.core.values.camera import project
 from recon.places.keyframe import Keyframe, make_keyframe, words_of
 from recon.places.loop import LOOP_SIGMAS, Loop, agreeing_loops
 from recon.places.places import (
     VIEW_DEG,
-    VIEW_M,
     Place,
     Places,
     WordIndex,
     drift_over,
     is_possible,
     most_alike,
+    reach_of,
 )
-from recon.places.verify import Verdict, verify
+from recon.places.verify import Verdict, coarse_points, verify
 
 CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""
-_DISTANCE_M: Final = 1.5  # distance from the last keyframe at which a new one is taken
-_ANGLE_DEG: Final = 10.0  # rotation since the last keyframe at which a new one is taken
+_SEEN_SHARE: Final = 0.75
+"""Share of what the last keyframe saw from which on a view is no new one."""
+
+_HERE: Final = (3, 3)
+"""Loops of a keyframe that are enough, and how many more candidates may fail, where it is compared
+with places that odometry says it may be near."""
+
+_ANYWHERE: Final = (10, 8)  # the same where odometry says nothing: another stretch of the drive
 _MIN_LIKENESS: Final = 0.3
 """Least likeness of a candidate, as a share of that of two neighbouring keyframes."""
 
@@ -41,6 +49,7 @@ class StoredKeyframe:
     keyframe: Keyframe  # features and coarse disparities
     T_world_camera: Float64  # (4, 4), by odometry
     path_m: float  # path up to it, by `path_lengths`
+    stretch: int = 0  # of the drive that it belongs to: nothing is known between stretches
     loops: tuple[Loop, ...] = ()  # verified loops that end in it
     refused: tuple[str, ...] = ()  # why other candidates were refused
 
@@ -66,13 +75,17 @@ class LoopDetector:
 
     Args:
         store: Where keyframes go.
+        camera: The rectified camera of the drive.
         search: Whether to look for loops; else keyframes are only kept, for later drives.
     """
 
-    def __init__(self, store: KeyframeStore, *, search: bool = True) -> None:
-        self._store = store
+    def __init__(
+        self, store: KeyframeStore, camera: RectifiedCamera, *, search: bool = True
+    ) -> None:
+        self._store, self._camera = store, camera
         self._search = search
         self._places = Places()
+        self._last: StoredKeyframe | None = None
         self.loops: list[Loop] = []
         self.refused: Counter[str] = Counter()
 
@@ -87,21 +100,22 @@ class LoopDetector:
         T_world_camera: Float64,
         *,
         path_m: float,
-        trusted: bool = True,
+        stretch: int = 0,
     ) -> tuple[Loop, ...]:
         """Add the next frame; return its verified loops, which ``loops`` keeps as well.
 
-        A frame with a pose that is not trusted is no keyframe, nor is one that was not matched.
-        ``path_m`` is the path up to it, by `path_lengths`.
+        A frame is a keyframe if it sees enough that the last one did not, or another stretch of the
+        drive begins; not one that was not matched, or with a pose that is not trusted, of stretch
+        -1. ``path_m`` is the path up to it, by `path_lengths`.
         """
-        if not trusted or not disparity.valid.any() or not self._is_due(T_world_camera):
+        if stretch < 0 or not disparity.valid.any() or not self._is_new(T_world_camera, stretch):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
-        return self.look(StoredKeyframe(keyframe, T_world_camera, path_m), pair.camera)
+        return self.look(StoredKeyframe(keyframe, T_world_camera, path_m, stretch))
 
-    def look(self, new: StoredKeyframe, camera: RectifiedCamera) -> tuple[Loop, ...]:
+    def look(self, new: StoredKeyframe) -> tuple[Loop, ...]:
         """Add the next keyframe; return its verified loops."""
-        stored = self._compared(new, camera) if self._search else new
+        stored = self._compared(new) if self._search else new
         self._store.put(stored)
         self.restore(stored)
         return stored.loops
@@ -109,58 +123,90 @@ class LoopDetector:
     def restore(self, stored: StoredKeyframe) -> None:
         """Add a keyframe of an interrupted drive, with its loops."""
         self._places.add(self._place(stored))
+        self._last = stored
         self.loops.extend(stored.loops)
         self.refused.update(stored.refused)
 
     def agreeing(self) -> list[Loop]:
         """Return the loops that enough loops of other keyframes confirm."""
         places = self._places
-        known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
-        poses = {frame: (T, path_m) for frame, T, path_m in known}
+        known = zip(
+            places.T_world_camera, places.path_m.tolist(), places.stretches.tolist(), strict=True
+        )
+        poses = dict(zip(places.frames, known, strict=True))
         return agreeing_loops(self.loops, poses, poses)
 
     def _place(self, stored: StoredKeyframe) -> Place:
-        words = words_of(stored.keyframe.descriptors)
-        return Place(stored.keyframe.frame, stored.T_world_camera, stored.path_m, words)
+        keyframe, reach_m = stored.keyframe, reach_of(stored.keyframe.depth_m(self._camera))
+        words = words_of(keyframe.descriptors)
+        pose = stored.T_world_camera
+        return Place(keyframe.frame, pose, stored.path_m, stored.stretch, reach_m, words)
 
-    def _is_due(self, T_world_camera: Float64) -> bool:
-        if not len(self._places):
+    def _is_new(self, T_world_camera: Float64, stretch: int) -> bool:
+        """Whether a view shows enough that the last keyframe did not."""
+        last = self._last
+        if last is None or last.stretch != stretch:
             return True
-        T = invert(self._places.T_world_camera[-1]) @ T_world_camera
-        moved = float(np.linalg.norm(T[:3, 3])) >= _DISTANCE_M
-        return moved or float(np.rad2deg(angle_rad(T))) >= _ANGLE_DEG
+        T = invert(T_world_camera) @ last.T_world_camera
+        u, v, _ = project(apply(T, coarse_points(last.keyframe, self._camera)), self._camera)
+        width, height = self._camera.width_px, self._camera.height_px
+        with np.errstate(invalid="ignore"):
+            inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        return not inside.size or float(inside.mean()) < _SEEN_SHARE
 
-    def _compared(self, new: StoredKeyframe, camera: RectifiedCamera) -> StoredKeyframe:
-        """The keyframe with the loop to the first candidate that is verified, if any is."""
-        place, refused = self._place(new), []
-        for old in self._candidates(place):
+    def _compared(self, new: StoredKeyframe) -> StoredKeyframe:
+        """The keyframe with its loops to the candidates that are verified."""
+        place, places = self._place(new), self._places
+        elsewhere = places.stretches != place.stretch
+        here = self._loops_among(places.near(place) & ~elsewhere, new, place, *_HERE)
+        there = self._loops_among(elsewhere, new, place, *_ANYWHERE)
+        return replace(new, loops=(*here[0], *there[0]), refused=(*here[1], *there[1]))
+
+    def _loops_among(
+        self, among: Bool, new: StoredKeyframe, place: Place, enough: int, failures: int
+    ) -> tuple[list[Loop], list[str]]:
+        """The loops to some places, and why others were refused.
+
+        The most similar ones are compared first, and after one that is verified those around it.
+        """
+        loops, refused = list[Loop](), list[str]()
+        waiting = deque(islice(self._candidates(place, among), enough + failures))
+        left = among.copy()
+        while waiting and len(loops) < enough and len(refused) < failures + len(loops):
+            old = waiting.popleft()
+            if not left[old]:
+                continue
+            left[old] = False
             known = self._store.get(self._places.frames[old]).keyframe
-            verdict = verify(known, new.keyframe, camera)
+            verdict = verify(known, new.keyframe, self._camera)
             if verdict.loop is None:
                 refused.append(verdict.refused)
-            elif self._possible(old, place, verdict.loop):
-                return replace(new, loops=(verdict.loop,), refused=tuple(refused))
-            else:
+            elif not self._possible(old, place, verdict.loop):
                 refused.append(CONTRADICTED)
-        return replace(new, refused=tuple(refused))
+            else:
+                loops.append(verdict.loop)
+                around = self._places.around(old, verdict.loop.T_first_last, place.reach_m)
+                waiting.extendleft(reversed(around))
+        return loops, refused
 
-    def _candidates(self, place: Place) -> list[int]:
-        """Numbers of old keyframes that may be near, most similar first."""
-        near = self._places.near(place)
-        if not near.any():
-            return []
+    def _candidates(self, place: Place, among: Bool) -> Iterator[int]:
+        """Yield numbers of some old keyframes, most similar first."""
+        if not among.any():
+            return iter(())
         likeness = self._places.likeness(place)
-        worth = np.flatnonzero(near & (likeness >= _MIN_LIKENESS * likeness[-1]))
-        return most_alike(likeness, worth, self._places.path_m[:, None])
+        worth = np.flatnonzero(among & (likeness >= _MIN_LIKENESS * likeness[-1]))
+        return most_alike(likeness, worth, self._places.path_m[:, None], place.reach_m)
 
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
-        """Whether drift explains the difference between a loop and odometry."""
+        """Whether drift explains the difference between a loop and odometry, if there was any."""
+        if self._places.stretches[old] != new.stretch:
+            return True
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
         drift = drift_over(new.path_m - float(self._places.path_m[old]))
         return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS)
 
 
-_TURN_M: Final = 4.0  # two views in opposite directions count as twice this far apart
+_MOST: Final = 3  # most views of a map that are compared with a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,21 +240,21 @@ class KnownPlaces:
 
     Attributes:
         T_world_camera: float64 (N, 4, 4), where the views were taken, in the world of the map.
-        focal_px: Focal length of most of them; None = there are none.
     """
 
     def __init__(self, views: Sequence[KnownView]) -> None:
         self._views = views
         self._words = WordIndex()
-        poses, focals_px = [], []
+        poses, reach_m = list[Float64](), list[float]()
         for view in views:
             self._words.add(words_of(view.keyframe.descriptors))
             poses.append(view.T_world_camera)
-            focals_px.append(view.camera.focal_px)
-        self.focal_px = float(np.median(focals_px)) if focals_px else None
+            reach_m.append(reach_of(view.keyframe.depth_m(view.camera)))
         self.T_world_camera: Float64 = np.array(poses).reshape(-1, 4, 4)
-        ahead = self.T_world_camera[:, :3, 2]
-        self._stands = np.hstack([self.T_world_camera[:, :3, 3], _TURN_M * ahead])
+        self._reach_m = float(np.median(reach_m)) if reach_m else 0.0
+        # Two views in opposite directions count as apart.
+        ahead = self._reach_m * self.T_world_camera[:, :3, 2]
+        self._stands = np.hstack([self.T_world_camera[:, :3, 3], 0.5 * ahead])
 
     def __len__(self) -> int:
         return len(self._views)
@@ -222,7 +268,8 @@ class KnownPlaces:
         """
         likeness = self._words.likeness(words_of(keyframe.descriptors))
         worth = likeness > 0 if among is None else among & (likeness > 0)
-        found = most_alike(likeness, np.flatnonzero(worth), self._stands)
+        alike = most_alike(likeness, np.flatnonzero(worth), self._stands, self._reach_m)
+        found = islice(alike, _MOST)
         verdicts = [self.compare(number, keyframe, camera) for number in found]
         return Recognised(
             tuple(verdict.loop for verdict in verdicts if verdict.loop is not None),
@@ -233,7 +280,7 @@ class KnownPlaces:
         """Return numbers of the views that a camera may share a view with, nearest first."""
         T = invert(self.T_world_camera) @ T_world_camera
         far_m = np.linalg.norm(T[:, :3, 3], axis=1)
-        near = np.flatnonzero((far_m <= VIEW_M) & (angle_rad(T) <= np.deg2rad(VIEW_DEG)))
+        near = np.flatnonzero((far_m <= self._reach_m) & (angle_rad(T) <= np.deg2rad(VIEW_DEG)))
         ordered: list[int] = near[np.argsort(far_m[near], kind="stable")][:most].tolist()
         return ordered
 

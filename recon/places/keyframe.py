@@ -56,6 +56,10 @@ class Keyframe:
         """Return float64 (N, 3), the features in camera axes; NaN where the depth is unknown."""
         return points_of(self.uvd, camera)
 
+    def depth_m(self, camera: RectifiedCamera) -> Float64:
+        """Return float64 (h, w), depth of the coarse disparities; NaN = unknown."""
+        return depth_from_disparity(self.coarse, camera).astype(np.float64)
+
 
 def points_of(uvd: NDArray[Any], camera: RectifiedCamera) -> Float64:
     """Return points (N, 3) in camera axes of columns, rows and disparities (N, 3)."""
@@ -104,14 +108,14 @@ def _reduced(image: UInt8) -> tuple[UInt8, Float32]:
 def _signs(sifts: Float32) -> UInt8:
     """Signs of random projections of the roots of descriptors (N, 128), as bits (N, 32)."""
     roots = np.sqrt(sifts / np.maximum(sifts.sum(axis=1, keepdims=True), 1e-9))
-    return np.packbits(roots @ _projections() > 0.0, axis=1)
+    return np.asarray(np.packbits(roots @ _projections() > 0.0, axis=1))
 
 
 @lru_cache
 def _projections() -> Float32:
     """Directions (128, 256), all across that of the mean, in which all descriptors are alike."""
     directions = np.random.default_rng(0).standard_normal((128, 8 * _DESCRIPTOR_BYTES))
-    return (directions - directions.mean(axis=0)).astype(np.float32)
+    return np.asarray(directions - directions.mean(axis=0), np.float32)
 
 
 def words_of(descriptors: UInt8) -> NDArray[np.uint32]:

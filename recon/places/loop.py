@@ -32,8 +32,9 @@ class Loop:
         freeze(self, "information", np.float64, (6, 6))
 
 
-Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
-"""For each keyframe its pose by odometry, and the path up to it."""
+Poses: TypeAlias = Mapping[int, tuple[Float64, float, int]]
+"""For each keyframe its pose by odometry, the path up to it, and the stretch of the drive that it
+belongs to: nothing is known between stretches."""
 
 LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
 """Standard deviation of a verified loop, added to the drift: small, but never zero."""
@@ -53,20 +54,25 @@ def agreeing_loops(
     Where a row of similar houses makes them so, right loops nearby contradict them: without a clear
     majority none is accepted. ``firsts`` and ``lasts`` give pose and path of the keyframes in which
     loops begin and end, which may have different axes; the path is 0 in a map without drift of its
-    own. ``keyframes`` is the least number of later keyframes among loops that agree.
+    own. ``keyframes`` is the least number of later keyframes among loops that agree. Where a
+    stretch begins, which may be as short as one frame, as many earlier ones are enough.
     """
     poses = (firsts, lasts)
     paths_m = np.array([(firsts[loop.first][1], lasts[loop.last][1]) for loop in loops])
+    between = np.array([(firsts[loop.first][2], lasts[loop.last][2]) for loop in loops])
+    same_drive = firsts is lasts
     agreeing = []
     for number, loop in enumerate(loops):
         firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
-        near = np.flatnonzero(lasts_m <= _NEAR_M)
+        near = np.flatnonzero((lasts_m <= _NEAR_M) & (between == between[number]).all(axis=1))
         rings = {k: _closes(loop, loops[k], poses) for k in near.tolist()}
         against = sum(not closes for closes in rings.values())
         # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
         same = [loops[k] for k, closes in rings.items() if closes and firsts_m[k] <= _NEAR_M]
         confirmed = len(same) >= max(_MIN_AGREEING, _MAJORITY * against)
-        if confirmed and len({other.last for other in same}) >= keyframes:
+        apart = same_drive and between[number, 0] != between[number, 1]
+        views = max(len({o.last for o in same}), apart and len({o.first for o in same}))
+        if confirmed and views >= keyframes:
             agreeing.append(loop)
     return agreeing
 
@@ -82,5 +88,5 @@ def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses]) -> bool:
 
 def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:
     """``T_first_last`` by odometry, and the path between the two."""
-    (T_world_first, from_m), (T_world_last, to_m) = poses[first], poses[last]
+    (T_world_first, from_m, _), (T_world_last, to_m, _) = poses[first], poses[last]
     return invert(T_world_first) @ T_world_last, abs(to_m - from_m)

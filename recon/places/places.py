@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import astuple, dataclass
 from os import PathLike
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,10 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
-_MIN_PATH_M: Final = 25.0  # least path between two places that are compared
-VIEW_M: Final = 8.0  # largest distance at which two places see enough in common
-VIEW_DEG: Final = 45.0  # largest such angle between their viewing directions
-_MOST: Final = 3  # most candidates that are verified
-_APART_M: Final = 4.0  # least distance between two candidates
+_BETWEEN: Final = 12  # places between two of a stretch that are compared
+_REACH: Final = 0.5  # share of the depth of what is seen, within which most of it is seen, too
+_APART: Final = 0.5  # share of that distance which is between two candidates
+VIEW_DEG: Final = 45.0  # largest angle between viewing directions that see enough in common
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +31,8 @@ class Place:
     frame: int  # its frame
     T_world_camera: Float64  # (4, 4), by odometry
     path_m: float  # path up to it, by `path_lengths`
+    stretch: int  # of the drive that it belongs to: nothing is known between stretches
+    reach_m: float  # distance at which other places see enough in common
     words: NDArray[np.uint32]  # uint32 (W,), sorted, each once
 
 
@@ -41,6 +43,7 @@ class Places:
         self._frames: list[int] = []
         self._poses = np.empty((64, 4, 4))
         self._path_m = np.empty(64)
+        self._stretches = np.empty(64, np.int64)
         self._words = WordIndex()
 
     def __len__(self) -> int:
@@ -52,7 +55,9 @@ class Places:
         if count == len(self._path_m):
             self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
             self._path_m = np.concatenate([self._path_m, np.empty_like(self._path_m)])
+            self._stretches = np.concatenate([self._stretches, np.empty_like(self._stretches)])
         self._poses[count], self._path_m[count] = place.T_world_camera, place.path_m
+        self._stretches[count] = place.stretch
         self._frames.append(place.frame)
         self._words.add(place.words)
 
@@ -71,31 +76,51 @@ class Places:
         """float64 (N,)."""
         return self._path_m[: len(self)]
 
+    @property
+    def stretches(self) -> NDArray[np.int64]:
+        """int64 (N,), stretch of the drive that each belongs to."""
+        return self._stretches[: len(self)]
+
     def near(self, place: Place) -> Bool:
-        """Return bool (N,), places that drift allows to be in view of a later one."""
+        """Return bool (N,), those of its stretch that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
         sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0))
         T = invert(self.T_world_camera) @ place.T_world_camera
         far_m = np.linalg.norm(T[:, :3, 3], axis=1) - SIGMAS * sigma_m
         turned = angle_rad(T) - SIGMAS * sigma_rad
-        near = (far_m <= VIEW_M) & (turned <= np.deg2rad(VIEW_DEG))
-        return np.asarray(near & (way_m >= _MIN_PATH_M))
+        near = (far_m <= place.reach_m) & (turned <= np.deg2rad(VIEW_DEG))
+        before = np.arange(len(self)) < len(self) - _BETWEEN
+        return np.asarray(near & before & (self.stretches == place.stretch))
+
+    def around(self, number: int, T_place_camera: Float64, reach_m: float) -> list[int]:
+        """Return the places of a place's stretch in view of a camera beside it, nearest first."""
+        T = invert(self.T_world_camera) @ self.T_world_camera[number] @ T_place_camera
+        far_m = np.linalg.norm(T[:, :3, 3], axis=1)
+        near = (far_m <= reach_m) & (angle_rad(T) <= np.deg2rad(VIEW_DEG))
+        found = np.flatnonzero(near & (self.stretches == self.stretches[number]))
+        nearest: list[int] = found[np.argsort(far_m[found], kind="stable")].tolist()
+        return nearest
 
     def likeness(self, place: Place) -> Float64:
         """Return float64 (N,), similarity of each to a place, in [0, 1]."""
         return self._words.likeness(place.words)
 
 
-def most_alike(likeness: Float64, worth: NDArray[np.intp], stands_m: Float64) -> list[int]:
-    """The few most similar images that are ``worth`` it, each at some distance from the others."""
+def reach_of(depth_m: NDArray[Any]) -> float:
+    """Return the distance at which others see enough of what is seen at depths, NaN = unknown."""
+    return _REACH * float(np.nanmedian(depth_m)) if np.isfinite(depth_m).any() else 0.0
+
+
+def most_alike(
+    likeness: Float64, worth: NDArray[np.intp], stands_m: Float64, reach_m: float
+) -> Iterator[int]:
+    """Yield images that are ``worth`` it, most similar first, each apart from those before."""
     chosen: list[int] = []
     for number in worth[np.argsort(-likeness[worth], kind="stable")].tolist():
         gaps_m = np.linalg.norm(stands_m[chosen] - stands_m[number], axis=1)
-        if gaps_m.min(initial=np.inf) >= _APART_M:
+        if gaps_m.min(initial=np.inf) >= _APART * reach_m:
             chosen.append(number)
-        if len(chosen) == _MOST:
-            break
-    return chosen
+            yield number
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +140,19 @@ class _Run:
         order = np.argsort(words, kind="stable")
         return _Run(self.first, self.count + other.count, words[order], owners[order])
 
-    def shared(self, words: NDArray[np.uint32]) -> NDArray[np.intp]:
-        """Return int64 (count,), number of words that each image shares with another one."""
+    def find(self, words: NDArray[np.uint32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return int64 (K,), (K,), where the images have each word: from one number to another."""
         begin, end = (np.searchsorted(self.words, words, side) for side in ("left", "right"))
-        # words[k] is in the run at begin[k] … end[k] - 1.
+        return begin, end
+
+    def shared(
+        self, begin: NDArray[np.intp], end: NDArray[np.intp], weight: Float64
+    ) -> Float64:
+        """Return float64 (count,), the summed weights of words that each image has."""
         found = end - begin
         before = np.cumsum(found) - found
         places = np.arange(found.sum()) + np.repeat(begin - before, found)
-        return np.bincount(self.owners[places], minlength=self.count)
+        return np.bincount(self.owners[places], np.repeat(weight, found), self.count)
 
 
 class WordIndex:
@@ -147,10 +177,17 @@ class WordIndex:
         self._runs.append(run)
 
     def likeness(self, words: NDArray[np.uint32]) -> Float64:
-        """Return float64 (N,), shared words of each image and another one, normalised to [0, 1]."""
-        shared = np.zeros(len(self._sizes))
-        for run in self._runs:
-            shared[run.first : run.first + run.count] = run.shared(words)
+        """Return float64 (N,), shared words of each image and another one, normalised to [0, 1].
+
+        Words that many images have count for less (Spärck Jones, 1972).
+        """
+        count = len(self._sizes)
+        ranges = [run.find(words) for run in self._runs]
+        having = sum((end - begin for begin, end in ranges), np.zeros(len(words), np.intp))
+        weight = np.log((count + 1.0) / np.maximum(having, 1)) / math.log(count + 1.0)
+        shared = np.zeros(count)
+        for run, found in zip(self._runs, ranges, strict=True):
+            shared[run.first : run.first + run.count] = run.shared(*found, weight)
         sizes = np.sqrt(np.array(self._sizes, np.float64) * len(words))
         return np.divide(shared, sizes, out=np.zeros(len(shared)), where=sizes > 0)
 

@@ -7,13 +7,12 @@ from typing import Final
 
 import cv2
 import numpy as np
-
-from recon.core.values.camera import project
 from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
+from recon.core.values.camera import project
 from recon.places.align import MIN_INLIERS, Alignment, Seen, find_motion, settle
 from recon.places.keyframe import Keyframe, feature_sigma_px, points_of
 from recon.places.loop import Loop
@@ -146,8 +145,8 @@ def dense_agreement(
     hardly overlap.
     """
     return min(
-        _confirmed(_coarse_points(last, last_camera), first, T_first_last, first_camera),
-        _confirmed(_coarse_points(first, first_camera), last, invert(T_first_last), last_camera),
+        _confirmed(coarse_points(last, last_camera), first, T_first_last, first_camera),
+        _confirmed(coarse_points(first, first_camera), last, invert(T_first_last), last_camera),
     )
 
 
@@ -187,7 +186,7 @@ def _grid(keyframe: Keyframe, camera: RectifiedCamera) -> tuple[int, int]:
     return step, step // 2
 
 
-def _coarse_points(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
+def coarse_points(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
     """Points (N, 3) in camera axes of the coarse samples that have a disparity."""
     row, column = np.nonzero(keyframe.coarse + camera.doffs_px > 1.0)
     step, half = _grid(keyframe, camera)

@@ -26,6 +26,7 @@ from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.map import Map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
+from recon.odometry.health import stretches
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.machine import versions
 from recon.run.work import Stopwatch, look_ahead, work_in_background
@@ -90,7 +91,7 @@ class Drive:
 
     def _add(self, frame: ReconstructedFrame, found: OdometryResult) -> FrameResult:
         result = self.mapper.add(frame, found, total=self._total)
-        self._loops.add(frame, result.T_world_camera, trusted=result.health.ok)
+        self._loops.add(frame, result.T_world_camera, result.stretch)
         if result.index <= self._total // 2 and (self.sample is None or len(frame.cloud)):
             self.sample = frame
         if self._due():
@@ -147,7 +148,7 @@ class Drive:
     def _restore(self, state: dict[str, Any]) -> None:
         self.mapper.restore(state["mapper"])
         path, health = self.session.odometry, self.session.health
-        self._loops.restore(path.T_world_camera, [record.ok for record in health])
+        self._loops.restore(path.T_world_camera, stretches(health))
         self._saved = len(self.mapper)
         self._last = time.perf_counter()
         self._start = self._last - state["seconds"]

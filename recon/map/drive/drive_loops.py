@@ -9,12 +9,13 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.text import counted
-from recon.core.values import Trajectory
+from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.session import Keyframes
-from recon.places.closure import Closure, close_loops
+from recon.places.closure import Closure, DrivePath, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.places import path_lengths
 from recon.run.work import Stopwatch
@@ -91,20 +92,26 @@ class LoopWatch:
     """
 
     def __init__(
-        self, keyframes: Keyframes, stopwatch: Stopwatch | None = None, *, search: bool = True
+        self,
+        keyframes: Keyframes,
+        camera: RectifiedCamera,
+        stopwatch: Stopwatch | None = None,
+        *,
+        search: bool = True,
     ) -> None:
         self.searching = search
         self._stage = (stopwatch or Stopwatch()).stage
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
         self._keyframes = keyframes
-        self._detector = LoopDetector(keyframes, search=search)
+        self._detector = LoopDetector(keyframes, camera, search=search)
+        self._stretches: list[int] = []
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
-    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, trusted: bool) -> None:
+    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, stretch: int) -> None:
         """Add the next frame; earlier ones may still be in progress."""
-        path_m, number = self._advance(T_world_camera, trusted=trusted), len(self._path_m) - 1
+        path_m, number = self._advance(T_world_camera, stretch), len(self._path_m) - 1
 
         def look() -> None:
             with self._stage("loops"):
@@ -114,7 +121,7 @@ class LoopWatch:
                     frame.disparity,
                     T_world_camera,
                     path_m=path_m,
-                    trusted=trusted,
+                    stretch=stretch,
                 )
 
         self._wait(_BEHIND)
@@ -128,21 +135,21 @@ class LoopWatch:
         """End the thread; pending frames are dropped."""
         self._pool.shutdown(cancel_futures=True)
 
-    def restore(self, T_world_camera: Iterable[Float64], trusted: Iterable[bool]) -> None:
+    def restore(self, T_world_camera: Iterable[Float64], stretches: NDArray[np.int64]) -> None:
         """Resume after frames with these poses, whose keyframes are kept."""
-        for T, good in zip(T_world_camera, trusted, strict=True):
-            self._advance(T, trusted=good)
+        for T, stretch in zip(T_world_camera, stretches.tolist(), strict=True):
+            self._advance(T, stretch)
         for stored in self._keyframes:
             self._detector.restore(stored)
 
     def close(self, trajectory: Trajectory) -> DriveLoops:
         """Close the loops of a path."""
         self.wait()
-        path_m = np.array(self._path_m)
+        path = DrivePath(trajectory, np.array(self._path_m), np.array(self._stretches))
         loops = self._detector.agreeing()
         return DriveLoops(
             odometry=trajectory,
-            closure=close_loops(trajectory, path_m, loops),
+            closure=close_loops(path, loops),
             keyframes=len(self._detector),
             found=len(self._detector.loops),
             refused=dict(self._detector.refused),
@@ -153,10 +160,11 @@ class LoopWatch:
         while len(self._waiting) > left:
             self._waiting.popleft().result()
 
-    def _advance(self, T_world_camera: Float64, *, trusted: bool) -> float:
+    def _advance(self, T_world_camera: Float64, stretch: int) -> float:
         """Return path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
-        step = path_lengths(np.stack([before, T_world_camera]), np.array([True, trusted]))
+        step = path_lengths(np.stack([before, T_world_camera]), np.array([True, stretch >= 0]))
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
+        self._stretches.append(stretch)
         self._last = T_world_camera
         return self._path_m[-1]

@@ -26,7 +26,7 @@ from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import Submap, SubmapSettings
-from recon.odometry.health import stretches
+from recon.odometry.health import StretchCounter
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.run.work import OneBehind, Stopwatch
 from recon.stereo.frame import ReconstructedFrame
@@ -50,6 +50,7 @@ class Mapper:
         self.session, self._stage = session, stopwatch.stage
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
         self._behind = OneBehind()
+        self._stretches = StretchCounter()
         self._builder: SubmapBuilder | None = None
         self._grain = ray_grain(config.occupancy) if config.occupancy.keep_rays else None
 
@@ -71,23 +72,16 @@ class Mapper:
         # A hole in the map is better than wrong geometry.
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
         rays = frame.rays if health.ok else None
-        if self._begins_stretch(health):
-            self.close()  # a map of several drives may have to do without what follows
+        before, stretch = self._stretches.number, self._stretches.add(health)
+        if stretch > before:
+            self.close()  # the map may have to do without what follows
         builder = self._builder_from(frame)
         work = (builder, len(self), cloud, rays, T_world_camera)
         self._behind.begin(partial(self._integrate, *work))
         self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
         valid_share = float(np.mean(frame.disparity.valid))
-        return FrameResult(
-            len(self) - 1, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health
-        )
-
-    def _begins_stretch(self, health: OdometryHealth) -> bool:
-        """Return whether nothing says where the next frame is beside those before."""
-        before = self.session.health
-        if not health.ok or not before or before[-1].ok:
-            return False
-        return bool(stretches([*before, health])[-1] > stretches(before).max())
+        found = (len(frame.cloud), T_world_camera, health, stretch)
+        return FrameResult(len(self) - 1, total, 0.0, valid_share, *found)
 
     def _integrate(
         self,
@@ -134,6 +128,8 @@ class Mapper:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state`."""
         self._odometry.restore(state["odometry"])
+        for record in self.session.health:
+            self._stretches.add(record)
         if state["builder"] is not None:
             self._builder = self._new_builder()
             self._builder.restore(state["builder"])
@@ -256,6 +252,7 @@ class FrameResult:
     points: int  # number of points in the cloud of the frame
     T_world_camera: Float64  # (4, 4)
     health: OdometryHealth
+    stretch: int = 0  # of the drive, see `StretchCounter`; -1 = the pose is not trusted
 
     def __post_init__(self) -> None:
         freeze(self, "T_world_camera", np.float64, (4, 4))

@@ -165,7 +165,7 @@ def map_sequence(
     odometry = odometry_of(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None
     session = work.session(source, config)
-    watch = LoopWatch(session.keyframes, work.stopwatch, search=looking)
+    watch = LoopWatch(session.keyframes, reconstructor.camera, work.stopwatch, search=looking)
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
     drive = Drive(source, reconstructor, mapper, watch, config, work)
     steps = drive.frames()

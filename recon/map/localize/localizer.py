@@ -128,8 +128,7 @@ class Localizer:
         self._frames += 1
         if self._belief is not None and self._belief.sigma_m <= _SURE_SIGMA_M and hurried():
             return self._result(_Confirmed(self._belief, refused="no time to look at the map"))
-        focal_px = self._known.focal_px
-        keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity, focal_px=focal_px)
+        keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity)
         if self._belief is not None:
             return self._result(self._confirm(self._belief, keyframe, frame))
         camera = frame.pair.camera
@@ -254,6 +253,6 @@ class FirstFix:
         if not loops:
             return []
         # The map is a rigid thing: only the drive in it drifts.
-        firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0) for loop in loops}
-        lasts = {loop.last: (T, path_m) for T, path_m, loops in self._seen for loop in loops}
+        firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0, 0) for loop in loops}
+        lasts = {loop.last: (T, path_m, 0) for T, path_m, loops in self._seen for loop in loops}
         return agreeing_loops(loops, firsts, lasts, keyframes=self._frames)

@@ -21,6 +21,7 @@ from recon.map.store.records import Key
 from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
 from recon.map.store.trees import FRAMES, RAYS, RIG
 from recon.map.submaps import Submap
+from recon.odometry.health import stretches
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.places import path_lengths
 
@@ -62,11 +63,13 @@ def join_parts(
     is as uncertain as in a drive that was never cut. Loops are looked for in the whole drive.
     """
     session = map_.session()
-    detector = LoopDetector(session.keyframes, search=settings.loops.enabled)
+    detector: LoopDetector | None = None
     for part_map, lead in parts:
         part, begin = part_map.session(), len(session) - lead
         if not len(session):
             session.set_axes(part.T_map_world, part.camera)
+        search = settings.loops.enabled
+        detector = detector or LoopDetector(session.keyframes, part.camera, search=search)
         T_world_part = _append_frames(session, part, lead)
         rays = (key[1] for key in part_map.store.keys(RAYS) if isinstance(key, tuple))
         own: dict[Key, Key] = {
@@ -75,13 +78,13 @@ def join_parts(
         part_map.store.copy(RAYS, map_.store, own)
         _append_submaps(session, part, lead, T_world_part, settings.fusion.voxel_m)
         poses = session.odometry.T_world_camera
-        path_m = path_lengths(poses, session.trusted)
+        path_m, stretch = path_lengths(poses, session.trusted), stretches(session.health)
         for stored in part.keyframes:
             if stored.keyframe.frame >= lead:
                 frame = begin + stored.keyframe.frame
                 keyframe = replace(stored.keyframe, frame=frame)
-                new = StoredKeyframe(keyframe, poses[frame], float(path_m[frame]))
-                detector.look(new, session.camera)
+                pose, along_m = poses[frame], float(path_m[frame])
+                detector.look(StoredKeyframe(keyframe, pose, along_m, int(stretch[frame])))
 
 
 def read_all(map_: MapFile) -> None:

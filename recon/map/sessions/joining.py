@@ -173,7 +173,10 @@ def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
         shared = shared_frames(other, new).tolist()
         ones, news = stretches(other.health), stretches(new.health)
         # One for each two stretches: nothing else may say where those behind a lost pose are.
-        last = {(int(ones[first]), int(news[last])): (first, last) for first, last in shared}
+        both = [(int(ones[first]), int(news[last]), first, last) for first, last in shared]
+        last = {
+            (one, other): (first, last) for one, other, first, last in both if min(one, other) >= 0
+        }
         links += [Link((number, new.number), link_by_frame(other, *pair)) for pair in last.values()]
         theirs |= {(number, first) for first, _ in shared}
         own |= {last for _, last in shared}
@@ -196,8 +199,9 @@ def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Lin
         return []
     path_m, poses = path_up_to(new), new.odometry.T_world_camera
     # The other drives are finished: what they drifted is corrected as far as it is known.
-    firsts = {loop.first: (views[loop.first].T_world_camera, 0.0) for loop in loops}
-    lasts = {loop.last: (poses[loop.last], float(path_m[loop.last])) for loop in loops}
+    of = stretches(new.health).tolist()
+    firsts = {loop.first: (views[loop.first].T_world_camera, 0.0, 0) for loop in loops}
+    lasts = {n: (poses[n], float(path_m[n]), of[n]) for n in {loop.last for loop in loops}}
     links = []
     for loop in agreeing_loops(loops, firsts, lasts):
         number, frame = views.keys[loop.first]
@@ -278,7 +282,9 @@ def _solve(
     sessions = [map_.session(number) for number in numbers]
     drives = [
         DrivePath(
-            replace(one.odometry, T_world_camera=T @ one.odometry.T_world_camera), path_up_to(one)
+            replace(one.odometry, T_world_camera=T @ one.odometry.T_world_camera),
+            path_up_to(one),
+            stretches(one.health),
         )
         for one, T in zip(sessions, places.values(), strict=True)
     ]

@@ -141,15 +141,12 @@ class MapFile:
     def placed(self) -> dict[int, Bool]:
         """Which frames of each linked drive, by its number, have a place in the map; bool (N,).
 
-        Those whose pose is to be trusted; in a map of several drives only those of stretches that
-        loops, links or measured positions hold to the longest one of the first drive. Behind a lost
-        pose odometry guesses, and a guess does not enter what other drives saw. Only these frames
-        are in products, and to be recognised.
+        Those whose pose is to be trusted, of stretches that loops, links or measured positions hold
+        to the longest one of the first drive. Behind a lost pose odometry guesses, and a guess does
+        not enter the map. Only these frames are in products, and to be recognised.
         """
         sessions = self.linked
         of = {session.number: stretches(session.health) for session in sessions}
-        if len(sessions) < 2:
-            return {number: stretch >= 0 for number, stretch in of.items()}
         ties, first = [*_ties(sessions, self.links, of)], sessions[0].number
         held = {(first, int(np.bincount(of[first] + 1)[1:].argmax()))}
         while more := {b for tie in ties for a, b in (tie, tie[::-1]) if a in held} - held:

@@ -342,7 +342,7 @@ def _entry_of(submap: Submap) -> SubmapEntry:
     return SubmapEntry(submap.index, submap.first_frame, submap.frames, fused, cells)
 
 
-KEYFRAME: Final = "keyframe"
+KEYFRAME: Final = "view"  # "keyframe" was of features that are compared no more
 _MOST_BYTES: Final = 1 << 24
 """Hundreds of features, and every 64th disparity: of 100 megapixels 6 MB."""
 
@@ -360,6 +360,7 @@ class Keyframes:
             "keyframe": asdict(stored.keyframe),
             "T_world_camera": stored.T_world_camera,
             "path_m": stored.path_m,
+            "stretch": stored.stretch,
             "loops": [asdict(loop) for loop in stored.loops],
             "refused": list(stored.refused),
         }
@@ -386,6 +387,7 @@ class Keyframes:
                 value_in(Keyframe, {**content["keyframe"], "frame": frame}),
                 array_in(content, "T_world_camera", np.float64, (4, 4)),
                 float(content["path_m"]),
+                int(content["stretch"]),
                 tuple(loop_in(loop) for loop in content["loops"]),
                 tuple(content["refused"]),
             )
