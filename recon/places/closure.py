@@ -16,9 +16,11 @@ from recon.core.geometry.alignment import pose_between
 from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
+from recon.odometry.health import stretches, trusted_poses
+from recon.odometry.protocol import OdometryHealth
 from recon.places.fixes import Held
-from recon.places.loop import Loop
-from recon.places.places import Drift, drift_over
+from recon.places.loop import MIN_AGREEING, Loop
+from recon.places.places import Drift, drift_over, path_lengths
 from recon.places.pose_graph import PoseEdge, optimise_poses
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
@@ -68,6 +70,19 @@ class DrivePath:
     # int64 (N,), the stretch of each frame (`recon.odometry.health.stretches`): odometry says
     # nothing of what lies between two of them, or of a frame of stretch -1
     stretch: NDArray[np.int64]
+    # float64 (N, 2), summed variances of the motions up to each frame, as odometry states them:
+    # of positions (m²) and of rotations (rad²)
+    variance: Float64
+
+    @staticmethod
+    def of(odometry: Trajectory, health: Sequence[OdometryHealth]) -> DrivePath:
+        """Return the path of a drive by odometry, or of known poses."""
+        path_m = path_lengths(odometry.T_world_camera, trusted_poses(health))
+        if all(record.known for record in health):
+            path_m = np.zeros(len(health))
+        sigma = np.array([(record.sigma_m, np.deg2rad(record.sigma_deg)) for record in health])
+        variance = np.cumsum(np.nan_to_num(sigma, posinf=0.0) ** 2, axis=0)
+        return DrivePath(odometry, path_m, stretches(health), variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +106,27 @@ def close_loops(path: DrivePath, loops: Sequence[Loop]) -> Closure:
     joined = join_drives([path], [Tie((0, 0), loop) for loop in loops]) if loops else None
     if joined is None:  # a map by odometry alone is better than none
         return Closure(path.trajectory, (), tuple(loops))
+    believed = _believed(loops, joined.kept, path.stretch)
     closed, refused = (
-        tuple(loop for loop, kept in zip(loops, joined.kept, strict=True) if kept == side)
+        tuple(loop for loop, kept in zip(loops, believed, strict=True) if kept == side)
         for side in (True, False)
     )
     return Closure(joined.trajectories[0], closed, refused)
+
+
+def _believed(loops: Sequence[Loop], kept: Bool, stretch: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return bool (L,), which loops are believed: not those that alone hold two parts of a drive.
+
+    Stretches are put together where loops enough that contradict none hold them.
+    """
+    ends = stretch[np.array([(loop.first, loop.last) for loop in loops])]
+    while True:
+        apart = kept & (ends[:, 0] != ends[:, 1])
+        pairs, counts = np.unique(np.sort(ends[apart], axis=1), axis=0, return_counts=True)
+        if counts.max(initial=0) < MIN_AGREEING:
+            return np.asarray(kept & ~apart)
+        one, other = pairs[counts.argmax()]
+        ends[ends == other] = one
 
 
 def join_drives(
@@ -177,7 +208,7 @@ def _numbered(stretch: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
 def _tied_frames(ties: Sequence[Tie], drive: int) -> list[int]:
     """Return the frames of a drive that ties are at."""
     ends = ((one, tie.loop) for tie in ties for one in zip(tie.drives, (0, 1), strict=True))
-    return [(loop.first, loop.last)[end] for (number, end), loop in ends if number == drive]
+    return sorted({(loop.first, loop.last)[end] for (number, end), loop in ends if number == drive})
 
 
 def _spaced(drives: Sequence[DrivePath], tied: Sequence[list[int]]) -> list[NDArray[np.intp]]:
@@ -220,7 +251,9 @@ def _beside(
     surest = sorted(zip(ties, edges, strict=True), key=lambda each: -each[0].loop.inliers)
     while True:
         bridges = (
-            edge for _, edge in surest if len({*parts[[edge.first, edge.last]]} & placed) == 1
+            edge
+            for _, edge in surest
+            if (int(parts[edge.first]) in placed) != (int(parts[edge.last]) in placed)
         )
         edge = next(bridges, None)
         if edge is None:
@@ -277,8 +310,10 @@ def _odometry_edges(
             continue
         # Where the camera stands still, 0.1 m keeps the information finite.
         drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1))
+        stated = np.repeat(drive.variance[last] - drive.variance[first], 3)
         T = invert(poses[first]) @ poses[last]
-        edges.append(PoseEdge(k, k + 1, T, _inverse(share**2 * drift.covariance)))
+        information = _inverse(share**2 * (drift.covariance + np.diag(stated)))
+        edges.append(PoseEdge(k, k + 1, T, information))
     return edges
 
 

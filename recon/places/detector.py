@@ -128,13 +128,18 @@ class LoopDetector:
         self.refused.update(stored.refused)
 
     def agreeing(self) -> list[Loop]:
-        """Return the loops that enough loops of other keyframes confirm."""
+        """Return the loops that enough others confirm, and those between two stretches.
+
+        How these confirm one another is not known before all stretches are placed.
+        """
         places = self._places
         known = zip(
             places.T_world_camera, places.path_m.tolist(), places.stretches.tolist(), strict=True
         )
         poses = dict(zip(places.frames, known, strict=True))
-        return agreeing_loops(self.loops, poses, poses)
+        apart = {id(one) for one in self.loops if poses[one.first][2] != poses[one.last][2]}
+        agreeing = agreeing_loops([one for one in self.loops if id(one) not in apart], poses, poses)
+        return [*agreeing, *(one for one in self.loops if id(one) in apart)]
 
     def _place(self, stored: StoredKeyframe) -> Place:
         keyframe, reach_m = stored.keyframe, reach_of(stored.keyframe.depth_m(self._camera))

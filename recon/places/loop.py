@@ -39,13 +39,13 @@ belongs to: nothing is known between stretches."""
 LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
 """Standard deviation of a verified loop, added to the drift: small, but never zero."""
 
-_MIN_AGREEING: Final = 3  # loops that must agree, no two between the same keyframes
+MIN_AGREEING: Final = 3  # loops that must agree, no two between the same keyframes
 _NEAR_M: Final = 12.0  # path within which neighbouring loops are compared
 _MAJORITY: Final = 2  # loops that confirm one, for each that contradicts it
 
 
 def agreeing_loops(
-    loops: Sequence[Loop], firsts: Poses, lasts: Poses, *, keyframes: int = _MIN_AGREEING
+    loops: Sequence[Loop], firsts: Poses, lasts: Poses, *, keyframes: int = MIN_AGREEING
 ) -> list[Loop]:
     """The verified loops that enough others confirm, and few contradict.
 
@@ -54,13 +54,11 @@ def agreeing_loops(
     Where a row of similar houses makes them so, right loops nearby contradict them: without a clear
     majority none is accepted. ``firsts`` and ``lasts`` give pose and path of the keyframes in which
     loops begin and end, which may have different axes; the path is 0 in a map without drift of its
-    own. ``keyframes`` is the least number of later keyframes among loops that agree. Where a
-    stretch begins, which may be as short as one frame, as many earlier ones are enough.
+    own. ``keyframes`` is the least number of later keyframes among loops that agree.
     """
     poses = (firsts, lasts)
     paths_m = np.array([(firsts[loop.first][1], lasts[loop.last][1]) for loop in loops])
     between = np.array([(firsts[loop.first][2], lasts[loop.last][2]) for loop in loops])
-    same_drive = firsts is lasts
     agreeing = []
     for number, loop in enumerate(loops):
         firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
@@ -69,10 +67,8 @@ def agreeing_loops(
         against = sum(not closes for closes in rings.values())
         # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
         same = [loops[k] for k, closes in rings.items() if closes and firsts_m[k] <= _NEAR_M]
-        confirmed = len(same) >= max(_MIN_AGREEING, _MAJORITY * against)
-        apart = same_drive and between[number, 0] != between[number, 1]
-        views = max(len({o.last for o in same}), apart and len({o.first for o in same}))
-        if confirmed and views >= keyframes:
+        confirmed = len(same) >= max(MIN_AGREEING, _MAJORITY * against)
+        if confirmed and len({other.last for other in same}) >= keyframes:
             agreeing.append(loop)
     return agreeing
 

@@ -18,7 +18,7 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
-_BETWEEN: Final = 12  # places between two of a stretch that are compared
+_BETWEEN: Final = 4  # places between two of a stretch that are compared
 _REACH: Final = 0.5  # share of the depth of what is seen, within which most of it is seen, too
 _APART: Final = 0.5  # share of that distance which is between two candidates
 VIEW_DEG: Final = 45.0  # largest angle between viewing directions that see enough in common
@@ -145,14 +145,14 @@ class _Run:
         begin, end = (np.searchsorted(self.words, words, side) for side in ("left", "right"))
         return begin, end
 
-    def shared(
-        self, begin: NDArray[np.intp], end: NDArray[np.intp], weight: Float64
-    ) -> Float64:
+    def shared(self, begin: NDArray[np.intp], end: NDArray[np.intp], weight: Float64) -> Float64:
         """Return float64 (count,), the summed weights of words that each image has."""
         found = end - begin
         before = np.cumsum(found) - found
         places = np.arange(found.sum()) + np.repeat(begin - before, found)
-        return np.bincount(self.owners[places], np.repeat(weight, found), self.count)
+        return np.bincount(self.owners[places], np.repeat(weight, found), self.count).astype(
+            np.float64
+        )
 
 
 class WordIndex:

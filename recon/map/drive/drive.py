@@ -125,7 +125,7 @@ class Drive:
         if not self._loops.searching:
             return None
         with self._stage("close_loops"):
-            loops = self._loops.close(path)
+            loops = self._loops.close(path, self.session.health)
             self.session.set_loops(loops.record())
             return loops
 

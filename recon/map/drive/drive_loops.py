@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any, Final
@@ -15,6 +15,7 @@ from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.session import Keyframes
+from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure, DrivePath, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.places import path_lengths
@@ -105,7 +106,6 @@ class LoopWatch:
         self._waiting: deque[Future[None]] = deque()
         self._keyframes = keyframes
         self._detector = LoopDetector(keyframes, camera, search=search)
-        self._stretches: list[int] = []
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
@@ -142,10 +142,10 @@ class LoopWatch:
         for stored in self._keyframes:
             self._detector.restore(stored)
 
-    def close(self, trajectory: Trajectory) -> DriveLoops:
-        """Close the loops of a path."""
+    def close(self, trajectory: Trajectory, health: Sequence[OdometryHealth]) -> DriveLoops:
+        """Close the loops of a path by odometry."""
         self.wait()
-        path = DrivePath(trajectory, np.array(self._path_m), np.array(self._stretches))
+        path = DrivePath.of(trajectory, health)
         loops = self._detector.agreeing()
         return DriveLoops(
             odometry=trajectory,
@@ -165,6 +165,5 @@ class LoopWatch:
         before = self._last if self._path_m else T_world_camera
         step = path_lengths(np.stack([before, T_world_camera]), np.array([True, stretch >= 0]))
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
-        self._stretches.append(stretch)
         self._last = T_world_camera
         return self._path_m[-1]

@@ -30,7 +30,6 @@ from recon.places.closure import DrivePath, Tie, join_drives
 from recon.places.detector import KnownPlaces
 from recon.places.fixes import Held
 from recon.places.loop import Loop, agreeing_loops
-from recon.places.places import path_lengths
 
 _INFORMATION: Final = 1e8  # of what is the same: 0.1 mm and 0.1 mrad, as no covariance may be zero
 _FEWEST: Final = 5  # links from which a scale is estimated, besides six parameters of the place
@@ -122,9 +121,7 @@ def path_up_to(session: Session) -> Float64:
 
     Of known poses it is 0 everywhere: odometry, whose drift grows with the path, had no part in it.
     """
-    if all(record.known for record in session.health):
-        return np.zeros(len(session))
-    return path_lengths(session.odometry.T_world_camera, session.trusted)
+    return DrivePath.of(session.odometry, session.health).path_m
 
 
 def doubts_of_lengths(map_: MapFile) -> list[str]:
@@ -281,10 +278,8 @@ def _solve(
     numbers = list(places)
     sessions = [map_.session(number) for number in numbers]
     drives = [
-        DrivePath(
-            replace(one.odometry, T_world_camera=T @ one.odometry.T_world_camera),
-            path_up_to(one),
-            stretches(one.health),
+        DrivePath.of(
+            replace(one.odometry, T_world_camera=T @ one.odometry.T_world_camera), one.health
         )
         for one, T in zip(sessions, places.values(), strict=True)
     ]
