@@ -22,7 +22,7 @@ from recon.export.trajectories import export_paths
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.sequence import MappedSequence, check_map, map_sequence
+from recon.map.drive.sequence import MappedSequence, break_warnings, check_map, map_sequence
 from recon.map.map import Map
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
@@ -123,11 +123,12 @@ def run_map(
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
         drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_share)
         doubts = [*rig.warnings(findings), *_warnings(source, mapped, drift)]
-        warnings = [*findings, *doubts, *made.warnings, *errors.warnings]
+        breaks = break_warnings(mapped.sessions)
+        warnings = [*breaks, *findings, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         with run.stage("write"):
-            export_paths(map_.first, made.camera_height_m, run)
+            export_paths(map_.first, mapped.joined, made.camera_height_m, run)
             keep_map(map_, run.path(MAP_FILE))
         with run.report(result.summary):
             shown = map_content(map_, made, errors, mapped.sample, rig)
@@ -197,7 +198,9 @@ def _summary(
         "source": source.name,
         "frames": frames,
         "fps": frames / mapped.seconds if mapped.seconds > 0 else None,
-        "path_length_m": mapped.trajectory.path_length_m,
+        "frames_joined": int(mapped.joined.sum()),
+        "sessions": [plain(session) for session in mapped.sessions],
+        "path_length_m": mapped.trajectory.select(mapped.joined).path_length_m,
         "expected_drift_percent": None if drift is None else drift.percent,
         "expected_drift_rig_percent": None if drift is None else drift.rig_percent,
         "frames_not_trusted": int((~mapped.trusted).sum()),

@@ -65,7 +65,9 @@ def map_of_run(folder: Path) -> MapOfRun:
     """Read what is needed from the map of a run; without one, from its record and path file."""
     if (folder / MAP_FILE).is_file():
         with closing(MapFile.open(folder)) as map_:
-            return MapOfRun(map_.first.trajectory, map_.first.T_map_world, map_.doubts)
+            first = map_.first
+            path = first.trajectory.select(map_.joined(first))
+            return MapOfRun(path, map_.first.T_map_world, map_.doubts)
     T_map_world, doubts = made_from(folder)
     file = folder / "trajectory_tum.txt"
     return MapOfRun(read_trajectory(file) if file.is_file() else None, T_map_world, doubts)
@@ -268,9 +270,10 @@ def compare_with_truth(
 
     truth = source.truth or SequenceTruth()
     path = None if poses_given else truth.trajectory
+    own = mapped.trajectory.select(mapped.joined)
     cells = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
     return DriveErrors(
-        attempt("path", path, lambda true: evaluate_trajectory(mapped.trajectory, true)),
+        attempt("path", path, lambda true: evaluate_trajectory(own, true)),
         # Loads the whole cloud, but only where the whole true surface is in memory as well.
         attempt("surface", truth.surface, lambda true: evaluate_map(mapped.cloud, true, _NEAR_M)),
         attempt(

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert, quaternion_from_rotation
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.io.atomic import write_text
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map.ground.axes import base_axes
@@ -17,6 +17,7 @@ from recon.map.localize.sequence import LocalizedDrive, LocalizedFrame
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.map.store.trees import loop_in
+from recon.odometry.health import stretches
 from recon.places.loop import Loop
 from recon.run.directory import RunDirectory
 
@@ -32,15 +33,25 @@ HEADER: Final = (
 )
 
 
-def export_paths(session: Session, camera_height_m: float | None, run: RunDirectory) -> None:
-    """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed."""
-    path = session.trajectory
+def export_paths(
+    session: Session, joined: Bool, camera_height_m: float | None, run: RunDirectory
+) -> None:
+    """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed.
+
+    They have the frames that are joined (N,). Each other part of the drive between two breaks has
+    ``sessions/<number>/trajectory_tum.txt``, in axes of its own.
+    """
+    stretch = stretches(session.health)
+    for number in np.unique(stretch[~joined & (stretch >= 0)]).tolist():
+        apart = session.trajectory.select(stretch == number)
+        write_tum(run.path(f"sessions/{number}/trajectory_tum.txt"), apart)
+    path = session.trajectory.select(joined)
     write_kitti_poses(run.path("trajectory_kitti.txt"), path)
     write_tum(run.path("trajectory_tum.txt"), path)
     based = _of_base(path, session.T_map_world, camera_height_m)
     write_tum(run.path("trajectory_map_base_tum.txt"), based)
     if session.loops.get("closed"):
-        write_tum(run.path("trajectory_odometry_tum.txt"), session.odometry)
+        write_tum(run.path("trajectory_odometry_tum.txt"), session.odometry.select(joined))
         kinds = ("closed", "refused")
         loops = {kind: [*map(_edge, map(loop_in, session.loops[kind]))] for kind in kinds}
         run.write_json("loops.json", loops)

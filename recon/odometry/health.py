@@ -58,15 +58,13 @@ def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:
     bad = [index for index, record in enumerate(health) if not record.ok]
     if len(bad) > _MANY * len(health):
         poses = f"the poses of {len(bad)} of {counted(len(health), 'frame')} are not"
-        follows = "an error once made stays in all that follows"
-        return [f"PATH AND MAP ARE NOT TO BE TRUSTED: {poses}, and {follows}"]
+        return [f"PATH AND MAP ARE NOT TO BE TRUSTED: {poses}"]
     if not bad:
         return []
     poses = (
         f"{len(bad)} of {counted(len(health), 'pose')} are not to be trusted ({name_frames(bad)})"
     )
-    guessed = ", and what follows may be misplaced" if stretches(health).max() > 0 else ""
-    return [f"{poses}: nothing of them is in the map{guessed}"]
+    return [f"{poses}: nothing of them is in the map"]
 
 
 def name_frames(indices: Sequence[int]) -> str:

@@ -18,7 +18,7 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
-_BETWEEN: Final = 4  # places between two of a stretch that are compared
+_BETWEEN: Final = 3.0  # path between two places of a stretch that are compared, in reaches
 _REACH: Final = 0.5  # share of the depth of what is seen, within which most of it is seen, too
 _APART: Final = 0.5  # share of that distance which is between two candidates
 VIEW_DEG: Final = 45.0  # largest angle between viewing directions that see enough in common
@@ -89,7 +89,7 @@ class Places:
         far_m = np.linalg.norm(T[:, :3, 3], axis=1) - SIGMAS * sigma_m
         turned = angle_rad(T) - SIGMAS * sigma_rad
         near = (far_m <= place.reach_m) & (turned <= np.deg2rad(VIEW_DEG))
-        before = np.arange(len(self)) < len(self) - _BETWEEN
+        before = way_m >= _BETWEEN * place.reach_m
         return np.asarray(near & before & (self.stretches == place.stretch))
 
     def around(self, number: int, T_place_camera: Float64, reach_m: float) -> list[int]:

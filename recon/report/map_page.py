@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import compress
 from typing import Final
 
 import numpy as np
@@ -40,10 +41,14 @@ def map_content(
 ) -> Json:
     """Return what the page of a drive shows: map and path, the rig, and a frame of it in full."""
     session, truth = map_.first, errors.true_path
-    path, health, T_map_world = session.trajectory, session.health, session.T_map_world
+    joined, T_map_world = map_.joined(session), session.T_map_world
+    path, odometry = (one.select(joined) for one in (session.trajectory, session.odometry))
+    health = tuple(compress(session.health, joined))
+    number = np.cumsum(joined) - 1  # of each frame among those that are joined
     drift = expected_drift(path, health, session.camera, rig.length_share)
     radius_share = 0.0 if drift is None else drift.radius_share
-    pairs = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
+    closed = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
+    pairs = [(int(number[a]), int(number[b])) for a, b in closed if joined[a] and joined[b]]
     true_path = {} if truth is None else {"true path": truth}
     return {
         **_map_content(made, {"path": path}, true_path, T_map_world),
@@ -52,9 +57,7 @@ def map_content(
         "metrics": errors.path,
         "figures": {
             "path": figures.path_figure(path, truth, T_map_world, health, radius_share),
-            "loops": figures.loops_figure(session.odometry, path, pairs, T_map_world)
-            if pairs
-            else None,
+            "loops": figures.loops_figure(odometry, path, pairs, T_map_world) if pairs else None,
             "drift": None if truth is None else figures.drift_figure(path, truth, health),
             "health": figures.health_figure(health) if health else None,
         },

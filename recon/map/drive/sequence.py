@@ -36,10 +36,35 @@ from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
+from recon.odometry.health import name_frames, stretches
 from recon.odometry.protocol import OdometryHealth
 from recon.run.work import SILENT, Progress, serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedFrame
+
+
+@dataclass(frozen=True)
+class DriveSession:
+    """A part of a drive in which odometry was never lost."""
+
+    first: int  # its first frame
+    last: int  # its last frame
+    frames: int  # how many of them have a trusted pose
+    joined: bool  # whether it is in the map: places that were seen again say where it lies
+
+
+def break_warnings(sessions: Sequence[DriveSession]) -> list[str]:
+    """Return what to know first of all about a drive whose odometry was lost."""
+    if len(sessions) < 2:
+        return []
+    into = f"the path breaks into {len(sessions)} sessions"
+    apart = [session for session in sessions if not session.joined]
+    if not apart:
+        return [f"{into}, which places that were seen again join"]
+    lost, frames = sum(one.frames for one in apart), sum(one.frames for one in sessions)
+    named = name_frames([n for one in apart for n in range(one.first, one.last + 1)])
+    why = f"nothing that was seen again says where {len(apart)} of them lie ({named})"
+    return [f"{into.upper()}: {why}; {lost} of {counted(frames, 'frame')} are not in the map"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +123,21 @@ class MappedSequence:
     def trusted(self) -> Bool:
         """bool (N,), which poses are to be trusted."""
         return self.session.trusted
+
+    @cached_property
+    def joined(self) -> Bool:
+        """bool (N,), which frames are part of the path in the map, see `Map.joined`."""
+        return self.map.joined(self.session)
+
+    @cached_property
+    def sessions(self) -> list[DriveSession]:
+        """The parts of the drive between its breaks, in order."""
+        stretch = stretches(self.health)
+        parts = [np.flatnonzero(stretch == n) for n in range(int(stretch.max(initial=-1)) + 1)]
+        return [
+            DriveSession(int(own[0]), int(own[-1]), len(own), bool(self.joined[own[0]]))
+            for own in parts
+        ]
 
     @property
     def path_m(self) -> Float64:

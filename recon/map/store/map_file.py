@@ -156,6 +156,18 @@ class MapFile:
             for number, stretch in of.items()
         }
 
+    def joined(self, session: Session) -> Bool:
+        """Which frames of a linked drive are part of its path in the map; bool (N,).
+
+        Frames without a trusted pose go with those before them. All, if no pose is trusted.
+        """
+        stretch, placed = stretches(session.health), self.placed[session.number]
+        last = np.maximum.accumulate(np.where(stretch >= 0, np.arange(len(stretch)), -1))
+        first = int(np.argmax(stretch >= 0))
+        return np.asarray(
+            np.isin(stretch[np.maximum(last, first)], stretch[placed]) | ~placed.any()
+        )
+
     @property
     def doubts(self) -> list[str]:
         """Lines of what is not to be trusted in the linked drives; whoever uses the map says so."""
@@ -165,7 +177,7 @@ class MapFile:
             lines += [of + line for line in doubt_about(session.health)]
             apart = np.flatnonzero(session.trusted & ~placed[session.number]).tolist()
             if apart:
-                why = "follow a lost pose, and nothing that was seen again says where"
+                why = "lie beyond a break, and nothing that was seen again says where"
                 left_out = "not in cloud, grid, OctoMap and mesh, nor to be recognised"
                 lines.append(f"{of}{name_frames(apart)} {why}: {left_out}")
         return lines
