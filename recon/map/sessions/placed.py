@@ -143,7 +143,9 @@ class PlacedSubmaps:
         submap = submaps[own]
         frames = range(submap.first_frame, submap.first_frame + submap.frames)
         if not self._apart[drive].isdisjoint(frames):
-            return replace(submap, fused=submap.fused.select(np.zeros(0, np.intp)))
+            nothing = np.zeros(len(submap.occupancy.blocks), np.bool_)
+            seen = submap.occupancy.select(nothing) if len(self.drives) == 1 else submap.occupancy
+            return replace(submap, fused=submap.fused.select(np.zeros(0, np.intp)), occupancy=seen)
         if T is None or np.array_equal(T[own], np.eye(4)):
             return submap
         return replace(submap, fused=submap.fused.moved(T[own], self._settings.fusion.voxel_m))
