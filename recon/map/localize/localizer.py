@@ -115,7 +115,7 @@ class Localizer:
         self._belief: Belief | None = None
         self._T_odometry = np.eye(4)
         self._path_m = 0.0
-        self._frames = 0
+        self._frames = self._breaks = 0
 
     def add(self, frame: OdometryFrame, *, hurried: Callable[[], bool] = lambda: False) -> Located:
         """Locate the next frame.
@@ -129,18 +129,23 @@ class Localizer:
         if self._belief is not None and self._belief.sigma_m <= _SURE_SIGMA_M and hurried():
             return self._result(_Confirmed(self._belief, refused="no time to look at the map"))
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity)
+        lost = None
         if self._belief is not None:
-            return self._result(self._confirm(self._belief, keyframe, frame))
+            lost = self._result(self._confirm(self._belief, keyframe, frame))
+            if lost.state is not State.LOST:
+                return lost
         camera = frame.pair.camera
-        fix = self._first_fix.find(keyframe, camera, self._T_odometry, self._path_m)
+        at = (self._T_odometry, self._path_m, self._breaks)
+        fix = self._first_fix.find(keyframe, camera, *at)
         if fix is None:
-            return Located(State.SEARCHING, note="no place is recognised for certain")
+            return lost or Located(State.SEARCHING, note="no place is recognised for certain")
         confirmed = self._confirm(Belief(*self._measured(fix)), keyframe, frame)
         return self._result(replace(confirmed, loops=confirmed.loops or (fix,)))
 
     def _advance(self, visual: VisualEstimate) -> None:
         T_now = visual.result.T_world_camera
         seen = visual.information is not None
+        self._breaks += self._frames > 0 and not seen
         steps = np.stack([self._T_odometry, T_now])
         step_m = float(path_lengths(steps, np.array([True, seen or not self._frames]))[-1])
         if self._belief is not None:
@@ -172,12 +177,26 @@ class Localizer:
             loops.append(verdict.loop)
             if frame.rough:  # one tells most of it, and in a hurry time counts
                 break
+        if not loops and not frame.rough:
+            loops, belief = self._recognised(belief, keyframe, frame)
         # Aligning takes as long as several frames may, where they are in a hurry.
         due = not loops or (not frame.rough and self._frames % _SURFACES_EVERY == 0)
         by_surfaces = None
         if self._surroundings is not None and due:
             by_surfaces = self._surroundings.correct(belief, frame, learn=bool(loops))
         return _Confirmed(by_surfaces or belief, tuple(loops), refused, by_surfaces is not None)
+
+    def _recognised(
+        self, belief: Belief, keyframe: Keyframe, frame: OdometryFrame
+    ) -> tuple[list[Loop], Belief]:
+        """Return loops to views that are not near but look alike, and the belief they correct."""
+        loops = []
+        for loop in self._known.recognise(keyframe, frame.pair.camera).loops:
+            corrected = belief.corrected_to(*self._measured(loop))
+            if corrected is not None:
+                belief = corrected
+                loops.append(loop)
+        return loops, belief
 
     def _result(self, confirmed: _Confirmed) -> Located:
         belief, seen = confirmed.belief, bool(confirmed.loops) or confirmed.surfaces
@@ -221,13 +240,23 @@ class FirstFix:
         self._known = known
         self._frames = frames
         self._among = among
-        self._seen: deque[tuple[Float64, float, list[Loop]]] = deque(maxlen=_REMEMBERED)
+        self._seen: deque[tuple[tuple[Float64, float, int], list[Loop]]] = deque(maxlen=_REMEMBERED)
 
     def find(
-        self, keyframe: Keyframe, camera: RectifiedCamera, T_odometry_camera: Float64, path_m: float
+        self,
+        keyframe: Keyframe,
+        camera: RectifiedCamera,
+        T_odometry_camera: Float64,
+        path_m: float,
+        breaks: int = 0,
     ) -> Loop | None:
-        """Return the best believed loop to the next frame, ``path_m`` into the drive, if any."""
-        self._seen.append((T_odometry_camera, path_m, self._loops(keyframe, camera)))
+        """Return the best believed loop to the next frame, ``path_m`` into the drive, if any.
+
+        Behind one of the ``breaks`` of the odometry no frame before says where it is: several views
+        of the map are enough.
+        """
+        at = (T_odometry_camera, path_m, breaks)
+        self._seen.append((at, self._loops(keyframe, camera)))
         believed = [loop for loop in self._agreeing() if loop.last == keyframe.frame]
         if not believed:
             return None
@@ -249,10 +278,12 @@ class FirstFix:
         return list(found.values())
 
     def _agreeing(self) -> list[Loop]:
-        loops = [loop for _, _, loops in self._seen for loop in loops]
+        loops = [loop for _, loops in self._seen for loop in loops]
         if not loops:
             return []
         # The map is a rigid thing: only the drive in it drifts.
         firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0, 0) for loop in loops}
-        lasts = {loop.last: (T, path_m, 0) for T, path_m, loops in self._seen for loop in loops}
-        return agreeing_loops(loops, firsts, lasts, keyframes=self._frames)
+        lasts = {loop.last: at for at, loops in self._seen for loop in loops}
+        breaks = self._seen[-1][0][2]
+        alone = breaks > 0 and sum(at[2] == breaks for at, _ in self._seen) == 1
+        return agreeing_loops(loops, firsts, lasts, keyframes=1 if alone else self._frames)
