@@ -8,6 +8,7 @@
 - `checked.py`: poses that cannot be trusted are marked, by all patches of the image;
 - `health.py`: what that says of a drive, and how far its path may be off;
 - `rig/`: the rig as the motion of a drive shows it;
-- `kiss.py`: clouds registered over time, also in a finished map (`recon.map.localize`);
+- `kiss.py`: clouds registered over time, from where the features put the camera, also in a finished
+  map (`recon.map.localize`);
 - `prior.py`: what wheels or an inertial unit say; `prior_axes.py`: in which axes.
 """

@@ -1,85 +1,98 @@
-"""kiss-icp: as an odometry, on the points that stereo measures well; and in a map that is there."""
+"""kiss-icp on the points that stereo measures well: as an odometry, and in a map that is there."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from kiss_icp.config import KISSConfig
-from kiss_icp.config.config import (
-    AdaptiveThresholdConfig,
-    DataConfig,
-    MappingConfig,
-    RegistrationConfig,
-)
+from kiss_icp.config.config import DataConfig, MappingConfig, RegistrationConfig
 from kiss_icp.kiss_icp import KissICP
 from numpy.typing import NDArray
 
 from recon.core.errors import RegistrationError
-from recon.core.geometry.se3 import angle_rad, invert, orthonormalise
+from recon.core.geometry.se3 import invert, orthonormalise
 from recon.core.text import counted
 from recon.core.values import Disparity, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, depth_sigma, unproject
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
+from recon.odometry.visual import VisualOdometry
 
-_VOXEL_M: Final = 0.2  # edge of a voxel of the map
-_MIN_POINTS: Final = 300  # frames with fewer points are skipped
+_RANGE_IN_VOXELS: Final = 100.0
+"""Range relative to the edge of a voxel, by kiss-icp's own rule. Of 30 m this gives 0.3 m: points
+are as uncertain, and with 0.2 m paths are the same and take twice the time."""
+
+_BEYOND: Final = 2.0
+"""How far the map reaches, and how uncertain its points may be, relative to those registered. At
+the rim of the map new points would find older ones before them nearest, and hold the camera back.
+"""
+
+_MIN_POINTS: Final = 300  # frames with fewer points are not registered
 
 
 class KissOdometry:
-    """Gives kiss-icp the points that stereo measures well; it has a motion model of its own.
+    """Registers points in a map of those before, from where visual odometry sees the camera.
 
-    With every point, as of a LiDAR, it underestimates motion by half (`select_points`).
+    The guess makes frames meet, and registration decides: guesses off by 0.1 m in any direction
+    give the same path. With every point, as of a LiDAR, motion is underestimated (`select_points`).
 
     Args:
-        max_range_m: Farther points are not used.
+        max_range_m: Farther points are not registered.
+        visual: Gives the guess.
     """
 
-    def __init__(self, max_range_m: float) -> None:
-        self._max_range_m = max_range_m
-        self._icp = KissIcp(KissIcpOptions(max_range_m, _VOXEL_M))
-        self._poses: list[Float64] = []
+    def __init__(self, max_range_m: float, visual: VisualOdometry) -> None:
+        self._max_range_m, self._visual = max_range_m, visual
+        voxel_m = max_range_m / _RANGE_IN_VOXELS
+        # Points of the map are half a voxel apart. What is off by more is another place.
+        self._threshold_m = 0.5 * voxel_m
+        self._icp = KissIcp(KissIcpOptions(_BEYOND * max_range_m, voxel_m))
+        self._T_world_camera = self._T_visual = np.eye(4)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame; one with too few points is extrapolated."""
-        points = select_points(frame, self._max_range_m)
-        if len(points) < _MIN_POINTS:
-            note = f"too few for ICP: {counted(len(points), 'point')}; the last motion goes on"
-            first = not self._poses
-            health = OdometryHealth(first, skipped=not first, icp_points=len(points), notes=(note,))
-            return self._keep(self._extrapolated(), health)
-        alignment = self._icp.register(points.xyz)
-        health = OdometryHealth(icp_points=len(alignment.source))
-        return self._keep(alignment.T_world_camera, health)
+        """Register the next frame; one with too few points goes where visual odometry says."""
+        seen = self._visual.register(frame)
+        guess = self._T_world_camera @ invert(self._T_visual) @ seen.T_world_camera
+        self._T_visual = seen.T_world_camera
+        points = select_points(frame, _BEYOND * self._max_range_m, _BEYOND * MAX_SIGMA_M)
+        near = (points.xyz[:, 2] <= self._max_range_m) & (np.asarray(points.sigma_m) <= MAX_SIGMA_M)
+        source, visual_m = points.xyz[near], tuple(seen.T_world_camera[:3, 3].tolist())
+        health = OdometryHealth(icp_points=len(source), visual_m=visual_m)
+        if len(source) < _MIN_POINTS:
+            note = f"too few for ICP: {counted(len(source), 'point')}; the visual motion goes on"
+            notes = (note, *seen.health.notes)
+            health = replace(seen.health, icp_points=len(source), visual_m=visual_m, notes=notes)
+            self._T_world_camera = orthonormalise(guess)
+        else:
+            # kiss-icp weighs by the ratio of its kernel to the square of a distance.
+            kernel_m2 = self._threshold_m**2
+            alignment = self._icp.align(source, guess, self._threshold_m, kernel_m2)
+            self._T_world_camera = alignment.T_world_camera
+            self._icp.add(points.xyz, self._T_world_camera)
+        return OdometryResult(self._T_world_camera, health)
 
     def state(self) -> dict[str, Any]:
-        return {"icp": self._icp.state(), "poses": [{"T": pose} for pose in self._poses]}
+        return {
+            "visual": self._visual.state(),
+            "points": self._icp.points(),
+            "T_world_camera": self._T_world_camera,
+            "T_visual": self._T_visual,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
-        self._icp.restore(state["icp"])
-        self._poses = [pose_in(pose, "T") for pose in state["poses"]]
-
-    def _keep(self, T_world_camera: Float64, health: OdometryHealth) -> OdometryResult:
-        self._poses = [*self._poses[-1:], T_world_camera]
-        return OdometryResult(T_world_camera, health)
-
-    def _extrapolated(self) -> Float64:
-        """The last pose, moved by the last motion."""
-        if len(self._poses) < 2:
-            return self._poses[-1] if self._poses else np.eye(4)
-        before, last = self._poses
-        return np.asarray(last @ invert(before) @ last)
+        self._visual.restore(state["visual"])
+        self._icp.set_map(state["points"])
+        self._T_world_camera, self._T_visual = (
+            pose_in(state, name) for name in ("T_world_camera", "T_visual")
+        )
 
 
 _POINTS_PER_VOXEL: Final = 20  # most points that a voxel of the map keeps
-_INITIAL_THRESHOLD_M: Final = 2.0  # first value of the adaptive threshold
-_MIN_MOTION_M: Final = 0.1  # smaller deviations from the motion model do not change the threshold
 
 
 @dataclass(frozen=True)
@@ -108,26 +121,20 @@ class KissIcp:
     """
 
     def __init__(self, options: KissIcpOptions) -> None:
-        self._options = options
-        self._icp = _new(options)
-
-    def register(self, xyz_camera: NDArray[np.floating]) -> IcpAlignment:
-        """Register points (N, 3) with kiss-icp's own motion model, threshold and map update."""
-        points = _points(xyz_camera)
         with _our_errors():
-            _, source = self._icp.register_frame(points, np.zeros(0))
-        return IcpAlignment(_pose(self._icp.last_pose), np.array(source))
+            self._icp = KissICP(_config(options))
 
     def align(
         self,
         xyz_camera: NDArray[np.floating],
         T_world_guess: NDArray[np.floating],
         threshold_m: float,
+        kernel_m2: float,
     ) -> IcpAlignment:
         """Align points (N, 3) to the map from a guess of the pose, without changing the map.
 
-        ``threshold_m`` is the scale of the robust kernel; correspondences are at most three times
-        as far.
+        Correspondences are at most three times ``threshold_m`` long; one whose square is
+        ``kernel_m2`` counts a quarter.
         """
         points = _points(xyz_camera)
         guess, icp = _pose(T_world_guess), self._icp
@@ -141,7 +148,7 @@ class KissIcp:
                 voxel_map=icp.local_map,
                 initial_guess=guess,
                 max_correspondance_distance=3 * threshold_m,
-                kernel=threshold_m,
+                kernel=kernel_m2,
             )
         return IcpAlignment(_pose(pose), np.array(source))
 
@@ -152,71 +159,15 @@ class KissIcp:
             if len(xyz_world):
                 self._icp.local_map.add_points(_points(xyz_world))
 
-    def state(self) -> dict[str, Any]:
-        """Return everything that later results depend on, as arrays and plain values."""
-        icp = self._icp
-        return {
-            "points": np.array(icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3),
-            "last_pose": np.array(icp.last_pose),
-            "last_delta": np.array(icp.last_delta),
-            "threshold": icp.adaptive_threshold.state(),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state` of the same options."""
-        poses = [state[name] for name in ("last_pose", "last_delta")]
-        for pose in poses:
-            _pose(pose)
-        self._icp = _new(self._options)
+    def add(self, xyz_camera: NDArray[np.floating], T_world_camera: Float64) -> None:
+        """Add points (N, 3) of a frame to the map, and forget those out of its range."""
         with _our_errors():
-            if len(state["points"]):
-                self._icp.local_map.add_points(_points(state["points"]))
-        self._icp.last_pose, self._icp.last_delta = poses
-        self._icp.adaptive_threshold.restore(state["threshold"])
+            _, points = self._icp.voxelize(_points(xyz_camera))
+            self._icp.local_map.update(points, T_world_camera)
 
-
-class _AdaptiveThreshold:
-    """kiss-icp's adaptive threshold: rms error of the motion model. The state of its own is hidden.
-
-    Ref:
-        Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 2023, section III-C.
-    """
-
-    def __init__(self, max_range_m: float) -> None:
-        self._max_range_m = max_range_m
-        self._sum_m2 = _INITIAL_THRESHOLD_M**2
-        self._count = 1
-
-    def get_threshold(self) -> float:
-        """The root mean square of the deviations so far, metres."""
-        return math.sqrt(self._sum_m2 / self._count)
-
-    def update_model_deviation(self, model_deviation: Float64) -> None:
-        """Count one more deviation, a transform (4, 4)."""
-        turn_m = 2.0 * self._max_range_m * math.sin(0.5 * float(angle_rad(model_deviation)))
-        error_m = turn_m + float(np.linalg.norm(model_deviation[:3, 3]))
-        if error_m > _MIN_MOTION_M:
-            self._sum_m2 += error_m**2
-            self._count += 1
-
-    def state(self) -> list[float]:
-        """Sum of the squared deviations, and their number."""
-        return [self._sum_m2, self._count]
-
-    def restore(self, state: list[float]) -> None:
-        """Continue from a `state`."""
-        sum_m2, count = state
-        if not (math.isfinite(sum_m2) and sum_m2 >= 0 and count >= 1):
-            raise RegistrationError("threshold of ICP is damaged", got=state)
-        self._sum_m2, self._count = float(sum_m2), int(count)
-
-
-def _new(options: KissIcpOptions) -> KissICP:
-    """kiss-icp with an empty map, and a threshold of which the state can be saved."""
-    with _our_errors():
-        icp = KissICP(_config(options))
-    icp.adaptive_threshold = _AdaptiveThreshold(options.max_range_m)
-    return icp
+    def points(self) -> Float64:
+        """The points (M, 3) of the map, of which an equal one can be made."""
+        return np.array(self._icp.local_map.point_cloud(), np.float64).reshape(-1, 3)
 
 
 def _config(options: KissIcpOptions) -> KISSConfig:
@@ -230,11 +181,6 @@ def _config(options: KissIcpOptions) -> KISSConfig:
             max_num_threads=1,
         ),
         mapping=MappingConfig(voxel_size=options.voxel_m, max_points_per_voxel=_POINTS_PER_VOXEL),
-        adaptive_threshold=AdaptiveThresholdConfig(
-            fixed_threshold=None,
-            initial_threshold=_INITIAL_THRESHOLD_M,
-            min_motion_th=_MIN_MOTION_M,
-        ),
     )
 
 
@@ -270,10 +216,12 @@ _MAX_DISPARITY_STEP_PX: Final = 0.5
 """Largest difference between a disparity and the median around it."""
 
 _MIN_RANGE_M: Final = 1.0  # nearer points are not used
-_MAX_SIGMA_M: Final = 1.0  # points with a less certain depth are not used
+MAX_SIGMA_M: Final = 1.0  # points with a less certain depth are not used
 
 
-def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
+def select_points(
+    frame: OdometryFrame, max_range_m: float, max_sigma_m: float = MAX_SIGMA_M
+) -> PointCloud:
     """Near, textured points (camera axes) whose disparity agrees with its neighbours.
 
     Dense stereo clouds are smeared along the rays where there is little texture, and extend the
@@ -284,7 +232,7 @@ def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
     sigma = depth_sigma(depth, frame.disparity.sigma_px, camera)
     with np.errstate(invalid="ignore"):
         good = (depth >= _MIN_RANGE_M) & (depth <= max_range_m)
-        good &= sigma <= _MAX_SIGMA_M
+        good &= sigma <= max_sigma_m
     good &= textured(frame.pair.left, _MIN_GRADIENT)
     good &= consistent(frame.disparity, _MAX_DISPARITY_STEP_PX)
     return _cloud(frame, depth, sigma, good)

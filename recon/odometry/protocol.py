@@ -46,6 +46,7 @@ class OdometryHealth:
     # by its information. If all disparities are off by 1 % of it, so is the length of the motion.
     scale_px: float = float("nan")
     icp_points: int = 0  # points given to ICP
+    visual_m: tuple[float, ...] = ()  # where visual odometry alone would be (x, y, z), if not there
     # Why something was refused or went wrong, for the log
     notes: tuple[str, ...] = field(default=())
     # Problems of the frame that the user should know, even if it has a pose

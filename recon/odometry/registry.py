@@ -20,7 +20,7 @@ from recon.odometry.visual import VisualOdometry
 
 ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odometry]]] = {
     "visual": lambda settings, prior: VisualOdometry(prior),
-    "kiss": lambda settings, prior: KissOdometry(settings.max_range_m),
+    "kiss": lambda settings, prior: KissOdometry(settings.max_range_m, VisualOdometry(prior)),
 }
 
 
@@ -35,10 +35,6 @@ def make_odometry(
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
-    if name == "kiss" and prior is not None:
-        raise SettingsError(
-            "kiss takes no prior", expected="visual", hint="drop --prior or --odometry"
-        )
     settings = settings or OdometrySettings()
     motion_prior = None if prior is None else MotionPrior(prior, settings.prior)
     return CheckedOdometry(ODOMETRIES[name](settings, motion_prior))

@@ -48,8 +48,8 @@ class OdometrySettings(Settings):
     """Where the camera is in each frame."""
 
     method: Annotated[OdometryName, BeforeValidator(_name_today)] = "visual"
-    """visual = features followed from frame to frame; kiss = kiss-icp, which registers the points
-    that stereo measures well over time, to compare with."""
+    """visual = features followed from frame to frame; kiss = kiss-icp, which from there registers
+    the points that stereo measures well over time, to compare with."""
     max_range_m: float = Field(30.0, ge=0.1, le=10000.0)
     """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
     it with a wide baseline in open country."""

@@ -44,6 +44,10 @@ def path_figure(
         lines.append((_circles(path, radius_share * estimate.distances_m), look))
     if truth is not None:
         lines.insert(0, (seen_from_above(truth, T_map_world), TRUTH_LINE))
+    visual_m = np.array([record.visual_m or (np.nan,) * 3 for record in health]).reshape(-1, 3)
+    if np.isfinite(visual_m).any():
+        look = {"color": style.FAINT, "linewidth": 1.4, "linestyle": "--", "label": "visual alone"}
+        lines.append((apply(T_map_world, visual_m)[:, :2], look))
     bad = _bad_frames(health, len(estimate))
     if len(bad):
         look = {"marker": "x", "linestyle": "", "markersize": 8, "markeredgewidth": 2}

@@ -4,31 +4,39 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kiss_icp.pybind import kiss_icp_pybind
 
 from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.odometry import kiss
+from recon.odometry.protocol import OdometryHealth, OdometryResult
+from recon.odometry.visual import VisualOdometry
 from tests.odometry.conftest import PLANES
 
 
-def test_a_motion_towards_a_wall_is_found(see):
-    odometry = kiss.KissOdometry(30.0)
+class Still:
+    """Visual odometry that sees no motion."""
+
+    def register(self, frame):
+        return OdometryResult(np.eye(4), OdometryHealth())
+
+
+@pytest.mark.parametrize("visual", [VisualOdometry, Still])
+def test_a_motion_towards_a_wall_is_found_whatever_the_guess(see, visual):
+    odometry = kiss.KissOdometry(30.0, visual())
     poses = [make_transform(np.eye(3), np.array([0.06 * n, 0.0, 0.0])) for n in range(7)]
     found = [odometry.register(see(T)).T_world_camera for T in poses][-1]
     # The wall tells, the ground does not: a tenth of 0.36 m.
     assert abs(found[0, 3] - poses[-1][0, 3]) < 0.04
 
 
-def test_an_empty_frame_extrapolates_and_an_empty_drive_stays(blind, see):
-    odometry = kiss.KissOdometry(30.0)
+def test_an_empty_frame_goes_with_visual_odometry_and_an_empty_drive_stays(blind, see):
+    odometry = kiss.KissOdometry(30.0, VisualOdometry())
     before = [odometry.register(see(np.eye(4))) for _ in range(2)]
     result = odometry.register(blind())
-    step = invert(before[0].T_world_camera) @ before[1].T_world_camera
-    np.testing.assert_allclose(result.T_world_camera, before[1].T_world_camera @ step, atol=1e-9)
+    np.testing.assert_allclose(result.T_world_camera, before[1].T_world_camera, atol=1e-3)
     assert not result.health.ok
     assert "too few" in result.health.notes[0]
-    odometry = kiss.KissOdometry(30.0)
+    odometry = kiss.KissOdometry(30.0, VisualOdometry())
     results = [odometry.register(blind()) for _ in range(3)]
     assert all(np.array_equal(result.T_world_camera, np.eye(4)) for result in results)
     assert [result.health.ok for result in results] == [True, False, False]
@@ -43,8 +51,7 @@ def test_selected_points_lie_on_the_street_within_range_and_accuracy(see, monkey
     frame = see(np.eye(4))
     every = kiss.select_points(frame, 30.0)
     monkeypatch.setattr(kiss, "_MIN_RANGE_M", 6.0)
-    monkeypatch.setattr(kiss, "_MAX_SIGMA_M", 0.2)
-    cloud = kiss.select_points(frame, 20.0)
+    cloud = kiss.select_points(frame, 20.0, 0.2)
     assert cloud.xyz[:, 2].min() >= 6.0
     assert cloud.xyz[:, 2].max() <= 20.0
     assert cloud.sigma_m.max() <= 0.2
@@ -87,7 +94,7 @@ def seen_from(T_world_camera: np.ndarray) -> np.ndarray:
 def aligned_to_room(prior: np.ndarray) -> np.ndarray:
     made = kiss.KissIcp(OPTIONS)
     made.set_map(room())
-    return made.align(seen_from(T_MOVED), prior, 0.5).T_world_camera
+    return made.align(seen_from(T_MOVED), prior, 0.5, 0.25).T_world_camera
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.001])
@@ -98,8 +105,16 @@ def test_points_in_camera_axes_give_the_pose_of_the_camera(scale):
     assert np.linalg.norm(off[:3, 3]) < 0.005
 
 
+def test_frames_that_are_added_make_the_map():
+    icp = kiss.KissIcp(OPTIONS)
+    icp.add(seen_from(np.eye(4)), np.eye(4))
+    off = invert(T_MOVED) @ icp.align(seen_from(T_MOVED), np.eye(4), 0.5, 0.25).T_world_camera
+    # Points are voxel-sampled, and ICP ends at steps of 1e-4: centimetres.
+    assert np.linalg.norm(off[:3, 3]) < 0.02
+
+
 def test_without_a_map_the_guess_stays():
-    alignment = kiss.KissIcp(OPTIONS).align(seen_from(np.eye(4)), T_MOVED, 0.5)
+    alignment = kiss.KissIcp(OPTIONS).align(seen_from(np.eye(4)), T_MOVED, 0.5, 0.25)
     np.testing.assert_allclose(alignment.T_world_camera, T_MOVED, atol=1e-12)
 
 
@@ -113,32 +128,17 @@ def test_environment_variables_change_nothing(value, monkeypatch):
 def test_bad_points_and_poses_and_foreign_exceptions_are_refused(monkeypatch):
     icp = kiss.KissIcp(OPTIONS)
     for xyz in (np.zeros((0, 3)), np.zeros((5, 2)), np.full((5, 3), np.nan), np.zeros(3)):
-        for call in (icp.register, lambda p: icp.align(p, np.eye(4), 0.5)):
+        for call in (lambda p: icp.add(p, np.eye(4)), lambda p: icp.align(p, np.eye(4), 1, 1)):
             with pytest.raises(RegistrationError):
                 call(xyz)
     for pose in (np.full((4, 4), np.nan), np.eye(3)):
         with pytest.raises(RegistrationError):
-            icp.align(room(), pose, 0.5)
+            icp.align(room(), pose, 0.5, 0.25)
     icp = kiss.KissIcp(OPTIONS)
 
     def fail(*_: object) -> None:
         raise RuntimeError("from the library")
 
-    monkeypatch.setattr(icp._icp, "register_frame", fail)
+    monkeypatch.setattr(icp._icp, "voxelize", fail)
     with pytest.raises(RegistrationError, match="from the library"):
-        icp.register(room())
-
-
-def test_the_threshold_is_that_of_kiss_icp():
-    """Our threshold, unlike that of kiss-icp, can be saved; it gives the same values."""
-    theirs = kiss_icp_pybind._AdaptiveThreshold(
-        initial_threshold=kiss._INITIAL_THRESHOLD_M,
-        min_motion_th=kiss._MIN_MOTION_M,
-        max_range=30.0,
-    )
-    ours, rng = kiss._AdaptiveThreshold(30.0), np.random.default_rng(4)
-    for size in (0.0, 0.001, 0.01, 0.1, 0.5):
-        T = make_transform(exp_so3(size * rng.normal(size=3)), size * rng.normal(size=3))
-        ours.update_model_deviation(T)
-        theirs._update_model_deviation(model_deviation=T)
-        assert ours.get_threshold() == pytest.approx(theirs._compute_threshold(), rel=1e-9)
+        icp.add(room(), np.eye(4))

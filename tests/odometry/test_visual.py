@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.core.errors import RegistrationError, SettingsError
+from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import Disparity, Trajectory
 from recon.odometry.features import in_crowd
@@ -171,8 +171,10 @@ def path(poses: np.ndarray, interval_s: float = 0.1, start_s: float = 0.0) -> Tr
     return Trajectory(ELSEWHERE @ poses, times_s)
 
 
-def led_by(frames: list[OdometryFrame], prior: Trajectory | None) -> list[OdometryResult]:
-    odometry = make_odometry("visual", OdometrySettings(), prior)
+def led_by(
+    frames: list[OdometryFrame], prior: Trajectory | None, name: str = "visual"
+) -> list[OdometryResult]:
+    odometry = make_odometry(name, OdometrySettings(), prior)
     return [odometry.register(frame) for frame in frames]
 
 
@@ -204,8 +206,6 @@ def test_what_is_no_path_of_the_drive_is_refused():
     MotionPrior(path(steps(5), start_s=0.45), PriorSettings()).check_covers(0.1 * np.arange(20))
     with pytest.raises(RegistrationError, match="two poses"):
         MotionPrior(path(steps(1)), PriorSettings())
-    with pytest.raises(SettingsError, match="kiss takes no prior"):
-        make_odometry("kiss", OdometrySettings(), path(steps(3)))
 
 
 def test_frames_without_sight_are_carried_by_the_prior(see, blind):
@@ -222,6 +222,9 @@ def test_frames_without_sight_are_carried_by_the_prior(see, blind):
     assert off_m(alone[-1], truth[-1]) > 0.5
     assert all(result.health.ok for result in carried)
     assert "carried by the prior" in carried[-1].health.notes[0]
+    registered = led_by(frames, path(np.stack(truth)), "kiss")[-1].health
+    assert registered.ok
+    assert "carried by the prior" in registered.notes[1]
     # The prior is exact; what is left is the error of the seen motion before.
     assert off_m(carried[-1], truth[-1]) < 0.06
 

@@ -176,10 +176,11 @@ def drawn(monkeypatch):
 def test_path_is_drawn_with_truth_drift_and_frames_that_are_not_trusted_or_without(
     trajectory, T_map_world, health, drawn
 ):
-    figures.path_figure(trajectory, trajectory, T_map_world, health, 0.1)
+    led = [replace(record, visual_m=(0.0, 0.1, 1.0)) for record in health]
+    figures.path_figure(trajectory, trajectory, T_map_world, led, 0.1)
     figures.path_figure(trajectory, None, T_map_world)
     names = [[str(line.get_label()) for line in figure.axes[0].lines] for figure in drawn]
-    given = ["truth", "estimate", "95 % (expected drift)", "not trusted (1)"]
+    given = ["truth", "estimate", "95 % (expected drift)", "visual alone", "not trusted (1)"]
     assert [[name for name in line if name[0] != "_"] for line in names] == [given, ["estimate"]]
 
 

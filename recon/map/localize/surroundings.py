@@ -35,7 +35,8 @@ from recon.odometry.protocol import OdometryFrame
 from recon.places.places import SIGMAS
 
 _VOXEL_M: Final = 0.3  # edge of a voxel of the map of ICP
-_THRESHOLD_M: Final = 0.3  # scale of the robust kernel; points pair up to thrice as far
+_THRESHOLD_M: Final = 0.3  # points pair up to thrice as far
+_KERNEL_M2: Final = 0.3  # squared distance at which a pair counts a quarter
 _SURFACE_M: Final = 1.0  # edge of the cells in which surfaces are fitted to the map
 _RELOAD_M: Final = 10.0  # way after which the points around the camera are read again
 _MIN_POINTS: Final = 300  # frames with fewer points are not corrected
@@ -104,7 +105,7 @@ class Surroundings:
     def align(self, xyz: Float64, T_world_guess: Float64) -> IcpAlignment:
         """Return kiss-icp's pose of a frame with points (N, 3) in the map, from a guess."""
         self._load(T_world_guess[:3, 3])
-        return self._icp.align(xyz, T_world_guess, _THRESHOLD_M)
+        return self._icp.align(xyz, T_world_guess, _THRESHOLD_M, _KERNEL_M2)
 
     def _measure(self, belief: Belief, xyz: Float64) -> Correction:
         T_prior = belief.T_world_camera
