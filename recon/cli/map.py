@@ -32,10 +32,11 @@ def map_(
     out: opt.Out = None,
     start: Start = None,
     odometry: Annotated[
-        Literal["visual", "kiss", "fused"] | None,
+        Literal["visual", "kiss", "sfm", "fused"] | None,
         opt.setting(
             "odometry.method",
-            "visual (also named fused): features; kiss: kiss-icp on points, to compare with.",
+            "visual (also named fused): features; kiss: kiss-icp on points, to compare with; sfm: "
+            "structure from motion, for pairs in any order (extra sfm).",
             default="visual",
         ),
     ] = None,
@@ -77,6 +78,7 @@ def map_(
       recon map ~/kitti/sequences/06 --out outputs/kitti06
       recon map drive.bag --calib camchain.yaml --left /cam0 --right /cam1
       recon map left.mp4 --right right.mp4 --calib stereo.yaml
+      recon map photos --odometry sfm
       recon map rides/today --prior wheels.txt
       recon map drive.bag --prior /odom
       recon map --resume outputs/kitti06

@@ -12,7 +12,13 @@ from typing import Any, Final
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import begun_in_pieces, map_pieces, pieces_of
-from recon.core.errors import ClusterError, MemoryLimitError, OutputError, ReconError
+from recon.core.errors import (
+    ClusterError,
+    MemoryLimitError,
+    OutputError,
+    ReconError,
+    SettingsError,
+)
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
 from recon.evaluation.map_comparison import DriveErrors, compare_with_truth
@@ -28,6 +34,7 @@ from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
 from recon.odometry.rig.refine import KnownRig, RefinedRig, refine_rig
+from recon.odometry.sfm.find import check_sfm
 from recon.report.map_page import map_content
 from recon.report.page import write_page
 from recon.rig.audit.audit import quick_warnings
@@ -96,6 +103,8 @@ def run_map(
     """
     config, options = config or load_config(), options or MapOptions()
     check_source(source)
+    if config.odometry.method == "sfm" and options.known_poses is None:
+        refuse_with_sfm(source, options)
     findings = quick_warnings(source, config) if options.audit else ()
     if options.audit and options.known_poses is not None:
         findings += doubt_poses(options.known_poses, source, config)
@@ -124,7 +133,8 @@ def run_map(
         drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_share)
         doubts = [*rig.warnings(findings), *_warnings(source, mapped, drift)]
         breaks = break_warnings(mapped.sessions)
-        warnings = [*breaks, *findings, *doubts, *made.warnings, *errors.warnings]
+        first = [] if mapped.sfm is None else mapped.sfm.warnings()
+        warnings = [*first, *breaks, *findings, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         with run.stage("write"):
@@ -141,6 +151,14 @@ def run_map(
         }
         run.finish(result.summary, source=source.name, inputs=source.files, record=record)
     return result
+
+
+def refuse_with_sfm(source: StereoSource, options: MapOptions) -> None:
+    """Refuse what structure from motion cannot work with, before any work is done."""
+    check_sfm(source)
+    if options.prior is not None or options.workers is not None:
+        what = "structure from motion takes all pairs at once, and no motion of other sensors"
+        raise SettingsError(what, hint="drop --prior, --workers and --scheduler")
 
 
 RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of the run
@@ -211,6 +229,7 @@ def _summary(
         **result.made.figures,
         "warnings": warnings,
         **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
+        **({} if mapped.sfm is None else {"sfm": mapped.sfm.figures()}),
         **{name: plain(found) for name, found in known.items() if found is not None},
         **source.figures(),
         **({} if prior is None else {"prior": {"from": options.prior_origin, **plain(prior)}}),

@@ -1,10 +1,11 @@
-"""From frames to poses: visual odometry, or kiss-icp to compare with.
+"""From frames to poses: visual odometry, structure from motion, or kiss-icp to compare with.
 
 - `protocol.py`: what every odometry takes and gives; `registry.py`: the odometries by name, and
   known poses as one of them;
 - `visual.py`: features, found again from other positions (`features.py`), give a pose, adjusted in
   a short window of frames (`pose.py`);
 - `rig/`: the rig as the motion of a drive shows it, before the drive is mapped;
+- `sfm/`: structure from motion, for pairs in any order, by COLMAP;
 - `checked.py`: poses that cannot be trusted are marked, by all patches of the image;
 - `health.py`: what that says of a drive, and how far its path may be off;
 - `rig/`: the rig as the motion of a drive shows it;

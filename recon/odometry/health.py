@@ -56,7 +56,7 @@ def stretches(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:
 def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:
     """One line about a drive with poses that are not to be trusted; empty = it has none."""
     bad = [index for index, record in enumerate(health) if not record.ok]
-    if len(bad) > _MANY * len(health):
+    if len(bad) > _MANY * len(health) and not all(health[index].skipped for index in bad):
         poses = f"the poses of {len(bad)} of {counted(len(health), 'frame')} are not"
         return [f"PATH AND MAP ARE NOT TO BE TRUSTED: {poses}"]
     if not bad:

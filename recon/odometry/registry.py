@@ -32,6 +32,9 @@ def make_odometry(
     Each odometry uses its own part of the settings; ``prior`` is the path of the rig by other
     sensors, on the clock of the frames.
     """
+    if name == "sfm":
+        what, expected = "structure from motion is no odometry frame by frame", "visual or kiss"
+        raise SettingsError(what, where="odometry.method", got=name, expected=expected)
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")

@@ -27,7 +27,7 @@ class PriorSettings(Settings):
     """Standard deviation of its rotation from frame to frame."""
 
 
-OdometryName = Literal["visual", "kiss"]
+OdometryName = Literal["visual", "kiss", "sfm"]
 
 
 def _name_today(name: object) -> object:
@@ -49,7 +49,8 @@ class OdometrySettings(Settings):
 
     method: Annotated[OdometryName, BeforeValidator(_name_today)] = "visual"
     """visual = features followed from frame to frame; kiss = kiss-icp, which from there registers
-    the points that stereo measures well over time, to compare with."""
+    the points that stereo measures well over time, to compare with; sfm = structure from motion by
+    COLMAP over all pairs, in any order (extra sfm)."""
     max_range_m: float = Field(30.0, ge=0.1, le=10000.0)
     """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
     it with a wide baseline in open country."""

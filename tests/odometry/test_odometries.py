@@ -45,7 +45,7 @@ def test_a_saved_odometry_goes_on_to_the_bit(name, street, tmp_path):
 def test_the_settings_offer_what_there_is_and_runs_of_older_versions_were_visual_too():
     with pytest.raises(SettingsError, match="one of: kiss, visual"):
         make_odometry("lidar")
-    assert set(typing.get_args(OdometryName)) == set(ODOMETRIES)
+    assert set(typing.get_args(OdometryName)) == {*ODOMETRIES, "sfm"}
     assert OdometrySettings().method == "visual"
     assert OdometrySettings.parse({"method": "fused"}).method == "visual"
 

@@ -65,6 +65,12 @@ class Drive:
             if state is not None:
                 self._restore(state)
 
+    def begin_at(self, frame: int) -> None:
+        """Lay the axes of the map by the ground of a frame, and save what the odometry found."""
+        pair = next(self.source.frames(frame))
+        self.mapper.fix_axes(self.reconstructor.reconstruct(pair).cloud)
+        self._save()
+
     def frames(self) -> Generator[FrameResult]:
         """Yield the pose of each frame that is left, which becomes part of the map."""
         if self.source.live:
@@ -147,8 +153,9 @@ class Drive:
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.mapper.restore(state["mapper"])
-        path, health = self.session.odometry, self.session.health
-        self._loops.restore(path.T_world_camera, stretches(health))
+        if len(self.session):
+            path, health = self.session.odometry, self.session.health
+            self._loops.restore(path.T_world_camera, stretches(health))
         self._saved = len(self.mapper)
         self._last = time.perf_counter()
         self._start = self._last - state["seconds"]

@@ -75,7 +75,7 @@ class Mapper:
         before, stretch = self._stretches.number, self._stretches.add(health)
         if stretch > before:
             self.close()  # the map may have to do without what follows
-        builder = self._builder_from(frame)
+        builder = self._builder or self.fix_axes(frame.cloud)
         work = (builder, len(self), cloud, rays, T_world_camera)
         self._behind.begin(partial(self._integrate, *work))
         self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
@@ -136,13 +136,12 @@ class Mapper:
             if self.session.submaps.frames + self._builder.frames != len(self):
                 raise FormatError("submaps of the drive are missing")
 
-    def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
-        """Return the submap under construction; the first frame fixes the map axes."""
-        if self._builder is None:
-            config, ground = self._config, estimate_ground(frame.cloud)
-            T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m)
-            self.session.set_axes(T_map_world, self._camera)
-            self._builder = self._new_builder()
+    def fix_axes(self, cloud: PointCloud) -> SubmapBuilder:
+        """Lay the axes of the map by the ground in a cloud, world axes; begin the first submap."""
+        config, ground = self._config, estimate_ground(cloud)
+        T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m)
+        self.session.set_axes(T_map_world, self._camera)
+        self._builder = self._new_builder()
         return self._builder
 
     def _new_builder(self) -> SubmapBuilder:

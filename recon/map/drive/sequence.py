@@ -37,7 +37,10 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 from recon.odometry.health import name_frames, stretches
-from recon.odometry.protocol import OdometryHealth
+from recon.odometry.protocol import Odometry, OdometryHealth
+from recon.odometry.sfm.find import SfmOptions, find_poses
+from recon.odometry.sfm.found import FoundOdometry, FoundPoses
+from recon.run.machine import available_cores
 from recon.run.work import SILENT, Progress, serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedFrame
@@ -79,6 +82,7 @@ class MappedSequence:
         seconds: Wall-clock time from the first frame to the last.
         loops: Result of loop closure; None = it was not run.
         prior: How the external trajectory was used; None = there was none.
+        sfm: What structure from motion found; None = it was not asked.
         threads: Threads with which rays are cast.
     """
 
@@ -88,6 +92,7 @@ class MappedSequence:
     seconds: float
     loops: DriveLoops | None = None
     prior: UsedPrior | None = None
+    sfm: FoundPoses | None = None
     threads: int = 1
 
     def __repr__(self) -> str:
@@ -202,12 +207,20 @@ def map_sequence(
     used = None
     if prior is not None and known_poses is None:
         used = axes_of(prior, source, reconstructor, config.odometry.prior)
-    odometry = odometry_of(config, source, known_poses, prior, used)
-    looking = config.loops.enabled and known_poses is None
     session = work.session(source, config)
+    by_sfm = config.odometry.method == "sfm" and known_poses is None
+    odometry: Odometry
+    if by_sfm:
+        progress.on_stage("sfm")
+        odometry = _photos(source, config, work, session)
+    else:
+        odometry = odometry_of(config, source, known_poses, prior, used)
+    looking = config.loops.enabled and known_poses is None and not by_sfm
     watch = LoopWatch(session.keyframes, reconstructor.camera, work.stopwatch, search=looking)
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
     drive = Drive(source, reconstructor, mapper, watch, config, work)
+    if isinstance(odometry, FoundOdometry) and not len(mapper):
+        drive.begin_at(int(odometry.found.models[0].frames[0]))
     steps = drive.frames()
     progress.on_start(source.name, len(source))
     try:
@@ -226,8 +239,28 @@ def map_sequence(
         seconds=drive.seconds,
         loops=drive.close_loops(session.odometry),
         prior=used,
+        sfm=odometry.found if isinstance(odometry, FoundOdometry) else None,
         threads=work.threads or 1,
     )
+
+
+def _photos(
+    source: StereoSource, config: DriveSettings, work: Workspace, session: Session
+) -> FoundOdometry:
+    """Return the poses of pairs in any order, which an interrupted drive has found already."""
+    path = work.map.store.path
+    options = SfmOptions(
+        config.rectification,
+        None if path is None else path.parent,
+        work.threads or available_cores(),
+        config.memory.limit_mb,
+        work.stopwatch,
+    )
+    if session.state() is not None:
+        return FoundOdometry()
+    found = find_poses(source, options)
+    config.memory.check("structure from motion")
+    return FoundOdometry(found)
 
 
 _AUDIT: Final = "recon audit SOURCE shows what is wrong"
