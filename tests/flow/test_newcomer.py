@@ -42,6 +42,17 @@ def photograph(camera: CameraIntrinsics, T_left_camera: np.ndarray) -> np.ndarra
     return np.asarray(grey).astype(np.uint8)
 
 
+def take_images(folder, rig):
+    board = parse_board(BOARD)
+    pairs = render_views(rig, board, place_boards(rig, board, 12, seed=4))
+    poses = (np.eye(4), np.linalg.inv(rig.T_right_left))
+    pairs.append((photograph(rig.left, poses[0]), photograph(rig.right, poses[1])))
+    for number, pair in enumerate(pairs):
+        for side, image in zip(("left", "right"), pair, strict=True):
+            name = "room" if number == 12 else f"board{number:02d}"
+            write_image(folder / f"{side}_{name}.png", image)
+
+
 def recon(*arguments: str | Path) -> dict[str, object]:
     done = run(*arguments, "--json")
     assert done.code == 0, done.err
@@ -53,14 +64,8 @@ def recon(*arguments: str | Path) -> dict[str, object]:
     ("lens", "form"), [("radtan", "recon"), ("rational", "ros"), ("fisheye", "opencv")]
 )
 def test_images_of_a_board_lead_to_a_cloud_in_metres(tmp_path, lens, form):
-    rig, board = board_rig(lens, 480, 360), parse_board(BOARD)
-    pairs = render_views(rig, board, place_boards(rig, board, 12, seed=4))
-    poses = (np.eye(4), np.linalg.inv(rig.T_right_left))
-    pairs.append((photograph(rig.left, poses[0]), photograph(rig.right, poses[1])))
-    for number, pair in enumerate(pairs):
-        for side, image in zip(("left", "right"), pair, strict=True):
-            name = "room" if number == 12 else f"board{number:02d}"
-            write_image(tmp_path / f"{side}_{name}.png", image)
+    rig = board_rig(lens, 480, 360)
+    take_images(tmp_path, rig)
     recon("board", BOARD, "--out", tmp_path / "board.pdf")
     calibrated = recon(
         "calibrate", tmp_path / "left_board*.png", tmp_path / "right_board*.png", "--board", BOARD,
