@@ -65,7 +65,7 @@ def _add_drive(map_: Map) -> None:
         session.add_rays(frame, rays, grain)
     uvd, coarse = np.ones((4, 3), np.float32), np.ones((2, 2), np.float32)
     seen = Keyframe(1, uvd, np.ones((4, 32), np.uint8), coarse)
-    session.keyframes.put(StoredKeyframe(seen, np.eye(4), 1.0, (LOOP,), ("few inliers",)))
+    session.keyframes.put(StoredKeyframe(seen, np.eye(4), 1.0, 0, (LOOP,), ("few inliers",)))
     two = np.ones(2, np.float32)
     fused = FusedPart(KEYS, np.ones((2, 11), np.float32), two, np.ones(2, np.int32))
     starts, cells = np.array([0, 1, 2], np.int64), np.array([0, 511], np.uint16)
@@ -167,7 +167,7 @@ def accepted(records: tuple[Store, Path], kind: str, key: Key, spoiled: Any) -> 
 
 
 KINDS: Final = (
-    "session", "axes", "rig", "frames", "loops", "keyframe", "rays", "submap", "submap_entry",
+    "session", "axes", "rig", "frames", "loops", "view", "rays", "submap", "submap_entry",
     "links",
 )  # fmt: skip
 
@@ -233,7 +233,7 @@ REFUSED: Final[dict[str, tuple[str, tuple[Any, ...], Any]]] = {
     "a fix beyond the drive": ("loops", ("fixes", "frames"), np.array([0, 1, 5], np.int32)),
     "fixes of no sigma": ("loops", ("fixes", "sigma_m"), 0.0),
     "fixes of fewer positions": ("loops", ("fixes", "position_m"), np.ones((2, 3))),
-    "no coarse disparity": ("keyframe", ("keyframe", "coarse"), np.zeros((0, 2), np.float32)),
+    "no coarse disparity": ("view", ("keyframe", "coarse"), np.zeros((0, 2), np.float32)),
 }  # fmt: skip
 
 
@@ -246,7 +246,7 @@ def test_a_record_that_fits_no_drive_is_refused(name, records):
 
 
 @pytest.mark.parametrize("key", ["", "1.0", "00", "+1", "1_0", "\u0661", " 1", "0,", "word"])
-@pytest.mark.parametrize("kind", ["session", "frames", "keyframe", "submap_entry"])
+@pytest.mark.parametrize("kind", ["session", "frames", "view", "submap_entry"])
 def test_a_key_of_no_number_is_refused(kind, key, records):
     store, path = records
     database = store._database
@@ -320,7 +320,7 @@ def many(rows: int) -> Callable[[dict[str, Any]], dict[str, Any]]:
     return longer
 
 
-ROWS: Final = {"frames": 10**6, "rays": 10**7, "keyframe": 2 * 10**6, "submap": 2 * 10**6}
+ROWS: Final = {"frames": 10**6, "rays": 10**7, "view": 2 * 10**6, "submap": 2 * 10**6}
 
 
 @pytest.mark.parametrize("kind", ROWS)
@@ -328,7 +328,7 @@ ROWS: Final = {"frames": 10**6, "rays": 10**7, "keyframe": 2 * 10**6, "submap": 
 def test_a_record_of_very_many_rows_is_refused(kind, neighbours, map_file):
     claim(map_file, kind, many(ROWS[kind]))
     if neighbours == "forged":
-        if kind != "keyframe":  # before which a forged entry is noticed
+        if kind != "view":  # before which a forged entry is noticed
             forged = {"voxels": 10**9, "cells": 10**9}
             claim(map_file, "submap_entry", lambda entry: {**entry, **forged})
         camera = RectifiedCamera(1e5, 5e4, 5e4, 5e4, 0.5, 100_000, 100_000).__dict__

@@ -148,7 +148,7 @@ class MapFile:
         sessions = self.linked
         of = {session.number: stretches(session.health) for session in sessions}
         ties, first = [*_ties(sessions, self.links, of)], sessions[0].number
-        held = {(first, int(np.bincount(of[first] + 1)[1:].argmax()))}
+        held = {(first, int(np.bincount(of[first] + 1, minlength=2)[1:].argmax()))}
         while more := {b for tie in ties for a, b in (tie, tie[::-1]) if a in held} - held:
             held |= more
         return {

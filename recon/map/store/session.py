@@ -387,7 +387,7 @@ class Keyframes:
                 value_in(Keyframe, {**content["keyframe"], "frame": frame}),
                 array_in(content, "T_world_camera", np.float64, (4, 4)),
                 float(content["path_m"]),
-                int(content["stretch"]),
+                int(np.int64(content["stretch"])),
                 tuple(loop_in(loop) for loop in content["loops"]),
                 tuple(content["refused"]),
             )

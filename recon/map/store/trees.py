@@ -205,7 +205,7 @@ FRAMES: Final = "frames"
 FARTHEST_M: Final = 1e5  # from the start: farther than any drive, or ray
 _SKEW: Final = 1e-3  # of poses that were written with few digits
 _HEALTH: Final = tuple(f.name for f in fields(OdometryHealth))
-_NEW: Final = ("visual_m",)  # maps of older versions lack it
+_NEW: Final = ("visual_m", "begins")  # maps of older versions lack it
 
 
 def frames_record(

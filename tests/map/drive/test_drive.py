@@ -23,7 +23,7 @@ from recon.map.store.records import Store
 from recon.map.store.session import Keyframes
 from recon.odometry.protocol import OdometryHealth, OdometryResult
 from recon.places import places
-from recon.places.closure import close_loops
+from recon.places.closure import DrivePath, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.stereo.frame import ReconstructedFrame
 from recon.street.settings import StreetScene
@@ -142,7 +142,7 @@ CAMERA = RectifiedCamera(200.0, 159.5, 59.5, 159.5, 0.5, 320, 120)
 LAP = 60
 FRAMES = LAP + 8
 STEP_M = 2.0
-ALL_MEASURED = [True] * FRAMES
+MEASURED = [OdometryHealth()] * FRAMES
 
 
 def _frame(index: int) -> ReconstructedFrame:
@@ -180,12 +180,12 @@ def frames():
 
 def _watch(frames, path, store=None, upto=FRAMES, committed=0):
     store = store or Store.temporary()
-    watch = LoopWatch(Keyframes(store))
+    watch = LoopWatch(Keyframes(store), CAMERA)
     for number, (frame, T) in enumerate(zip(frames[:upto], path.T_world_camera, strict=False)):
         if number == committed:
             watch.wait()
             store.commit()
-        watch.add(frame, T, trusted=True)
+        watch.add(frame, T, 0)
     watch.wait()
     return watch
 
@@ -193,7 +193,7 @@ def _watch(frames, path, store=None, upto=FRAMES, committed=0):
 @pytest.fixture(scope="module")
 def closed(frames):
     path = _circle(0.01)
-    return _watch(frames, path).close(path)
+    return _watch(frames, path).close(path, MEASURED)
 
 
 def _pairs(loops: DriveLoops) -> list[tuple[int, int, bytes]]:
@@ -219,7 +219,7 @@ def test_a_lap_closes_and_a_drive_without_loops_stays_as_it_is(frames, closed):
     assert figures["largest_correction_m"] == pytest.approx(closed.corrections_m.max())
     assert closed.warnings() == []
     short = Trajectory(truth.T_world_camera[:40], truth.timestamps_s[:40])
-    loops = _watch(frames, short, upto=40).close(short)
+    loops = _watch(frames, short, upto=40).close(short, MEASURED[:40])
     assert loops.closure.trajectory is loops.odometry
 
 
@@ -230,12 +230,12 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
         _watch(frames, path, store, upto=killed + 1, committed=checkpoint)
     keyframes = Keyframes(Store.open(tmp_path / "map.recon"))
     assert len(list(keyframes)) == checkpoint
-    resumed = LoopWatch(keyframes)
-    resumed.restore(path.T_world_camera[:checkpoint], ALL_MEASURED[:checkpoint])
+    resumed = LoopWatch(keyframes, CAMERA)
+    resumed.restore(path.T_world_camera[:checkpoint], np.zeros(checkpoint, np.int64))
     for frame, T in zip(frames[checkpoint:], path.T_world_camera[checkpoint:], strict=True):
-        resumed.add(frame, T, trusted=True)
+        resumed.add(frame, T, 0)
 
-    loops = resumed.close(path)
+    loops = resumed.close(path, MEASURED)
     assert (_pairs(loops), loops.figures()) == (_pairs(closed), closed.figures())
     assert np.array_equal(
         loops.closure.trajectory.T_world_camera, closed.closure.trajectory.T_world_camera
@@ -261,9 +261,9 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
 
     monkeypatch.setattr(LoopDetector, "add", slow)
     monkeypatch.setattr(drive_loops, "ThreadPoolExecutor", pool)
-    watch = LoopWatch(Keyframes(Store.temporary()))
+    watch = LoopWatch(Keyframes(Store.temporary()), CAMERA)
     for frame in frames[:4]:
-        watch.add(frame, np.eye(4), trusted=True)
+        watch.add(frame, np.eye(4), 0)
     while not looked:
         time.sleep(0.001)
     watch.stop()
@@ -272,14 +272,14 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
 
 def test_what_contradicts_odometry_or_itself_is_a_warning(closed):
     # Odometry is believed to the millimetre, so that bending it is impossible.
-    path = closed.odometry
+    path, drive = closed.odometry, DrivePath.of(closed.odometry, MEASURED)
     with patch.multiple(places, SHARE=1e-6, TURN_DEG=1e-5):
-        refused = close_loops(path, path.distances_m, list(closed.closure.closed))
+        refused = close_loops(drive, list(closed.closure.closed))
     loops = DriveLoops(path, refused, FRAMES, len(closed.closure.closed), {})
 
     assert refused.trajectory is path
     assert "none closed" in loops.warnings()[0]
-    nothing = close_loops(path, path.distances_m, [])
+    nothing = close_loops(drive, [])
     for times, warned in ((2, False), (3, True)):  # places where the drive cannot have been
         loops = DriveLoops(path, nothing, FRAMES, 0, {CONTRADICTED: times})
         assert [("alike" in text) for text in loops.warnings()] == [True] * warned

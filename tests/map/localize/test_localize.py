@@ -180,7 +180,7 @@ def test_a_damaged_map_or_one_without_keyframes_is_refused(street, street_map):
         open_localizer(empty, SETTINGS)
     for kind in street_map.store.kinds():
         street_map.store.copy(kind, damaged.store)
-    damaged.store.put("keyframe", (0, 4), {"keyframe": {}})
+    damaged.store.put("view", (0, 4), {"keyframe": {}})
     with pytest.raises(FormatError):
         _localized(street.taken(slice(1, 4, 2)), Map(damaged.store))
 

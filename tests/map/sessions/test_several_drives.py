@@ -166,7 +166,7 @@ def _torn(health: OdometryHealth, last: int = FRAMES) -> Map:
     return map_
 
 
-def test_what_follows_a_lost_pose_stays_out_of_a_map_of_several_drives():
+def test_what_follows_a_lost_pose_stays_out_of_the_map():
     map_ = _torn(LOST, last=AT)
     placed = map_.placed
     assert placed[0].all()
@@ -179,7 +179,7 @@ def test_what_follows_a_lost_pose_stays_out_of_a_map_of_several_drives():
     assert not made.trusted[FRAMES + 1 + AT :].any()
     not_trusted, left_out = map_.doubts
     assert not_trusted.startswith("session 1 (wall): 1 of 20 poses are not to be trusted (frame 9)")
-    assert left_out.startswith("session 1 (wall): frames 10-19 follow a lost pose")
+    assert left_out.startswith("session 1 (wall): frames 10-19 lie beyond a break")
 
 
 @pytest.mark.parametrize(("health", "last"), [(LOST, FRAMES), (SKIPPED, AT)])
@@ -205,14 +205,21 @@ def test_loops_and_measured_positions_hold_what_follows_a_lost_pose():
 def test_a_first_frame_that_sees_nothing_is_not_where_the_map_begins():
     map_ = Map.temporary()
     session = drive(map_, TRUE[0], 0, health={1: LOST})
-    # A map of one drive keeps what follows a lost pose, and says so.
-    np.testing.assert_array_equal(map_.placed[0], session.trusted)
-    (line,) = map_.doubts
-    assert line.startswith("1 of 20 poses are not to be trusted (frame 1)")
+    not_trusted, left_out = map_.doubts
+    assert not_trusted.startswith("1 of 20 poses are not to be trusted (frame 1)")
+    assert left_out.startswith("frame 0 lie")
+    assert np.flatnonzero(~map_.joined(session)).tolist() == [0, 1]
     drive(map_, TRUE[1], 1)
     joining.join_sessions(map_, links_between(0, 1, TRUE[:2]))
     assert np.flatnonzero(~map_.placed[0]).tolist() == [0, 1]
     assert map_.placed[1].all()
+
+
+def test_of_a_drive_without_any_trusted_pose_nothing_is_in_the_map():
+    map_ = Map.temporary()
+    session = drive(map_, TRUE[0], 0, health=dict.fromkeys(range(FRAMES), LOST))
+    assert not map_.placed[0].any()
+    assert map_.joined(session).all()  # the path is all that there is to look at
 
 
 SMALL_TILES = load_config(None, ["submaps.length_m=8", "submaps.tile_m=12.8", "fusion.min_count=1"])

@@ -60,7 +60,13 @@ def test_frames_come_back_bit_by_bit(tmp_path):
                 assert list(map(repr, again.health)) == list(map(repr, session.health))
                 assert again.info == session.info
         assert made.store.keys("frames") == [(0, 0), (0, 1), (0, 8)]
-        assert made.store.read("frames", (0, 8))["times_s"].shape == (32,)
+        record = made.store.read("frames", (0, 8))
+        assert record["times_s"].shape == (32,)
+        del record["health"]["begins"]  # as in maps of before
+        made.store.put("frames", (0, 8), record)
+        made.commit()
+        with Map.open(path) as read:
+            assert list(map(repr, read.session().health)) == list(map(repr, session.health))
     with Map.open(path) as read, pytest.raises(FormatError, match=r"session \(got 2, expected 0"):
         read.session(2)
     with Map.temporary() as made, pytest.raises(FormatError, match="no frame"):
@@ -150,7 +156,7 @@ def test_views_are_the_keyframes_of_all_linked_drives():
     assert MapViews(map_)[1].T_world_camera == pytest.approx(moved[2])
 
 
-def test_what_follows_a_lost_pose_is_not_to_be_recognised_among_several_drives():
+def test_what_follows_a_lost_pose_is_not_to_be_recognised():
     map_ = _three(lost=(1, 3))
     seen = [(view.session, view.keyframe.frame) for view in MapViews(map_)]
     assert seen == [(0, 0), (0, 2), (0, 5), (1, 0), (1, 2)]
