@@ -226,9 +226,11 @@ def test_one_frame_makes_a_map(seen, tmp_path):
 def test_where_nothing_says_how_a_drive_went_on_another_submap_begins(seen, tmp_path):
     pairs = [*seen[:2], dimmed(seen[2], 0), *seen[3:6], *ROAD.pairs(range(60, 64))]
     run = map_drive(pairs, tmp_path)
-    assert doubted(run) == [2, 6]
-    assert [run.mapped.health[n].skipped for n in (2, 6)] == [True, False]
-    assert [entry.first_frame for entry in run.mapped.session.submaps.entries] == [0, 7]
+    assert doubted(run) == [2]
+    assert run.mapped.health[2].skipped
+    assert [n for n, record in enumerate(run.mapped.health) if record.begins] == [6]
+    assert [entry.first_frame for entry in run.mapped.session.submaps.entries] == [0, 6]
+    assert [(one.first, one.joined) for one in run.mapped.sessions] == [(0, True), (6, False)]
 
 
 @pytest.fixture(scope="module")

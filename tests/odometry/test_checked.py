@@ -52,7 +52,9 @@ LOST = OdometryHealth(ok=False, notes=("lost",))
         (0.5, SURE, None),
         (0.0, SURE, "of the image moved like that"),
         (0.5, OdometryHealth(sigma_m=0.3), "the motion is known to 0.30 m only"),
-        (0.0, LOST, None),  # what was not measured is not doubted twice
+        # What was not measured is not doubted twice.
+        (0.0, LOST, None),
+        (0.0, OdometryHealth(begins=True), None),
     ],
 )
 def test_a_motion_is_trusted_that_is_known_and_that_the_image_bears_out(
