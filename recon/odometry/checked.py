@@ -267,3 +267,25 @@ def _power(samples: _Samples, values: Float64, count: Int64) -> Float64:
 def _mean(samples: _Samples, values: Float64, count: Int64) -> Float64:
     """The mean of values (N,) in each patch; 0 in empty ones."""
     return np.asarray(np.bincount(samples.patch, values) / np.maximum(count, 1))
+
+
+class StretchCounter:
+    """Numbers the stretches of a drive: in one, poses are measured from one another.
+
+    A new one begins where odometry began anew, and after a pose that is not to be trusted unless it
+    was skipped: where it lies beside the one before is a guess.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._begun = self._lost = False
+
+    def add(self, record: OdometryHealth) -> int:
+        """Return the stretch of the next frame; -1 = its pose is not to be trusted."""
+        if not record.ok:
+            self._lost |= not record.skipped
+            return -1
+        if self._begun and (self._lost or record.begins):
+            self.number += 1
+        self._begun, self._lost = True, False
+        return self.number

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
+from recon.odometry.checked import StretchCounter
 from recon.odometry.protocol import OdometryHealth
 
 _MANY: Final = 0.1
@@ -23,28 +24,6 @@ _NAMED: Final = 3  # stretches of frames that a line names
 def trusted_poses(health: Sequence[OdometryHealth]) -> Bool:
     """Return bool (N,), which poses are to be trusted."""
     return np.array([record.ok for record in health], np.bool_)
-
-
-class StretchCounter:
-    """Numbers the stretches of a drive: in one, poses are measured from one another.
-
-    A new one begins where odometry began anew, and after a pose that is not to be trusted unless it
-    was skipped: where it lies beside the one before is a guess.
-    """
-
-    def __init__(self) -> None:
-        self.number = 0
-        self._begun = self._lost = False
-
-    def add(self, record: OdometryHealth) -> int:
-        """Return the stretch of the next frame; -1 = its pose is not to be trusted."""
-        if not record.ok:
-            self._lost |= not record.skipped
-            return -1
-        if self._begun and (self._lost or record.begins):
-            self.number += 1
-        self._begun, self._lost = True, False
-        return self.number
 
 
 def stretches(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:

@@ -111,6 +111,9 @@ def close_loops(path: DrivePath, loops: Sequence[Loop]) -> Closure:
         tuple(loop for loop, kept in zip(loops, believed, strict=True) if kept == side)
         for side in (True, False)
     )
+    if (joined.kept & ~believed).any():  # what is not believed must not bend the path
+        again = close_loops(path, closed)
+        return replace(again, refused=(*again.refused, *refused))
     return Closure(joined.trajectories[0], closed, refused)
 
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
-from recon.core.values.arrays import Bool, Float64, freeze
+from recon.core.values.arrays import Bool, Float32, Float64, freeze
 from recon.core.values.camera import project
-from recon.places.keyframe import Keyframe, make_keyframe, words_of
+from recon.places.keyframe import Keyframe, coarse_of, coarse_points, make_keyframe, words_of
 from recon.places.loop import LOOP_SIGMAS, Loop, agreeing_loops
 from recon.places.places import (
     VIEW_DEG,
@@ -26,12 +26,13 @@ from recon.places.places import (
     most_alike,
     reach_of,
 )
-from recon.places.verify import Verdict, coarse_points, verify
+from recon.places.verify import Verdict, verify
 
 CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""
 _SEEN_SHARE: Final = 0.75
-"""Share of what the last keyframe saw from which on a view is no new one."""
+"""Share of what either of a view and the last keyframe shows, and the other can see, from which on
+the view is no new one."""
 
 _HERE: Final = (3, 3)
 """Loops of a keyframe that are enough, and how many more candidates may fail, where it is compared
@@ -104,11 +105,12 @@ class LoopDetector:
     ) -> tuple[Loop, ...]:
         """Add the next frame; return its verified loops, which ``loops`` keeps as well.
 
-        A frame is a keyframe if it sees enough that the last one did not, or another stretch of the
-        drive begins; not one that was not matched, or with a pose that is not trusted, of stretch
-        -1. ``path_m`` is the path up to it, by `path_lengths`.
+        A frame is a keyframe if it sees enough that the last one did not, or too little of what
+        that did, or another stretch of the drive begins; not one that was not matched, or with a
+        pose that is not trusted, of stretch -1. ``path_m`` is the path up to it, by `path_lengths`.
         """
-        if stretch < 0 or not disparity.valid.any() or not self._is_new(T_world_camera, stretch):
+        seen = stretch >= 0 and bool(disparity.valid.any())
+        if not seen or not self._is_new(disparity, T_world_camera, stretch):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
         return self.look(StoredKeyframe(keyframe, T_world_camera, path_m, stretch))
@@ -147,17 +149,25 @@ class LoopDetector:
         pose = stored.T_world_camera
         return Place(keyframe.frame, pose, stored.path_m, stored.stretch, reach_m, words)
 
-    def _is_new(self, T_world_camera: Float64, stretch: int) -> bool:
-        """Whether a view shows enough that the last keyframe did not."""
+    def _is_new(self, disparity: Disparity, T_world_camera: Float64, stretch: int) -> bool:
+        """Whether a view shows enough that the last keyframe did not, or the other way round."""
         last = self._last
         if last is None or last.stretch != stretch:
             return True
-        T = invert(T_world_camera) @ last.T_world_camera
-        u, v, _ = project(apply(T, coarse_points(last.keyframe, self._camera)), self._camera)
-        width, height = self._camera.width_px, self._camera.height_px
+        T_last_new = invert(last.T_world_camera) @ T_world_camera
+        shares = (
+            self._share_in_view(coarse_of(disparity), T_last_new),
+            self._share_in_view(last.keyframe.coarse, invert(T_last_new)),
+        )
+        return min(shares) < _SEEN_SHARE
+
+    def _share_in_view(self, coarse: Float32, T: Float64) -> float:
+        """Return the share of what one view shows that another one can see."""
+        camera = self._camera
+        u, v, _ = project(apply(T, coarse_points(coarse, camera)), camera)
         with np.errstate(invalid="ignore"):
-            inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        return not inside.size or float(inside.mean()) < _SEEN_SHARE
+            inside = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
+        return float(inside.mean()) if inside.size else 0.0
 
     def _compared(self, new: StoredKeyframe) -> StoredKeyframe:
         """The keyframe with its loops to the candidates that are verified."""

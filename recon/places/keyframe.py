@@ -91,9 +91,29 @@ def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyf
     uv = uv[chosen]
     descriptors = _signs(np.zeros((0, 128), np.float32) if sifts is None else sifts[chosen])
     uvd = np.column_stack([uv, _disparity(disparity, uv, pair.camera)])
+    return Keyframe(frame, uvd.astype(np.float32), descriptors, coarse_of(disparity))
+
+
+def coarse_of(disparity: Disparity) -> Float32:
+    """Return every n-th disparity of every n-th row."""
     sampled = np.s_[_COARSE_PX // 2 :: _COARSE_PX]
-    coarse = np.ascontiguousarray(disparity.values[sampled, sampled])
-    return Keyframe(frame, uvd.astype(np.float32), descriptors, coarse)
+    return np.ascontiguousarray(disparity.values[sampled, sampled])
+
+
+def coarse_grid(coarse: Float32, camera: RectifiedCamera) -> tuple[int, int]:
+    """Pixels between coarse samples, and the place of the first."""
+    rows = coarse.shape[0]
+    step = max(1, round(camera.height_px / rows)) if rows else 1
+    return step, step // 2
+
+
+def coarse_points(coarse: Float32, camera: RectifiedCamera) -> Float64:
+    """Points (N, 3) in camera axes of the coarse samples that have a disparity."""
+    row, column = np.nonzero(coarse + camera.doffs_px > 1.0)
+    step, half = coarse_grid(coarse, camera)
+    d = coarse[row, column]
+    uvd = np.column_stack([column * step + half, row * step + half, d]).astype(np.float64)
+    return points_of(uvd, camera)
 
 
 def _reduced(image: UInt8) -> tuple[UInt8, Float32]:

@@ -41,7 +41,7 @@ LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
 
 MIN_AGREEING: Final = 3  # loops that must agree, no two between the same keyframes
 _NEAR_M: Final = 12.0  # path within which neighbouring loops are compared
-_MAJORITY: Final = 2  # loops that confirm one, for each that contradicts it
+_MAJORITY: Final = 2  # keyframes whose loops confirm one, for each whose loop contradicts it
 
 
 def agreeing_loops(
@@ -64,11 +64,13 @@ def agreeing_loops(
         firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
         near = np.flatnonzero((lasts_m <= _NEAR_M) & (between == between[number]).all(axis=1))
         rings = {k: _closes(loop, loops[k], poses) for k in near.tolist()}
-        against = sum(not closes for closes in rings.values())
+        # Counted by keyframes: how many views of a place each finds is chance.
+        against = {loops[k].last for k, closes in rings.items() if not closes}
         # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
         same = [loops[k] for k, closes in rings.items() if closes and firsts_m[k] <= _NEAR_M]
-        confirmed = len(same) >= max(MIN_AGREEING, _MAJORITY * against)
-        if confirmed and len({other.last for other in same}) >= keyframes:
+        behind = {other.last for other in same}
+        enough = max(keyframes, _MAJORITY * len(against))
+        if len(same) >= MIN_AGREEING and len(behind) >= enough:
             agreeing.append(loop)
     return agreeing
 

@@ -184,7 +184,7 @@ class WordIndex:
         count = len(self._sizes)
         ranges = [run.find(words) for run in self._runs]
         having = sum((end - begin for begin, end in ranges), np.zeros(len(words), np.intp))
-        weight = np.log((count + 1.0) / np.maximum(having, 1)) / math.log(count + 1.0)
+        weight = np.log((count + 1.0) / np.maximum(having, 1)) / math.log(max(count, 1) + 1.0)
         shared = np.zeros(count)
         for run, found in zip(self._runs, ranges, strict=True):
             shared[run.first : run.first + run.count] = run.shared(*found, weight)

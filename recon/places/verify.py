@@ -14,7 +14,13 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.camera import project
 from recon.places.align import MIN_INLIERS, Alignment, Seen, find_motion, settle
-from recon.places.keyframe import Keyframe, feature_sigma_px, points_of
+from recon.places.keyframe import (
+    Keyframe,
+    coarse_grid,
+    coarse_points,
+    feature_sigma_px,
+    points_of,
+)
 from recon.places.loop import Loop
 
 _CELLS: Final = 4
@@ -145,8 +151,10 @@ def dense_agreement(
     hardly overlap.
     """
     return min(
-        _confirmed(coarse_points(last, last_camera), first, T_first_last, first_camera),
-        _confirmed(coarse_points(first, first_camera), last, invert(T_first_last), last_camera),
+        _confirmed(coarse_points(last.coarse, last_camera), first, T_first_last, first_camera),
+        _confirmed(
+            coarse_points(first.coarse, first_camera), last, invert(T_first_last), last_camera
+        ),
     )
 
 
@@ -155,7 +163,7 @@ def _confirmed(
 ) -> float:
     """The share of points of another frame that the target sees where they should be."""
     u, v, d = project(apply(T_target_source, xyz), camera)
-    step, half = _grid(target, camera)
+    step, half = coarse_grid(target.coarse, camera)
     off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
     tolerance = _DENSE_TOLERANCE_PX + _DENSE_TOLERANCE_SHARE * np.abs(d)
     with np.errstate(invalid="ignore"):
@@ -177,22 +185,6 @@ def _interpolated(values: Float32, column: Float64, row: Float64) -> Float64:
     upper = (1 - x) * values[i, j] + x * values[i, j1]
     lower = (1 - x) * values[i1, j] + x * values[i1, j1]
     return np.where(inside, (1 - y) * upper + y * lower, np.nan)
-
-
-def _grid(keyframe: Keyframe, camera: RectifiedCamera) -> tuple[int, int]:
-    """Pixels between coarse samples, and the place of the first."""
-    rows = keyframe.coarse.shape[0]
-    step = max(1, round(camera.height_px / rows)) if rows else 1
-    return step, step // 2
-
-
-def coarse_points(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
-    """Points (N, 3) in camera axes of the coarse samples that have a disparity."""
-    row, column = np.nonzero(keyframe.coarse + camera.doffs_px > 1.0)
-    step, half = _grid(keyframe, camera)
-    d = keyframe.coarse[row, column]
-    uvd = np.column_stack([column * step + half, row * step + half, d]).astype(np.float64)
-    return points_of(uvd, camera)
 
 
 def _spread(seen: Seen) -> int:

@@ -12,6 +12,8 @@ import pytest
 
 from recon.core.geometry import se3
 from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
+from recon.odometry.protocol import OdometryHealth
+from recon.places.closure import DrivePath
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.loop import Loop
@@ -67,14 +69,17 @@ class Filmed:
     def keyframe(self, index: int) -> Keyframe:
         return make_keyframe(index, *self.frame(index))
 
-    def detect(self, frames, path: Trajectory, lost=()):
-        """A detector that has seen some frames, their poses being those of ``path``."""
-        trusted = ~np.isin(np.arange(len(path)), list(lost))
-        path_m = path_lengths(path.T_world_camera, trusted)
-        detector = LoopDetector(KeyframeMemory())
+    def detect(self, frames, path: Trajectory, stretches=None):
+        """A detector that has seen some frames, and the path up to each frame.
+
+        ``stretches`` has those of frames that are not of stretch 0.
+        """
+        stretch = [(stretches or {}).get(k, 0) for k in range(len(path))]
+        path_m = path_lengths(path.T_world_camera, np.array(stretch) >= 0)
+        detector = LoopDetector(KeyframeMemory(), self.camera.world.camera)
         for k in frames:
             pose = path.T_world_camera[k]
-            detector.add(k, *self.frame(k), pose, path_m=path_m[k], trusted=bool(trusted[k]))
+            detector.add(k, *self.frame(k), pose, path_m=path_m[k], stretch=stretch[k])
         return detector, path_m
 
 
@@ -99,6 +104,11 @@ def drifted(truth: Trajectory, *, share: float, turn_deg_per_m: float) -> Trajec
         longer = se3.make_transform(step[:3, :3] @ turn, step[:3, 3] * (1.0 + share))
         poses.append(poses[-1] @ longer)
     return Trajectory(np.stack(poses), truth.timestamps_s)
+
+
+def drive_path(path: Trajectory) -> DrivePath:
+    """A path that odometry measured without a break."""
+    return DrivePath.of(path, [OdometryHealth(ok=True)] * len(path))
 
 
 INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)

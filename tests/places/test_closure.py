@@ -10,10 +10,11 @@ import pytest
 from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
+from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import DrivePath, Tie, close_loops, join_drives
 from recon.places.loop import Loop, agreeing_loops
 from recon.places.places import Drift, drift_over, is_possible, path_lengths
-from tests.places.conftest import INFORMATION, drifted, true_loop
+from tests.places.conftest import INFORMATION, drifted, drive_path, true_loop
 
 LAP = 200
 
@@ -38,12 +39,8 @@ def loops(truth) -> list[Loop]:
     return [true_loop(truth, k, LAP + k) for k in range(0, 20, 2)]
 
 
-def _path_m(path: Trajectory) -> np.ndarray:
-    return path_lengths(path.T_world_camera, np.ones(len(path), np.bool_))
-
-
 def _close(odometry: Trajectory, loops: list[Loop]):
-    return close_loops(odometry, _path_m(odometry), loops)
+    return close_loops(drive_path(odometry), loops)
 
 
 def _end_error_m(path: Trajectory, truth: Trajectory) -> float:
@@ -145,7 +142,7 @@ def test_a_drive_with_known_poses_keeps_its_shape(truth, odometry, known):
         for sure in known
     ]
     drives = [
-        DrivePath(path, np.zeros(len(path)) if sure else _path_m(path))
+        DrivePath.of(path, [OdometryHealth(ok=True, known=sure)] * len(path))
         for path, sure in zip(paths, known, strict=True)
     ]
     off = noise.normal(0.0, [0.02] * 3 + [0.001] * 3, (12, 6))
@@ -164,12 +161,31 @@ def test_a_drive_with_known_poses_keeps_its_shape(truth, odometry, known):
     assert np.linalg.norm(apart_m, axis=1)[: ties[-1].loop.last].max() < 0.1
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_break_is_bridged_by_three_loops_and_by_no_fewer(truth, count):
+    """At frame 150 odometry begins anew, elsewhere; at 210 once more, and nothing is seen again."""
+    poses, begins = truth.T_world_camera.copy(), (150, 210)
+    for frame in begins:
+        poses[frame:] = se3.as_transform(np.array([30.0, 5.0, 0.0, 0.0, 1.0, 0.0])) @ poses[frame:]
+    health = [OdometryHealth(begins=k in begins) for k in range(len(truth))]
+    path = DrivePath.of(replace(truth, T_world_camera=poses), health)
+    loops = tuple(true_loop(truth, k, LAP + k) for k in range(0, 3 * count, 3))
+    closure = close_loops(path, loops)
+    if count < 3:
+        assert (closure.trajectory, closure.refused) == (path.trajectory, loops)
+    else:
+        off_m = np.linalg.norm(closure.trajectory.positions_m - truth.positions_m, axis=1)
+        assert closure.closed == loops
+        assert off_m[:210].max() < 0.01
+        assert off_m[210:].min() > 10.0
+
+
 HOUSE_M = 8  # from one house to the next, alike one
 
 
 def _agreeing(odometry: Trajectory, loops: list[Loop]) -> list[Loop]:
     poses = {
-        frame: (odometry.T_world_camera[frame], float(odometry.distances_m[frame]))
+        frame: (odometry.T_world_camera[frame], float(odometry.distances_m[frame]), 0)
         for loop in loops
         for frame in (loop.first, loop.last)
     }
@@ -214,7 +230,7 @@ def test_loops_to_anywhere_bend_nothing(odometry, truth, seed):
         for k, first in zip(range(1, 24, 6), rng.integers(0, 24, 4), strict=True)
     ]
     believed = _agreeing(odometry, [*right, *wrong])
-    closure = close_loops(odometry, odometry.distances_m, believed)
+    closure = _close(odometry, believed)
     assert not set(map(id, wrong)) & set(map(id, closure.closed))
     before, after = (
         np.linalg.norm(path.positions_m - truth.positions_m, axis=1).max()

@@ -8,9 +8,9 @@ import pytest
 from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import Trajectory
-from recon.places.closure import DrivePath, JoinedDrives, join_drives
+from recon.places.closure import JoinedDrives, join_drives
 from recon.places.fixes import NO_FIXES, Fixes, Held
-from recon.places.places import path_lengths
+from tests.places.conftest import drive_path
 
 T_SURVEY_WORLD = make_transform(exp_so3(np.array([0.1, 2.0, -0.3])), np.array([30.0, -8.0, 5.0]))
 ANTENNA_M = np.array([0.5, -1.2, -0.4])
@@ -37,10 +37,9 @@ def measured(truth: Trajectory, sigma_m: float, every: int = 5) -> Fixes:
 
 
 def held(odometry: Trajectory, fixes: Fixes) -> JoinedDrives | None:
-    path_m = path_lengths(odometry.T_world_camera, np.ones(FRAMES, np.bool_))
     # About where the survey is: half a degree and a metre off.
     about = invert(T_SURVEY_WORLD) @ make_transform(exp_so3(np.full(3, 0.005)), np.ones(3))
-    return join_drives([DrivePath(odometry, path_m)], [], Held(about, [fixes]))
+    return join_drives([drive_path(odometry)], [], Held(about, [fixes]))
 
 
 def bend_m(path: Trajectory, truth: Trajectory) -> float:

@@ -26,7 +26,7 @@ from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import Submap, SubmapSettings
-from recon.odometry.health import StretchCounter
+from recon.odometry.checked import StretchCounter
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.run.work import OneBehind, Stopwatch
 from recon.stereo.frame import ReconstructedFrame

@@ -60,7 +60,7 @@ def break_warnings(sessions: Sequence[DriveSession]) -> list[str]:
     """Return what to know first of all about a drive whose odometry was lost."""
     if len(sessions) < 2:
         return []
-    into = f"the path breaks into {len(sessions)} sessions"
+    into = f"the path breaks into {counted(len(sessions), 'session')}"
     apart = [session for session in sessions if not session.joined]
     if not apart:
         return [f"{into}, which places that were seen again join"]

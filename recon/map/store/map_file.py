@@ -145,7 +145,8 @@ class MapFile:
         to the longest one of the first drive. Behind a lost pose odometry guesses, and a guess does
         not enter the map. Only these frames are in products, and to be recognised.
         """
-        sessions = self.linked
+        if not (sessions := self.linked):
+            return {}
         of = {session.number: stretches(session.health) for session in sessions}
         ties, first = [*_ties(sessions, self.links, of)], sessions[0].number
         held = {(first, int(np.bincount(of[first] + 1, minlength=2)[1:].argmax()))}
