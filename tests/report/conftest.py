@@ -128,7 +128,9 @@ def drive(request):
         loops={},
     )
     return SimpleNamespace(
-        map_=SimpleNamespace(first=session),
+        map_=SimpleNamespace(
+            first=session, joined=lambda one: np.ones(len(one.trajectory), np.bool_)
+        ),
         made=given,
         errors=DriveErrors(METRICS, None, None, true_path=given.trajectory),
         sample=given,

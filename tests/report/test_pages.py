@@ -314,8 +314,9 @@ def test_notes_of_the_odometry_and_paths_in_the_axes_of_the_cloud_are_shown(driv
     assert high == pytest.approx(10.0, abs=0.3)
     assert rows(blocks(map_html(drive))["Notes of the odometry"]) == [("5", "too few <tracks>")]
     poses = np.tile(np.eye(4), (23, 1, 1))
-    drive.map_.first.trajectory = Trajectory(poses, np.arange(23.0))
-    drive.map_.first.health = [OdometryHealth(ok=False)] * 23
+    session = drive.map_.first
+    session.trajectory = session.odometry = Trajectory(poses, np.arange(23.0))
+    session.health = [OdometryHealth(ok=False)] * 23
     notes = blocks(map_html(drive))["Notes of the odometry"]
     assert len(rows(notes)) == 20
     assert "The first 20 of 23." in notes
