@@ -132,7 +132,7 @@ def run_map(
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
         drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_share)
         doubts = [*rig.warnings(findings), *_warnings(source, mapped, drift)]
-        breaks = break_warnings(mapped.sessions)
+        breaks = break_warnings(mapped)
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
         warnings = [*first, *breaks, *findings, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})

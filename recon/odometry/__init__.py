@@ -4,11 +4,10 @@
   known poses as one of them;
 - `visual.py`: features, found again from other positions (`features.py`), give a pose, adjusted in
   a short window of frames (`pose.py`);
-- `rig/`: the rig as the motion of a drive shows it, before the drive is mapped;
 - `sfm/`: structure from motion, for pairs in any order, by COLMAP;
 - `checked.py`: poses that cannot be trusted are marked, by all patches of the image;
 - `health.py`: what that says of a drive, and how far its path may be off;
-- `rig/`: the rig as the motion of a drive shows it;
+- `rig/`: the rig as the motion of a drive shows it, before the drive is mapped;
 - `kiss.py`: clouds registered over time, from where the features put the camera, also in a finished
   map (`recon.map.localize`);
 - `prior.py`: what wheels or an inertial unit say; `prior_axes.py`: in which axes.

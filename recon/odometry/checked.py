@@ -56,6 +56,8 @@ class CheckedOdometry:
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         result, state = self._odometry.register(frame), self._state
+        if state is None and not result.health.ok:
+            return result
         sight = Sight(frame.pair.left, frame.disparity)
         self._state = CheckedState(sight, result.T_world_camera)
         if state is None or not result.health.ok or result.health.begins:

@@ -44,6 +44,7 @@ from recon.stereo.rectify.features import match_features
 
 _FRAMES: Final = 6  # frames adjusted together
 _RELOCATE_FEATURES: Final = 2000  # features matched over the whole image where tracking fails
+_NOTHING: Final = "nothing to follow in the image"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +92,7 @@ class VisualOdometry:
         """
         state = self._state
         if state is None:
-            motion = Motion(np.eye(4), frame.pair.timestamp_s)
-            self._state = self._begin(frame, motion)
-            return VisualEstimate(OdometryResult(np.eye(4), OdometryHealth()), None)
+            return self._first(frame)
         time_s = frame.pair.timestamp_s
         prior_motion = self._prior_motion(state.motion.timestamp_s, time_s)
         motion = state.motion.drifted(time_s)
@@ -141,6 +140,17 @@ class VisualOdometry:
                 Motion(**last["motion"]),
                 float(last["seen_s"]),
             )
+
+    def _first(self, frame: OdometryFrame) -> VisualEstimate:
+        """Begin the path at a frame with enough features; those before it are skipped."""
+        begun = self._begin(frame, Motion(np.eye(4), frame.pair.timestamp_s))
+        points, health = len(begun.window.xyz_world), OdometryHealth()
+        if points >= MIN_INLIERS:
+            self._state = begun
+        else:
+            note = f"lost: {_NOTHING} ({counted(points, 'feature')}); skipped"
+            health = OdometryHealth(ok=False, skipped=True, notes=(note,))
+        return VisualEstimate(OdometryResult(np.eye(4), health), None)
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
         window = replenish(empty_window(motion.T_world_camera), frame)
@@ -227,7 +237,7 @@ class VisualOdometry:
         points = len(begun.window.xyz_world)
         sees = points >= MIN_INLIERS
         self._state = begun if sees else replace(state, motion=motion)
-        why = f"{what if sees else 'nothing to follow in the image'} ({counted(points, 'feature')})"
+        why = f"{what if sees else _NOTHING} ({counted(points, 'feature')})"
         if prior_motion is None or self._prior is None:
             notes = (f"lost: {why}; {'the path begins anew' if sees else 'skipped'}",)
             health = OdometryHealth(ok=sees, skipped=not sees, begins=sees, notes=notes)

@@ -39,7 +39,7 @@ def test_an_empty_frame_goes_with_visual_odometry_and_an_empty_drive_stays(blind
     odometry = kiss.KissOdometry(30.0, VisualOdometry())
     results = [odometry.register(blind()) for _ in range(3)]
     assert all(np.array_equal(result.T_world_camera, np.eye(4)) for result in results)
-    assert [result.health.ok for result in results] == [True, False, False]
+    assert not any(result.health.ok for result in results)
 
 
 def test_selected_points_lie_on_the_street_within_range_and_accuracy(see, monkeypatch):

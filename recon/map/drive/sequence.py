@@ -56,20 +56,6 @@ class DriveSession:
     joined: bool  # whether it is in the map: places that were seen again say where it lies
 
 
-def break_warnings(sessions: Sequence[DriveSession]) -> list[str]:
-    """Return what to know first of all about a drive whose odometry was lost."""
-    if len(sessions) < 2:
-        return []
-    into = f"the path breaks into {counted(len(sessions), 'session')}"
-    apart = [session for session in sessions if not session.joined]
-    if not apart:
-        return [f"{into}, which places that were seen again join"]
-    lost, frames = sum(one.frames for one in apart), sum(one.frames for one in sessions)
-    named = name_frames([n for one in apart for n in range(one.first, one.last + 1)])
-    why = f"nothing that was seen again says where {len(apart)} of them lie ({named})"
-    return [f"{into.upper()}: {why}; {lost} of {counted(frames, 'frame')} are not in the map"]
-
-
 @dataclass(frozen=True, eq=False)
 class MappedSequence:
     """A drive whose map is made: the map itself, and what it cost and looked like.
@@ -169,6 +155,25 @@ class MappedSequence:
     def voxels(self) -> OccupancyVoxels:
         """The whole 3-D occupancy, map axes; for long drives, see `tiles`."""
         return join_voxels((tile.voxels for tile in self.tiles), self.tiles.resolution_m)
+
+
+def break_warnings(mapped: MappedSequence) -> list[str]:
+    """Return what to know first of all about a drive whose odometry was lost."""
+    sessions = mapped.sessions
+    if len(sessions) < 2:
+        return []
+    into = f"the path breaks into {counted(len(sessions), 'session')}"
+    apart = [session for session in sessions if not session.joined]
+    if not apart:
+        return [f"{into}, which places that were seen again join"]
+    lost, frames = sum(one.frames for one in apart), sum(one.frames for one in sessions)
+    named = name_frames([n for one in apart for n in range(one.first, one.last + 1)])
+    lie = "one of them lies" if len(apart) == 1 else f"{len(apart)} of them lie"
+    why = f"nothing that was seen again says where {lie} ({named})"
+    way_on = "" if mapped.sfm else "; recon map --odometry sfm takes frames in any order"
+    return [
+        f"{into.upper()}: {why}; {lost} of {counted(frames, 'frame')} are not in the map{way_on}"
+    ]
 
 
 def map_sequence(

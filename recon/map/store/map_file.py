@@ -178,7 +178,8 @@ class MapFile:
             lines += [of + line for line in doubt_about(session.health)]
             apart = np.flatnonzero(session.trusted & ~placed[session.number]).tolist()
             if apart:
-                why = "lie beyond a break, and nothing that was seen again says where"
+                lie = "lies" if len(apart) == 1 else "lie"
+                why = f"{lie} beyond a break, and nothing that was seen again says where"
                 left_out = "not in cloud, grid, OctoMap and mesh, nor to be recognised"
                 lines.append(f"{of}{name_frames(apart)} {why}: {left_out}")
         return lines

@@ -3,7 +3,7 @@
 The system is sparse, because a point connects only the frames that see it. So the points are
 eliminated one by one (Schur complement), which leaves a small system of the poses alone.
 
-The reference implementations in plain numpy are in `tests/odometry/kernels/bundle_reference.py`.
+The reference implementations in plain numpy are in `tests/odometry/kernels/test_bundle.py`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Where a camera drives up to a feature its patch grows, and one on the road leans too. A motion and a
 depth say how; with the patch warped accordingly, only its place is left to be found.
 
-The reference implementation in plain numpy is `tests/odometry/kernels/patches_reference.py`.
+The reference implementation in plain numpy is `tests/odometry/kernels/test_patches.py`.
 """
 
 from __future__ import annotations
