@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from recon.sources.source import StereoSource
 
 
+def _length(text: str) -> dict[str, Any]:
+    numbers = opt.parse_numbers(text, "--length") or ()
+    return {"source.length": list(numbers)}
+
+
 @opt.takes_groups
 def map_(
     source: Annotated[Path | None, typer.Argument(help=opt.SOURCES_HELP)] = None,
@@ -49,6 +54,15 @@ def map_(
             "Trajectory of wheels, an IMU or GNSS that guides the odometry: a TUM file on the "
             "clock of the images, or a topic of the bag, such as /odom.",
             metavar="FILE|TOPIC",
+        ),
+    ] = None,
+    length: Annotated[
+        str | None,
+        opt.setting(
+            _length,
+            "Two frames, counted from 0, and metres between the left camera in them, by a tape or "
+            "GNSS: they show the baseline, which scales the map.",
+            metavar="A,B,METRES",
         ),
     ] = None,
     mesh: opt.Mesh = True,
@@ -81,6 +95,7 @@ def map_(
       recon map photos --odometry sfm
       recon map rides/today --prior wheels.txt
       recon map drive.bag --prior /odom
+      recon map rides/today --length 0,143,118.3
       recon map --resume outputs/kitti06
       recon map rides/long --workers 4
       recon map rides/tomorrow --into outputs/map/latest

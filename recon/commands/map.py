@@ -20,7 +20,13 @@ from recon.core.errors import (
     SettingsError,
 )
 from recon.core.text import counted
-from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
+from recon.core.values import (
+    OccupancyGrid,
+    PointCloud,
+    Trajectory,
+    TrajectoryMetrics,
+    TriangleMesh,
+)
 from recon.evaluation.map_comparison import DriveErrors, compare_with_truth
 from recon.export.make import Products, make
 from recon.export.product import Order
@@ -33,6 +39,8 @@ from recon.map.map import Map
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
+from recon.odometry.prior import MotionPrior
+from recon.odometry.rig.length import check_length, see_baseline
 from recon.odometry.rig.refine import KnownRig, RefinedRig, refine_rig
 from recon.odometry.sfm.find import check_sfm
 from recon.report.map_page import map_content
@@ -114,7 +122,7 @@ def run_map(
         with_resume_hint(run, source),
         options.begin(run, source, config) as map_,
     ):
-        rig = refine_drive(source, config, run)
+        rig = refine_drive(source, config, run, prior=options.prior)
         if config.rig.refine:
             map_.session().set_rig(rig)
         source = rig.applied(source)
@@ -165,11 +173,22 @@ RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of the ru
 
 
 def refine_drive(
-    source: StereoSource, config: ReconConfig, run: Run, known: KnownRig | None = None
+    source: StereoSource,
+    config: ReconConfig,
+    run: Run,
+    known: KnownRig | None = None,
+    prior: Trajectory | None = None,
 ) -> RefinedRig:
     """Refine the rig of a drive; the folder of the run gets its calibration."""
+    guide = None if prior is None else MotionPrior(prior, config.odometry.prior)
+    measured = config.source.length or guide
+    if config.source.length is not None:
+        check_length(source, config.source.length)
     with run.stage("rig"):
         rig = refine_rig(source, config, config.rig, known)
+        if measured is not None:
+            seen = see_baseline(rig.applied(source), config, measured, rig.length_share)
+            rig = rig if seen is None else rig.with_baseline(seen, config.rig)
         if rig.refined:
             write_recon_calibration(run.path(RIG_FILE), rig.calibration)
         return rig

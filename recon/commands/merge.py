@@ -102,7 +102,8 @@ def run_map_into(
     def fill(run: Run, map_: Map) -> list[int]:
         _copied(folder / MAP_FILE, map_, settings)
         kept = run.state("kept.recon")
-        rig = refine_drive(source, settings, run, map_.known_rig(source.calibration))
+        known = map_.known_rig(source.calibration)
+        rig = refine_drive(source, settings, run, known, options.prior)
         with Map.create(run.state("drive.recon")) as drive:
             mapped = map_drive(rig.applied(source), settings, options, run, drive)
             check_map(mapped, source.name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -12,6 +12,8 @@ from recon.core.errors import SourceError
 from recon.core.settings import Settings
 from recon.io.files import StrPath
 from recon.io.images.image import MAX_MEGAPIXELS
+
+_Frame = Annotated[int, Field(ge=0, le=1_000_000_000)]
 
 
 class SourceSettings(Settings):
@@ -56,6 +58,10 @@ class SourceSettings(Settings):
     """By how many frames the right camera is late: the left image of a frame is paired with the
     right one of so many frames later. Times, ground truth and known poses stay those of the left
     images. Negative = the left camera is late."""
+    length: tuple[_Frame, _Frame, Annotated[float, Field(ge=1e-6, le=1e6)]] | None = None
+    """Two frames of those used, counted from 0, and how far apart the left camera was in them,
+    metres, such as [0, 143, 118.3]: it shows the baseline, and with it the scale. none = the
+    baseline as calibrated."""
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = "left-right"
     """Arrangement of the two views in the frames of one video."""
 

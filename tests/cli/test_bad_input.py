@@ -101,6 +101,8 @@ def test_an_unwritable_output_folder_is_refused(drive, tmp_path):
         ("--set=matching.sad.no_such_setting=1", "", "no_such_setting"),
         ("--set=matching.sad.window_px=-3", "", "window_px"),
         ("--set=nonsense", "", "key=value"),
+        ("--length=0,2", "", "source.length"),
+        ("--length=0,9999,3", "", "no such frames"),
     ],
 )
 def test_wrong_poses_priors_and_settings_are_refused(good_drive, tmp_path, option, content, word):

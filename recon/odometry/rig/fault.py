@@ -4,7 +4,7 @@ The right camera is turned in place and its image enlarged, and both lenses bend
 calibrated. On all drives of KITTI that were tried the lenses are most of it; without their prisms
 (s1 to s4), a path becomes up to 2 % too short.
 
-What no motion shows is the baseline, and with it the scale of the map.
+What no motion shows is the baseline, and with it the scale of the map: see `length.py`.
 """
 
 from __future__ import annotations

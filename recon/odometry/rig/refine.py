@@ -21,6 +21,7 @@ from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
+from recon.odometry.rig.length import SeenBaseline
 from recon.odometry.rig.tracks import FRAMES, plan_stretches, track_stretches
 from recon.odometry.settings import RigSettings
 from recon.run.run import plain
@@ -87,6 +88,7 @@ class RefinedRig:
     sigma_px: float = float("nan")  # of the mean disparity
     begun_with: str | None = None  # the drive whose rig this one began with
     period_s: float = float("nan")  # of frames; NaN = not known
+    baseline: SeenBaseline | None = None  # None: no length was measured
 
     @property
     def refined(self) -> bool:
@@ -97,17 +99,24 @@ class RefinedRig:
     def length_share(self) -> float | None:
         """Standard deviation of the length of the path that is left to the rig used, as a share.
 
-        Without the baseline, which no motion shows; None if nothing was measured.
+        Without the baseline, unless lengths that were measured changed it; None if nothing was.
         """
         if self.fitted is None:
             return None
         by, squares = self.fitted.stretch, self.fitted.covariance
         kept = 0.0 if self.refined else float(by @ self.fitted.values)
-        return float(np.hypot(np.sqrt(by @ squares @ by), kept))
+        wider = self.baseline.sigma if self.baseline is not None and self.baseline.share else 0.0
+        return float(np.sqrt(by @ squares @ by + kept**2 + wider**2))
 
     def applied(self, source: StereoSource) -> StereoSource:
         """Return the drive with the refined rig."""
         return source.with_calibration(self.calibration) if self.refined else source
+
+    def with_baseline(self, seen: SeenBaseline, settings: RigSettings) -> RefinedRig:
+        """Return the rig with the baseline that lengths show; if it is to be kept, it says so."""
+        use = settings.refine and seen.share != 0.0
+        rig = seen.applied(self.calibration) if use else self.calibration
+        return replace(self, calibration=rig, baseline=seen)
 
     def poses(self, given: Trajectory, settings: RectificationSettings) -> Trajectory:
         """Return poses of the rectified left camera as given for the refined one."""
@@ -155,8 +164,9 @@ class RefinedRig:
 
         A depth error that is None is infinite.
         """
+        lengths = {} if self.baseline is None else {"baseline": self.baseline.figures()}
         if self.fitted is None:
-            return {"refined": False}
+            return {"refined": self.refined, **lengths}
         values, sigmas = self.fitted.values, np.sqrt(np.diag(self.fitted.covariance))
         rows = zip(NAMES, values, sigmas, RigFault(self.camera).sigmas, strict=True)
         percent = [self.depth_percent(change) for change in self.changes]
@@ -186,6 +196,7 @@ class RefinedRig:
                 for name, value, sigma, prior in rows
             },
             "not_visible": "baseline",
+            **lengths,
         }
         return dict(plain(figures))
 
@@ -201,6 +212,8 @@ class RefinedRig:
         late = f"right images are taken {self.late} {LATER}: what moves is seen at a wrong depth, "
         late += "which no calibration mends; trigger both cameras together"
         lines = [late] if self.late and not any(LATER in line for line in known) else []
+        if self.baseline is not None and self.baseline.share:
+            lines.append(self.baseline.describe(used=self.refined))
         if not self.wrong_at(DEPTHS_M[0]):
             return lines
         shows = "the motion shows" if self.begun_with is None else f"{self.begun_with} showed"
