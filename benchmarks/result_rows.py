@@ -107,6 +107,14 @@ def rig_intervals(found: Found) -> Rows:
     }
 
 
+def pair_meshes(found: Found) -> Rows:
+    return {
+        f"{scene}, `{way}`": figures
+        for scene, ways in found["scenes"].items()
+        for way, figures in ways.items()
+    }
+
+
 def occupancy(found: Found) -> Rows:
     return {f"street {seed}": one for seed, one in found["streets"]["streets"].items()}
 

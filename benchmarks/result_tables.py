@@ -174,6 +174,19 @@ TABLES: Final[dict[str, Table]] = {
         | {"within one sigma": "{:.0f} %", "within two": "{:.0f} %"},
         rows_of.confidence,
     ),
+    "pair-meshes": Table(
+        {
+            "scenes": "python benchmarks/pair_meshes.py --json "
+            + " ".join(
+                f"$RECON_DATA/middlebury/MiddEval3/trainingQ/{name}"
+                for name in ("Motorcycle", "Playroom", "Piano", "Recycle")
+            )
+        },
+        {"covered": SHARE, "within 1 px": SHARE, "mean": "{:.2f} px", "95 %": "{:.1f} px"}
+        | {"faces": "{:,}", "not manifold": "{}", "seconds": "{:.1f}"},
+        rows_of.pair_meshes,
+        timed=True,
+    ),
     "movers": Table(
         {
             "seed 4": "python benchmarks/movers.py --seed 4",

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile
-from typing import Any
+from typing import Any, Final
 
-from recon.core.errors import MeshingError
-from recon.core.values import Disparity, RectifiedCamera, TriangleMesh
-from recon.core.values.camera import depth_from_disparity
+import numpy as np
+
+from recon.core.errors import FormatError, MeshingError
+from recon.core.values import Disparity, PointCloud, RectifiedCamera, Texture, TriangleMesh
+from recon.core.values.arrays import UInt8
+from recon.core.values.camera import depth_from_disparity, project
 from recon.core.values.cloud import Frame
-from recon.export.mesh.pieces import LAYER, WHOLE, in_other_formats
+from recon.export.mesh.grid import check_coverage, mesh_coverage, mesh_grid
+from recon.export.mesh.pieces import LAYER, WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
-from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
 from recon.io.atomic import atomic_path
 from recon.io.files import naming, reading
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
-from recon.io.images.image import write_image
+from recon.io.images.image import read_image, write_image
 from recon.io.models.mesh import write_mesh
 from recon.io.models.mlp import Photo, write_mlp
 from recon.io.models.ply import read_ply, write_ply
@@ -25,6 +29,8 @@ from recon.run.directory import RunDirectory
 from recon.run.finished import PAIR_CLOUD, camera_of_pair
 from recon.run.run import Run
 from recon.stereo.frame import ReconstructedFrame
+
+_PHOTO: Final = "left.png"  # the left image, beside the mesh
 
 
 def mesh_frame(
@@ -36,11 +42,28 @@ def mesh_frame(
         The surface in camera axes, or None; the share of the points that lie on it; warnings.
     """
     try:
-        mesh = reconstruct_view(frame.cloud, frame.pair.camera, settings)
+        mesh = _surface(frame.cloud, frame.pair.camera, settings, frame.pair.colours)
         coverage = mesh_coverage(mesh, frame.cloud)
     except MeshingError as error:
         return None, None, (f"no mesh: {error}",)
     return mesh, coverage, check_coverage(coverage)
+
+
+def _surface(
+    cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings, image: UInt8 | None
+) -> TriangleMesh:
+    """Mesh the cloud of a pair, and colour it by the left image if that is known."""
+    if settings.pair_surface == "grid":
+        mesh = mesh_grid(cloud, camera, settings)
+    else:
+        mesh = reconstruct_mesh(cloud, settings, viewpoint_m=(0.0, 0.0, 0.0))
+    if image is None:
+        return mesh
+    u, v, _ = project(mesh.vertices, camera)
+    # The middle of the first pixel is half a pixel from the corner.
+    uv = np.stack([(u + 0.5) / camera.width_px, (v + 0.5) / camera.height_px], axis=1)
+    inside = np.clip(np.nan_to_num(uv), 0, 1).astype(np.float32)
+    return replace(mesh, texture=Texture(image, inside, _PHOTO))
 
 
 def write_disparity_files(disparity: Disparity, run: RunDirectory) -> float:
@@ -64,12 +87,24 @@ def write_cloud_files(
     write_pfm(run.path("disparity/depth.pfm"), depth_m)
     write_ply(run.path(PAIR_CLOUD), frame.cloud)
     if mesh is not None:
-        for suffix in dict.fromkeys(("ply", *formats)):
-            write_mesh(run.path(f"mesh/mesh.{suffix}"), mesh, "camera")
-        layers, left = {"mesh": run.path(WHOLE), "cloud": run.path(PAIR_CLOUD)}, "mesh/left.png"
-        write_image(run.path(left), frame.pair.colours)
-        photo = Photo(run.path(left), frame.pair.camera)
-        write_mlp(run.path("mesh/mesh.mlp"), layers, "camera", photo)
+        _write_surface(mesh, frame.pair.camera, run.path(PAIR_CLOUD), formats, run)
+
+
+def _write_surface(
+    mesh: TriangleMesh,
+    camera: RectifiedCamera | None,
+    cloud: Path,
+    formats: Sequence[str],
+    run: RunDirectory,
+) -> None:
+    """Write a mesh, with its texture if it is that of a camera, and a project with both."""
+    frame: Frame | None = None if camera is None else "camera"
+    for suffix in dict.fromkeys(("ply", *formats)):
+        write_mesh(run.path(f"mesh/mesh.{suffix}"), mesh, frame)
+    photo = None
+    if camera is not None and mesh.texture is not None:
+        photo = Photo(run.path(f"mesh/{mesh.texture.name}"), camera)
+    write_mlp(run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": cloud}, frame, photo)
 
 
 def mesh_cloud(
@@ -87,16 +122,27 @@ def mesh_cloud(
         if camera is None:
             mesh, coverage = reconstruct_mesh(cloud, settings), None
         else:
-            mesh = reconstruct_view(cloud, camera, settings)
+            mesh = _surface(cloud, camera, settings, _photo_of(path.parents[1], camera))
             coverage = mesh_coverage(mesh, cloud)
-    write_mesh(run.path(WHOLE), mesh)
-    frame: Frame | None = None if camera is None else "camera"
-    write_mlp(run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": run.path(LAYER)}, frame)
-    in_other_formats(run, formats, frame)
+    _write_surface(mesh, camera, run.path(LAYER), formats, run)
     figures = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     if coverage is None:
         return {**figures, "warnings": []}
     return {**figures, "mesh_coverage": coverage, "warnings": list(check_coverage(coverage))}
+
+
+def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:
+    """The left image of a run of `recon pair`, or None if that made no mesh."""
+    path = folder / "mesh" / _PHOTO
+    if not path.is_file():
+        return None
+    image = read_image(path)
+    size = (camera.height_px, camera.width_px)
+    if image.shape[:2] != size:
+        what, expected = "the image is not that of the run", f"{size[1]}x{size[0]} pixels"
+        got = f"{image.shape[1]}x{image.shape[0]}"
+        raise FormatError(what, where=path, got=got, expected=expected)
+    return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
 def export_pair(

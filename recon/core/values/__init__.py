@@ -13,6 +13,7 @@ from recon.core.values.cloud import Frame as Frame
 from recon.core.values.cloud import PointCloud as PointCloud
 from recon.core.values.cloud import RayCloud as RayCloud
 from recon.core.values.cloud import RayGrain as RayGrain
+from recon.core.values.cloud import Texture as Texture
 from recon.core.values.cloud import TriangleMesh as TriangleMesh
 from recon.core.values.cloud import join_clouds as join_clouds
 from recon.core.values.grid import FREE as FREE

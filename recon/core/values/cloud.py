@@ -86,16 +86,31 @@ def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointClou
 
 
 @dataclass(frozen=True, eq=False)
+class Texture:
+    """An image that colours a mesh."""
+
+    image: UInt8  # (H, W, 3) RGB
+    # (V, 2), right and down from its upper left corner to where each vertex is seen, from 0 to 1
+    uv: Float32
+    name: str = "texture.png"  # file name beside that of the mesh
+
+    def __post_init__(self) -> None:
+        freeze(self, "image", np.uint8, (None, None, 3))
+        freeze(self, "uv", np.float32, (None, 2))
+
+
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """A surface: vertices float32 (V, 3), metres; faces int32 (F, 3), counter-clockwise outside.
 
-    ``normals``, float32 (V, 3) unit vectors, and ``rgb``, uint8 (V, 3), may be None.
+    ``normals``, float32 (V, 3) unit vectors, ``rgb``, uint8 (V, 3), and ``texture`` may be None.
     """
 
     vertices: Float32
     faces: Int32
     normals: Float32 | None = None
     rgb: UInt8 | None = None
+    texture: Texture | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "vertices", np.float32, (None, 3))

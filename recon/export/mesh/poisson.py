@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,7 +14,7 @@ from recon.core.errors import MeshingError
 from recon.core.settings import Settings
 from recon.core.text import counted
 from recon.core.values import PointCloud, TriangleMesh
-from recon.core.values.arrays import Bool, Float32
+from recon.core.values.arrays import Bool, Float32, Int32
 from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
@@ -24,11 +24,11 @@ OVERLAP_M: Final = 3.0
 """Margin around a tile whose points its surface is fitted to as well. A tile is at least as wide as
 both margins together: in narrower ones every point would be meshed more than four times."""
 _MIN_POINTS = 50
-MIN_DEPTH = 4
+_MIN_DEPTH = 4
 _FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of their median
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
-OCTREE_SCALE = 1.1  # MeshLab's octree is this much wider than the cloud
+_OCTREE_SCALE = 1.1  # MeshLab's octree is this much wider than the cloud
 Point = tuple[float, float, float]
 _NORMALS_NEIGHBOURS: Final = 20  # neighbours for normals where the cloud has none
 
@@ -36,6 +36,9 @@ _NORMALS_NEIGHBOURS: Final = 20  # neighbours for normals where the cloud has no
 class MeshSettings(Settings):
     """How a surface is reconstructed and trimmed."""
 
+    pair_surface: Literal["grid", "poisson"] = "grid"
+    """How the surface of a pair is made: from the grid of its pixels, in a second; or by MeshLab's
+    Poisson reconstruction, as those of drives and clouds."""
     depth: int | None = Field(None, ge=4, le=12)
     """Octree depth; none = chosen by cell_spacings, up to max_depth. Each step halves the cells."""
     cell_spacings: float = Field(1.5, ge=0.1, le=20)
@@ -91,30 +94,11 @@ def reconstruct_mesh(
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
-    cloud = oriented(usable(cloud), viewpoint_m)
+    cloud = _oriented(usable(cloud), viewpoint_m)
     depth = settings.depth or _fitting_depth(cloud.xyz, settings)
-    return trimmed_surface(cloud, settings, Octree(depth), wrong)
-
-
-class Octree(NamedTuple):
-    """The grid of a surface: 2^depth cells, ``scale`` times the longest side of the cloud."""
-
-    depth: int
-    scale: float = OCTREE_SCALE
-
-
-def trimmed_surface(
-    cloud: PointCloud,
-    settings: MeshSettings,
-    octree: Octree,
-    wrong: Callable[[Float32], Bool] | None = None,
-) -> TriangleMesh:
-    """Return the Poisson surface of a cloud with unit normals, without what no points support.
-
-    ``wrong`` says which vertices (V, 3) cannot be on a surface.
-    """
+    normals = np.asarray(cloud.normals)
     vertices, faces, density = screened_poisson(
-        cloud.xyz, np.asarray(cloud.normals), octree.depth, octree.scale, settings.point_weight
+        cloud.xyz, normals, depth, _OCTREE_SCALE, settings.point_weight
     )
     supported = density >= np.quantile(density, settings.trim_density_quantile)
     if settings.max_distance_spacings is not None:
@@ -123,16 +107,23 @@ def trimmed_surface(
         supported &= ~wrong(vertices)
     vertices, faces = keep_vertices(vertices, faces, supported)
     vertices, faces = drop_small_components(vertices, faces, settings.min_component_faces)
-    if settings.target_faces is not None and len(faces) > settings.target_faces:
-        vertices, faces = open3d_meshes.decimate(vertices, faces, settings.target_faces)
-    return TriangleMesh(
-        vertices=vertices,
-        faces=faces,
-        normals=vertex_normals(vertices, faces),
-        rgb=None
-        if cloud.rgb is None
-        else cloud.rgb[open3d_clouds.nearest(vertices, cloud.xyz)[0][:, 0]],
-    )
+    rgb = None if cloud.rgb is None else cloud.rgb[_nearest(vertices, cloud.xyz)]
+    mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
+    return simplified(mesh, settings)
+
+
+def simplified(mesh: TriangleMesh, settings: MeshSettings) -> TriangleMesh:
+    """Return a mesh with about as many faces as the settings allow, if it has more."""
+    if settings.target_faces is None or len(mesh.faces) <= settings.target_faces:
+        return mesh
+    vertices, faces = open3d_meshes.decimate(mesh.vertices, mesh.faces, settings.target_faces)
+    rgb = None if mesh.rgb is None else mesh.rgb[_nearest(vertices, mesh.vertices)]
+    return TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
+
+
+def _nearest(some_xyz: Float32, xyz: Float32) -> Int32:
+    """Return int32 (N,): the nearest point of a cloud to each of some places."""
+    return open3d_clouds.nearest(some_xyz, xyz)[0][:, 0]
 
 
 def usable(cloud: PointCloud) -> PointCloud:
@@ -165,7 +156,7 @@ def _refuse_outliers(xyz: Float32) -> None:
         raise MeshingError("a point lies far from all others", got=got, hint=hint)
 
 
-def oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
+def _oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
     """Return the points that have a normal, or all points with estimated normals."""
     if cloud.normals is not None:
         # NaN fails the comparison, so it counts as no normal.
@@ -181,19 +172,14 @@ def oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
     return replace(cloud, normals=normals)
 
 
-def widest_cell(xyz: Float32, settings: MeshSettings) -> float:
-    """Return the widest octree cell that the settings allow, in the unit of the points."""
-    step = max(1, len(xyz) // _SPACING_SAMPLES)
-    return settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
-
-
 def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
     """Return the smallest octree depth whose cells are no wider than the settings allow."""
-    cell_m = widest_cell(xyz, settings)
-    extent_m = float(np.ptp(xyz, axis=0).max()) * OCTREE_SCALE
+    step = max(1, len(xyz) // _SPACING_SAMPLES)
+    cell_m = settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
+    extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
     if cell_m * 2**settings.max_depth <= extent_m:
         return settings.max_depth
-    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), MIN_DEPTH, settings.max_depth))
+    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
 
 
 def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:

@@ -138,14 +138,16 @@ def write_image(path: StrPath, image: NDArray[Any]) -> None:
     """Write uint8 or uint16, (H, W) or RGB (H, W, 3), atomically, in the format of the suffix."""
     suffix = Path(path).suffix.lower()
     _check_writable(path, suffix, image)
+    write_bytes(path, encode_image(image, suffix, path))
+
+
+def encode_image(image: NDArray[Any], suffix: str, where: StrPath) -> bytes:
+    """Return the bytes of an image file of a format; ``where`` names it in errors."""
     pixels = image if image.ndim == 2 else swap_red_and_blue(image)
     try:
-        done, content = cv2.imencode(suffix, pixels)
+        return bytes(cv2.imencode(suffix, pixels)[1].tobytes())
     except cv2.error as error:
-        raise OutputError("image cannot be encoded", where=path, got=error.err) from error
-    if not done:
-        raise OutputError("image cannot be encoded", where=path)
-    write_bytes(path, content.tobytes())
+        raise OutputError("image cannot be encoded", where=where, got=error.err) from error
 
 
 @contextmanager

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, OutputError, SettingsError
 from recon.core.geometry.se3 import T_YUP_FRAME
-from recon.core.values import TriangleMesh
+from recon.core.values import Texture, TriangleMesh
 from recon.core.values.arrays import UInt8
 from recon.core.values.cloud import Frame
-from recon.io.atomic import atomic_path, write_bytes
+from recon.io.atomic import atomic_path, write_bytes, write_text
 from recon.io.files import StrPath, reader
+from recon.io.images.image import encode_image, write_image
 from recon.io.models.ply import colours_of, fill_vertices, normals_of, positions_of, vertex_dtype
 from recon.io.models.ply_tables import (
     Table,
@@ -31,17 +32,20 @@ from recon.io.models.ply_tables import (
 MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
 _INDICES: Final = ("vertex_indices", "vertex_index")  # both names are in use
 _COMPONENTS: Final = {"float32": 5126, "uint32": 5125, "uint16": 5123}
-_KINDS: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_KINDS: Final = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
-_MATTE: Final = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+_MATTE: Final[dict[str, Any]] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+_TEXTURE: Final = "TextureFile "  # the comment of a PLY that names an image, as MeshLab has it
 _UNLIT: Final = "KHR_materials_unlit"  # colours of images already include the lighting
 
 
 def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh atomically, as .ply, .obj, .stl or .glb by the suffix of the file.
 
-    PLY is binary with float vertices. PLY, OBJ and GLB keep normals and colours; STL has neither.
-    GLB is glTF 2.0 in one file, which viewers show upright if the ``frame`` of the axes is known.
+    PLY is binary with float vertices. PLY, OBJ and GLB keep normals, colours and texture; STL has
+    none. The image of a texture is written beside a PLY or OBJ, which has its material in a third
+    file. GLB is glTF 2.0 in one file, which viewers show upright if the ``frame`` of the axes is
+    known.
 
     Raises:
         OutputError: The suffix is unknown, the mesh has no face, or the file cannot be written.
@@ -51,16 +55,38 @@ def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) ->
         raise OutputError("unknown kind of mesh file", where=path, expected=" ".join(MESH_SUFFIXES))
     if len(mesh.faces) == 0:
         raise OutputError("the mesh has no face", where=path)
+    texture = mesh.texture
+    if texture is not None and suffix in (".ply", ".obj"):
+        write_image(Path(path).with_name(texture.name), texture.image)
     if suffix == ".ply":
-        write_tables(path, _tables(mesh))
+        write_tables(path, _tables(mesh), [] if texture is None else [_TEXTURE + texture.name])
     elif suffix == ".glb":
         write_glb(path, mesh, frame)
+    elif suffix == ".obj" and texture is not None:
+        _write_textured_obj(Path(path), mesh, texture)
     else:
         # Importing Open3D takes two seconds; PLY files do not need it.
         from recon.io.models import open3d_meshes  # noqa: PLC0415
 
         with atomic_path(path) as temporary:
             open3d_meshes.write_mesh(temporary, mesh)
+
+
+def _write_textured_obj(path: Path, mesh: TriangleMesh, texture: Texture) -> None:
+    """Write OBJ and MTL: Open3D's writer names an image of its own after the temporary file."""
+    material = path.with_suffix(".mtl")
+    write_text(material, f"newmtl left\nKa 1 1 1\nKd 1 1 1\nmap_Kd {texture.name}\n")
+    # OBJ counts from the lower left corner of the image, and vertices from 1.
+    uv = np.stack([texture.uv[:, 0], 1 - texture.uv[:, 1]], axis=1)
+    normals = mesh.normals
+    number = np.repeat(mesh.faces + 1, 2 if normals is None else 3, axis=1)
+    corner = " %d/%d" if normals is None else " %d/%d/%d"
+    with atomic_path(path) as temporary, temporary.open("w") as stream:
+        stream.write(f"mtllib {material.name}\nusemtl left\n")
+        for key, values in (("v", mesh.vertices), ("vt", uv), ("vn", normals)):
+            if values is not None:
+                np.savetxt(stream, values, key + values.shape[1] * " %.7g")
+        np.savetxt(stream, number, "f" + 3 * corner)
 
 
 def check_mesh_formats(formats: Sequence[str]) -> None:
@@ -118,8 +144,11 @@ def read_mesh(path: StrPath) -> TriangleMesh:
 def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
     """Return the two tables of a PLY mesh, with ``start`` added to the indices of its faces."""
     fields = vertex_dtype(normals=mesh.normals is not None, colours=mesh.rgb is not None)
+    fields += [] if mesh.texture is None else [("s", "<f4"), ("t", "<f4")]
     vertices = np.zeros(len(mesh.vertices), fields)
     fill_vertices(vertices, mesh.vertices, mesh.normals, mesh.rgb)
+    if mesh.texture is not None:
+        vertices["s"], vertices["t"] = mesh.texture.uv[:, 0], 1 - mesh.texture.uv[:, 1]
     name = _INDICES[0]
     faces = np.zeros(len(mesh.faces), [(list_length(name), "u1"), (name, "<i4", (3,))])
     faces[list_length(name)] = 3
@@ -147,31 +176,50 @@ def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> 
     vertices: dict[str, NDArray[Any]] = {"POSITION": mesh.vertices}
     if mesh.normals is not None:
         vertices["NORMAL"] = mesh.normals
-    if mesh.rgb is not None:
+    if mesh.texture is not None:
+        # Colours of vertices would darken it.
+        vertices["TEXCOORD_0"] = mesh.texture.uv
+    elif mesh.rgb is not None:
         vertices["COLOR_0"] = _linear(mesh.rgb)
     arrays = [*vertices.values(), mesh.faces.astype(np.uint32).reshape(-1, 1)]
     views, accessors = _described(arrays)
+    blocks = [values.tobytes() for values in arrays]
+    surface, images = dict(_MATTE), {}
+    if mesh.texture is not None:
+        blocks.append(encode_image(mesh.texture.image, ".png", path))
+        start = sum(len(block) for block in blocks[:-1])
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(blocks[-1])})
+        images = {
+            "images": [{"bufferView": len(views) - 1, "mimeType": "image/png"}],
+            "textures": [{"source": 0}],
+        }
+        surface["baseColorTexture"] = {"index": 0}
     # glTF requires the bounding box of the positions.
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
     attributes = {name: number for number, name in enumerate(vertices)}
     primitive = {"attributes": attributes, "indices": len(vertices), "material": 0}
-    unlit: dict[str, Any] = {"extensions": {_UNLIT: {}}} if mesh.rgb is not None else {}
+    coloured = mesh.texture is not None or mesh.rgb is not None
+    unlit: dict[str, Any] = {"extensions": {_UNLIT: {}}} if coloured else {}
     # Column by column, in metres.
     turn = {} if frame is None else {"matrix": T_YUP_FRAME[frame].T.ravel().tolist()}
-    document = {
-        "asset": {"version": "2.0", "generator": "recon"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | turn],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": _MATTE} | unlit],
-        "buffers": [{"byteLength": sum(values.nbytes for values in arrays)}],
-        "bufferViews": views,
-        "accessors": accessors,
-    } | ({"extensionsUsed": [_UNLIT]} if unlit else {})
+    document = (
+        {
+            "asset": {"version": "2.0", "generator": "recon"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0} | turn],
+            "meshes": [{"primitives": [primitive]}],
+            "materials": [{"doubleSided": True, "pbrMetallicRoughness": surface} | unlit],
+            "buffers": [{"byteLength": sum(len(block) for block in blocks)}],
+            "bufferViews": views,
+            "accessors": accessors,
+        }
+        | images
+        | ({"extensionsUsed": [_UNLIT]} if unlit else {})
+    )
     head = _chunk(b"JSON", json.dumps(document).encode(), b" ")
-    body = _chunk(b"BIN\0", b"".join(values.tobytes() for values in arrays), b"\0")
+    body = _chunk(b"BIN\0", b"".join(blocks), b"\0")
     length = 12 + len(head) + len(body)
     write_bytes(path, struct.pack("<4sII", b"glTF", 2, length) + head + body)
 

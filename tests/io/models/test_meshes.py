@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pymeshlab
 import pytest
 
 from recon.core.errors import FormatError, OutputError
-from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
+from recon.core.values import PointCloud, RectifiedCamera, Texture, TriangleMesh
 from recon.io.images.image import write_image
 from recon.io.models import open3d_meshes
 from recon.io.models.mesh import MESH_SUFFIXES, read_mesh, write_glb, write_mesh
@@ -46,6 +47,34 @@ def test_every_format_gives_triangles_and_colours_back(tmp_path, suffix, off):
         return
     order = [int(np.argmin(np.abs(again.vertices - v).sum(axis=1))) for v in MESH.vertices]
     assert np.abs(again.rgb[order].astype(int) - MESH.rgb).max() <= off
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_a_texture_is_read_by_meshlab_where_it_was_written(tmp_path, suffix):
+    image = np.zeros((4, 8, 3), np.uint8)
+    image[:2, :, 0], image[:, 4:, 2] = 250, 90
+    uv = np.array([[0.1, 0.2], [0.9, 0.2], [0.1, 0.7], [0.9, 0.7]], np.float32)
+    path = tmp_path / f"mesh{suffix}"
+    write_mesh(path, replace(MESH, texture=Texture(image, uv, "photo.png")))
+    written = {".ply": ["photo.png"], ".obj": ["mesh.mtl", "photo.png"], ".glb": []}[suffix]
+    assert sorted(file.name for file in tmp_path.iterdir() if file != path) == written
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(path))
+    mesh = meshes.current_mesh()
+    assert mesh.texture_number() == 1
+    if mesh.has_wedge_tex_coord():
+        meshes.compute_texcoord_transfer_wedge_to_vertex()
+        mesh = meshes.current_mesh()
+    # Counted from the lower left corner of the image.
+    read = {
+        tuple(np.round(vertex, 4)): place
+        for vertex, place in zip(mesh.vertex_matrix(), mesh.vertex_tex_coord_matrix(), strict=True)
+    }
+    for vertex, (u, v) in zip(VERTICES, uv, strict=True):
+        np.testing.assert_allclose(read[tuple(vertex)], (u, 1 - v), atol=1e-5)
+    assert triangles(read_mesh(path).vertices, read_mesh(path).faces) == triangles(
+        VERTICES, MESH.faces
+    )
 
 
 def test_ply_keeps_all_bit_by_bit_and_that_of_others_is_read(tmp_path):

@@ -1,0 +1,365 @@
+"""The surface of one stereo pair, straight from the grid of its pixels.
+
+A plane in space is a plane in column, row and inverse depth, too. So these are smoothed by planes
+fitted to windows, and triangulated: the fewer triangles the flatter the surface.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from recon.core.errors import MeshingError
+from recon.core.open3d_raycasting import RayScene
+from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
+from recon.core.values.arrays import Bool, Float64, Int32, Int64
+from recon.export.mesh.cut import renumbered, vertex_normals
+from recon.export.mesh.poisson import MeshSettings, simplified, usable
+
+# A point is covered if the mesh is no farther from it than this share of its depth.
+COVERED_WITHIN: Final = 0.005
+LEAST_COVERAGE: Final = 0.8  # share of the points of a pair that its mesh should cover
+_COVERAGE_SAMPLES: Final = 100_000
+
+_SQUARE: Final = 64
+"""Grid steps along the legs of the largest triangles; a power of two."""
+
+_RADIUS: Final = 5
+"""Half the width of the windows that planes are fitted to, grid steps: that of a matcher's window,
+in which the errors of disparities are alike, and as much again."""
+
+_EDGE_SIGMAS: Final = 3.0  # a step of so many standard deviations between neighbours is an edge
+_MOST_SIGMAS: Final = 0.5  # a triangle may be off by so many
+_LEAST_SIGMA_PX: Final = 1 / 64  # disparities are rarely written more finely
+_LEAST_SPREAD: Final = 1e-6  # of coordinates in a window, square steps: next to nothing
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """A cloud, sorted into the pixels that its points come from; arrays (R, C)."""
+
+    point: Int32  # row of the cloud; -1 = none
+    disparity: Float64  # focal length times baseline by depth, px
+    sigma: Float64  # its standard deviation, px
+    right: Float64  # slope of the disparity to the right, px
+    down: Float64  # and down
+    u: Float64  # (C,), column from the principal point, px
+    v: Float64  # (R,), row from it
+
+    @property
+    def valid(self) -> Bool:
+        return np.asarray(self.point >= 0)
+
+
+def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings) -> TriangleMesh:
+    """Triangulate the surface that one stereo pair sees.
+
+    Args:
+        cloud: At most one point of each pixel, in camera axes, as of `FrameReconstructor`.
+        camera: Saw it.
+        settings: Of `min_component_faces`: a pixel counts as two.
+
+    Returns:
+        A manifold mesh in camera axes, with unit normals towards the camera, and colours if the
+        cloud has any. No triangle is across a step of disparity.
+
+    Raises:
+        MeshingError: There are too few points, or none next to one another.
+
+    Ref: Evans, Kirkpatrick & Townsend, "Right-triangulated irregular networks", Algorithmica 2001.
+    """
+    cloud = usable(cloud.select(cloud.xyz[:, 2] > 0))
+    grid = _smoothed(_sorted(cloud, camera))
+    edges = _edges(grid)
+    pixels = _whole(_triangles(_errors(grid, edges)), grid, edges)
+    place, faces = _manifold(pixels, settings.min_component_faces, grid.point.shape[1])
+    row, column = np.divmod(place, grid.point.shape[1])
+    z = camera.focal_px * camera.baseline_m / grid.disparity[row, column]
+    x, y = (k * z / camera.focal_px for k in (grid.u[column], grid.v[row]))
+    vertices = np.stack([x, y, z], axis=1).astype(np.float32)
+    rgb = None if cloud.rgb is None else cloud.rgb[grid.point[row, column]]
+    return simplified(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb), settings)
+
+
+def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
+    """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
+
+    Of more than 100,000 points, every n-th is used.
+    """
+    xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
+    distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
+    return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))
+
+
+def check_coverage(coverage: float) -> tuple[str, ...]:
+    """Return a warning if the mesh of a pair leaves out much of its cloud."""
+    if coverage >= LEAST_COVERAGE:
+        return ()
+    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
+    advice = "lower mesh.min_component_faces, or use the cloud"
+    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
+
+
+def _sorted(cloud: PointCloud, camera: RectifiedCamera) -> _Grid:
+    """Sort the points of a cloud into their pixels, of which it may have every n-th."""
+    z = cloud.xyz[:, 2].astype(np.float64)
+    u, v = (camera.focal_px * cloud.xyz[:, k] / z for k in (0, 1))
+    column, first_u = _places(u + camera.cx_px)
+    row, first_v = _places(v + camera.cy_px)
+    step = max(1, int(np.gcd(np.gcd.reduce(column), np.gcd.reduce(row))))
+    column, row = column // step, row // step
+    # The grid is padded to whole squares.
+    height, width = (_SQUARE * -(-int(k.max()) // _SQUARE) + 1 for k in (row, column))
+    point = np.full((height, width), -1, np.int32)
+    point[row, column] = np.arange(len(cloud), dtype=np.int32)
+    fb = camera.focal_px * camera.baseline_m
+    disparity, sigma, flat = np.zeros((3, height, width))
+    disparity[row, column] = fb / z
+    if cloud.sigma_m is not None:
+        sigma[row, column] = fb / z**2 * cloud.sigma_m
+    across, below = (step * np.arange(count, dtype=np.float64) for count in (width, height))
+    across, below = across + (first_u - camera.cx_px), below + (first_v - camera.cy_px)
+    return _Grid(point, disparity, sigma, flat, flat, across, below)
+
+
+def _places(coordinates: Float64) -> tuple[Int64, int]:
+    """The pixels of coordinates, counted from the first one."""
+    pixels = np.rint(coordinates).astype(np.int64)
+    first = int(pixels.min())
+    return pixels - first, first
+
+
+def _smoothed(grid: _Grid) -> _Grid:
+    """Smooth disparities twice: those that are far off the first time hardly count the second."""
+    first = _fit_planes(grid, np.ones(grid.point.shape))
+    off = (grid.disparity - first.disparity) / first.sigma
+    return _fit_planes(grid, np.asarray(1 / (1 + off**2)))
+
+
+def _fit_planes(grid: _Grid, trust: Float64) -> _Grid:
+    """Fit a plane to each window, and take the mean of those around a pixel.
+
+    Windows count by how well a plane fits: those across an edge for next to nothing.
+
+    Ref: He, Sun & Tang, "Guided image filtering", PAMI 2013, with coordinates as the guide.
+    """
+    d, valid = grid.disparity, grid.valid
+    y, x = (k.astype(np.float64) for k in np.indices(valid.shape))
+    known = valid & (grid.sigma > 0)
+    usual = np.median(grid.sigma[known]) if known.any() else 1.0
+    sigma = np.maximum(np.where(known, grid.sigma, usual), _LEAST_SIGMA_PX)
+    weight, count = np.asarray(trust * valid / sigma**2), np.rint(_window(valid.astype(np.float64)))
+    total, count = np.where(count > 0, _window(weight), 1.0), np.maximum(count, 1)
+    mean_x, mean_y, mean_d = (_window(weight * k) / total for k in (x, y, d))
+    xx, xy, xd = (_window(weight * x * k) / total for k in (x, y, d))
+    yy, yd = (_window(weight * y * k) / total for k in (y, d))
+    dd = _window(weight * d * d) / total
+    # A window with a single row or column of points has no slope across it.
+    xx, yy = (a - b * b + _LEAST_SPREAD for a, b in ((xx, mean_x), (yy, mean_y)))
+    xy, xd, yd = xy - mean_x * mean_y, xd - mean_x * mean_d, yd - mean_y * mean_d
+    right, down = (
+        (a * b - c * xy) / (xx * yy - xy * xy) for a, b, c in ((xd, yy, yd), (yd, xx, xd))
+    )
+    misfit = np.maximum(dd - mean_d**2 - right * xd - down * yd, 0) * total / count
+    if not known.any():
+        # Nothing says how noisy the disparities are, but how they scatter.
+        sigma = np.full(valid.shape, max(np.sqrt(np.median(misfit[valid])), _LEAST_SIGMA_PX))
+        misfit /= sigma**2
+    # Between points that a plane explains to within their noise, it holds for those missing, too.
+    filled = valid | ((count > 0.5 * (2 * _RADIUS + 1) ** 2) & (misfit < 1))
+    share = np.asarray(filled / (1.0 + misfit) ** 2)
+    offset = mean_d - right * mean_x - down * mean_y
+    total = np.where(filled, _window(share), 1.0)
+    right, down, offset = (_window(share * k) / total for k in (right, down, offset))
+    smooth = right * x + down * y + offset
+    return replace(
+        grid,
+        point=np.where(filled & (smooth > 0), _nearest(grid.point), -1),
+        disparity=smooth,
+        sigma=sigma,
+        right=right,
+        down=down,
+    )
+
+
+def _nearest(point: Int32) -> Int32:
+    """The nearest point (R, C) of each pixel."""
+    missing = (point < 0).astype(np.uint8)
+    kind = cv2.DIST_LABEL_PIXEL
+    label = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 3, labelType=kind)[1]
+    numbers = np.zeros(label.max() + 1, np.int32)
+    numbers[label[point >= 0]] = point[point >= 0]
+    return np.asarray(numbers[label], np.int32)
+
+
+def _window(values: Float64) -> Float64:
+    """The sum over the window around each pixel."""
+    size = (2 * _RADIUS + 1, 2 * _RADIUS + 1)
+    border = cv2.BORDER_CONSTANT
+    summed = cv2.boxFilter(values, cv2.CV_64F, size, normalize=False, borderType=border)
+    return np.asarray(summed, np.float64)
+
+
+def _edges(grid: _Grid) -> tuple[Bool, Bool]:
+    """Return bool (R, C - 1) and (R - 1, C): what no triangle may cross between neighbours.
+
+    One of them has no point, or neither lies on the plane of the other. A surface that falls off
+    to the right by a pixel per pixel hides itself from the right camera.
+    """
+    step_px = float(grid.u[1] - grid.u[0])
+
+    def between(d: Float64, slope: Float64, sigma: Float64, valid: Bool) -> Bool:
+        off = np.minimum(*(np.abs(np.diff(d) - k) for k in (slope[:, :-1], slope[:, 1:])))
+        edge = off > _EDGE_SIGMAS * np.hypot(sigma[:, :-1], sigma[:, 1:])
+        return np.asarray(edge | ~(valid[:, :-1] & valid[:, 1:]))
+
+    right = between(grid.disparity, grid.right, grid.sigma, grid.valid)
+    right |= np.diff(grid.disparity) >= step_px
+    return right, between(grid.disparity.T, grid.down.T, grid.sigma.T, grid.valid.T).T
+
+
+def _errors(grid: _Grid, edges: tuple[Bool, Bool]) -> Float64:
+    """Return (R, C): by how many sigmas triangles are off that are not split at a pixel.
+
+    A triangle is split in the middle of its longest side, and with it its neighbour there. What is
+    off in one of the parts counts for the whole.
+    """
+    error = np.where(_torn(grid.valid, edges), np.inf, 0.0)
+    size = 2
+    while size <= _SQUARE:
+        for view in (np.asarray, np.transpose):
+            _add_sides(view(error), view(grid.disparity), view(grid.sigma), size)
+        _add_middles(error, grid.disparity, grid.sigma, size)
+        size *= 2
+    return error
+
+
+def _torn(valid: Bool, edges: tuple[Bool, Bool]) -> Bool:
+    """Return bool (R, C): pixels beside an edge of a surface, whose triangles must be smallest."""
+    right, down = edges[0] & (valid[:, :-1] | valid[:, 1:]), edges[1] & (valid[:-1] | valid[1:])
+    torn = np.zeros(valid.shape, np.uint8)
+    torn[:, :-1] |= right
+    torn[:, 1:] |= right
+    torn[:-1] |= down
+    torn[1:] |= down
+    # Triangles have diagonal sides, too.
+    return np.asarray(cv2.dilate(torn, np.ones((3, 3), np.uint8)) > 0)
+
+
+def _add_sides(error: Float64, d: Float64, sigma: Float64, size: int) -> None:
+    """Add the errors in the middles of the upper and lower sides of squares of a size."""
+    half, quarter = size // 2, size // 4
+    middle = (slice(None, None, size), slice(half, None, size))
+    straight = 0.5 * (d[::size, :-1:size] + d[::size, size::size])
+    here = error[middle]
+    np.maximum(here, np.abs(straight - d[middle]) / sigma[middle], out=here)
+    if quarter:
+        inner = error[quarter::half, quarter::half]
+        inner = np.maximum(inner[:, ::2], inner[:, 1::2])
+        np.maximum(here[:-1], inner[::2], out=here[:-1])
+        np.maximum(here[1:], inner[1::2], out=here[1:])
+
+
+def _add_middles(error: Float64, d: Float64, sigma: Float64, size: int) -> None:
+    """Add the errors in the middles of squares of a size, which lie on their diagonals."""
+    half = size // 2
+    middle = (slice(half, None, size), slice(half, None, size))
+    a, b, c, e = (d[rows, columns] for rows, columns in _corners(size))
+    straight = 0.5 * np.where(_falling(a.shape), a + e, b + c)
+    here = error[middle]
+    np.maximum(here, np.abs(straight - d[middle]) / sigma[middle], out=here)
+    for side in (error[:-1:size, half::size], error[size::size, half::size]):
+        np.maximum(here, side, out=here)
+    for side in (error[half::size, :-1:size], error[half::size, size::size]):
+        np.maximum(here, side, out=here)
+
+
+def _corners(size: int) -> list[tuple[slice, slice]]:
+    """Upper left, upper right, lower left and lower right corners of all squares of a size."""
+    low, high = slice(None, -1, size), slice(size, None, size)
+    return [(low, low), (low, high), (high, low), (high, high)]
+
+
+def _falling(shape: tuple[int, ...]) -> Bool:
+    """Which squares are cut from the upper left to the lower right; the others the other way.
+
+    Squares of half the size are cut towards the middle of those that they are parts of.
+    """
+    row, column = np.indices(shape)
+    return np.asarray((row + column) % 2 == 0)
+
+
+def _triangles(error: Float64) -> Int64:
+    """Return (F, 3) pixels: ends of the longest side, and the corner at the right angle."""
+    pixel = np.arange(error.size).reshape(error.shape)
+    a, b, c, e = (pixel[rows, columns] for rows, columns in _corners(_SQUARE))
+    falling = _falling(a.shape)
+    one = np.where(falling, [a, e, b], [b, c, e]).reshape(3, -1)
+    other = np.where(falling, [e, a, c], [c, b, a]).reshape(3, -1)
+    open_, done, error = np.concatenate([one, other], axis=1), [], error.ravel()
+    for _ in range(2 * int(np.log2(_SQUARE))):
+        first, last, corner = open_
+        middle = (first + last) // 2
+        split = error[middle] > _MOST_SIGMAS
+        done.append(open_[:, ~split])
+        first, last, corner, middle = (k[split] for k in (first, last, corner, middle))
+        halves = ([corner, first, middle], [last, corner, middle])
+        open_ = np.concatenate([np.stack(half) for half in halves], axis=1)
+    return np.asarray(np.concatenate([*done, open_], axis=1).T, np.int64)
+
+
+def _whole(faces: Int64, grid: _Grid, edges: tuple[Bool, Bool]) -> Int64:
+    """The triangles (F, 3) that have points at their corners, and no edge between them."""
+    faces = faces[grid.valid.ravel()[faces].all(axis=1)]
+    width = grid.point.shape[1]
+    right = np.pad(edges[0], ((0, 0), (0, 1))).ravel()
+    down = np.pad(edges[1], ((0, 1), (0, 0))).ravel()
+    kept = np.ones(len(faces), np.bool_)
+    for end in faces.T[:2]:
+        low, way = np.minimum(end, faces[:, 2]), np.abs(end - faces[:, 2])
+        kept &= ~((way == 1) & right[low]) & ~((way == width) & down[low])
+    return faces[kept]
+
+
+def _manifold(faces: Int64, least: int, width: int) -> tuple[Int64, Int32]:
+    """Number the vertices of triangles (F, 3) of pixels anew: return their pixels, and faces.
+
+    Where surfaces touch in a pixel alone, each has a vertex of its own. Those with an area of less
+    than ``least`` half pixels are left out.
+    """
+    count = len(faces)
+    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    key = np.minimum(begin, end) * (begin.max(initial=0) + 1) + np.maximum(begin, end)
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)
+    one, other = order[same], order[same + 1]
+    following = np.arange(3 * count).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    # Two triangles run along a side in opposite directions.
+    links = (np.concatenate([one, following[one]]), np.concatenate([following[other], other]))
+    surface = _components(one // 3, other // 3, count)
+    row, column = np.divmod(faces, width)
+    area = np.abs(
+        (row[:, 0] - row[:, 2]) * (column[:, 1] - column[:, 2])
+        - (row[:, 1] - row[:, 2]) * (column[:, 0] - column[:, 2])
+    )
+    kept = np.bincount(surface, area)[surface] >= least if count else np.zeros(0, np.bool_)
+    if not kept.any():
+        hint = "lower mesh.min_component_faces, or filter less"
+        raise MeshingError("no surface: hardly any pixels with a depth are neighbours", hint=hint)
+    corner = _components(*links, 3 * count).reshape(-1, 3)
+    pixel = np.zeros(corner.max() + 1, np.int64)
+    pixel[corner] = faces
+    used, numbered = renumbered(corner[kept])
+    return pixel[used], numbered
+
+
+def _components(one: Int64, other: Int64, count: int) -> Int32:
+    """The number (count,) of the connected part of each of ``count`` things, by pairs of them."""
+    graph = coo_matrix((np.ones(len(one), np.bool_), (one, other)), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
