@@ -1,9 +1,8 @@
 """Images: PNG, JPEG, PGM, PPM, BMP and TIFF, messages of ROS; what is damaged is rejected.
 
 Ref:
-    PNG: ISO/IEC 15948, section 5 (chunks). JPEG: ITU-T T.81, annex B (markers).
-    PGM and PPM: the netpbm manual. BMP: BITMAPINFOHEADER in the Windows GDI reference.
-    EXIF: CIPA DC-008 (Exif 2.32), section 4.6.5; CIPA DCG-001 for the 35 mm equivalent.
+    PNG: ISO/IEC 15948, 5 (chunks). JPEG: ITU-T T.81, annex B (markers). PGM, PPM: netpbm manual.
+    BMP: BITMAPINFOHEADER, Windows GDI. EXIF: CIPA DC-008, 4.6.5; DCG-001 (35 mm equivalent).
 """
 
 from __future__ import annotations
@@ -145,9 +144,12 @@ def encode_image(image: NDArray[Any], suffix: str, where: StrPath) -> bytes:
     """Return the bytes of an image file of a format; ``where`` names it in errors."""
     pixels = image if image.ndim == 2 else swap_red_and_blue(image)
     try:
-        return bytes(cv2.imencode(suffix, pixels)[1].tobytes())
+        done, content = cv2.imencode(suffix, pixels)
     except cv2.error as error:
         raise OutputError("image cannot be encoded", where=where, got=error.err) from error
+    if not done:
+        raise OutputError("image cannot be encoded", where=where)
+    return bytes(content.tobytes())
 
 
 @contextmanager
@@ -223,8 +225,7 @@ def pixels_of_ros_image(
     return pixels if to_rgb is None else np.asarray(cv2.cvtColor(pixels, to_rgb), dtype=np.uint8)
 
 
-_PNG_START: Final = b"\x89PNG\r\n\x1a\n"
-_JPEG_START: Final = b"\xff\xd8\xff"
+_PNG_START, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _TIFF_STARTS: Final = (b"II*\x00", b"MM\x00*")
 _PNM_HEADER: Final = re.compile(
     rb"P([2356])(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)\s"
@@ -233,8 +234,7 @@ _BMP_HEADER: Final = struct.Struct("<2xI4xI4xiiHHII")
 _READERS: Final[dict[bytes, type[ImageFile]]] = {
     b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"P": PpmImageFile,
 }  # fmt: skip
-_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
-_EXIF_IFD: Final = 0x8769
+_TIFF_WIDTH, _TIFF_HEIGHT, _EXIF_IFD = 256, 257, 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
 _SENSOR_RESOLUTION, _SENSOR_UNIT, _SENSOR_WIDTH_PX = 0xA20E, 0xA210, 0xA002
 _MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
