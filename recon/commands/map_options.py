@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from typing_extensions import Self
 
 from recon.commands.config import Changes, ReconConfig, load_config
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
+from recon.core.geometry.se3 import make_transform
 from recon.core.values import Trajectory
 from recon.export.make import USUAL
 from recon.io.files import StrPath, resolved
@@ -30,6 +32,7 @@ from recon.run.run import Run, fingerprint
 from recon.run.work import SILENT, Progress
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
+from recon.stereo.rectify.rectifier import turns_of
 
 _OTHER: Final = {
     "config": "other settings", "source": "another source", "poses": "other poses",
@@ -115,9 +118,14 @@ class MapOptions:
         settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})
         source = open_source(self.source, self.kind, settings)
         prior = None if self.prior_from is None else source.read_prior(self.prior_from)
+        poses = None if self.poses_file is None else read_trajectory(self.poses_file)
+        if poses is not None and settings.poses_of == "raw":
+            R_rectified_raw = turns_of(source.calibration, config.rectification).R_left
+            T_raw_rectified = make_transform(R_rectified_raw.T, np.zeros(3))
+            poses = replace(poses, T_world_camera=poses.T_world_camera @ T_raw_rectified)
         return source, replace(
             self,
-            known_poses=None if self.poses_file is None else read_trajectory(self.poses_file),
+            known_poses=poses,
             prior=None if prior is None else prior.path,
             prior_origin="" if prior is None else prior.origin,
         )

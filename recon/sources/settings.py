@@ -58,6 +58,9 @@ class SourceSettings(Settings):
     """By how many frames the right camera is late: the left image of a frame is paired with the
     right one of so many frames later. Times, ground truth and known poses stay those of the left
     images. Negative = the left camera is late."""
+    poses_of: Literal["rectified", "raw"] = "rectified"
+    """Which left camera known poses are of: the rectified one, as all that recon writes, or the one
+    in front of the lens, as motion capture and other programs have it."""
     length: tuple[_Frame, _Frame, Annotated[float, Field(ge=1e-6, le=1e6)]] | None = None
     """Two frames of those used, counted from 0, and how far apart the left camera was in them,
     metres, such as [0, 143, 118.3]: it shows the baseline, and with it the scale. none = the

@@ -1,19 +1,27 @@
 """A drive that is mapped in pieces becomes one drive: every frame once, and the same map."""
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from recon.commands import map_options
 from recon.commands.config import load_config
+from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import LEAD, Piece, cut_drive
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import Trajectory
+from recon.io.trajectory import write_kitti_poses
 from recon.map.drive.drive import Workspace, session_info
 from recon.map.drive.drive_odometry import odometry_of
 from recon.map.drive.sequence import map_sequence
 from recon.map.map import Map
 from recon.map.sessions.copying import join_parts
 from recon.sources.source import SourcePart
+from recon.stereo.rectify.rectifier import turns_of
 from recon.street.settings import StreetScene
+from tests.scenery.boards import board_rig
 from tests.scenery.film import film
 
 STREET = StreetScene(
@@ -31,6 +39,24 @@ def test_pieces_have_every_frame_once_behind_their_leads(frames, workers):
     assert pieces[0].lead == 0
     assert all(piece.lead == LEAD for piece in pieces[1:])
     assert len(pieces) == 1 or len(pieces) % workers == 0 or len(pieces) == frames // (2 * LEAD)
+
+
+def test_known_poses_of_the_lens_become_those_of_the_rectified_camera(tmp_path, monkeypatch):
+    rig, config = board_rig(), load_config(None, ["source.poses_of=raw"])
+    source = SimpleNamespace(calibration=rig)
+    monkeypatch.setattr(map_options, "open_source", lambda *_: source)
+    turned = [make_transform(exp_so3(n * np.ones(3)), n * np.ones(3)) for n in (0.0, 0.3)]
+    raw = Trajectory(np.stack(turned), np.arange(2.0))
+    write_kitti_poses(tmp_path / "poses.txt", raw)
+    options = MapOptions(source=tmp_path, poses_file=tmp_path / "poses.txt")
+    poses = options.open(config)[1].known_poses.T_world_camera
+    turn = turns_of(rig, config.rectification).R_left
+    assert np.arccos((np.trace(turn) - 1) / 2) > 0.005
+    ray = np.array([0.1, 0.2, 1.0])  # of the raw camera
+    np.testing.assert_allclose(
+        poses[:, :3, :3] @ turn @ ray, raw.T_world_camera[:, :3, :3] @ ray, atol=1e-9
+    )
+    np.testing.assert_allclose(poses[:, :3, 3], raw.T_world_camera[:, :3, 3], atol=1e-9)
 
 
 def test_path_and_map_are_those_of_one_run():
