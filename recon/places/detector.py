@@ -221,9 +221,6 @@ class LoopDetector:
         return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS)
 
 
-_MOST: Final = 3  # most views of a map that are compared with a frame
-
-
 @dataclass(frozen=True, eq=False)
 class KnownView:
     """A keyframe of a map."""
@@ -275,16 +272,22 @@ class KnownPlaces:
         return len(self._views)
 
     def recognise(
-        self, keyframe: Keyframe, camera: RectifiedCamera, among: Bool | None = None
+        self,
+        keyframe: Keyframe,
+        camera: RectifiedCamera,
+        among: Bool | None = None,
+        *,
+        most: int = 3,
     ) -> Recognised:
         """The views, of those given, that show the same place as a frame, and their loops.
 
-        One such view alone proves little: `agreeing_loops` says which of several frames agree.
+        At most so many that look alike are compared. One such view alone proves little:
+        `agreeing_loops` says which of several frames agree.
         """
         likeness = self._words.likeness(words_of(keyframe.descriptors))
         worth = likeness > 0 if among is None else among & (likeness > 0)
         alike = most_alike(likeness, np.flatnonzero(worth), self._stands, self._reach_m)
-        found = islice(alike, _MOST)
+        found = islice(alike, most)
         verdicts = [self.compare(number, keyframe, camera) for number in found]
         return Recognised(
             tuple(verdict.loop for verdict in verdicts if verdict.loop is not None),

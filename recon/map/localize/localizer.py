@@ -6,7 +6,7 @@ Where the map confirms nothing, odometry goes on alone until its drift makes the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
@@ -35,6 +35,9 @@ _SURFACES_EVERY: Final = 3
 """Frames between two corrections by surfaces, where features confirm the pose."""
 _SURE_SIGMA_M: Final = 0.5 * MAX_SIGMA_M
 """Poses that are more certain than this need not be compared with the map if time is short."""
+_CONTRADICTS: Final = "the map contradicts the odometry"
+_ANYWHERE: Final = 10
+"""Most views that look alike which are compared with a frame behind a break, if there is time."""
 _LOST_SIGMA_M: Final = 0.05
 """Standard deviation of a motion without features, beside the drift over it."""
 _LOST_SIGMA_DEG: Final = 0.3  # that of its rotation
@@ -87,6 +90,7 @@ class _Confirmed:
     loops: tuple[Loop, ...] = ()
     refused: str = ""
     surfaces: bool = False
+    contradicted: bool = False  # whether more views show the place elsewhere
 
 
 class Localizer:
@@ -131,12 +135,18 @@ class Localizer:
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity)
         lost = None
         if self._belief is not None:
-            lost = self._result(self._confirm(self._belief, keyframe, frame))
-            if lost.state is not State.LOST:
-                return lost
+            confirmed = self._confirm(self._belief, keyframe, frame)
+            if confirmed.contradicted:
+                # If several views say the same they are believed, and odometry is not.
+                self._breaks += 1
+                self._belief, lost = None, Located(State.LOST, note=confirmed.refused)
+            else:
+                lost = self._result(confirmed)
+                if lost.state is not State.LOST:
+                    return lost
         camera = frame.pair.camera
         at = (self._T_odometry, self._path_m, self._breaks)
-        fix = self._first_fix.find(keyframe, camera, *at)
+        fix = self._first_fix.find(keyframe, camera, *at, hurried=frame.rough)
         if fix is None:
             return lost or Located(State.SEARCHING, note="no place is recognised for certain")
         confirmed = self._confirm(Belief(*self._measured(fix)), keyframe, frame)
@@ -163,40 +173,38 @@ class Localizer:
 
     def _confirm(self, belief: Belief, keyframe: Keyframe, frame: OdometryFrame) -> _Confirmed:
         """Return the belief, corrected by the nearest views of the map and its surfaces."""
-        loops, refused = [], ""
+        loops, against, refused = dict[int, Loop](), set[int](), ""
+
+        def weighed(belief: Belief, loop: Loop) -> Belief:
+            corrected = belief.corrected_to(*self._measured(loop))
+            if corrected is None:
+                against.add(loop.first)
+            elif loop.first not in loops:
+                loops[loop.first] = loop
+                return corrected
+            return belief
+
         for number in self._known.near(belief.T_world_camera, _VIEWS):
             verdict = self._known.compare(number, keyframe, frame.pair.camera)
             if verdict.loop is None:
                 refused = verdict.refused
                 continue
-            corrected = belief.corrected_to(*self._measured(verdict.loop))
-            if corrected is None:
-                refused = "the map contradicts the odometry"
-                continue
-            belief = corrected
-            loops.append(verdict.loop)
-            if frame.rough:  # one tells most of it, and in a hurry time counts
+            belief = weighed(belief, verdict.loop)
+            if frame.rough and loops:  # one tells most of it, and in a hurry time counts
                 break
-        if not loops and not frame.rough:
-            loops, belief = self._recognised(belief, keyframe, frame)
+        if not frame.rough and (against or not loops):
+            for loop in self._known.recognise(keyframe, frame.pair.camera).loops:
+                belief = weighed(belief, loop)
+        refused = _CONTRADICTS if against else refused
+        if len(against) > len(loops) and not frame.rough:
+            return _Confirmed(belief, refused=refused, contradicted=True)
         # Aligning takes as long as several frames may, where they are in a hurry.
         due = not loops or (not frame.rough and self._frames % _SURFACES_EVERY == 0)
         by_surfaces = None
         if self._surroundings is not None and due:
             by_surfaces = self._surroundings.correct(belief, frame, learn=bool(loops))
-        return _Confirmed(by_surfaces or belief, tuple(loops), refused, by_surfaces is not None)
-
-    def _recognised(
-        self, belief: Belief, keyframe: Keyframe, frame: OdometryFrame
-    ) -> tuple[list[Loop], Belief]:
-        """Return loops to views that are not near but look alike, and the belief they correct."""
-        loops = []
-        for loop in self._known.recognise(keyframe, frame.pair.camera).loops:
-            corrected = belief.corrected_to(*self._measured(loop))
-            if corrected is not None:
-                belief = corrected
-                loops.append(loop)
-        return loops, belief
+        found = tuple(loops.values())
+        return _Confirmed(by_surfaces or belief, found, refused, by_surfaces is not None)
 
     def _result(self, confirmed: _Confirmed) -> Located:
         belief, seen = confirmed.belief, bool(confirmed.loops) or confirmed.surfaces
@@ -249,6 +257,8 @@ class FirstFix:
         T_odometry_camera: Float64,
         path_m: float,
         breaks: int = 0,
+        *,
+        hurried: bool = False,
     ) -> Loop | None:
         """Return the best believed loop to the next frame, ``path_m`` into the drive, if any.
 
@@ -256,7 +266,9 @@ class FirstFix:
         of the map are enough.
         """
         at = (T_odometry_camera, path_m, breaks)
-        self._seen.append((at, self._loops(keyframe, camera)))
+        options = {"most": _ANYWHERE} if breaks and not hurried else {}
+        recognised = self._known.recognise(keyframe, camera, self._among, **options)
+        self._seen.append((at, self._around(recognised.loops, keyframe, camera)))
         believed = [loop for loop in self._agreeing() if loop.last == keyframe.frame]
         if not believed:
             return None
@@ -264,10 +276,12 @@ class FirstFix:
         self._among = None  # once lost, the drive may be anywhere
         return max(believed, key=lambda loop: loop.inliers)
 
-    def _loops(self, keyframe: Keyframe, camera: RectifiedCamera) -> list[Loop]:
+    def _around(
+        self, recognised: Sequence[Loop], keyframe: Keyframe, camera: RectifiedCamera
+    ) -> list[Loop]:
         """Return loops from recognised views and from those around them, each view once."""
         known = self._known
-        found = {loop.first: loop for loop in known.recognise(keyframe, camera, self._among).loops}
+        found = {loop.first: loop for loop in recognised}
         for loop in list(found.values()):
             for number in known.near(
                 known.T_world_camera[loop.first] @ loop.T_first_last, _NEIGHBOURS

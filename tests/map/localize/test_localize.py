@@ -114,6 +114,20 @@ def test_frames_that_are_matched_roughly_are_corrected_by_one_view_alone(street,
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.2
 
 
+def test_several_views_are_believed_against_odometry(street, street_map, truth):
+    localizer = open_localizer(street_map, SETTINGS)
+    match = FrameReconstructor(street.calibration, SETTINGS).match
+    *before, last = (OdometryFrame(*match(pair)) for pair in street.taken(slice(1, 8, 2)))
+    for frame in before:
+        localizer.add(frame)
+    belief = localizer._belief
+    aside = belief.T_world_camera @ as_transform(np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    localizer._belief = replace(belief, T_world_camera=aside)
+    found = localizer.add(last)
+    assert found.state is State.TRACKING
+    assert np.linalg.norm((se3.invert(truth[7]) @ found.T_world_camera)[:3, 3]) < 0.1
+
+
 def test_after_a_jump_to_a_place_that_is_not_in_the_map_the_drive_coasts_and_is_lost():
     """Two streets cut together, driven slowly: odometry hardly notices, the map knows nothing."""
     scene = STREET.model_copy(update={"frames": 6, "speed_m_per_frame": 0.19})
