@@ -6,6 +6,7 @@ heading; headings without a cell stay empty.
 
 from __future__ import annotations
 
+from statistics import median
 from typing import Any
 
 Found = dict[str, Any]
@@ -156,6 +157,24 @@ def loops(found: Found) -> Rows:
                 }
             rows[f"{block}{added}"] = row
     return rows
+
+
+def rooms(found: Found) -> Rows:
+    each = found["rooms"]["rooms"]
+    placed, frames, loops, wrong = (
+        sum(one[key] for one in each) for key in ("frames_placed", "frames", "loops", "wrong")
+    )
+    ate = [one["ate_percent"] for one in each]
+    return {
+        f"{len(each)} rooms": {
+            "frames in the map": 100.0 * placed / frames,
+            "ATE, median": median(ate),
+            "ATE, worst": max(ate),
+            "laps closed": sum(one["laps_closed"] for one in each),
+            "loops": loops,
+            "wrong": wrong,
+        }
+    }
 
 
 def localized(found: Found) -> Rows:

@@ -233,6 +233,18 @@ TABLES: Final[dict[str, Table]] = {
         },
         rows_of.loops,
     ),
+    "rooms": Table(
+        {"rooms": "python benchmarks/rooms.py --json"},
+        {
+            "frames in the map": "{:.1f} %",
+            "ATE, median": PERCENT,
+            "ATE, worst": PERCENT,
+            "laps closed": "{}",
+            "loops": "{}",
+            "wrong": "{}",
+        },
+        rows_of.rooms,
+    ),
     "degraded": Table(
         {"street": "python benchmarks/degraded_drives.py --json"},
         {

@@ -31,9 +31,9 @@ class RayScene:
             o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces)
         )
 
-    def first_hit(self, origin: Float64, directions: NDArray[Any]) -> Int32:
-        """Return int32 (N,): the first triangle on each ray (N, 3) from a point (3,); -1 = none."""
-        hits = self._scene.cast_rays(_rays(origin, directions), nthreads=self._threads)
+    def first_hit(self, origins: Float64, directions: NDArray[Any]) -> Int32:
+        """Return int32 (N,): the first triangle on rays (N, 3) from (3,) or (N, 3); -1 = none."""
+        hits = self._scene.cast_rays(_rays(origins, directions), nthreads=self._threads)
         faces = hits["primitive_ids"].numpy()
         return np.where(faces == _NO_HIT, -1, faces.astype(np.int64)).astype(np.int32)
 

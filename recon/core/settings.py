@@ -100,7 +100,7 @@ def _complete(field: FieldInfo, value: Any) -> Any:
         return None
     if isinstance(value, Mapping) and isinstance(field.default, Settings):
         # A group may stand with other defaults than its class: keep those that are not given.
-        return merge(field.default.model_dump(), value)
+        return merge(field.default.model_dump(exclude_unset=True), value)
     return value
 
 

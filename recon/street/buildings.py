@@ -77,7 +77,8 @@ def house(plan: HousePlan, rng: np.random.Generator) -> TriangleSoup:
     every = np.vstack([holes, door])
     x0, z0, x1, z1 = door.T
     leaf = _upright(np.column_stack([x0, z0, x1 - x0, z1 - z0]), _REVEAL_M, plan.door)
-    parts = [_facade(plan, every), leaf, _windows(holes, rng)]
+    facade = wall_with_holes(plan.width, plan.eaves, every, plan.wall)
+    parts = [facade, leaf, _windows(holes, rng)]
     w, d, h = plan.width, plan.depth, plan.eaves
     feet, along = [[0, 0, 0], [w, 0, 0], [0, d, 0]], [[0, d, 0], [0, d, 0], [w, 0, 0]]
     blind_walls = quads(feet, along, [0, 0, h], plan.wall)
@@ -110,10 +111,13 @@ def _openings(plan: HousePlan, rng: np.random.Generator) -> tuple[Float64, Float
     return np.array(holes), np.array([[x - 0.55, 0.05, x + 0.55, 2.3]])
 
 
-def _facade(plan: HousePlan, holes: Float64) -> TriangleSoup:
-    """Return the wall y = 0 with rectangular holes, split along the edges of all holes."""
-    xs = np.unique(np.concatenate([[0.0, plan.width], holes[:, 0], holes[:, 2]]))
-    zs = np.unique(np.concatenate([[0.0, plan.eaves], holes[:, 1], holes[:, 3]]))
+def wall_with_holes(width_m: float, height_m: float, holes: Float64, paint: Paint) -> TriangleSoup:
+    """Return a wall in the plane y = 0 with rectangular holes (N, 4), each (x0, z0, x1, z1).
+
+    It is split along the edges of all holes.
+    """
+    xs = np.unique(np.concatenate([[0.0, width_m], holes[:, 0], holes[:, 2]]))
+    zs = np.unique(np.concatenate([[0.0, height_m], holes[:, 1], holes[:, 3]]))
     x_mid, z_mid = 0.5 * (xs[:-1] + xs[1:]), 0.5 * (zs[:-1] + zs[1:])
     gx, gz = np.meshgrid(np.arange(len(x_mid)), np.arange(len(z_mid)), indexing="ij")
     px, pz = x_mid[gx][..., None], z_mid[gz][..., None]
@@ -122,7 +126,7 @@ def _facade(plan: HousePlan, holes: Float64) -> TriangleSoup:
     column, row = gx[~in_hole], gz[~in_hole]
     low = np.column_stack([xs[column], zs[row]]) - _OVERLAP_M
     high = np.column_stack([xs[column + 1], zs[row + 1]]) + _OVERLAP_M
-    return _upright(np.column_stack([low, high - low]), 0.0, plan.wall, low)
+    return _upright(np.column_stack([low, high - low]), 0.0, paint, low)
 
 
 def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:

@@ -29,7 +29,7 @@ GRAIN: Final = {
     Material.GLASS: (1.6, 0.9), Material.DOOR: (0.5, 0.35), Material.ROOF: (0.8, 0.5),
     Material.CAR_PAINT: (0.5, 0.09), Material.CAR_GLASS: (0.7, 0.09), Material.BARK: (0.25, 1.0),
     Material.LEAVES: (0.6, 2.0), Material.METAL: (0.3, 0.35), Material.GRASS: (0.7, 0.9),
-    Material.POSTER: (0.35, 0.6),
+    Material.POSTER: (0.35, 0.6), Material.WHITE: (1.0, 0.03), Material.MIRROR: (1.0, 0.0),
 }  # fmt: skip
 _WAVELENGTHS, _CONTRASTS = np.array([GRAIN[material] for material in Material]).T.copy()
 

@@ -64,7 +64,7 @@ class CentreLine:
 def centre_line(settings: StreetScene, length_m: float) -> CentreLine:
     """Return the road from 60 m before the start to ``length_m`` after it, or around a block."""
     if settings.path == "block":
-        return _block(*settings.block_m)
+        return lap(*settings.block_m, CORNER_M)
     along = np.arange(-_BEFORE_M, length_m + _STEP_M, _STEP_M)
     rate = math.radians(settings.turn_deg_per_100m) / 100.0
     # A real road is not a perfect arc but winds slightly around it.
@@ -82,10 +82,10 @@ def _walk(along_m: Float64, heading_rad: Float64) -> Float64:
     return np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
-def _block(length_m: float, width_m: float) -> CentreLine:
+def lap(length_m: float, width_m: float, corner_m: float) -> CentreLine:
     """Return one lap around a block, counter-clockwise, from the start of a long side."""
-    arc_m = 0.5 * math.pi * CORNER_M
-    sides = [length_m - 2 * CORNER_M, width_m - 2 * CORNER_M] * 2
+    arc_m = 0.5 * math.pi * corner_m
+    sides = [length_m - 2 * corner_m, width_m - 2 * corner_m] * 2
     ends = np.cumsum([[side, arc_m] for side in sides])
     knots = np.concatenate([[0.0], ends])
     turns = 0.5 * math.pi * np.repeat(np.arange(5), 2)[:-1]

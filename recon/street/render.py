@@ -7,21 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import SettingsError
+from recon.core.geometry.se3 import as_step, as_transform, invert
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
-from recon.core.values.arrays import Bool, Float32, Float64, UInt8, freeze
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8, freeze
 from recon.core.values.camera import disparity_from_depth
 from recon.street.kernels.surface import SurfaceHits, SurfaceTable, describe_hits
 from recon.street.materials import GAMMA, albedo, sky_colour
-from recon.street.shapes import TriangleSoup
+from recon.street.shapes import Material, TriangleSoup
 from recon.street.street import StreetWorld
 
 
@@ -74,19 +76,23 @@ class StreetCamera:
     def pair(self, index: int) -> StereoPair:
         """Render only the images."""
         # Prepared before the threads start, so that it is done only once.
-        views, stage = self.views(index), self.stage
+        views, stage, motion = self.views(index), self.stage, self._motion(index)
         smooth, threads = self.world.settings.smooth_edges, self.world.settings.threads
         # The two views are independent, so the number of threads does not affect the result.
         with ThreadPoolExecutor(max_workers=1 if threads == 1 else 2) as pool:
-            images = list(pool.map(lambda view: take_image(stage, view, smooth), views))
+            images = list(pool.map(lambda view: take_image(stage, view, smooth, motion), views))
         left, right = (self._record(image, index, side) for side, image in enumerate(images))
         time_s = index / self.world.settings.frame_rate_hz
         return StereoPair(left, right, timestamp_s=time_s, index=index, name=f"{index:06d}")
 
-    def depth(self, index: int) -> Float32:
-        """Return float32 (H, W), true depth of the left image in metres; NaN = sky."""
+    def depth(self, index: int, *, in_mirrors: bool = True) -> Float32:
+        """Return float32 (H, W), true depth of the left image in metres; NaN = sky.
+
+        What is in a mirror is as far as the cameras see it, or the mirror itself is taken.
+        """
         view = self.views(index)[0]
-        depth = self.stage.depth(view.origin, view.directions(view.pixels()))
+        directions = view.directions(view.pixels())
+        depth = self.stage.depth(view.origin, directions, in_mirrors=in_mirrors)
         return depth.reshape(view.height_px, view.width_px).astype(np.float32)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
@@ -99,6 +105,13 @@ class StreetCamera:
             known = f"0 to {len(self) - 1}"
             raise SettingsError("no such frame", got=index, expected=known, hint="raise `frames`")
         return stereo_views(self.world.camera, self.world.T_street_camera[index])
+
+    def _motion(self, index: int) -> Float64:
+        """Return the step (6,) of the left camera while the shutter is open around a frame."""
+        poses = self.world.T_street_camera
+        before, after = max(index - 1, 0), min(index + 1, len(poses) - 1)
+        step = as_step(invert(poses[before]) @ poses[after]) / max(after - before, 1)
+        return self.world.settings.shutter * step
 
     def _truth(self, index: int, depth_m: Float32) -> DisparityTruth:
         camera = self.world.camera
@@ -122,13 +135,20 @@ class StreetCamera:
         return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 
+_MOMENTS: Final = 7  # of an exposure that are mixed
+_FAR_M: Final = 1e6  # depth of the sky
 _QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 _CREASE: Final = 0.92  # cosine of the angle between normals, below which there is an edge
 _EXPOSURE: Final = 0.9
 
 
-def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
-    """Render one view as float64 (H, W, 3), display values in [0, 1]."""
+def take_image(
+    stage: Stage, view: View, smooth_edges: bool, motion: Float64 | None = None
+) -> Float64:
+    """Render one view as float64 (H, W, 3), display values in [0, 1].
+
+    ``motion`` (6,) is the step of the camera meanwhile, which blurs what moves in the image.
+    """
     size, pixels = (view.height_px, view.width_px), view.pixels()
     sample = stage.look(view.origin, view.directions(pixels), 1.0 / view.focal_px)
     light = sample.rgb
@@ -137,7 +157,26 @@ def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
         quarters = (pixels[edge, None, :] + np.array(_QUARTERS)).reshape(-1, 2)
         four = stage.look(view.origin, view.directions(quarters), 0.5 / view.focal_px)
         light[edge] = four.rgb.reshape(-1, 4, 3).mean(axis=1)
-    return np.asarray(light ** (1.0 / GAMMA)).reshape(*size, 3)
+    light = light.reshape(*size, 3)
+    if motion is not None and motion.any():
+        light = _blurred(light, stage, view, motion)
+    return np.asarray(light ** (1.0 / GAMMA))
+
+
+def _blurred(light: Float64, stage: Stage, view: View, motion: Float64) -> Float64:
+    """Return the mean of an image (H, W, 3) over moments of the exposure."""
+    pixels = view.pixels()
+    directions = view.directions(pixels)
+    depth = np.nan_to_num(stage.depth(view.origin, directions), nan=_FAR_M)
+    xyz = view.origin + depth[:, None] * directions
+    total = np.zeros_like(light)
+    for moment in (np.arange(_MOMENTS) + 0.5) / _MOMENTS - 0.5:
+        then = replace(view, T_scene_camera=view.T_scene_camera @ as_transform(moment * motion))
+        # What a pixel shows then is where it came from, in the image of the middle.
+        there = (2.0 * pixels - then.project(xyz)).reshape(*light.shape[:2], 2)
+        there = np.nan_to_num(there, nan=-1.0).astype(np.float32)
+        total += cv2.remap(light, there, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return total / _MOMENTS
 
 
 def _edges(sample: Sample, size: tuple[int, int]) -> Bool:
@@ -208,10 +247,24 @@ def stereo_views(camera: RectifiedCamera, T_scene_left: Float64) -> tuple[View, 
 
 _SUN: Final = np.array([1.50, 1.38, 1.18])
 _SKY: Final = np.array([0.52, 0.58, 0.68])
+_BOUNCES: Final = 2  # mirrors that a ray is followed through
 _SIGHT: Final = 1.0 - 1e-4  # fraction of a line of sight that must be free
 _SKIN_M: Final = 2e-3  # shadow rays start this far above a surface
 _REACH_M: Final = 80.0  # length of shadow rays
 _SHELTER_M: Final = 1.0  # a horizontal surface with an object this close above sees little sky
+
+
+class Sight(NamedTuple):
+    """Rays that seem to come from one point, and what they hit."""
+
+    rays: NDArray[np.int64]  # (N,), their numbers
+    origin: Float64  # (3,)
+    directions: Float64  # (N, 3), of unit depth
+    faces: Int32  # (N,), triangles; -1 = the sky
+
+    def select(self, which: Bool) -> Sight:
+        """Return some of them."""
+        return Sight(self.rays[which], self.origin, self.directions[which], self.faces[which])
 
 
 class Sample(NamedTuple):
@@ -232,19 +285,58 @@ class Stage:
     to_sun: Float64  # (3,), unit vector towards the sun
     seed: int  # of grain and clouds
 
-    def depth(self, origin: Float64, directions: Float64) -> Float64:
-        """Return float64 (N,), depth along rays of unit depth; NaN where they hit nothing."""
-        faces = self.rays.first_hit(origin, directions)
-        hit = faces >= 0
+    def depth(self, origin: Float64, directions: Float64, *, in_mirrors: bool = True) -> Float64:
+        """Return float64 (N,), depth along rays of unit depth; NaN where they hit nothing.
+
+        What is in a mirror is as far as both cameras see it, unless the mirror itself is asked for.
+        """
         depth = np.full(len(directions), np.nan)
-        normal = self.table.normal[faces[hit]]
-        height = np.einsum("nx,nx->n", self.table.anchor[faces[hit]] - origin, normal)
-        depth[hit] = height / np.einsum("nx,nx->n", directions[hit], normal)
+        for sight in self._sights(origin, directions, _BOUNCES if in_mirrors else 0):
+            hit = sight.faces >= 0
+            depth[sight.rays[hit]] = self._along(sight)[hit]
         return depth
 
     def look(self, origin: Float64, directions: Float64, pixel: float) -> Sample:
         """Trace rays of unit depth, where a pixel is ``pixel`` wide, and shade what they hit."""
-        faces = self.rays.first_hit(origin, directions)
+        sights = list(self._sights(origin, directions, _BOUNCES))
+        samples = [self._shade(sight, pixel) for sight in sights]
+        order = np.argsort(np.concatenate([sight.rays for sight in sights]))
+        return Sample(*(np.concatenate(part)[order] for part in zip(*samples, strict=True)))
+
+    def _sights(
+        self, origin: Float64, directions: Float64, bounces: int, beyond: Sight | None = None
+    ) -> Iterator[Sight]:
+        """Yield rays by the point from which they seem to come: the eye, or its mirror images.
+
+        They go on where those of a mirror, ``beyond``, end.
+        """
+        start = (
+            origin
+            if beyond is None
+            else origin + directions * self._along(beyond)[:, None] / _SIGHT
+        )
+        rays = np.arange(len(directions)) if beyond is None else beyond.rays
+        seen = Sight(rays, origin, directions, self.rays.first_hit(start, directions))
+        mirror = (seen.faces >= 0) & (self.soup.material[seen.faces] == Material.MIRROR)
+        if not bounces:
+            mirror[:] = False
+        yield seen.select(~mirror)
+        for part in np.unique(self.soup.part[seen.faces[mirror]]):
+            glass = seen.select(mirror & (self.soup.part[seen.faces] == part))
+            normal = self.table.normal[glass.faces[0]]
+            turn = np.eye(3) - 2.0 * np.outer(normal, normal)
+            anchor = self.table.anchor[glass.faces[0]]
+            image = anchor + turn @ (origin - anchor)
+            yield from self._sights(image, glass.directions @ turn, bounces - 1, glass)
+
+    def _along(self, sight: Sight) -> Float64:
+        """Return depth (N,) of the planes of triangles along rays; without meaning for the sky."""
+        normal = self.table.normal[sight.faces]
+        height = np.einsum("nx,nx->n", self.table.anchor[sight.faces] - sight.origin, normal)
+        return np.asarray(height / np.einsum("nx,nx->n", sight.directions, normal))
+
+    def _shade(self, sight: Sight, pixel: float) -> Sample:
+        _, origin, directions, faces = sight
         hit = np.flatnonzero(faces >= 0)
         sky = np.flatnonzero(faces < 0)
         rgb, normal = np.empty((len(faces), 3)), np.zeros((len(faces), 3))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
@@ -10,6 +10,10 @@ from typing_extensions import Self
 from recon.core.settings import Settings
 
 CORNER_M: Final = 16.0  # radius of the corners of a block
+_IN_HAND: Final = {
+    "height_px": 400, "baseline_m": 0.12, "pitch_deg": 8.0, "speed_m_per_frame": 0.1,
+    "shutter": 0.1,
+}  # fmt: skip
 
 _LEAST_SIDE_M: Final = 2 * CORNER_M + 28.0  # two rows of houses, back to back
 _SideM = Annotated[float, Field(ge=_LEAST_SIDE_M, le=2000.0)]
@@ -28,8 +32,9 @@ class StreetSettings(Settings):
     """Seed of the street: another one, another street."""
     frames: int = Field(40, ge=1, le=2000)
     """Number of stereo pairs, a metre apart."""
-    path: Literal["curve", "straight", "block"] = "curve"
-    """Shape of the street; block = repeated laps around a block, for loops."""
+    path: Literal["curve", "straight", "block", "room"] = "curve"
+    """Shape of the street; block = repeated laps around a block, for loops; room = laps through a
+    furnished room with mirrors and windows, a rig of 12 cm in the hand, frames 10 cm apart."""
     width_px: int = Field(640, ge=16, le=8192)
     """Image width. Take that of your rig to try it."""
     height_px: int = Field(240, ge=16, le=8192)
@@ -42,6 +47,16 @@ class StreetSettings(Settings):
     """Height of the cameras above the road."""
     pitch_deg: float = Field(1.0, ge=-30.0, le=30.0)
     """Pitch of the mounted rig; positive = down."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _in_hand(cls, values: Any) -> Any:
+        """What is not given is that of a hand-held rig, where the path is in a room."""
+        if not isinstance(values, dict) or values.get("path") != "room":
+            return values
+        return {
+            name: value for name, value in _IN_HAND.items() if name in cls.model_fields
+        } | values
 
 
 class StreetScene(StreetSettings):
@@ -64,6 +79,8 @@ class StreetScene(StreetSettings):
     #: Brightness of the right camera relative to the left, and grey levels added in its images.
     right_gain: float = Field(default=1.0, gt=0.0, le=4.0)
     right_offset_dn: float = Field(default=0.0, ge=-128.0, le=128.0)
+    #: Share of the time between frames in which the shutter is open: what moves is blurred.
+    shutter: float = Field(default=0.0, ge=0.0, le=1.0)
     smooth_edges: bool = True  # four rays instead of one per pixel at edges (antialiasing)
     #: Rendering threads, 0 = one per core; does not affect the result.
     threads: int = Field(default=0, ge=0, le=256)

@@ -159,6 +159,7 @@ class Material(IntEnum):
 
     PLAIN, ASPHALT, PAVING, KERB, PLASTER, BRICK, GLASS, DOOR = range(8)
     ROOF, CAR_PAINT, CAR_GLASS, BARK, LEAVES, METAL, GRASS, POSTER = range(8, 16)
+    WHITE, MIRROR = range(16, 18)
 
 
 @dataclass(frozen=True)

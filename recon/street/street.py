@@ -18,6 +18,7 @@ from recon.street.buildings import draw_plan, house
 from recon.street.materials import ROAD_HALF_M
 from recon.street.path import BEHIND_M, CentreLine, camera_poses, centre_line
 from recon.street.props import SECTION_M, SECTIONS
+from recon.street.room import furnished_room, hand_poses, room_lap
 from recon.street.settings import StreetScene, StreetSettings
 from recon.street.shapes import Material, Paint, TriangleSoup, at, band, merge, move, painted
 
@@ -71,6 +72,10 @@ class StreetWorld:
 def build_street(settings: StreetSettings) -> StreetWorld:
     """Lay out the street for some settings."""
     settings = StreetScene.of(settings)
+    if settings.path == "room":
+        road = room_lap(settings)
+        soup, poses = furnished_room(settings, road), hand_poses(settings, road)
+        return StreetWorld(settings, soup, rig(settings), poses, _sun(settings.seed))
     length = settings.frames * settings.speed_m_per_frame + _AHEAD_M
     road = centre_line(settings, length + 60.0)
     layers: list[Callable[[CentreLine, float, np.random.Generator], Iterator[TriangleSoup]]] = [

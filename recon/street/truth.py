@@ -94,7 +94,7 @@ def _raster(columns: Int32, frames: NDArray[np.int64], least: int) -> tuple[Int3
 
 
 def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64:
-    depth = camera.depth(index).astype(np.float64).ravel()
+    depth = camera.depth(index, in_mirrors=False).astype(np.float64).ravel()
     rig = camera.world.camera
     near = np.flatnonzero(depth <= range_m)
     v, u = np.divmod(near, rig.width_px)

@@ -93,6 +93,18 @@ def test_a_drive_broken_off_closes_the_same_way(block, closed, tmp_path):
     assert run.summary["loops"] == closed[1].summary["loops"]
 
 
+def test_a_walk_round_a_room_with_mirrors_and_windows_closes(tmp_path):
+    size = {"width_px": 256, "height_px": 160, "focal_px": 144.0, "smooth_edges": False}
+    # Steps of twice the usual length, of which odometry loses one.
+    walk = film(StreetScene(path="room", seed=2, frames=90, speed_m_per_frame=0.2, **size))
+    walk.truth = SequenceTruth(walk.trajectory)
+    run = _run(walk, tmp_path)
+    assert run.summary["frames_joined"] == len(walk)
+    assert run.summary["trajectory"]["ate_m"] < 0.005 * walk.trajectory.path_length_m
+    assert run.summary["loops"]["closed"] >= 10
+    assert run.summary["loops"]["refused_by_graph"] == 0
+
+
 def test_a_street_that_repeats_itself_is_mapped_without_loops(tmp_path):
     drive = _film(path="straight", repeat_m=40.0, frames=56)
     looked = _run(drive, tmp_path / "looked")

@@ -16,11 +16,12 @@ from recon.core.values import OCCUPIED
 from recon.core.values.camera import project, unproject
 from recon.street import materials, shapes
 from recon.street.path import LANE_M, R_STREET_LEVEL, camera_poses, centre_line
-from recon.street.render import StreetCamera
+from recon.street.render import StreetCamera, make_stage
 from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import StreetWorld, build_street, rig
 from recon.street.truth import true_occupancy, true_surface
 
+MIRROR = shapes.Material.MIRROR
 SMALL = StreetScene(seed=3, frames=4, width_px=320, height_px=120, focal_px=180.0, noise_dn=0.0)
 
 
@@ -417,6 +418,35 @@ COLOURS = {
     "CAR_PAINT": 0.24223622, "CAR_GLASS": 0.162575411, "LEAVES": 0.22693827, "METAL": 0.247969724,
     "POSTER": 0.221870245,
 }  # fmt: skip
+
+
+def test_a_mirror_shows_what_is_before_it_as_far_behind_it():
+    wall, glass = (shapes.Paint(kind, part=1) for kind in (shapes.Material.BRICK, MIRROR))
+    soup = shapes.merge([
+        shapes.quads([3, -5, -5], [0, 10, 0], [0, 0, 10], glass),
+        shapes.quads([-2, -5, -5], [0, 10, 0], [0, 0, 10], wall),
+    ])  # fmt: skip
+    stage, eye = make_stage(soup, np.array([0.0, 0.0, 1.0]), 0), np.zeros(3)
+    ahead, back = np.array([[1.0, 0.1, 0.0]]), np.array([[-1.0, 0.4, 0.0]])
+    assert stage.depth(eye, ahead) == pytest.approx(3.0 + 5.0)
+    assert stage.depth(eye, ahead, in_mirrors=False) == pytest.approx(3.0)
+    assert stage.look(eye, ahead, 0.01).label == stage.look(eye, back, 0.01).label
+
+
+def test_a_room_is_that_of_its_seed_with_way_through_and_blurred_by_turns():
+    size = {"width_px": 160, "height_px": 100, "focal_px": 90.0, "smooth_edges": False}
+    scene = StreetScene(path="room", seed=5, frames=150, noise_dn=0.0, **size)
+    room, again = (StreetCamera(build_street(scene)) for _ in range(2))
+    sharp = StreetCamera(build_street(scene.model_copy(update={"shutter": 0.0})))
+    images = [camera.pair(10).left for camera in (room, again, sharp)]
+    np.testing.assert_array_equal(images[0], images[1])
+    edges = [cv2.Laplacian(image, cv2.CV_64F).var() for image in images[1:]]
+    assert 1.2 * edges[0] < edges[1]
+    path = room.world.T_street_camera
+    assert room.stage.rays.distance(path[:, :3, 3]).min() > 0.4
+    assert np.abs(np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1) - 0.1).max() < 0.05
+    assert (scene.baseline_m, scene.pitch_deg) == (0.12, 8.0)
+    assert StreetScene(path="room", baseline_m=0.3).baseline_m == 0.3
 
 
 def test_places_have_the_colours_of_their_material_that_they_had_before():
