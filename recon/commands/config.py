@@ -8,12 +8,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, get_args, get_origin
 
+from pydantic import model_validator
 from pydantic.fields import FieldInfo
+from typing_extensions import Self
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.settings import Settings, alternatives, can_be_none, merge, suggest_names
+from recon.core.settings import (
+    Settings,
+    alternatives,
+    can_be_none,
+    follows_scene,
+    merge,
+    suggest_names,
+)
 from recon.evaluation.paper import PaperConfig
-from recon.export.mesh.poisson import MeshSettings
+from recon.export.mesh.poisson import OVERLAP_M, MeshSettings
 from recon.io.fields import parse_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
 from recon.map.settings import DriveSettings
@@ -42,6 +51,13 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
     mesh: MeshSettings = MeshSettings()
     street: StreetSettings = StreetSettings()
 
+    @model_validator(mode="after")
+    def _check_mesh(self) -> Self:
+        least_m = 2 * OVERLAP_M * self.scale
+        if self.scene.scale is not None and self.mesh.tile_m < least_m:
+            raise ValueError(f"mesh.tile_m must be greater than or equal to {least_m:g} m")
+        return self
+
     @property
     def readable_megapixels(self) -> float:
         """Largest image to read, in 10⁶ pixels: as set, and small enough for the memory limit."""
@@ -68,8 +84,8 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
 
 _FRAME: Final = ("source", "rectification", "matching", "cloud", "filters")
 _DRIVE: Final = (
-    *_FRAME, "map_filters", "rig", "odometry", "loops", "axes", "fusion", "occupancy", "submaps",
-    "memory", "ground", "grid", "mesh", "street",
+    *_FRAME, "scene", "map_filters", "rig", "odometry", "loops", "axes", "fusion", "occupancy",
+    "submaps", "memory", "ground", "grid", "mesh", "street",
 )  # fmt: skip
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "map": _DRIVE,
@@ -88,7 +104,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 """The groups of settings that determine the result of each command."""
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
-    "cloud": {"max_range_m": None, "max_relative_sigma": None},
+    "cloud": {"min_range_m": 0.0, "max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
     "mesh": {"point_weight": 16.0},
 }
@@ -211,8 +227,9 @@ _UNITS: Final = {
 _INTRODUCTION: Final = (
     "Every setting, as `recon settings` lists them. Change one with `--set name=value`, several in "
     "a YAML file given as `--config FILE`; the `config.yaml` in the folder of a run has those that "
-    "were in effect. `none` is a value where it says so. (pair: …) is the default of `recon pair` "
-    "and `recon disparity` where it differs."
+    "were in effect. `none` is a value where it says so. `× scale`: that on a road, times "
+    "`scene.scale`. (pair: …) is the default of `recon pair` and `recon disparity` where it "
+    "differs."
 )
 _BOUNDS: Final = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 _PLAIN: Final = {bool: "true, false", str: "text", int: "whole number", float: "number"}
@@ -222,7 +239,8 @@ _PLAIN: Final = {bool: "true, false", str: "text", int: "whole number", float: "
 class SettingEntry:
     """One setting, by its dotted name; ``default_pair`` is that of `recon pair`.
 
-    Defaults are as in YAML. The unit is empty where there is none.
+    Defaults are as in YAML, of what follows the scene those on a road. The unit is empty where
+    there is none.
     """
 
     name: str
@@ -231,11 +249,13 @@ class SettingEntry:
     unit: str
     values: str
     description: str
+    follows_scene: bool = False
 
     @property
     def shown_default(self) -> str:
         """The default with its unit, and that of a pair where it differs."""
         unit = f" {self.unit}" if self.unit and self.default != "none" else ""
+        unit += " × scale" * self.follows_scene
         differs = self.default_pair != self.default
         return f"{self.default}{unit}" + (f" (pair: {self.default_pair})" if differs else "")
 
@@ -294,7 +314,7 @@ def _groups(
         else:
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
             values = (_as_yaml(value), _as_yaml(paired), unit, _values(field))
-            own.append(SettingEntry(name, *values, text))
+            own.append(SettingEntry(name, *values, text, follows_scene(field)))
     if own:
         about = purpose or (type(drive).__doc__ or "").partition("\n")[0].replace("``", "`")
         yield SettingGroup(prefix.removesuffix("."), about, tuple(own))

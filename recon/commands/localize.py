@@ -17,6 +17,7 @@ from recon.export.trajectories import export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
 from recon.map.drive.drive import Workspace
+from recon.map.drive.scale import look_at_scene
 from recon.map.drive.sequence import map_sequence
 from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
 from recon.map.map import Map
@@ -53,7 +54,7 @@ def run_localize(
     refuse_as_target(map_path, options.out)
     with (
         Map.open(map_path, cache_bytes=config.memory.cache_bytes) as map_,
-        options.run(config) as run,
+        options.run(config.at_scale(map_.first.scale)) as run,
     ):
         folder = map_path if map_path.is_dir() else None
         inputs = [*source.files, map_path if folder is None else folder / MAP_FILE]
@@ -122,9 +123,11 @@ def run_live(
     if config.odometry.method == "kiss":
         what = "while images arrive, poses come before the points that kiss-icp needs"
         raise SettingsError(what, where="odometry.method", got="kiss", expected="visual")
-    first = LiveSource(_Beginning(source), stopped=stopped)  # what comes is done once and forgotten
+    beginning = _Beginning(source)
+    first = LiveSource(beginning, stopped=stopped)  # what comes is done once and forgotten
     with Map.temporary() if map_path is None else Map.open(map_path) as map_:
         if map_path is None:
+            config = config.at_scale(look_at_scene(beginning, config).scale)
             map_sequence(first, config, workspace=Workspace(map_))
         else:
             localize_sequence(first, Workspace(map_), config)

@@ -34,6 +34,7 @@ from recon.export.trajectories import export_paths
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
+from recon.map.drive.scale import Scene, look_at_scene
 from recon.map.drive.sequence import MappedSequence, break_warnings, check_map, map_sequence
 from recon.map.map import Map
 from recon.map.store.finished import keep_map
@@ -117,12 +118,7 @@ def run_map(
     if options.audit and options.known_poses is not None:
         findings += doubt_poses(options.known_poses, source, config)
     options.warn(findings)
-    with (
-        options.run(config) as run,
-        with_resume_hint(run, source),
-        options.begin(run, source, config) as map_,
-    ):
-        rig = refine_drive(source, config, run, prior=options.prior)
+    with _begun(source, config, options) as (run, map_, rig, scene, config):
         if config.rig.refine:
             map_.session().set_rig(rig)
         source = rig.applied(source)
@@ -145,6 +141,7 @@ def run_map(
         warnings = [*first, *breaks, *findings, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
+        result.summary["typical_depth_m"] = scene.depth_m
         with run.stage("write"):
             export_paths(map_.first, mapped.joined, made.camera_height_m, run)
             keep_map(map_, run.path(MAP_FILE))
@@ -167,6 +164,23 @@ def refuse_with_sfm(source: StereoSource, options: MapOptions) -> None:
     if options.prior is not None or options.workers is not None:
         what = "structure from motion takes all pairs at once, and no motion of other sensors"
         raise SettingsError(what, hint="drop --prior, --workers and --scheduler")
+
+
+@contextmanager
+def _begun(
+    source: StereoSource, config: ReconConfig, options: MapOptions
+) -> Iterator[tuple[Run, Map, RefinedRig, Scene, ReconConfig]]:
+    """Begin a run and its map, once it is known what the drive shows of its rig and its scene.
+
+    The settings are those of the map, in which lengths that are not set follow from the scene.
+    """
+    with options.run(config) as run, with_resume_hint(run, source):
+        rig = refine_drive(source, config, run, prior=options.prior)
+        scene = look_at_scene(rig.applied(source), config)
+        fitted = config.at_scale(scene.scale)
+        run.settle(fitted)
+        with options.begin(run, source, fitted) as map_:
+            yield run, map_, rig, scene, fitted
 
 
 RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of the run
@@ -244,6 +258,8 @@ def _summary(
         "focal_px": mapped.camera.focal_px,
         "field_of_view_deg": mapped.camera.field_of_view_deg,
         "T_map_world": mapped.T_map_world.tolist(),
+        "scale": mapped.config.scale,
+        "voxel_m": mapped.config.fusion.voxel_m,
         "faces": 0,
         **result.made.figures,
         "warnings": warnings,

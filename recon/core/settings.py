@@ -5,11 +5,12 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from types import UnionType
-from typing import Any, ClassVar, Union, get_args, get_origin
+from typing import Any, ClassVar, Final, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Field,
     ValidationError,
     ValidationInfo,
     field_validator,
@@ -20,6 +21,21 @@ from typing_extensions import Self
 
 from recon.core.errors import SettingsError
 from recon.core.text import refuse_other_numbers
+
+_FOLLOWS: Final = {"follows_scene": True}
+
+
+def Length(road_m: float, *, ge: float, le: float) -> Any:
+    """Return the field of a length that follows from the size of the scene unless it is set.
+
+    Its default is that of a road; see `Settings.at_scale`.
+    """
+    return Field(road_m, ge=ge, le=le, json_schema_extra=dict(_FOLLOWS))
+
+
+def follows_scene(field: FieldInfo) -> bool:
+    """Return whether a field is a `Length`."""
+    return field.json_schema_extra == _FOLLOWS
 
 
 class Settings(BaseModel):
@@ -68,6 +84,20 @@ class Settings(BaseModel):
             field = type(self).model_fields.get(name or "")
             if field is None or value != field.get_default(call_default_factory=True):
                 yield name, value
+
+    def at_scale(self, scale: float) -> Self:
+        """Return settings in which a `Length` that is not set is that of a road times ``scale``.
+
+        All of them are set then, so that another scale changes nothing any more.
+        """
+        found: dict[str, Any] = {}
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, Settings):
+                found[name] = value.at_scale(scale)
+            elif follows_scene(field) and name not in self.model_fields_set:
+                found[name] = float(f"{scale * value:.9g}")
+        return self.model_copy(update=found)
 
     def recorded(self, command: str) -> dict[str, Any]:
         """Return what is written beside the results of a command, as plain values; here all."""

@@ -238,7 +238,7 @@ def _size(name: str, T: Float64) -> dict[str, Any]:
     return {f"{name}_moved_m": float(moved_m), f"{name}_turned_deg": float(turned_deg)}
 
 
-_NEAR_M: Final = 0.2  # a map point this near the true surface is correct
+_NEAR_M: Final = 0.2  # a map point of a road this near the true surface is correct
 LEAST_FRAMES: Final = 3  # number of frames that must have seen a cell for it to be compared
 
 
@@ -270,12 +270,12 @@ def compare_with_truth(
 
     truth = source.truth or SequenceTruth()
     path = None if poses_given else truth.trajectory
-    own = mapped.trajectory.select(mapped.joined)
+    own, near_m = mapped.trajectory.select(mapped.joined), mapped.config.scale * _NEAR_M
     cells = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
     return DriveErrors(
         attempt("path", path, lambda true: evaluate_trajectory(own, true)),
         # Loads the whole cloud, but only where the whole true surface is in memory as well.
-        attempt("surface", truth.surface, lambda true: evaluate_map(mapped.cloud, true, _NEAR_M)),
+        attempt("surface", truth.surface, lambda true: evaluate_map(mapped.cloud, true, near_m)),
         attempt(
             "occupancy",
             cells,

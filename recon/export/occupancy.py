@@ -37,7 +37,8 @@ from recon.map.sessions.placed import PlacedMap
 _MOST_CELLS: Final = 1_000_000_000
 # Share of the ground that must lie below the height band: else parts of it become obstacles.
 _GROUND_SHARE: Final = 0.95
-# Least distance from the path to the edge of the grid: a footprint must fit in at the start.
+# Least distance, on a road, from the path to the edge of the grid: a footprint must fit in at the
+# start.
 _MARGIN_M: Final = 5.0
 WrittenGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
 
@@ -78,6 +79,7 @@ class _Flattening:
     def __init__(self, placed: PlacedMap) -> None:
         self._tiles, self._path_m, self._trusted = placed.tiles, placed.path_m, placed.trusted
         self._config, self._resolution_m = placed.tiles.config, placed.tiles.resolution_m
+        self._margin_m = self._config.scale * _MARGIN_M
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> WrittenGrid:
@@ -94,7 +96,7 @@ class _Flattening:
             submap, step_m = self._tiles.submap_of_frame, self._resolution_m / 2
             path = DrivenPath.through(self._path_m, self._trusted, submap, step_m)
         keys = [tile.key for tile in self._tiles]
-        for key in dict.fromkeys((*keys, *self._crossed(_MARGIN_M))):
+        for key in dict.fromkeys((*keys, *self._crossed(self._margin_m))):
             part = self._flat(key, settings, path)
             if part is not None:
                 _paste(cells, low, part, key, self._tiles.edge_cells)
@@ -136,8 +138,8 @@ class _Flattening:
         path_m = self._path_m[self._trusted, :2]
         if not len(path_m):
             return low, high
-        first = np.floor((path_m.min(axis=0) - _MARGIN_M) / self._resolution_m)
-        last = np.ceil((path_m.max(axis=0) + _MARGIN_M) / self._resolution_m)
+        first = np.floor((path_m.min(axis=0) - self._margin_m) / self._resolution_m)
+        last = np.ceil((path_m.max(axis=0) + self._margin_m) / self._resolution_m)
         low, high = np.minimum(low, first).astype(int), np.maximum(high, last).astype(int)
         return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
 
@@ -163,7 +165,7 @@ class _Flattening:
         self, key: TileKey, path: DrivenPath, ground: GroundSurface
     ) -> dict[int, OccupancyPart]:
         """Return the space that the vehicle took up in a tile and its margin, by submap."""
-        path = path.select(self._tiles.bounds(key).wider(_MARGIN_M).contains(path.points_m))
+        path = path.select(self._tiles.bounds(key).wider(self._margin_m).contains(path.points_m))
         width_m, free = self._config.grid.vehicle_width_m, log_odds(MIN_PROBABILITY)
         passed = {}
         for submap in np.unique(path.submap).tolist():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -72,7 +73,9 @@ def survey_product(suffix: str) -> Callable[[Order], Made]:
         T_file_map = np.eye(4) if placed is None else placed.T_survey_map
         clouds = (tile.cloud for tile in order.placed.tiles)
         path, crs = order.run.path(f"map/cloud.{suffix}"), None if survey is None else survey.crs
-        points = write_las(path, clouds, T_file_map, crs)
+        # A hundredth of a voxel, as a decimal: a millimetre on a road.
+        step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
+        points = write_las(path, clouds, T_file_map, crs, step_m)
         if placed is None:
             return Made({"points": points})
         return Made({**placed.figures(), "points": points}, placed.warnings())

@@ -10,11 +10,10 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from recon.core.errors import MappingError
 from recon.core.kernels import voxels
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, RayGrain
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.core.values.grid import log_odds
@@ -22,9 +21,8 @@ from recon.map.fusion import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPar
 from recon.map.kernels import clamped, raycast
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, sum_points
 
-_MIN_SIGMA_M: Final = 0.02  # points more precise than this count as this precise: bounds the weight
-_MAX_SIGMA_M: Final = 0.6
-"""Points less precise than this are left out: they would smear over voxels."""
+_MIN_SIGMA: Final = 0.2  # in voxels: more precise points count as this precise, no more
+_MAX_SIGMA: Final = 6.0  # in voxels: less precise points are left out, they would smear
 
 
 class CloudBuilder:
@@ -88,9 +86,10 @@ class CloudBuilder:
         confidence = np.float32(1) if cloud.confidence is None else cloud.confidence
         if cloud.sigma_m is None:
             return np.full(len(cloud), 1.0, np.float32) * confidence
-        bounded = np.maximum(cloud.sigma_m, np.float32(_MIN_SIGMA_M))
+        voxel_m = self._settings.voxel_m
+        bounded = np.maximum(cloud.sigma_m, np.float32(_MIN_SIGMA * voxel_m))
         weights = confidence / bounded**2
-        return np.where(cloud.sigma_m <= _MAX_SIGMA_M, weights, 0).astype(np.float32)
+        return np.where(cloud.sigma_m <= _MAX_SIGMA * voxel_m, weights, 0).astype(np.float32)
 
     def _check(self, cloud: PointCloud) -> None:
         """Refuse what would silently spoil the map."""
@@ -138,9 +137,9 @@ class OccupancySettings(Settings):
 
     fixed: ClassVar = {"rays_per_voxel": 2, "thin_surfaces": True}
 
-    resolution_m: float = Field(0.2, ge=0.001, le=10.0)
+    resolution_m: float = Length(0.2, ge=1e-06, le=1000.0)
     """Edge of a voxel, and of a cell of the grid. Half of it takes about six times the memory."""
-    max_range_m: float = Field(25.0, ge=0.1, le=1000.0)
+    max_range_m: float = Length(25.0, ge=1e-06, le=100000.0)
     """Points farther away hit nothing. Less for short baselines, more for long ones."""
     keep_rays: bool = True
     """Keep the rays of every frame in the run's folder, for recon occupancy. Off saves 0.2 to 0.3

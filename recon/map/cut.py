@@ -29,6 +29,7 @@ from recon.map.submaps import Submap
 
 FUSED: Final = "fused"  # kind of the parts of the fused cloud in the tiles
 OCCUPANCY: Final = "occupancy"  # kind of the parts of the occupancy
+# Lengths are those on a road: they are times the scale of the scene.
 _FILTER_MARGIN_M: Final = 1.0  # least margin around a tile for the filters of the fused cloud
 _LEAST_TILE_M: Final = 5.0
 _FUSED_BYTES: Final = 60
@@ -108,7 +109,8 @@ class Cutter:
         cells = round(math.log2(config.submaps.tile_m / resolution_m))
         self.edge_cells = 1 << max(BLOCK_BITS, cells - halvings)
         self.edge_m = self.edge_cells * resolution_m
-        margin_m = max(_FILTER_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
+        margin_m = max(2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
+        margin_m = max(config.scale * _FILTER_MARGIN_M, margin_m)
         # A voxel more, since a point may lie anywhere in its voxel; and whether a point moved
         # depends on the points in the voxels that touch those through which it may have grown.
         beyond = 3 + GROWTH_CELLS
@@ -117,7 +119,9 @@ class Cutter:
         beyond = config.grid.min_blob_cells + JOINED_CELLS + 2
         beyond = max(beyond, math.ceil(self._filter_margin_m / resolution_m) + 1)
         self.grid_margin_m = math.ceil(beyond / BLOCK_EDGE) * BLOCK_EDGE * resolution_m
-        least_m = max(_LEAST_TILE_M, margin_m, config.grid.min_blob_cells * resolution_m)
+        least_m = max(
+            config.scale * _LEAST_TILE_M, margin_m, config.grid.min_blob_cells * resolution_m
+        )
         small = self.edge_m < 2 * least_m or self.edge_cells == BLOCK_EDGE
         self.limit_bytes = None if small else config.memory.tile_bytes
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels import voxels
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, array_in
 
@@ -24,12 +24,12 @@ _NOMINAL_ERROR_PX: Final = 0.3  # error of a good match, by which the range of f
 class FusionSettings(Settings):
     """How clouds are fused."""
 
-    voxel_m: float = Field(0.1, ge=0.001, le=10.0)
-    """Edge of a voxel. Half of it takes about four times the memory; scale it with the scene."""
+    voxel_m: float = Length(0.1, ge=1e-06, le=1000.0)
+    """Edge of a voxel. Half of it takes about four times the memory."""
     min_count: int = Field(3, ge=1, le=1000)
     """Voxels seen by fewer frames are not exported, or by fewer than one less where they are
     precise. Lower it for slow or sparse drives, raise it where noise is left."""
-    max_depth_error_m: float | None = Field(0.25, ge=1e-06, le=100.0)
+    max_depth_error_m: float | None = Length(0.25, ge=1e-09, le=1000.0)
     """Points are fused up to the depth at which a matching error of 0.3 px makes this error; none =
     all. Raise it to map farther and less precisely."""
     remove_moving: bool = True
@@ -54,7 +54,7 @@ NORMAL: Final = slice(3, 6)
 CONFIDENCE: Final = 6
 VALUES: Final = 7
 KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")
-PRECISE_SIGMA_M: Final = 0.08  # voxels at least this precise need one frame less
+_PRECISE: Final = 0.8  # voxels known to this share of their edge need one frame less
 _PLACED: Final = slice(0, 4)
 _MOST: Final = 1e20
 """Larger than any sum of weights, or of values by weight; sums of much larger ones overflow."""
@@ -143,7 +143,7 @@ class FusedPart:
         ``sigma_m`` treats frames as independent, and the points of one frame in one voxel as one
         measurement. Voxels whose normals cancel are left out.
         """
-        rows = np.flatnonzero(self.enough(least))
+        rows = np.flatnonzero(self.enough(least, voxel_m))
         part = self.select(rows[self._has_direction(rows)])
         weight = part.sums[:, :1]
         values = part.sums[:, 4:] / weight
@@ -172,11 +172,11 @@ class FusedPart:
         variance = self.frames / np.maximum(self.information, np.float32(1e-9))
         return np.asarray(np.sqrt(variance), np.float32)
 
-    def enough(self, least: int) -> Bool:
+    def enough(self, least: int, voxel_m: float) -> Bool:
         """Return bool (N,): seen by ``least`` frames, precise ones by one less."""
         if "sigma_m" not in self.known:
             return np.asarray(self.frames >= least)
-        precise = self.information >= np.float32(PRECISE_SIGMA_M**-2)
+        precise = self.information >= np.float32((_PRECISE * voxel_m) ** -2)
         return np.asarray(self.frames >= np.where(precise, max(1, least - 1), least))
 
     def _has_direction(self, rows: NDArray[np.intp]) -> Bool:

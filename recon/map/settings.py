@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 from recon.map.builders import OccupancySettings
 from recon.map.fusion import FusionSettings
 from recon.map.ground.axes import AxesSettings
@@ -16,6 +18,25 @@ from recon.map.submaps import SubmapSettings
 from recon.odometry.settings import OdometrySettings, RigSettings
 from recon.run.work import MemorySettings
 from recon.stereo.frame import FilterSettings, StereoSettings
+
+SCALES: Final = (1e-5, 1e3)
+
+
+class SceneSettings(Settings):
+    """How large what the cameras see is."""
+
+    scale: float | None = Field(None, ge=SCALES[0], le=SCALES[1])
+    """Size of the scene against a road: lengths whose default is marked ``× scale`` are that
+    times this unless they are set. none = by the depth of what the drive shows; a room has about
+    0.2. Give two drives that are to share a map the same."""
+
+
+class MapFilterSettings(FilterSettings):
+    """Which filters are applied to the fused cloud, in this order; none turns one off."""
+
+    radius_m: float | None = Length(0.3, ge=1e-06, le=1000000.0)
+    """Points with fewer than two others within this radius are dropped. About three voxels; larger
+    drops larger islands."""
 
 
 class CheckpointSettings(Settings):
@@ -35,8 +56,8 @@ class LoopSettings(Settings):
 class DriveSettings(StereoSettings):
     """Everything that determines the map of a drive."""
 
-    map_filters: FilterSettings = FilterSettings(radius_m=0.3)
-    """Filters of the fused cloud on export, in this order; none turns one off."""
+    scene: SceneSettings = SceneSettings()
+    map_filters: MapFilterSettings = MapFilterSettings()
     rig: RigSettings = RigSettings()
     odometry: OdometrySettings = OdometrySettings()
     loops: LoopSettings = LoopSettings()
@@ -48,6 +69,18 @@ class DriveSettings(StereoSettings):
     memory: MemorySettings = MemorySettings()
     ground: GroundSettings = GroundSettings()
     grid: GridSettings = GridSettings()
+
+    @property
+    def scale(self) -> float:
+        """Size of the scene against a road."""
+        return self.scene.scale or 1.0
+
+    def at_scale(self, scale: float) -> Self:
+        """Return the settings with lengths that follow from a scale, unless another one is set."""
+        scale = self.scene.scale or scale
+        scene = SceneSettings(scale=scale)
+        fitted = super().at_scale(scale).model_copy(update={"scene": scene})
+        return self.parse(dict(fitted))  # again: what is set may not go with what follows
 
     @model_validator(mode="after")
     def _check_margins(self) -> Self:

@@ -9,10 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pydantic import Field
-
 from recon.core.geometry.se3 import invert
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 from recon.core.values.arrays import Float64
 from recon.map.fusion import FusedPart
 from recon.map.occupancy.part import OccupancyPart
@@ -25,10 +23,10 @@ class SubmapSettings(Settings):
     back and saw something on its own track: whether that came later is known by submaps.
     """
 
-    length_m: float = Field(25.0, ge=0.1, le=10_000.0)
+    length_m: float = Length(25.0, ge=1e-06, le=100_000.0)
     """Path after which a new submap begins. Shorter ones bend better with closed loops and take
     less memory."""
-    tile_m: float = Field(50.0, ge=5.0, le=10_000.0)
+    tile_m: float = Length(50.0, ge=1e-06, le=100_000.0)
     """Edge of the tiles, rounded to whole voxels. Smaller ones take less memory, and more time."""
 
 

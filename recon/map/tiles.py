@@ -285,7 +285,7 @@ class Tiles:
         if not fusion.remove_moving or self._looks is None:
             return np.zeros(len(fused), np.bool_)
         points = apply(self._T_map_world, fused.points(fusion.voxel_m))
-        counted = fused.enough(self._least_frames)
+        counted = fused.enough(self._least_frames, fusion.voxel_m)
         voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
         sigma_m = fused.frame_sigma_m
         return find_moved(points, sigma_m, counted, voxels, evidence, self._looks)

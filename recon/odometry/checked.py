@@ -27,7 +27,7 @@ from recon.odometry.protocol import (
     pose_in,
 )
 
-_MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion
+_MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion on a road
 _MAX_SIGMA_SHARE: Final = 0.05  # share of the motion's length that is added to it
 _MIN_TELLING: Final = 8  # with fewer usable patches the images say nothing
 MIN_SHARE: Final = 0.6  # least share of patches that must agree with a trusted motion
@@ -48,10 +48,11 @@ class CheckedOdometry:
 
     Args:
         odometry: Finds the poses.
+        scale: Size of the scene against a road.
     """
 
-    def __init__(self, odometry: Odometry) -> None:
-        self._odometry = odometry
+    def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
+        self._odometry, self._max_sigma_m = odometry, scale * _MAX_SIGMA_M
         self._state: CheckedState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -97,8 +98,8 @@ class CheckedOdometry:
     ) -> list[str]:
         """What speaks against a motion; empty where it is to be trusted."""
         length_m = float(np.linalg.norm(T_before_now[:3, 3]))
-        if health.sigma_m > _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m:
-            return [f"the motion is known to {health.sigma_m:.2f} m only"]
+        if health.sigma_m > self._max_sigma_m + _MAX_SIGMA_SHARE * length_m:
+            return [f"the motion is known to {health.sigma_m:.2g} m only"]
         found = explain_motion(*views, T_before_now, camera)
         if found.informative >= _MIN_TELLING:
             return _contradiction(found.share, found.informative)

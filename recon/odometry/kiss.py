@@ -32,6 +32,8 @@ _BEYOND: Final = 2.0
 the rim of the map new points would find older ones before them nearest, and hold the camera back.
 """
 
+_RANGE: Final = 30.0  # relative to the nearest points used, and to the largest standard deviation
+_STILL: Final = 1e-4  # step of ICP that is its last one, relative to the same
 _MIN_POINTS: Final = 300  # frames with fewer points are not registered
 
 
@@ -51,7 +53,8 @@ class KissOdometry:
         voxel_m = max_range_m / _RANGE_IN_VOXELS
         # Points of the map are half a voxel apart. What is off by more is another place.
         self._threshold_m = 0.5 * voxel_m
-        self._icp = KissIcp(KissIcpOptions(_BEYOND * max_range_m, voxel_m))
+        still = _STILL * max_range_m / _RANGE
+        self._icp = KissIcp(KissIcpOptions(_BEYOND * max_range_m, voxel_m, convergence=still))
         self._T_world_camera = self._T_visual = np.eye(4)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -59,8 +62,9 @@ class KissOdometry:
         seen = self._visual.register(frame)
         guess = self._T_world_camera @ invert(self._T_visual) @ seen.T_world_camera
         self._T_visual = seen.T_world_camera
-        points = select_points(frame, _BEYOND * self._max_range_m, _BEYOND * MAX_SIGMA_M)
-        near = (points.xyz[:, 2] <= self._max_range_m) & (np.asarray(points.sigma_m) <= MAX_SIGMA_M)
+        points, range_m = select_points(frame, self._max_range_m, _BEYOND), self._max_range_m
+        sigma_m = np.asarray(points.sigma_m)
+        near = (points.xyz[:, 2] <= range_m) & (sigma_m <= range_m / _RANGE)
         source, visual_m = points.xyz[near], tuple(seen.T_world_camera[:3, 3].tolist())
         health = OdometryHealth(icp_points=len(source), visual_m=visual_m)
         if len(source) < _MIN_POINTS:
@@ -102,7 +106,7 @@ class KissIcpOptions:
     max_range_m: float  # points farther from the sensor are dropped, and the map is clipped there
     voxel_m: float  # voxel size of the map
     iterations: int = 500  # maximum number of ICP iterations
-    convergence: float = 1e-4  # step length below which ICP has converged
+    convergence: float = _STILL  # step length below which ICP has converged
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,14 +219,11 @@ _MIN_GRADIENT: Final = 100.0  # least horizontal gradient, 3x3 Sobel of grey val
 _MAX_DISPARITY_STEP_PX: Final = 0.5
 """Largest difference between a disparity and the median around it."""
 
-_MIN_RANGE_M: Final = 1.0  # nearer points are not used
-MAX_SIGMA_M: Final = 1.0  # points with a less certain depth are not used
 
-
-def select_points(
-    frame: OdometryFrame, max_range_m: float, max_sigma_m: float = MAX_SIGMA_M
-) -> PointCloud:
+def select_points(frame: OdometryFrame, max_range_m: float, beyond: float = 1.0) -> PointCloud:
     """Near, textured points (camera axes) whose disparity agrees with its neighbours.
+
+    Those ``beyond`` times as far away, and as uncertain, as the range allows are among them.
 
     Dense stereo clouds are smeared along the rays where there is little texture, and extend the
     ground towards the camera; ICP on all points underestimates forward motion.
@@ -231,8 +232,8 @@ def select_points(
     depth = depth_from_disparity(frame.disparity.values, camera)
     sigma = depth_sigma(depth, frame.disparity.sigma_px, camera)
     with np.errstate(invalid="ignore"):
-        good = (depth >= _MIN_RANGE_M) & (depth <= max_range_m)
-        good &= sigma <= max_sigma_m
+        good = (depth >= max_range_m / _RANGE) & (depth <= beyond * max_range_m)
+        good &= sigma <= beyond * max_range_m / _RANGE
     good &= textured(frame.pair.left, _MIN_GRADIENT)
     good &= consistent(frame.disparity, _MAX_DISPARITY_STEP_PX)
     return _cloud(frame, depth, sigma, good)

@@ -230,7 +230,7 @@ class TrackWindow:
 def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """Observed minus predicted column, row, disparity (W, N, 3); NaN = unseen."""
     xyz = np.stack([apply(T, window.xyz_world) for T in invert(window.T_world_camera)])
-    z = np.maximum(xyz[:, :, 2], bundle.MIN_DEPTH_M)
+    z = np.maximum(xyz[:, :, 2], bundle.NEAREST * camera.baseline_m)
     f = camera.focal_px
     predicted = np.stack(
         [

@@ -25,12 +25,15 @@ ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odo
 
 
 def make_odometry(
-    name: str, settings: OdometrySettings | None = None, prior: Trajectory | None = None
+    name: str,
+    settings: OdometrySettings | None = None,
+    prior: Trajectory | None = None,
+    scale: float = 1.0,
 ) -> Odometry:
     """Make the odometry of a name in `ODOMETRIES`; its poses are checked (`CheckedOdometry`).
 
     Each odometry uses its own part of the settings; ``prior`` is the path of the rig by other
-    sensors, on the clock of the frames.
+    sensors, on the clock of the frames, ``scale`` the size of the scene against a road.
     """
     if name == "sfm":
         what, expected = "structure from motion is no odometry frame by frame", "visual or kiss"
@@ -40,7 +43,7 @@ def make_odometry(
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
     settings = settings or OdometrySettings()
     motion_prior = None if prior is None else MotionPrior(prior, settings.prior)
-    return CheckedOdometry(ODOMETRIES[name](settings, motion_prior))
+    return CheckedOdometry(ODOMETRIES[name](settings, motion_prior), scale)
 
 
 class KnownPoses:

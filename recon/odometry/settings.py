@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 
 
 class PriorSettings(Settings):
@@ -51,7 +51,7 @@ class OdometrySettings(Settings):
     """visual = features followed from frame to frame; kiss = kiss-icp, which from there registers
     the points that stereo measures well over time, to compare with; sfm = structure from motion by
     COLMAP over all pairs, in any order (extra sfm)."""
-    max_range_m: float = Field(30.0, ge=0.1, le=10000.0)
+    max_range_m: float = Length(30.0, ge=1e-06, le=100000.0)
     """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
     it with a wide baseline in open country."""
     prior: PriorSettings = PriorSettings()

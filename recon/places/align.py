@@ -23,7 +23,8 @@ _FEWEST: Final = 8  # least number of companions
 _SIGMA_D_PX: Final = 1.0  # standard deviation of a disparity
 _STEPS: Final = 15
 _ROUNDS: Final = 3
-_STILL: Final = 1e-5  # metres and radians: a step that ends the fit
+_STILL: Final = 1e-5  # baselines and radians: a step that ends the fit
+_NEAREST: Final = 0.2  # of the baseline: what is nearer is not in both views
 _CAUCHY_SIGMAS: Final = 2.0
 _SHARED: Final = 0.5  # both directions see the same matches, so together they count once
 
@@ -122,12 +123,12 @@ def _companions(rigid: Bool, seed: int) -> NDArray[np.intp]:
 
 def refine(first: Seen, last: Seen, T_first_last: Float64, *, steps: int = _STEPS) -> Alignment:
     """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights."""
-    T = T_first_last
+    T, units = T_first_last, np.repeat([last.camera.baseline_m, 1.0], 3)
     for _ in range(steps):
         H, g = _normal_equations(first, last, T)
         step = np.linalg.solve(H + 1e-9 * np.eye(6), -g)
         T = T @ as_transform(step)
-        if np.linalg.norm(step) < _STILL:
+        if np.linalg.norm(step / units) < _STILL:
             break
     H, _ = _normal_equations(first, last, T)
     return Alignment(T, agreement(first, last, T), _SHARED * H)
@@ -164,9 +165,9 @@ def _normal_equations(first: Seen, last: Seen, T: Float64) -> tuple[Float64, Flo
 def _residuals(xyz: Float64, d_xyz: Float64, seen: Seen) -> tuple[Float64, Float64]:
     """Return whitened residuals (N, 3) and derivatives (N, 3, 6); 0 for points behind a camera."""
     sigma, camera = np.array([seen.sigma_px, seen.sigma_px, _SIGMA_D_PX]), seen.camera
-    front = xyz[:, 2] > 0.1
-    z = np.where(front, xyz[:, 2], 1.0)
     f, b = camera.focal_px, camera.baseline_m
+    front = xyz[:, 2] > _NEAREST * b
+    z = np.where(front, xyz[:, 2], 1.0)
     u, v = f * xyz[:, 0] / z + camera.cx_px, f * xyz[:, 1] / z + camera.cy_px
     predicted = np.stack([u, v, f * b / z - camera.doffs_px], axis=1)
     J = np.zeros((len(xyz), 3, 3))

@@ -25,6 +25,7 @@ from recon.places.pose_graph import PoseEdge, optimise_poses
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
 _KEPT: Final = 0.25  # least weight of a loop that is believed
+# Lengths are those on a road: they are times the scale of the scene.
 _NODE_M: Final = 5.0  # path between two nodes of the graph
 _MAX_NODES: Final = 4000  # longer drives get nodes farther apart; so many take some seconds
 _LOOP_SIGMA_M: Final = 0.05  # standard deviation of a loop that more matches do not improve
@@ -73,16 +74,17 @@ class DrivePath:
     # float64 (N, 2), summed variances of the motions up to each frame, as odometry states them:
     # of positions (m²) and of rotations (rad²)
     variance: Float64
+    scale: float = 1.0  # of the scene, against a road
 
     @staticmethod
-    def of(odometry: Trajectory, health: Sequence[OdometryHealth]) -> DrivePath:
+    def of(odometry: Trajectory, health: Sequence[OdometryHealth], scale: float = 1.0) -> DrivePath:
         """Return the path of a drive by odometry, or of known poses."""
-        path_m = path_lengths(odometry.T_world_camera, trusted_poses(health))
+        path_m = path_lengths(odometry.T_world_camera, trusted_poses(health), scale)
         if all(record.known for record in health):
             path_m = np.zeros(len(health))
         sigma = np.array([(record.sigma_m, np.deg2rad(record.sigma_deg)) for record in health])
         variance = np.cumsum(np.nan_to_num(sigma, posinf=0.0) ** 2, axis=0)
-        return DrivePath(odometry, path_m, stretches(health), variance)
+        return DrivePath(odometry, path_m, stretches(health), variance, scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,12 +184,12 @@ def join_drives(
     return JoinedDrives(tuple(paths), kept)
 
 
-def loop_bias(loop: Loop) -> Drift:
+def loop_bias(loop: Loop, scale: float = 1.0) -> Drift:
     """Return the standard deviations of a loop that more matches do not improve."""
     if loop.same_frame:
         return Drift(0.0, 0.0)
     apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
-    position_m = math.hypot(_LOOP_SIGMA_M, _LOOP_SHARE * apart_m)
+    position_m = math.hypot(scale * _LOOP_SIGMA_M, _LOOP_SHARE * apart_m)
     return Drift(position_m, math.radians(_LOOP_SIGMA_DEG))
 
 
@@ -217,7 +219,7 @@ def _tied_frames(ties: Sequence[Tie], drive: int) -> list[int]:
 def _spaced(drives: Sequence[DrivePath], tied: Sequence[list[int]]) -> list[NDArray[np.intp]]:
     """Return the frames of each drive that are nodes: at even distances, and where ties are."""
     length_m = sum(float(drive.path_m[-1]) for drive in drives)
-    gap_m = max(_NODE_M, 2.0 * length_m / _MAX_NODES)
+    gap_m = max(min(drive.scale for drive in drives) * _NODE_M, 2.0 * length_m / _MAX_NODES)
     if 2 * sum(map(len, tied)) > _MAX_NODES:
         tied = [[] for _ in drives]
     return [_nodes(drive, gap_m, frames) for drive, frames in zip(drives, tied, strict=True)]
@@ -312,7 +314,8 @@ def _odometry_edges(
         if drive.stretch[first] != drive.stretch[last]:
             continue
         # Where the camera stands still, 0.1 m keeps the information finite.
-        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1))
+        between_m = max(float(path_m[last] - path_m[first]), 0.1 * drive.scale)
+        drift = drift_over(between_m, drive.scale)
         stated = np.repeat(drive.variance[last] - drive.variance[first], 3)
         T = invert(poses[first]) @ poses[last]
         information = _inverse(share**2 * (drift.covariance + np.diag(stated)))
@@ -327,7 +330,8 @@ def _tie_edge(
     loop, (one, other) = tie.loop, tie.drives
     first, to_first, before_m = _to_node(drives[one], nodes[one], loop.first)
     last, to_last, after_m = _to_node(drives[other], nodes[other], loop.last)
-    drift, bias = drift_over(before_m + after_m), loop_bias(loop)
+    scale = drives[one].scale
+    drift, bias = drift_over(before_m + after_m, scale), loop_bias(loop, scale)
     more = Drift(*map(math.hypot, astuple(drift), astuple(bias)))
     turn = adjoint(invert(to_last))  # from the axes of the frame to those of its node
     covariance = np.linalg.inv(turn.T @ loop.information @ turn) + more.covariance

@@ -15,7 +15,7 @@ from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, freeze
 from recon.core.values.camera import project
 from recon.places.keyframe import Keyframe, coarse_of, coarse_points, make_keyframe, words_of
-from recon.places.loop import LOOP_SIGMAS, Loop, agreeing_loops
+from recon.places.loop import Loop, agreeing_loops, loop_sigmas
 from recon.places.places import (
     VIEW_DEG,
     Place,
@@ -78,14 +78,20 @@ class LoopDetector:
         store: Where keyframes go.
         camera: The rectified camera of the drive.
         search: Whether to look for loops; else keyframes are only kept, for later drives.
+        scale: Of the scene, against a road.
     """
 
     def __init__(
-        self, store: KeyframeStore, camera: RectifiedCamera, *, search: bool = True
+        self,
+        store: KeyframeStore,
+        camera: RectifiedCamera,
+        *,
+        search: bool = True,
+        scale: float = 1.0,
     ) -> None:
         self._store, self._camera = store, camera
-        self._search = search
-        self._places = Places()
+        self._search, self._scale = search, scale
+        self._places = Places(scale)
         self._last: StoredKeyframe | None = None
         self.loops: list[Loop] = []
         self.refused: Counter[str] = Counter()
@@ -140,7 +146,8 @@ class LoopDetector:
         )
         poses = dict(zip(places.frames, known, strict=True))
         apart = {id(one) for one in self.loops if poses[one.first][2] != poses[one.last][2]}
-        agreeing = agreeing_loops([one for one in self.loops if id(one) not in apart], poses, poses)
+        own = [one for one in self.loops if id(one) not in apart]
+        agreeing = agreeing_loops(own, poses, poses, scale=self._scale)
         return [*agreeing, *(one for one in self.loops if id(one) in apart)]
 
     def _place(self, stored: StoredKeyframe) -> Place:
@@ -193,7 +200,7 @@ class LoopDetector:
                 continue
             left[old] = False
             known = self._store.get(self._places.frames[old]).keyframe
-            verdict = verify(known, new.keyframe, self._camera)
+            verdict = verify(known, new.keyframe, self._camera, scale=self._scale)
             if verdict.loop is None:
                 refused.append(verdict.refused)
             elif not self._possible(old, place, verdict.loop):
@@ -217,8 +224,8 @@ class LoopDetector:
         if self._places.stretches[old] != new.stretch:
             return True
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
-        drift = drift_over(new.path_m - float(self._places.path_m[old]))
-        return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS)
+        drift = drift_over(new.path_m - float(self._places.path_m[old]), self._scale)
+        return is_possible(invert(T) @ loop.T_first_last, drift, loop_sigmas(self._scale))
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,10 +259,11 @@ class KnownPlaces:
 
     Attributes:
         T_world_camera: float64 (N, 4, 4), where the views were taken, in the world of the map.
+        scale: That of the scene, against a road.
     """
 
-    def __init__(self, views: Sequence[KnownView]) -> None:
-        self._views = views
+    def __init__(self, views: Sequence[KnownView], scale: float = 1.0) -> None:
+        self._views, self.scale = views, scale
         self._words = WordIndex()
         poses, reach_m = list[Float64](), list[float]()
         for view in views:
@@ -305,7 +313,7 @@ class KnownPlaces:
     def compare(self, number: int, keyframe: Keyframe, camera: RectifiedCamera) -> Verdict:
         """Return whether a view shows the same place as a frame; ``first`` is its number."""
         view = self._views[number]
-        verdict = verify(view.keyframe, keyframe, camera, view.camera)
+        verdict = verify(view.keyframe, keyframe, camera, view.camera, self.scale)
         if verdict.loop is None:
             return verdict
         return Verdict(replace(verdict.loop, first=number))

@@ -37,9 +37,13 @@ class Place:
 
 
 class Places:
-    """All places so far, in order; a query among thousands takes some milliseconds."""
+    """All places so far, in order; a query among thousands takes some milliseconds.
 
-    def __init__(self) -> None:
+    ``scale`` is that of the scene, of which drift depends.
+    """
+
+    def __init__(self, scale: float = 1.0) -> None:
+        self._scale = scale
         self._frames: list[int] = []
         self._poses = np.empty((64, 4, 4))
         self._path_m = np.empty(64)
@@ -84,7 +88,7 @@ class Places:
     def near(self, place: Place) -> Bool:
         """Return bool (N,), those of its stretch that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
-        sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0))
+        sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), self._scale)
         T = invert(self.T_world_camera) @ place.T_world_camera
         far_m = np.linalg.norm(T[:, :3, 3], axis=1) - SIGMAS * sigma_m
         turned = angle_rad(T) - SIGMAS * sigma_rad
@@ -192,6 +196,7 @@ class WordIndex:
         return np.divide(shared, sizes, out=np.zeros(len(shared)), where=sizes > 0)
 
 
+# Lengths are those on a road: they are times the scale of the scene (`scene.scale`).
 _LOST_FACTOR: Final = 20.0  # metres that one metre of extrapolated path counts as
 _LOST_M: Final = 2.0  # path that is added for each frame without a measurement
 SIGMAS: Final = 3.5  # largest possible deviation from odometry, in standard deviations
@@ -213,26 +218,26 @@ class Drift:
         return np.diag([self.position_m**2] * 3 + [self.angle_rad**2] * 3)
 
 
-def path_lengths(T_world_camera: Float64, trusted: Bool) -> Float64:
+def path_lengths(T_world_camera: Float64, trusted: Bool, scale: float = 1.0) -> Float64:
     """The path (N,) up to each frame; metres without a trusted pose count several times."""
     step_m = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     lost = ~trusted[1:]
-    step_m = np.where(lost, _LOST_FACTOR * step_m + _LOST_M, step_m)
+    step_m = np.where(lost, _LOST_FACTOR * step_m + scale * _LOST_M, step_m)
     return np.concatenate([np.zeros(min(1, len(trusted))), np.cumsum(step_m)])
 
 
-def drift_over(path_m: float) -> Drift:
+def drift_over(path_m: float, scale: float = 1.0) -> Drift:
     """The drift over a path.
 
     The scale error is constant and the heading a random walk. The position error of the latter is
     that of a straight drive, the worst case: ``turn·√(path³/3)``.
     """
-    return Drift(*map(float, spread_over(np.array(path_m))))
+    return Drift(*map(float, spread_over(np.array(path_m), scale)))
 
 
-def spread_over(path_m: Float64) -> tuple[Float64, Float64]:
+def spread_over(path_m: Float64, scale: float = 1.0) -> tuple[Float64, Float64]:
     """Return `drift_over` of many paths (N,): standard deviations of positions and of rotations."""
-    turn = math.radians(TURN_DEG)
+    turn = math.radians(TURN_DEG) / math.sqrt(scale)
     position_m = np.hypot(SHARE * path_m, turn * np.sqrt(path_m**3 / 3.0))
     return position_m, turn * np.sqrt(path_m)
 

@@ -28,7 +28,7 @@ _MAX_HAMMING: Final = 72  # largest Hamming distance of a match
 _GUIDED_HAMMING: Final = 90  # that of features that are where they should be
 _GUIDED_SIGMAS: Final = 4.0  # how far they may be from there
 _SPREAD_CELLS: Final = 5  # of 4 by 4 cells of each image, how many must hold inliers
-_MAX_SIGMA_M: Final = 0.3  # loops less certain than this in any direction are refused
+_MAX_SIGMA_M: Final = 0.3  # loops less certain than this, on a road, in any direction are refused
 _DENSE_TOLERANCE_PX: Final = 1.0
 """Largest difference between a predicted and a seen disparity that agree."""
 
@@ -50,6 +50,7 @@ def verify(
     last: Keyframe,
     camera: RectifiedCamera,
     first_camera: RectifiedCamera | None = None,
+    scale: float = 1.0,
 ) -> Verdict:
     """Whether two keyframes show the same place.
 
@@ -58,7 +59,7 @@ def verify(
     determine the motion in all directions. The coarse disparities must agree with it, too.
     """
     cameras = (first_camera or camera, camera)
-    aligned = _aligned(Matchable.of(first, cameras[0]), Matchable.of(last, cameras[1]))
+    aligned = _aligned(Matchable.of(first, cameras[0]), Matchable.of(last, cameras[1]), scale)
     if isinstance(aligned, str):
         return Verdict(None, aligned)
     T, inliers = aligned.T_first_last, int(aligned.agree.sum())
@@ -68,7 +69,7 @@ def verify(
     return Verdict(Loop(first.frame, last.frame, T, aligned.information, inliers, dense))
 
 
-def _aligned(first: Matchable, last: Matchable) -> Alignment | str:
+def _aligned(first: Matchable, last: Matchable, scale: float) -> Alignment | str:
     """The motion between the frames, or why it is not verified."""
     found = find_motion(*_seen(first, last, first.mutual(last)))
     if found is None:
@@ -80,7 +81,7 @@ def _aligned(first: Matchable, last: Matchable) -> Alignment | str:
         return "few inliers"
     if min(_spread(one.select(aligned.agree)) for one in seen) < _SPREAD_CELLS:
         return "inliers in one corner"
-    if _sigma_m(aligned.information) > _MAX_SIGMA_M:
+    if _sigma_m(aligned.information) > scale * _MAX_SIGMA_M:
         return "motion not fixed"
     return aligned
 

@@ -70,11 +70,15 @@ class Run(RunDirectory):
         super().__enter__()
         try:
             if self._config is not None:
-                write_yaml(self.path(CONFIG), self._config.recorded(self.command))
+                self.settle(self._config)
         except BaseException:  # such as a full disk
             self.__exit__(*sys.exc_info())
             raise
         return self
+
+    def settle(self, config: Settings) -> None:
+        """Write ``config.yaml``, anew where some settings are known only now."""
+        write_yaml(self.path(CONFIG), config.recorded(self.command))
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Time the body of a ``with`` statement as part of the stage ``name``."""

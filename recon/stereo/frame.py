@@ -17,7 +17,7 @@ from pydantic import Field
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 from recon.core.values import (
     Disparity,
     PointCloud,
@@ -151,9 +151,9 @@ class CloudSettings(Settings):
     remove_flying_edges: bool = True
     """Drop pixels that float between a foreground and its background. Turn it off to see what the
     matcher found."""
-    min_range_m: float = Field(0.1, ge=0, le=1000000.0)
+    min_range_m: float = Length(0.1, ge=0, le=1000000.0)
     """Nearest depth kept. Set it to hide a bonnet or gripper."""
-    max_range_m: float | None = Field(30.0, ge=1e-06, le=1000000.0)
+    max_range_m: float | None = Length(30.0, ge=1e-06, le=1000000.0)
     """Farthest depth kept; none = no limit. The error of a depth grows with its square."""
     max_relative_sigma: float | None = Field(0.1, ge=1e-06, le=1000000.0)
     """Largest standard deviation of a depth kept, as a share of it; none = no limit. Smaller for

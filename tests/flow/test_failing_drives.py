@@ -150,11 +150,16 @@ def test_a_drive_without_a_map_says_why(seen, tmp_path):
         map_drive(BARE.pairs(range(8)), tmp_path / "bare")
     with pytest.raises(MappingError, match=r"no point in the middle of the drive: .* at .* m"):
         map_drive(seen[:4], tmp_path / "near", "cloud.max_range_m=0.5")
-    with pytest.raises(MappingError, match=r"the map is empty .*baseline is implausible: 540 m"):
-        map_drive(seen[:4], tmp_path / "mm", baseline=1000, audit=True)
     with pytest.raises(CalibrationError, match="left and right images are swapped"):
         map_drive(swapped, tmp_path / "swapped")
-    assert [path.name for path in tmp_path.glob("*/*")] == ["drive"] * 4
+    assert [path.name for path in tmp_path.glob("*/*")] == ["drive"] * 3
+
+
+def test_a_baseline_in_another_unit_is_warned_of_and_throws_nothing_away(seen, tmp_path):
+    run = map_drive(seen[:4], tmp_path, baseline=1000, audit=True)
+    assert "baseline is implausible: 540 m" in " ".join(run.warnings)
+    assert run.summary["scale"] == 1000.0
+    assert len(run.cloud)
 
 
 def body_path(change: Callable[[np.ndarray], np.ndarray] = np.copy) -> Trajectory:

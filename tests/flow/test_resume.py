@@ -61,8 +61,8 @@ def test_other_settings_sources_and_poses_are_refused(drive, tmp_path):
     begun = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         _run(drive, begun, Breaks(12))
-    with pytest.raises(SettingsError, match=r"other settings.*fusion.voxel_m = 0.2, expected 0.1"):
-        _run(drive, begun, None, "fusion.voxel_m=0.2", resume=True)
+    with pytest.raises(SettingsError, match=r"other settings.*fusion.voxel_m = 0.3, expected 0.2"):
+        _run(drive, begun, None, "fusion.voxel_m=0.3", resume=True)
     other = shutil.copytree(drive, tmp_path / "other")
     (other / "image_0" / "000007.png").write_bytes((drive / "image_0" / "000008.png").read_bytes())
     with pytest.raises(SettingsError, match="another source"):

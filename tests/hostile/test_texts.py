@@ -250,5 +250,7 @@ def test_margins_beyond_a_tile_are_refused(setting):
         load_config(None, [setting])
     load_config(None, [setting, "submaps.tile_m=60"])
     with pytest.raises(SettingsError, match=r"mesh\.tile_m.*greater than or equal to 6"):
-        load_config(None, ["mesh.tile_m=5.9"])
+        load_config(None, ["mesh.tile_m=5.9"]).at_scale(1.0)
+    with pytest.raises(SettingsError, match="beyond a tile of 10 m"):
+        load_config(None, ["map_filters.radius_m=11"]).at_scale(0.2)
     assert ReconConfig().mesh.tile_m > 6

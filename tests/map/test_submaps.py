@@ -260,10 +260,10 @@ def test_voxels_seen_too_rarely_are_not_exported():
 def test_precise_voxels_need_one_frame_less(monkeypatch):
     # Two frames of 0.1 m make 0.071 m, two of 0.15 m make 0.106 m.
     cloud = _cloud([HERE, ELSEWHERE], sigma_m=np.float32([0.1, 0.15]))
-    for limit_m, exported in ((0.08, 1), (0.07, 0), (0.11, 2)):
-        monkeypatch.setattr(fusion, "PRECISE_SIGMA_M", limit_m)
+    for limit, exported in ((0.8, 1), (0.7, 0), (1.1, 2)):
+        monkeypatch.setattr(fusion, "_PRECISE", limit)
         assert len(_fused(cloud, cloud, least=3)) == exported
-    monkeypatch.setattr(fusion, "PRECISE_SIGMA_M", 10.0)
+    monkeypatch.setattr(fusion, "_PRECISE", 100.0)
     assert (len(_fused(cloud, least=3)), len(_fused(cloud))) == (0, 2)
 
 

@@ -51,7 +51,7 @@ LOST = OdometryHealth(ok=False, notes=("lost",))
     [
         (0.5, SURE, None),
         (0.0, SURE, "of the image moved like that"),
-        (0.5, OdometryHealth(sigma_m=0.3), "the motion is known to 0.30 m only"),
+        (0.5, OdometryHealth(sigma_m=0.3), "the motion is known to 0.3 m only"),
         # What was not measured is not doubted twice.
         (0.0, LOST, None),
         (0.0, OdometryHealth(begins=True), None),

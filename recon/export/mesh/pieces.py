@@ -36,6 +36,7 @@ LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where the run has no 
 SAMPLE_FACES: Final = 2_000_000  # most triangles of a mesh that is loaded whole for images
 _MOST_AT_ONCE: Final = 4
 _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))  # of a piece: axis, 1 for the far side
+# Lengths are those on a road: they are times the scale of the scene.
 _SEAM_M: Final = 0.15  # widest gap that is closed where two pieces meet
 _BULGE_M: Final = 2.0  # how far a surface may go beyond the points that it is made of
 PieceKey = tuple[int, int]
@@ -160,11 +161,12 @@ class _Mesher:
 
     def _surface(self, key: PieceKey) -> TriangleMesh | MeshingError:
         """Return the surface of a piece with its margin, cut at its sides, or why there is none."""
-        wide = self._bounds(key).wider(OVERLAP_M)
+        scale = self.tiles.config.scale
+        wide = self._bounds(key).wider(scale * OVERLAP_M)
         cloud = self.tiles.cloud_in(wide)
         wrong = None
         if self.settings.free_space:
-            voxels = self.tiles.voxels_in(wide.wider(_BULGE_M))
+            voxels = self.tiles.voxels_in(wide.wider(scale * _BULGE_M))
             wrong = partial(looked_through, voxels=voxels) if len(voxels) else None
         settings, target = self.settings, self.settings.target_faces
         if target is not None:
@@ -186,7 +188,7 @@ class _Mesher:
             neighbour = (key[0], key[1] + step) if axis else (key[0] + step, key[1])
             border = self.borders.pop((neighbour, plane), None)
             if border is not None:
-                mesh = close_seam(mesh, plane, border, _SEAM_M)
+                mesh = close_seam(mesh, plane, border, self.tiles.config.scale * _SEAM_M)
             else:
                 self.borders[key, plane] = open_edges(mesh, plane)
         return mesh

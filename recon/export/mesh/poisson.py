@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from recon.core.errors import MeshingError
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 from recon.core.text import counted
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32
@@ -21,8 +21,8 @@ from recon.io.models import open3d_meshes
 from recon.stereo import open3d_clouds
 
 OVERLAP_M: Final = 3.0
-"""Margin around a tile whose points its surface is fitted to as well. A tile is at least as wide as
-both margins together: in narrower ones every point would be meshed more than four times."""
+"""Margin, on a road, around a tile whose points its surface is fitted to as well. A tile is at
+least as wide as both margins together: else every point would be meshed more than four times."""
 _MIN_POINTS = 50
 _MIN_DEPTH = 4
 _FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of their median
@@ -58,7 +58,7 @@ class MeshSettings(Settings):
     target_faces: int | None = Field(None, ge=4, le=1_000_000_000)
     """Simplify to about so many faces; none = do not. For viewers and other programs with a limit.
     """
-    tile_m: float = Field(50.0, ge=2 * OVERLAP_M, le=10000.0)
+    tile_m: float = Length(50.0, ge=1e-06, le=100_000.0)
     """Edge of the tiles in which the map of a drive is meshed. Smaller ones take less memory."""
     free_space: bool = True
     """Remove surfaces in space that the cameras of a drive saw to be free. Off keeps what moved

@@ -25,20 +25,25 @@ _FULL_COLOUR: Final = 257  # colours have 16 bits: 255 becomes 65535
 
 
 def write_las(
-    path: StrPath, clouds: Iterable[PointCloud], T_to_from: Float64, crs: str | None = None
+    path: StrPath,
+    clouds: Iterable[PointCloud],
+    T_to_from: Float64,
+    crs: str | None = None,
+    step_m: float = _STEP_M,
 ) -> int:
     """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
 
-    Positions are rounded to millimetres; colours, and the standard deviation of the depth as the
-    extra dimension ``sigma``, are written where the clouds have them. ``T_to_from`` (4, 4) leads to
-    the coordinates of the file, in the system ``crs``. The number of points is returned.
+    Positions are rounded to multiples of ``step_m``; colours, and the standard deviation of the
+    depth as the extra dimension ``sigma``, are written where the clouds have them. ``T_to_from``
+    (4, 4) leads to the coordinates of the file, in the system ``crs``. The number of points is
+    returned.
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
     laspy = require("laspy", extra=_EXTRA)
     header = laspy.LasHeader(point_format=_COLOURED, version="1.4")
     header.generating_software = "recon"
-    header.scales, header.offsets = np.full(3, _STEP_M), np.floor(T_to_from[:3, 3])
+    header.scales, header.offsets = np.full(3, step_m), np.floor(T_to_from[:3, 3])
     sigma = laspy.ExtraBytesParams("sigma", np.float32, "depth, 1 sigma, metres")
     header.add_extra_dims([sigma])
     if crs is not None:

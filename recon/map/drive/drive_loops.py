@@ -99,13 +99,14 @@ class LoopWatch:
         stopwatch: Stopwatch | None = None,
         *,
         search: bool = True,
+        scale: float = 1.0,
     ) -> None:
-        self.searching = search
+        self.searching, self._scale = search, scale
         self._stage = (stopwatch or Stopwatch()).stage
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
         self._keyframes = keyframes
-        self._detector = LoopDetector(keyframes, camera, search=search)
+        self._detector = LoopDetector(keyframes, camera, search=search, scale=scale)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
@@ -145,7 +146,7 @@ class LoopWatch:
     def close(self, trajectory: Trajectory, health: Sequence[OdometryHealth]) -> DriveLoops:
         """Close the loops of a path by odometry."""
         self.wait()
-        path = DrivePath.of(trajectory, health)
+        path = DrivePath.of(trajectory, health, self._scale)
         loops = self._detector.agreeing()
         return DriveLoops(
             odometry=trajectory,
@@ -163,7 +164,8 @@ class LoopWatch:
     def _advance(self, T_world_camera: Float64, stretch: int) -> float:
         """Return path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
-        step = path_lengths(np.stack([before, T_world_camera]), np.array([True, stretch >= 0]))
+        poses, trusted = np.stack([before, T_world_camera]), np.array([True, stretch >= 0])
+        step = path_lengths(poses, trusted, self._scale)
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
         self._last = T_world_camera
         return self._path_m[-1]

@@ -77,7 +77,7 @@ def odometry_of(
         if used is not None:
             axes = settings.prior.model_copy(update={"axes": used.axes})
             settings = settings.model_copy(update={"prior": axes})
-        return make_odometry(settings.method, settings, prior)
+        return make_odometry(settings.method, settings, prior, config.scale)
     return KnownPoses(_of_frames(known_poses, source))
 
 

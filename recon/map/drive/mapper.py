@@ -138,7 +138,7 @@ class Mapper:
 
     def fix_axes(self, cloud: PointCloud) -> SubmapBuilder:
         """Lay the axes of the map by the ground in a cloud, world axes; begin the first submap."""
-        config, ground = self._config, estimate_ground(cloud)
+        config, ground = self._config, estimate_ground(cloud, self._config.scale)
         T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m)
         self.session.set_axes(T_map_world, self._camera)
         self._builder = self._new_builder()

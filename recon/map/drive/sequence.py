@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -221,7 +221,8 @@ def map_sequence(
     else:
         odometry = odometry_of(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None and not by_sfm
-    watch = LoopWatch(session.keyframes, reconstructor.camera, work.stopwatch, search=looking)
+    how: Any = {"search": looking, "scale": config.scale}
+    watch = LoopWatch(session.keyframes, reconstructor.camera, work.stopwatch, **how)
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
     drive = Drive(source, reconstructor, mapper, watch, config, work)
     if isinstance(odometry, FoundOdometry) and not len(mapper):

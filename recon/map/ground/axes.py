@@ -22,6 +22,7 @@ _MAX_TILT_DEG: Final = 30.0  # planes tilted more than this are no ground
 _MIN_TILT_DEG: Final = 3.0
 """The map is levelled only where the camera is tilted more than this: less is within the error of
 the measured ground, and of a road's own slope."""
+# Lengths are those on a road: they are times the scale of the scene.
 _MAX_RANGE_M: Final = 20.0
 """How far away the ground is looked for: farther points are too uncertain to level by."""
 _INLIER_M: Final = 0.05  # distance to the plane of points that support it
@@ -97,7 +98,7 @@ def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
     return ground.height_m / float(turn[2] @ ground.normal)
 
 
-def estimate_ground(cloud: PointCloud) -> GroundPlane | None:
+def estimate_ground(cloud: PointCloud, scale: float = 1.0) -> GroundPlane | None:
     """Find the plane that the camera stands above in a cloud of one frame, camera axes.
 
     RANSAC, then least squares: the plane within 30 degrees of level with the most support, or None.
@@ -105,12 +106,12 @@ def estimate_ground(cloud: PointCloud) -> GroundPlane | None:
 
     Ref: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981.
     """
-    xyz = _candidates(cloud)
+    xyz, inlier_m = _candidates(cloud, scale * _MAX_RANGE_M), scale * _INLIER_M
     if len(xyz) < _MIN_INLIERS:
         return None
-    normal, height = _best_plane(xyz)
+    normal, height = _best_plane(xyz, inlier_m)
     for _ in range(3):
-        inside = np.abs(xyz @ normal + height) < _INLIER_M
+        inside = np.abs(xyz @ normal + height) < inlier_m
         if inside.sum() < _MIN_INLIERS:
             return None
         normal, height = _fit_plane(xyz[inside])
@@ -118,17 +119,17 @@ def estimate_ground(cloud: PointCloud) -> GroundPlane | None:
     return plane if plane.tilt_deg <= _MAX_TILT_DEG and height > 0 else None
 
 
-def _candidates(cloud: PointCloud) -> Float64:
+def _candidates(cloud: PointCloud, range_m: float) -> Float64:
     """Return points in range that a tilted ground could hold, thinned evenly; float64 (N, 3)."""
     xyz = cloud.xyz.astype(np.float64)
     z = xyz[:, 2]
     highest = z * math.tan(math.radians(_MAX_TILT_DEG))
-    below = (z > 0) & (z < _MAX_RANGE_M) & (xyz[:, 1] > -highest)
+    below = (z > 0) & (z < range_m) & (xyz[:, 1] > -highest)
     xyz = xyz[below]
     return np.asarray(xyz[:: max(1, math.ceil(len(xyz) / 20_000))])
 
 
-def _best_plane(xyz: Float64) -> tuple[Float64, float]:
+def _best_plane(xyz: Float64, inlier_m: float) -> tuple[Float64, float]:
     """Return the plane through three points that most points support."""
     random = np.random.default_rng(0)
     few = xyz[:: max(1, len(xyz) // 4000)]
@@ -139,7 +140,7 @@ def _best_plane(xyz: Float64) -> tuple[Float64, float]:
     normals *= np.where(normals[:, 1] > 0, -1.0, 1.0)[:, None]
     heights = -np.einsum("ij,ij->i", normals, triples[:, 0])
     level = normals @ _UP_CAMERA >= math.cos(math.radians(_MAX_TILT_DEG))
-    support = np.abs(few @ normals.T + heights) < _INLIER_M
+    support = np.abs(few @ normals.T + heights) < inlier_m
     votes = np.where(level & (heights > 0), support.sum(axis=0), -1)
     best = int(np.argmax(votes))
     return normals[best], float(heights[best])

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from recon.core.errors import MappingError
 from recon.core.kernels.voxels import find_keys, pack_keys
-from recon.core.settings import Settings
+from recon.core.settings import Length, Settings
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, freeze
 from recon.core.values.grid import log_odds
@@ -27,7 +27,8 @@ from recon.core.values.grid import log_odds
 _BIN_M: Final = 0.05
 _DEEPEST_M: Final = 5.0  # points farther below the path are not what the camera is carried on
 _NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
-CELL_M: Final = 1.0  # edge of a cell of the surface
+CELL_M: Final = 1.0  # least edge of a cell of the surface
+_MOST_RINGS: Final = 500  # of cells around the path: in large scenes they are wider
 WINDOW_M: Final = 0.3
 """Points this far from the expected height may be ground: also the largest step from one cell to
 the next."""
@@ -39,7 +40,7 @@ _MAX_GAP_M: Final = 4.0  # how far a height is carried over cells without points
 class GroundSettings(Settings):
     """How the ground is followed."""
 
-    reach_m: float = Field(25.0, ge=0.1, le=500.0)
+    reach_m: float = Length(25.0, ge=1e-06, le=100_000.0)
     """How far from the path the surface grows, and with it the grid. Raise it with
     occupancy.max_range_m."""
     camera_height_m: float | None = Field(None, ge=0.01, le=100.0)
@@ -115,7 +116,7 @@ def estimate_ground_surface(
         field.grow(camera_height)
     return GroundSurface(
         heights_m=_smooth(field.heights, field.measured),
-        cell_m=CELL_M,
+        cell_m=field.cell_m,
         origin_m=field.origin,
         camera_height_m=camera_height,
         drops_m=field.drops(),
@@ -147,7 +148,8 @@ class _Field:
     """The surface while it grows."""
 
     def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
-        cell, rings = CELL_M, math.ceil(settings.reach_m / CELL_M)
+        self.cell_m = cell = max(CELL_M, settings.reach_m / _MOST_RINGS)
+        rings = math.ceil(settings.reach_m / cell)
         path = np.concatenate([_densify(piece, cell / 2) for piece in _pieces(path)])
         low = np.floor(path[:, :2].min(axis=0) / cell) - rings
         columns, rows = (np.floor(path[:, :2].max(axis=0) / cell) - low + rings + 1).astype(int)
@@ -213,7 +215,7 @@ class _Field:
             total = np.bincount(slot[near], weights=z[near], minlength=len(cells))
             found = number >= MIN_POINTS
             height = np.where(found, total / np.maximum(number, 1), height)
-        gap = np.where(found, 0.0, gap + CELL_M)
+        gap = np.where(found, 0.0, gap + self.cell_m)
         lost = gap > _MAX_GAP_M
         self.heights.ravel()[cells] = np.where(lost, np.nan, height)
         self.measured.ravel()[cells] = found
@@ -256,7 +258,7 @@ class _Field:
     def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], Bool]:
         """Return flat index of the cell of each point, and whether it lies on the field."""
         rows, columns = self.heights.shape
-        place = np.floor((xyz[:, :2] - self.origin) / CELL_M)
+        place = np.floor((xyz[:, :2] - self.origin) / self.cell_m)
         inside = np.all((place >= 0) & (place < (columns, rows)), axis=1)
         column, row = np.where(inside, place.T, 0).astype(np.intp)
         return row * columns + column, np.asarray(inside)

@@ -26,7 +26,7 @@ BLOCK_BITS: Final = 3
 BLOCK_EDGE: Final = 1 << BLOCK_BITS
 BLOCK_CELLS: Final = BLOCK_EDGE**3
 _LOW: Final = BLOCK_EDGE - 1
-MIN_DEPTH_M: Final = 1e-3
+MIN_DEPTH_M: Final = 1e-9
 _SQRT2: Final = math.sqrt(2.0)
 
 

@@ -11,7 +11,7 @@ from recon.core.geometry.se3 import adjoint, as_step, as_transform, invert, orth
 from recon.core.values.arrays import Float64
 from recon.places.places import drift_over
 
-MAX_SIGMA_M: Final = 0.15
+MAX_SIGMA_M: Final = 0.15  # on a road
 """Poses less certain than this are not given out: an error of 0.5 m is then beyond three sigmas."""
 MAX_SIGMA_DEG: Final = 1.0  # the same of the rotation
 _MAX_CHI2: Final = 22.5
@@ -30,6 +30,7 @@ class Belief:
     T_world_camera: Float64
     corrected: Float64
     path_m: float = 0.0
+    scale: float = 1.0  # of the map, against a road
 
     @property
     def covariance(self) -> Float64:
@@ -37,7 +38,7 @@ class Belief:
 
         Errors of the scale add up along the path, so its drift is not that of independent steps.
         """
-        return self.corrected + drift_over(self.path_m).covariance
+        return self.corrected + drift_over(self.path_m, self.scale).covariance
 
     @property
     def sigma_m(self) -> float:
@@ -52,7 +53,7 @@ class Belief:
     @property
     def certain(self) -> bool:
         """Whether the pose is certain enough to be given out."""
-        return self.sigma_m <= MAX_SIGMA_M and self.sigma_deg <= MAX_SIGMA_DEG
+        return self.sigma_m <= self.scale * MAX_SIGMA_M and self.sigma_deg <= MAX_SIGMA_DEG
 
     def moved(self, T_before_now: Float64, covariance: Float64, path_m: float) -> Belief:
         """Return the belief after a motion by odometry; the covariance is in the new camera axes.
@@ -62,7 +63,7 @@ class Belief:
         turn = adjoint(invert(T_before_now))
         spread = turn @ self.corrected @ turn.T + covariance
         T = orthonormalise(self.T_world_camera @ T_before_now)
-        return Belief(T, spread, self.path_m + path_m)
+        return Belief(T, spread, self.path_m + path_m, self.scale)
 
     def corrected_to(self, T_world_camera: Float64, covariance: Float64) -> Belief | None:
         """Return the belief after a measurement of the pose; None where the two contradict."""
@@ -74,4 +75,4 @@ class Belief:
         gain = np.linalg.solve(both, ours).T
         T = orthonormalise(self.T_world_camera @ as_transform(gain @ news))
         left = ours - gain @ ours
-        return Belief(T, 0.5 * (left + left.T))
+        return Belief(T, 0.5 * (left + left.T), scale=self.scale)

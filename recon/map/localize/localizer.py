@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from recon.stereo.frame import FrameReconstructor
 _VIEWS: Final = 2  # nearest views of the map that each frame is compared with
 _SURFACES_EVERY: Final = 3
 """Frames between two corrections by surfaces, where features confirm the pose."""
-_SURE_SIGMA_M: Final = 0.5 * MAX_SIGMA_M
+_SURE_SIGMA_M: Final = 0.5 * MAX_SIGMA_M  # on a road, as the next
 """Poses that are more certain than this need not be compared with the map if time is short."""
 _CONTRADICTS: Final = "the map contradicts the odometry"
 _ANYWHERE: Final = 10
@@ -130,7 +130,8 @@ class Localizer:
         visual = self._visual.track(frame)
         self._advance(visual)
         self._frames += 1
-        if self._belief is not None and self._belief.sigma_m <= _SURE_SIGMA_M and hurried():
+        sure_m = self._known.scale * _SURE_SIGMA_M
+        if self._belief is not None and self._belief.sigma_m <= sure_m and hurried():
             return self._result(_Confirmed(self._belief, refused="no time to look at the map"))
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity)
         lost = None
@@ -149,7 +150,8 @@ class Localizer:
         fix = self._first_fix.find(keyframe, camera, *at, hurried=frame.rough)
         if fix is None:
             return lost or Located(State.SEARCHING, note="no place is recognised for certain")
-        confirmed = self._confirm(Belief(*self._measured(fix)), keyframe, frame)
+        begun = Belief(*self._measured(fix), scale=self._known.scale)
+        confirmed = self._confirm(begun, keyframe, frame)
         return self._result(replace(confirmed, loops=confirmed.loops or (fix,)))
 
     def _advance(self, visual: VisualEstimate) -> None:
@@ -157,9 +159,10 @@ class Localizer:
         seen = visual.information is not None
         self._breaks += self._frames > 0 and not seen
         steps = np.stack([self._T_odometry, T_now])
-        step_m = float(path_lengths(steps, np.array([True, seen or not self._frames]))[-1])
+        trusted, scale = np.array([True, seen or not self._frames]), self._known.scale
+        step_m = float(path_lengths(steps, trusted, scale)[-1])
         if self._belief is not None:
-            covariance = step_covariance(_LOST_SIGMA_M, _LOST_SIGMA_DEG)
+            covariance = step_covariance(scale * _LOST_SIGMA_M, _LOST_SIGMA_DEG)
             if visual.information is not None:
                 covariance = covariance_of(visual.information)
             T_before_now = invert(self._T_odometry) @ T_now
@@ -169,7 +172,8 @@ class Localizer:
     def _measured(self, loop: Loop) -> tuple[Float64, Float64]:
         """Return the pose by a loop from a view of the map, and its covariance."""
         T = self._known.T_world_camera[loop.first] @ loop.T_first_last
-        return T, covariance_of(loop.information) + loop_bias(loop).covariance
+        bias = loop_bias(loop, self._known.scale)
+        return T, covariance_of(loop.information) + bias.covariance
 
     def _confirm(self, belief: Belief, keyframe: Keyframe, frame: OdometryFrame) -> _Confirmed:
         """Return the belief, corrected by the nearest views of the map and its surfaces."""
@@ -300,4 +304,5 @@ class FirstFix:
         lasts = {loop.last: at for at, loops in self._seen for loop in loops}
         breaks = self._seen[-1][0][2]
         alone = breaks > 0 and sum(at[2] == breaks for at, _ in self._seen) == 1
-        return agreeing_loops(loops, firsts, lasts, keyframes=1 if alone else self._frames)
+        how: Any = {"keyframes": 1 if alone else self._frames, "scale": self._known.scale}
+        return agreeing_loops(loops, firsts, lasts, **how)

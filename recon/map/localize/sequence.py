@@ -180,6 +180,7 @@ def localize_sequence(
     """
     check_source(source)
     map_, watch = workspace.map, workspace.stopwatch
+    config = config.at_scale(map_.first.scale)
     localizer = open_localizer(map_, config, start=start)
     reconstructor = FrameReconstructor(
         source.calibration, config, threads=workspace.threads, stopwatch=watch

@@ -15,7 +15,7 @@ THIN_SHARE = 0.1
 """A cell is thin along an axis where its points spread by less than this share of its edge.
 
 Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
-NOISE_M = 0.02  # standard deviation that is added to that of every surface
+NOISE = 0.02  # standard deviation that is added to that of every surface, as a share of that edge
 FAR_CHI2 = 9.0
 """Points three standard deviations from the surface of their cell count like those without one."""
 
@@ -40,6 +40,7 @@ class Fit:
     residual_m: float  # median distance of points to the surface of their cell; NaN = no surface
     # float64 (6, 6), of a step (translation in metres, rotation vector in radians) of their frame
     information: Float64
+    edge_m: float = 1.0  # edge of the cells
 
 
 def describe_surfaces(xyz: Float64, edge_m: float) -> Surfaces:
@@ -63,13 +64,13 @@ def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
     overlap = float(hit.mean()) if len(hit) else 0.0
     flat = np.flatnonzero(hit)[surfaces.information[cell[hit]].any(axis=(1, 2))]
     if not len(flat):
-        return Fit(overlap, float("nan"), np.zeros((6, 6)))
+        return Fit(overlap, float("nan"), np.zeros((6, 6)), surfaces.edge_m)
     near, information = xyz[flat], surfaces.information[cell[flat]]
     off = near - surfaces.means[cell[flat]]
     residual_m = float(np.median(_distance_m(off, information)))
     J = step_jacobian(near)
     total = np.einsum("nki,nkl,nlj->ij", J, information, J, optimize=True)
-    return Fit(overlap, residual_m, total)
+    return Fit(overlap, residual_m, total, surfaces.edge_m)
 
 
 def misfit(xyz: Float64, surfaces: Surfaces) -> float:
@@ -85,7 +86,7 @@ def _thin_information(covariance: Float64, edge_m: float) -> Float64:
     """Return the inverse covariance (M, 3, 3) along the thin axes, zero along the others."""
     spread, axes = np.linalg.eigh(covariance)
     thin = np.sqrt(np.maximum(spread, 0.0)) < THIN_SHARE * edge_m
-    strength = np.where(thin, 1.0 / (np.maximum(spread, 0.0) + NOISE_M**2), 0.0)
+    strength = np.where(thin, 1.0 / (np.maximum(spread, 0.0) + (NOISE * edge_m) ** 2), 0.0)
     information: Float64 = np.einsum("mik,mk,mjk->mij", axes, strength, axes)
     return information
 

@@ -34,17 +34,20 @@ from recon.odometry.prior import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame
 from recon.places.places import SIGMAS
 
+# Lengths are those on a road: they are times the scale of the map.
 _VOXEL_M: Final = 0.3  # edge of a voxel of the map of ICP
 _THRESHOLD_M: Final = 0.3  # points pair up to thrice as far
 _KERNEL_M2: Final = 0.3  # squared distance at which a pair counts a quarter
+_STILL: Final = 1e-3  # step of ICP that is its last one
 _SURFACE_M: Final = 1.0  # edge of the cells in which surfaces are fitted to the map
 _RELOAD_M: Final = 10.0  # way after which the points around the camera are read again
 _MIN_POINTS: Final = 300  # frames with fewer points are not corrected
 _OFFSET_FRAMES: Final = 30
 """Corrections of poses that features confirm are averaged over as many frames and subtracted: their
 mean is the bias of stereo depth, not an error of the pose."""
-_ASIDE: Final = SIGMAS * np.repeat([MAX_SIGMA_M, np.deg2rad(MAX_SIGMA_DEG)], 3)
-"""Steps along and about each axis to poses that no pose given out may be mistaken for."""
+_ASIDE: Final = SIGMAS * np.repeat([MAX_SIGMA_M / _SURFACE_M, np.deg2rad(MAX_SIGMA_DEG)], 3)
+"""Steps, in edges of cells and radians, along and about each axis to poses that no pose given out
+may be mistaken for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +79,10 @@ class Surroundings:
     def __init__(self, map_: MapFile, max_range_m: float) -> None:
         self._range_m = max_range_m
         self._parts = [part for session in map_.linked for part in _parts(map_, session)]
-        options = KissIcpOptions(max_range_m, _VOXEL_M, iterations=50, convergence=1e-3)
-        self._icp = KissIcp(options)
+        self._scale = scale = map_.first.scale
+        self._icp = KissIcp(KissIcpOptions(max_range_m, scale * _VOXEL_M, 50, scale * _STILL))
         self._loaded_at = np.full(3, np.inf)
-        self._surfaces = describe_surfaces(np.zeros((0, 3)), _SURFACE_M)
+        self._surfaces = describe_surfaces(np.zeros((0, 3)), scale * _SURFACE_M)
         self._offset = np.zeros(6)
         self._measured = 0
 
@@ -105,7 +108,8 @@ class Surroundings:
     def align(self, xyz: Float64, T_world_guess: Float64) -> IcpAlignment:
         """Return kiss-icp's pose of a frame with points (N, 3) in the map, from a guess."""
         self._load(T_world_guess[:3, 3])
-        return self._icp.align(xyz, T_world_guess, _THRESHOLD_M, _KERNEL_M2)
+        limits = self._scale * _THRESHOLD_M, self._scale**2 * _KERNEL_M2
+        return self._icp.align(xyz, T_world_guess, *limits)
 
     def _measure(self, belief: Belief, xyz: Float64) -> Correction:
         T_prior = belief.T_world_camera
@@ -120,15 +124,16 @@ class Surroundings:
 
     def _load(self, camera_m: Float64) -> None:
         """Take the points around a position into the map of ICP, unless they are there."""
-        if np.linalg.norm(camera_m - self._loaded_at) <= _RELOAD_M:
+        reload_m = self._scale * _RELOAD_M
+        if np.linalg.norm(camera_m - self._loaded_at) <= reload_m:
             return
         self._loaded_at = np.array(camera_m)
-        reach_m = self._range_m + _RELOAD_M
+        reach_m = self._range_m + reload_m
         near = [p for p in self._parts if _distance_m(p.cameras_m, camera_m) <= reach_m]
         xyz = np.concatenate([np.zeros((0, 3)), *(part.points() for part in near)])
         xyz = xyz[np.linalg.norm(xyz - camera_m, axis=1) <= reach_m]
         self._icp.set_map(xyz)
-        self._surfaces = describe_surfaces(xyz, _SURFACE_M)
+        self._surfaces = describe_surfaces(xyz, self._scale * _SURFACE_M)
 
 
 def contrast(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> float:
@@ -136,10 +141,11 @@ def contrast(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -
 
     Surfaces that fit half a metre away, too, say nothing of a pose, however well they fit there.
     """
-    steps = np.concatenate([np.diag(_ASIDE), np.diag(-_ASIDE)])
+    aside = _ASIDE * np.repeat([surfaces.edge_m, 1.0], 3)
+    steps = np.concatenate([np.diag(aside), np.diag(-aside)])
     around = [T_world_camera @ as_transform(step) for step in steps]
-    here, *aside = (misfit(apply(T, xyz_camera), surfaces) for T in (T_world_camera, *around))
-    return min(aside) - here
+    here, *there = (misfit(apply(T, xyz_camera), surfaces) for T in (T_world_camera, *around))
+    return min(there) - here
 
 
 def _parts(map_: MapFile, session: Session) -> Iterator[_Part]:
@@ -173,8 +179,8 @@ prior."""
 _ICP_INDEPENDENCE: Final = 0.05  # share of the points whose errors count as independent
 _MIN_CONTRAST: Final = 2.0 * math.log(1000.0)
 """Chi-square by which any pose that is wrong must fit worse: it is a thousand times less likely."""
-_ICP_FLOOR_M: Final = 0.02
-"""Standard deviation of ICP's translation that more points do not improve."""
+_ICP_FLOOR: Final = 0.02
+"""Standard deviation of ICP's translation, in edges of cells, that more points do not improve."""
 _ICP_FLOOR_DEG: Final = 0.05  # that of its rotation
 
 
@@ -208,7 +214,7 @@ def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
 
 def icp_covariance(fit: Fit) -> Float64:
     """Return the covariance (6, 6) of ICP: from the surfaces that fix it, at least their bias."""
-    floor = step_covariance(_ICP_FLOOR_M, _ICP_FLOOR_DEG)
+    floor = step_covariance(_ICP_FLOOR * fit.edge_m, _ICP_FLOOR_DEG)
     return covariance_of(_ICP_INDEPENDENCE * fit.information) + floor
 
 

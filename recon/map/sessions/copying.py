@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from itertools import chain
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -68,8 +68,8 @@ def join_parts(
         part, begin = part_map.session(), len(session) - lead
         if not len(session):
             session.set_axes(part.T_map_world, part.camera)
-        search = settings.loops.enabled
-        detector = detector or LoopDetector(session.keyframes, part.camera, search=search)
+        how: Any = {"search": settings.loops.enabled, "scale": settings.scale}
+        detector = detector or LoopDetector(session.keyframes, part.camera, **how)
         T_world_part = _append_frames(session, part, lead)
         rays = (key[1] for key in part_map.store.keys(RAYS) if isinstance(key, tuple))
         own: dict[Key, Key] = {
@@ -78,7 +78,8 @@ def join_parts(
         part_map.store.copy(RAYS, map_.store, own)
         _append_submaps(session, part, lead, T_world_part, settings.fusion.voxel_m)
         poses = session.odometry.T_world_camera
-        path_m, stretch = path_lengths(poses, session.trusted), stretches(session.health)
+        path_m = path_lengths(poses, session.trusted, settings.scale)
+        stretch = stretches(session.health)
         for stored in part.keyframes:
             if stored.keyframe.frame >= lead:
                 frame = begin + stored.keyframe.frame
@@ -105,7 +106,7 @@ def check_session(session: Session, settings: DriveSettings) -> None:
             where=session.where,
             got=f"{voxel_m} m",
             expected=f"{settings.fusion.voxel_m:g} m",
-            hint="map one of the drives again with --set fusion.voxel_m=",
+            hint="map one again with --set scene.scale= or fusion.voxel_m= of the other",
         )
     check_rays(session, settings)
 

@@ -121,7 +121,7 @@ def path_up_to(session: Session) -> Float64:
 
     Of known poses it is 0 everywhere: odometry, whose drift grows with the path, had no part in it.
     """
-    return DrivePath.of(session.odometry, session.health).path_m
+    return DrivePath.of(session.odometry, session.health, session.scale).path_m
 
 
 def doubts_of_lengths(map_: MapFile) -> list[str]:
@@ -179,7 +179,7 @@ def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
         own |= {last for _, last in shared}
     views = MapViews(map_, group)
     # What a frame that both have shows again is a loop of either drive alone, which knows it.
-    known = KnownPlaces(views)
+    known = KnownPlaces(views, new.scale)
     loops = [
         loop
         for stored in (new.keyframes if len(known) else ())
@@ -200,7 +200,7 @@ def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Lin
     firsts = {loop.first: (views[loop.first].T_world_camera, 0.0, 0) for loop in loops}
     lasts = {n: (poses[n], float(path_m[n]), of[n]) for n in {loop.last for loop in loops}}
     links = []
-    for loop in agreeing_loops(loops, firsts, lasts):
+    for loop in agreeing_loops(loops, firsts, lasts, scale=new.scale):
         number, frame = views.keys[loop.first]
         links.append(Link((number, new.number), replace(loop, first=frame)))
     return links
@@ -279,7 +279,9 @@ def _solve(
     sessions = [map_.session(number) for number in numbers]
     drives = [
         DrivePath.of(
-            replace(one.odometry, T_world_camera=T @ one.odometry.T_world_camera), one.health
+            replace(one.odometry, T_world_camera=T @ one.odometry.T_world_camera),
+            one.health,
+            one.scale,
         )
         for one, T in zip(sessions, places.values(), strict=True)
     ]

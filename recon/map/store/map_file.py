@@ -248,7 +248,7 @@ def known_places(map_: MapFile) -> KnownPlaces:
             where=map_.store.name,
             hint="map the drive again with this version",
         )
-    return KnownPlaces(views)
+    return KnownPlaces(views, map_.first.scale)
 
 
 class MapViews(Sequence[KnownView]):

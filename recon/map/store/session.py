@@ -108,6 +108,12 @@ class Session:
         return self._store.name
 
     @property
+    def scale(self) -> float:
+        """Size of its scene against a road, to which lengths that were not set are made."""
+        with reading(self.where):
+            return float(self.info.config.get("scene", {}).get("scale") or 1.0)
+
+    @property
     def odometry(self) -> Trajectory:
         """The path by odometry."""
         if not self._poses:

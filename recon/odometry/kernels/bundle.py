@@ -18,7 +18,7 @@ from recon.core.kernels.compiled import kernel
 
 Float64 = NDArray[np.float64]
 
-MIN_DEPTH_M: Final = 0.1
+NEAREST: Final = 0.2  # of the baseline: what is nearer is not in both views
 RIDGE: Final = 1e-9
 """Added to the diagonals, so that the system is solvable where nothing is observed."""
 
@@ -125,7 +125,7 @@ def _observe(
     focal, cx, cy, fb, doffs, sigma_uv, sigma_d, _ = model
     for i in range(3):
         place[i] = T[i, 0] * xyz[0] + T[i, 1] * xyz[1] + T[i, 2] * xyz[2] + T[i, 3]
-    z = max(place[2], MIN_DEPTH_M)
+    z = max(place[2], NEAREST * fb / focal)
     residual[0] = (uvd[0] - (focal * place[0] / z + cx)) / sigma_uv
     residual[1] = (uvd[1] - (focal * place[1] / z + cy)) / sigma_uv
     residual[2] = (uvd[2] - (fb / z - doffs)) / sigma_d
@@ -157,7 +157,7 @@ def _linearise(
                 continue
             _observe(T, xyz_world[n], uvd[w, n], model, place, residual)
             weight = 1.0 / (1.0 + _square(residual) / (cauchy * cauchy))
-            x, y, z = place[0], place[1], max(place[2], MIN_DEPTH_M)
+            x, y, z = place[0], place[1], max(place[2], NEAREST * fb / focal)
             for k in range(3):
                 if k == 2 and not np.isfinite(uvd[w, n, 2]):
                     continue

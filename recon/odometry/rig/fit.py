@@ -299,7 +299,7 @@ def _of_places(window: TrackWindow, places: Places, camera: RectifiedCamera) -> 
 def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
     """Return how column, row and disparity follow a place in camera axes: (W, N, 3, 3)."""
     f, fb = camera.focal_px, camera.focal_px * camera.baseline_m
-    z = np.maximum(xyz[..., 2], bundle.MIN_DEPTH_M)
+    z = np.maximum(xyz[..., 2], bundle.NEAREST * camera.baseline_m)
     x, y, zero = xyz[..., 0] / z, xyz[..., 1] / z, np.zeros_like(z)
     rows = [f / z, zero, -f * x / z], [zero, f / z, -f * y / z], [zero, zero, -fb / z**2]
     return np.stack([np.stack(row, -1) for row in rows], axis=-2)

@@ -14,7 +14,7 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.localize import localizer as localizer_file
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive, StartPose, localize_sequence, open_localizer
-from recon.map.localize.surfaces import NOISE_M, Fit, describe_surfaces, fit_surfaces
+from recon.map.localize.surfaces import NOISE, Fit, describe_surfaces, fit_surfaces
 from recon.map.localize.surroundings import Correction, contrast, is_worthwhile
 from recon.map.map import Map
 from recon.map.settings import DriveSettings
@@ -253,7 +253,7 @@ def test_information_is_the_curvature_of_the_squared_distance():
     for axis, step in enumerate(h * np.eye(6)):
         curvature = (cost(step) - 2 * cost(np.zeros(6)) + cost(-step)) / (2 * h * h)
         # The rest of the curvature is the residuals' own, some 1/1000 here.
-        assert curvature == pytest.approx(fit.information[axis, axis], rel=0.02, abs=1 / NOISE_M**2)
+        assert curvature == pytest.approx(fit.information[axis, axis], rel=0.02, abs=1 / NOISE**2)
 
 
 UNSURE = step_covariance(0.3, 1.0)

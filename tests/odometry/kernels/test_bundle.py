@@ -45,7 +45,7 @@ windows = st.builds(
 )
 
 
-# float64: sums of some hundred terms in another order, with depths of at least `MIN_DEPTH_M`.
+# float64: sums of some hundred terms in another order, with depths of at least `NEAREST`.
 ROUNDING = 1e-9
 
 
@@ -154,7 +154,7 @@ def _white(T_camera_world, uvd, xyz_world, model):
     """Residuals in standard deviations (W, N, 3), 0 where not seen; points in camera axes."""
     xyz = np.einsum("wij,nj->wni", T_camera_world[:, :3, :3], xyz_world)
     xyz += T_camera_world[:, None, :3, 3]
-    z = np.maximum(xyz[:, :, 2], bundle.MIN_DEPTH_M)
+    z = np.maximum(xyz[:, :, 2], bundle.NEAREST * model.fb / model.focal)
     u, v = (model.focal * xyz[:, :, k] / z + c for k, c in enumerate((model.cx, model.cy)))
     predicted = np.stack([u, v, model.fb / z - model.doffs], axis=-1)
     sigmas = np.array([model.sigma_uv, model.sigma_uv, model.sigma_d])
@@ -163,7 +163,7 @@ def _white(T_camera_world, uvd, xyz_world, model):
 
 def _projection_jacobian(xyz: Float64, model: bundle.BundleModel) -> Float64:
     """Return whitened derivative (W, N, 3, 3) of column, row and disparity by the point."""
-    z = np.maximum(xyz[:, :, 2], bundle.MIN_DEPTH_M)
+    z = np.maximum(xyz[:, :, 2], bundle.NEAREST * model.fb / model.focal)
     J = np.zeros((*xyz.shape, 3))
     J[:, :, 0, 0] = J[:, :, 1, 1] = model.focal / z / model.sigma_uv
     J[:, :, 0, 2] = -model.focal * xyz[:, :, 0] / z**2 / model.sigma_uv
