@@ -22,8 +22,9 @@ def export(
     to: Annotated[
         list[str] | None,
         opt.option(
-            "cloud, grid, octomap, mesh, las, laz (for surveying programs); several with commas.",
-            default="all but las and laz",
+            "cloud, grid, octomap, mesh; for surveying programs las, laz, and dsm, dtm, slope, "
+            "orthophoto (GeoTIFF); several with commas.",
+            default="the first four",
         ),
     ] = None,
     out: opt.Out = None,
@@ -32,7 +33,8 @@ def export(
     georeference: Annotated[
         Path | None,
         opt.option(
-            "Measured positions, in whose coordinates las and laz are written." + opt.POSITIONS
+            "Measured positions, in whose coordinates those for surveying programs are written."
+            + opt.POSITIONS
         ),
     ] = None,
     antenna: opt.Antenna = None,
@@ -55,6 +57,7 @@ def export(
       recon export outputs/map/latest --to grid --set grid.max_height_m=3.2
       recon export outputs/map/latest --to mesh --set mesh.depth=9
       recon export outputs/site --to laz --georeference gnss.txt --crs EPSG:25832
+      recon export outputs/site --to dsm,orthophoto --resolution 0.1
       recon export outputs/city --to grid,octomap --workers 4
     """
     with shared.one_line_errors():

@@ -8,11 +8,10 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.core.errors import FormatError, SettingsError
-from recon.export.make import known_products, make, need_rays
+from recon.export.make import PRODUCTS, known_products, make, need_rays
 from recon.export.pair import export_pair, finish_cloud_run, mesh_cloud
 from recon.export.product import Order
 from recon.io.files import StrPath, resolved
-from recon.io.models.las import SUFFIXES as SURVEYED
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.map import Map
@@ -74,8 +73,9 @@ def run_export(
     pair = is_pair_run(source)
     wanted = known_products(products, pair=pair)
     refuse_as_target(source, out)
-    if survey is not None and not set(wanted) & set(SURVEYED):
-        what, expected = "only LAS and LAZ have the coordinates of a survey", " or ".join(SURVEYED)
+    surveyed = [name for name, one in PRODUCTS.items() if one.surveyed]
+    if survey is not None and not set(wanted) & set(surveyed):
+        what, expected = "no product has the coordinates of the survey", " or ".join(surveyed)
         raise SettingsError(what, where="--to", got=", ".join(wanted), expected=expected)
     if survey is not None and survey.crs is not None:
         check_crs(survey.crs)

@@ -12,6 +12,7 @@ from recon.export.cloud import cloud_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import Made, Order, Product
+from recon.export.rasters import RASTERS, raster_product
 from recon.export.survey import survey_product
 from recon.map.sessions.placed import has_occupancy
 from recon.map.store.finished import check_rays
@@ -22,8 +23,12 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "octomap": Product(octomap_product, needs_occupancy=True),
     "grid": Product(grid_product, needs_occupancy=True),
     "mesh": Product(mesh_product),
-    "las": Product(survey_product("las")),
-    "laz": Product(survey_product("laz")),
+    # Their cells, and the ground far from the path, are those of the voxels.
+    **{
+        name: Product(raster_product(name), needs_occupancy=True, surveyed=True) for name in RASTERS
+    },
+    "las": Product(survey_product("las"), surveyed=True),
+    "laz": Product(survey_product("laz"), surveyed=True),
 }
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")

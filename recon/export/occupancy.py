@@ -73,6 +73,11 @@ def export_grid(placed: PlacedMap, stem: Path) -> WrittenGrid:
     return written
 
 
+def grounds(placed: PlacedMap) -> Iterator[tuple[Rectangle, GroundSurface]]:
+    """Yield the tiles of a map that are near the path, and the ground in each."""
+    return _Flattening(placed).grounds()
+
+
 class _Flattening:
     """Makes a grid tile by tile: the ground below the path first, then what stands on it."""
 
@@ -147,15 +152,29 @@ class _Flattening:
         self, key: TileKey, settings: GroundSettings, path: DrivenPath | None
     ) -> OccupancyGrid | None:
         """Return the grid of a tile and its margin; None without voxels or a path nearby."""
-        area = self._tiles.bounds(key).wider(settings.reach_m)
-        path_m = area.path(self._path_m)
-        if not len(path_m):
+        ground = self._ground(key, settings)
+        if ground is None:
             return None
-        ground = estimate_ground_surface(self._ground_points(area), path_m, settings)
         passed = {} if path is None else self._passed(key, path, ground)
         voxels = self._tiles.wide_voxels(key, passed)
         self._ground_depths.append(ground_depths(voxels, ground))
         return flatten(voxels, ground, self._config.grid) if len(voxels) else None
+
+    def grounds(self) -> Iterator[tuple[Rectangle, GroundSurface]]:
+        """Yield the tiles near the path, and the ground in each."""
+        settings, _ = self._along_the_path()
+        for tile in self._tiles:
+            ground = self._ground(tile.key, settings)
+            if ground is not None:
+                yield self._tiles.bounds(tile.key), ground
+
+    def _ground(self, key: TileKey, settings: GroundSettings) -> GroundSurface | None:
+        """Return the ground of a tile and its margin; None without a path nearby."""
+        area = self._tiles.bounds(key).wider(settings.reach_m)
+        path_m = area.path(self._path_m)
+        if not len(path_m):
+            return None
+        return estimate_ground_surface(self._ground_points(area), path_m, settings)
 
     def _ground_points(self, area: Rectangle) -> PointCloud:
         """Return points in which ground is looked for: those of the cloud, and floors of voxels."""

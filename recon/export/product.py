@@ -37,7 +37,8 @@ class Made:
 
 @dataclass(frozen=True)
 class Product:
-    """A kind of file: what writes it, and whether it is made of what is free and occupied."""
+    """A kind of file."""
 
     write: Callable[[Order], Made]
-    needs_occupancy: bool = False
+    needs_occupancy: bool = False  # whether it is made of what is free and occupied
+    surveyed: bool = False  # whether it can be in the coordinates of a survey

@@ -68,19 +68,24 @@ def survey_product(suffix: str) -> Callable[[Order], Made]:
     """Return what writes ``map/cloud.las`` or ``.laz``, perhaps in survey coordinates."""
 
     def write(order: Order) -> Made:
-        survey = order.survey
-        placed = None if survey is None else georeference(order.map, survey)
-        T_file_map = np.eye(4) if placed is None else placed.T_survey_map
+        T_file_map, figures, warnings = placed_in_survey(order)
         clouds = (tile.cloud for tile in order.placed.tiles)
-        path, crs = order.run.path(f"map/cloud.{suffix}"), None if survey is None else survey.crs
+        path = order.run.path(f"map/cloud.{suffix}")
+        crs = None if order.survey is None else order.survey.crs
         # A hundredth of a voxel, as a decimal: a millimetre on a road.
         step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
         points = write_las(path, clouds, T_file_map, crs, step_m)
-        if placed is None:
-            return Made({"points": points})
-        return Made({**placed.figures(), "points": points}, placed.warnings())
+        return Made({**figures, "points": points}, warnings)
 
     return write
+
+
+def placed_in_survey(order: Order) -> tuple[Float64, dict[str, Any], list[str]]:
+    """Return how map axes become those of a file (4, 4), figures of that, and warnings."""
+    if order.survey is None:
+        return np.eye(4), {}, []
+    placed = georeference(order.map, order.survey)
+    return placed.T_survey_map, placed.figures(), placed.warnings()
 
 
 def georeference(map_: Map, survey: Survey) -> Georeference:

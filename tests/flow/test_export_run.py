@@ -90,10 +90,44 @@ def test_the_cloud_comes_as_laz_in_survey_coordinates(small_demo, tmp_path):
     assert summary_of(out)["misfit_rms_m"] < 0.001
 
 
+def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    path, turn = read_tum(small_demo / "trajectory_map_base_tum.txt"), np.radians(30)
+    R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    origin, height_m = np.array([4e5, 5e6, 100]), summary_of(small_demo)["camera_height_m"]
+    there = np.column_stack([path.timestamps_s, path.positions_m @ R.T + origin])
+    np.savetxt(tmp_path / "gnss.txt", there, fmt="%.6f")
+    words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}"]
+    out = tmp_path / "out"
+    words += ["--crs", "EPSG:25832", "--out", out]
+    done = run("export", small_demo, "--to", "dsm,dtm,slope,orthophoto", *words)
+    assert done.code == 0, done.err
+    cloud = read_ply(small_demo / "map/cloud.ply")
+    xyz = np.einsum("ij,nj->ni", R, cloud.xyz.astype(np.float64)) + origin
+
+    def at_points(name, band=1, places=xyz):
+        with rasterio.open(out / f"map/{name}.tif") as file:
+            assert file.crs.to_epsg() == 25832
+            row, column = rasterio.transform.rowcol(file.transform, *places[:, :2].T)
+            return file.read(band)[row, column]
+
+    # A point in the survey may be rounded into the next cell.
+    assert np.mean(at_points("dsm") >= xyz[:, 2] - 1e-3) > 0.98
+    highest = np.abs(at_points("dsm") - xyz[:, 2]) < 1e-3
+    assert 0.1 < highest.mean() < 1
+    assert (at_points("orthophoto", 4) == 255).mean() > 0.98
+    assert np.mean(at_points("orthophoto")[highest] == cloud.rgb[highest, 0]) > 0.85
+    # The base is driven over the ground, from where it is seen on; the rendered street is level.
+    ahead = there[-1, 1:] - there[0, 1:]
+    driven = there[-2:, 1:] + 8.0 * ahead / np.linalg.norm(ahead)
+    assert np.abs(at_points("dtm", places=driven) - driven[:, 2]).max() < 0.1
+    assert np.nanmedian(at_points("slope")) < 3
+
+
 @pytest.mark.parametrize(("options", "said"), [
     ("laz --crs EPSG:25832", "--crs: there are no positions"),
     ("laz --georeference none.txt --antenna 1,2", "not three numbers"),
-    ("grid --georeference none.txt", "only LAS and LAZ"),
+    ("grid --georeference none.txt", "no product has the coordinates"),
     ("laz --georeference none.txt --crs EPSG:4326", "not metres"),
     ("laz --georeference none.txt", "none.txt"),
     ("cloud,gird", "--to: unknown product (got gird, expected cloud, octomap, grid"),

@@ -1,0 +1,156 @@
+"""The map from above as GeoTIFFs, for programs of surveying and GIS.
+
+North is up: the map is turned as the survey is, and what each tile has is written where it lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import product
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from recon.core.errors import MappingError
+from recon.core.geometry.se3 import apply, invert
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Bool, Float64, Int64
+from recon.export.occupancy import grounds
+from recon.export.product import Made, Order
+from recon.export.survey import placed_in_survey
+from recon.io.models.geotiff import RasterFile, RasterPlace, write_geotiff
+from recon.map.ground.surface import GroundSurface
+
+_CORNERS: Final = np.array([*product((0.0, 1.0), repeat=2)])
+Fill = Callable[[Order, RasterFile, Float64], None]
+
+
+def raster_product(name: str) -> Callable[[Order], Made]:
+    """Return what writes ``map/<name>.tif``, one of `RASTERS`, perhaps in survey coordinates."""
+    fill, colours = RASTERS[name]
+
+    def write(order: Order) -> Made:
+        T_file_map, figures, warnings = placed_in_survey(order)
+        place = _place(order, T_file_map)
+        crs = None if order.survey is None else order.survey.crs
+        path = order.run.path(f"map/{name}.tif")
+        with write_geotiff(path, place, colours=colours, crs=crs) as file:
+            fill(order, file, T_file_map)
+        return Made({**figures, f"{name}_size": [place.columns, place.rows]}, warnings)
+
+    return write
+
+
+def _place(order: Order, T_file_map: Float64) -> RasterPlace:
+    """Return the cells that have all points, as large as those of the grid."""
+    clouds = (tile.cloud.xyz.astype(np.float64) for tile in order.placed.tiles)
+    seen = [apply(T_file_map, xyz)[:, :2] for xyz in clouds if len(xyz)]
+    if not seen:
+        raise MappingError("the map is empty: there is nothing to see from above")
+    cell_m = order.placed.tiles.resolution_m
+    west, south = np.floor(np.min([xy.min(axis=0) for xy in seen], axis=0) / cell_m).astype(int)
+    east, north = np.floor(np.max([xy.max(axis=0) for xy in seen], axis=0) / cell_m).astype(int) + 1
+    return RasterPlace(cell_m, int(west), int(north), int(east - west), int(north - south))
+
+
+class _Seen(NamedTuple):
+    """What is seen of a tile from above."""
+
+    row: int  # first row of the raster
+    column: int
+    top: Int64  # (R, C), the highest point of each cell; -1 = none
+    cloud: PointCloud
+    height_m: Float64  # of its points
+
+    @property
+    def known(self) -> Bool:
+        return np.asarray(self.top >= 0)
+
+
+def _seen(order: Order, place: RasterPlace, T_file_map: Float64) -> Iterator[_Seen]:
+    for tile in order.placed.tiles:
+        cloud = tile.cloud
+        if not len(cloud):
+            continue
+        xyz = apply(T_file_map, cloud.xyz.astype(np.float64))
+        row, column = place.cells_of(xyz[:, :2])
+        first = int(row.min()), int(column.min())
+        top = np.full((int(np.ptp(row)) + 1, int(np.ptp(column)) + 1), -1)
+        # The last point that is written into a cell stays.
+        upwards = np.argsort(xyz[:, 2], kind="stable")
+        top[row[upwards] - first[0], column[upwards] - first[1]] = upwards
+        yield _Seen(*first, top, cloud, xyz[:, 2])
+
+
+def _surface_heights(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+    """Write the height of the highest point of each cell."""
+    for one in _seen(order, file.place, T_file_map):
+        before = file.read(one.row, one.column, one.top.shape)
+        heights = np.where(one.known, one.height_m[one.top], np.nan).astype(np.float32)
+        file.write(one.row, one.column, np.fmax(before, heights))
+
+
+def _surface_colours(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+    """Write the colour of the highest point of each cell; where tiles meet, of the first tile."""
+    for one in _seen(order, file.place, T_file_map):
+        if one.cloud.rgb is None:
+            raise MappingError("the points of the map have no colours")
+        before = file.read(one.row, one.column, one.top.shape)
+        opaque = np.where(one.known, 255, 0)[None]
+        colours = np.where(one.known, one.cloud.rgb[one.top].transpose(2, 0, 1), 0)
+        colours = np.concatenate([colours, opaque]).astype(np.uint8)
+        file.write(one.row, one.column, np.where(before[3] > 0, before, colours))
+
+
+def _ground_heights(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+    """Write the height of the ground in the middle of each cell."""
+
+    def heights(ground: GroundSurface, xy_m: Float64) -> Float64:
+        xyz = np.column_stack([xy_m, ground.height_at(xy_m)])
+        return np.asarray(apply(T_file_map, xyz)[:, 2])
+
+    _write_ground(order, file, T_file_map, heights)
+
+
+def _ground_slopes(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+    """Write by how many degrees the ground is inclined, over a cell of it to either side."""
+
+    def slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
+        sides = ground.cell_m * np.eye(2)
+        rises = [ground.height_at(xy_m + side) - ground.height_at(xy_m - side) for side in sides]
+        return np.asarray(np.degrees(np.arctan(np.hypot(*rises) / (2 * ground.cell_m))))
+
+    _write_ground(order, file, T_file_map, slopes)
+
+
+def _write_ground(
+    order: Order,
+    file: RasterFile,
+    T_file_map: Float64,
+    measure: Callable[[GroundSurface, Float64], Float64],
+) -> None:
+    """Write what is measured of the ground of each tile at the middles of cells."""
+    T_map_file, place = invert(T_file_map), file.place
+    for bounds, ground in grounds(order.placed):
+        low, high = np.array(bounds.low), np.array(bounds.high)
+        corners = np.pad(low + _CORNERS * (high - low), ((0, 0), (0, 1)))
+        row, column = place.cells_of(apply(T_file_map, corners)[:, :2])
+        row, column = np.clip(row, 0, place.rows - 1), np.clip(column, 0, place.columns - 1)
+        first = int(row.min()), int(column.min())
+        shape = (int(np.ptp(row)) + 1, int(np.ptp(column)) + 1)
+        middles = place.centres(*first, shape).reshape(-1, 2)
+        # The map's own level, for the place of a cell in a map that is tilted against the survey.
+        level = np.full((len(middles), 1), T_file_map[2, 3])
+        xy_m = apply(T_map_file, np.hstack([middles, level]))[:, :2]
+        inside, values = bounds.contains(xy_m), np.full(len(xy_m), np.nan, np.float32)
+        values[inside] = measure(ground, xy_m[inside])
+        file.write(*first, np.fmax(file.read(*first, shape), values.reshape(shape)))
+
+
+RASTERS: Final[dict[str, tuple[Fill, bool]]] = {
+    "dsm": (_surface_heights, False),
+    "dtm": (_ground_heights, False),
+    "slope": (_ground_slopes, False),
+    "orthophoto": (_surface_colours, True),
+}
+"""What fills a raster, and whether it is one of colours."""
