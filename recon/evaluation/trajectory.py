@@ -20,8 +20,8 @@ from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
 from recon.places.places import drift_at_end, fit_to_path
 
-# On a shorter path, relative errors would be dominated by the noise of the ground truth.
-MIN_PATH_M: Final = 1.0
+# A camera that moved less stood still, be it an endoscope: errors relative to it say nothing.
+MIN_PATH_M: Final = 0.01
 _STRAIGHT: Final = 0.05  # largest width of a straight path, as share of its length (both rms)
 # The positions fix the roll to about their error over the width of the path, in radians.
 _FIXED_RAD: Final = float(np.radians(0.5))
