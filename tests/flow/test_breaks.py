@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
+from recon.commands.localize import run_live
 from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
 from recon.io.trajectory import read_tum
 from recon.street.settings import StreetScene
 from tests.flow.runs import Breaks, content, summary_of
 from tests.scenery.film import RIG, Film, film
+from tests.scenery.patience import be_patient
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,17 @@ def test_a_place_seen_again_joins_what_a_break_has_parted(
     apart = sorted(path.relative_to(folder) for path in (folder / "sessions").rglob("*.txt"))
     assert apart == [Path("sessions/1/trajectory_tum.txt")]
     assert len(read_tum(folder / apart[0])) == 5
+
+
+def test_live_the_sessions_are_the_same_and_said_first(
+    street_film: Film, broken: Film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    be_patient(monkeypatch)
+    options = MapOptions("live", tmp_path, mesh=False)
+    summary, count = run_live(broken, load_config(), options, rate=10.0), len(street_film)
+    sessions = [(one["first"], one["joined"]) for one in summary["drive_sessions"]]
+    assert sessions == [(0, True), (count, False), (count + 5, True)]
+    assert summary["warnings"][0].startswith("THE PATH BREAKS INTO 3 SESSIONS")
 
 
 @pytest.mark.slow

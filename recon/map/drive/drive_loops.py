@@ -71,7 +71,7 @@ class DriveLoops:
         """Return warnings about loops that were not closed."""
         closed, refused = len(self.closure.closed), len(self.closure.refused)
         if refused and not closed:
-            what = "they contradict the odometry; the map may show a place twice"
+            what = "odometry contradicts, or too few agree; the map may show a place twice"
             return [f"{counted(refused, 'loop')} found and none closed: {what}"]
         if refused:
             loops = counted(refused + closed, "loop")
