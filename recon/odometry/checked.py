@@ -281,14 +281,14 @@ class StretchCounter:
 
     def __init__(self) -> None:
         self.number = 0
-        self._begun = self._lost = False
+        self.begun = self._lost = False
 
     def add(self, record: OdometryHealth) -> int:
         """Return the stretch of the next frame; -1 = its pose is not to be trusted."""
         if not record.ok:
             self._lost |= not record.skipped
             return -1
-        if self._begun and (self._lost or record.begins):
+        if self.begun and (self._lost or record.begins):
             self.number += 1
-        self._begun, self._lost = True, False
+        self.begun, self._lost = True, False
         return self.number

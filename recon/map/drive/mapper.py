@@ -72,10 +72,13 @@ class Mapper:
         # A hole in the map is better than wrong geometry.
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
         rays = frame.rays if health.ok else None
-        before, stretch = self._stretches.number, self._stretches.add(health)
+        before, begun = self._stretches.number, self._stretches.begun
+        stretch = self._stretches.add(health)
         if stretch > before:
             self.close()  # the map may have to do without what follows
-        builder = self._builder or self.fix_axes(frame.cloud)
+        builder = self._builder
+        if builder is None or (health.ok and not begun):  # frames that show nothing come first
+            builder = self.fix_axes(frame.cloud)
         work = (builder, len(self), cloud, rays, T_world_camera)
         self._behind.begin(partial(self._integrate, *work))
         self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
@@ -141,8 +144,12 @@ class Mapper:
         config, ground = self._config, estimate_ground(cloud, self._config.scale)
         T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m)
         self.session.set_axes(T_map_world, self._camera)
-        self._builder = self._new_builder()
-        return self._builder
+        self._behind.wait()
+        before, builder = self._builder, self._new_builder()
+        if before is not None:
+            builder.restore(before.state())
+        self._builder = builder
+        return builder
 
     def _new_builder(self) -> SubmapBuilder:
         config = self._config
