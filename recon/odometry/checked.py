@@ -52,7 +52,9 @@ class CheckedOdometry:
     """
 
     def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
-        self._odometry, self._max_sigma_m = odometry, scale * _MAX_SIGMA_M
+        self._odometry = odometry
+        # Between near things steps are long, and loops hold the path: 2.5 times as much of the scale.
+        self._max_sigma_m = min(1.0, 2.5 * scale) * _MAX_SIGMA_M
         self._state: CheckedState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
