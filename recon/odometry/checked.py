@@ -53,7 +53,7 @@ class CheckedOdometry:
 
     def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
         self._odometry = odometry
-        # Between near things steps are long, and loops hold the path: 2.5 times as much of the scale.
+        # Among near things steps are long, and loops hold the path: there it may be more.
         self._max_sigma_m = min(1.0, 2.5 * scale) * _MAX_SIGMA_M
         self._state: CheckedState | None = None
 
