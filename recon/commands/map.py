@@ -230,6 +230,7 @@ def _warnings(
         *health_warnings(mapped.health),
         *(() if drift is None else drift.warnings()),
         *(() if mapped.prior is None else mapped.prior.warnings()),
+        *(() if mapped.imu is None else mapped.imu.lines),
         *(() if mapped.loops is None else mapped.loops.warnings()),
     ]
 
@@ -264,6 +265,7 @@ def _summary(
         **result.made.figures,
         "warnings": warnings,
         **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
+        **({} if mapped.imu is None else {"imu": plain(mapped.imu.summary())}),
         **({} if mapped.sfm is None else {"sfm": mapped.sfm.figures()}),
         **{name: plain(found) for name, found in known.items() if found is not None},
         **source.figures(),

@@ -10,5 +10,6 @@
 - `rig/`: the rig as the motion of a drive shows it, before the drive is mapped;
 - `kiss.py`: clouds registered over time, from where the features put the camera, also in a finished
   map (`recon.map.localize`);
-- `prior.py`: what wheels or an inertial unit say; `prior_axes.py`: in which axes.
+- `guide.py`: what other sensors say of the motion: a path (`prior.py`, `prior_axes.py`), or an
+  inertial unit (`imu.py`), known by what cameras see (`imu_fit.py`, `imu_runs.py`).
 """

@@ -52,9 +52,7 @@ class CheckedOdometry:
     """
 
     def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
-        self._odometry = odometry
-        # Among near things steps are long, and loops hold the path: there it may be more.
-        self._max_sigma_m = min(1.0, 2.5 * scale) * _MAX_SIGMA_M
+        self._odometry, self._scale = odometry, scale
         self._state: CheckedState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -100,7 +98,7 @@ class CheckedOdometry:
     ) -> list[str]:
         """What speaks against a motion; empty where it is to be trusted."""
         length_m = float(np.linalg.norm(T_before_now[:3, 3]))
-        if health.sigma_m > self._max_sigma_m + _MAX_SIGMA_SHARE * length_m:
+        if health.sigma_m > most_sigma_m(length_m, self._scale):
             return [f"the motion is known to {health.sigma_m:.2g} m only"]
         found = explain_motion(*views, T_before_now, camera)
         if found.informative >= _MIN_TELLING:
@@ -110,6 +108,12 @@ class CheckedOdometry:
             return []
         patches = counted(found.informative, "patch", "patches")
         return [f"only {patches} of the image can distinguish motions"]
+
+
+def most_sigma_m(length_m: float, scale: float) -> float:
+    """Return the largest standard deviation of a trusted motion of that length."""
+    # Among near things steps are long, and loops hold the path: there it may be more.
+    return min(1.0, 2.5 * scale) * _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m
 
 
 def _contradiction(share: float, informative: int) -> list[str]:

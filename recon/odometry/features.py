@@ -35,7 +35,7 @@ class VisualState:
     left: UInt8  # (H, W), the left image of the newest of them
     disparity: Disparity  # its disparity
     motion: Motion  # pose and motion by now, which may be some frames later
-    seen_s: float  # time of the newest frame that was registered
+    seen: Motion  # those of the newest frame that was registered
 
 
 def follow_points(state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:

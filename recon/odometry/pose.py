@@ -7,13 +7,14 @@ disparities average out before they become errors of the path (bundle adjustment
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 
 from recon.core.geometry.se3 import (
     apply,
+    as_step,
     as_transform,
     covariance_of,
     invert,
@@ -33,24 +34,15 @@ _MIN_INLIER_SHARE: Final = 0.3  # a smaller share of agreeing tracks gives no po
 
 
 def locate_camera(
-    xyz_world: Float64,
-    uv: Float64,
-    camera: RectifiedCamera,
-    T_world_guess: Float64,
+    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, T_world_guess: Float64
 ) -> LocatedCamera | None:
     """Locate a camera that sees known points, from the largest set of them that agrees.
 
     The pose is fitted to that set from the guess and from RANSAC's pose; the fit with more inliers
     wins. None where too few points agree on one.
     """
-    consensus = find_consensus(
-        xyz_world,
-        uv,
-        camera,
-        limit_px=REPROJECTION_PX,
-        iterations=_SAMPLES,
-        min_inliers=MIN_INLIERS,
-    )
+    how = {"iterations": _SAMPLES, "min_inliers": MIN_INLIERS}
+    consensus = find_consensus(xyz_world, uv, camera, limit_px=REPROJECTION_PX, **how)
     if consensus is None:
         return None
     among = consensus.agree
@@ -68,10 +60,7 @@ def enough_agree(agreeing: int, tracks: int) -> bool:
 
 
 def _agreement(
-    T_world_camera: Float64,
-    xyz_world: Float64,
-    uv: Float64,
-    camera: RectifiedCamera,
+    T_world_camera: Float64, xyz_world: Float64, uv: Float64, camera: RectifiedCamera
 ) -> LocatedCamera:
     """Which points agree with a pose; none, where it is not finite."""
     u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
@@ -243,17 +232,6 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     return np.asarray(window.uvd - predicted)
 
 
-def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
-    """Residuals (W, N, 3) in standard deviations, 0 where unseen, and Cauchy weights (W, N).
-
-    As `adjust` weighs them in its kernel; for the rig of a drive (`rig/fit.py`) alone.
-    """
-    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
-    residual = np.nan_to_num(reprojection(window, camera) / sigmas)
-    square = np.square(residual).sum(axis=2)
-    return residual, window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
-
-
 def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
     """Points (N,) whose newest observation is an outlier."""
     residual = np.nan_to_num(reprojection(window, camera)[-1])
@@ -262,11 +240,21 @@ def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
     return np.asarray(square > _MAX_SIGMAS**2)
 
 
-def adjust(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
+class KnownPose(NamedTuple):
+    """What other sensors say of the newest pose of a window."""
+
+    T_world_camera: Float64
+    information: Float64  # (6, 6) of a step in its axes
+
+
+def adjust(
+    window: TrackWindow, camera: RectifiedCamera, known: KnownPose | None = None
+) -> TrackWindow:
     """Adjust poses and points to all observations; the oldest pose stays fixed.
 
     Levenberg-Marquardt on whitened residuals with Cauchy weights; the points are eliminated
-    (Schur complement), so that each step solves for the poses alone.
+    (Schur complement), so that each step solves for the poses alone. ``known`` is what other
+    sensors say of the newest pose.
 
     Ref:
         Triggs et al., "Bundle adjustment: a modern synthesis", 1999.
@@ -275,11 +263,11 @@ def adjust(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
         return window
     usable = window.seen.sum(axis=0) >= 2
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    model = _model(camera)
+    model = model_of(camera)
     part = minimise(
         Problem(
-            cost=lambda window: _cost(window, model),
-            linearise=lambda window: _linearise(window, model),
+            cost=lambda window: _cost(window, model, known),
+            linearise=lambda window: linearise(window, model, known),
             step=lambda window, normal, damping: _moved(
                 window, *bundle.solve_step(normal, damping)
             ),
@@ -304,29 +292,35 @@ def pose_information(
     """
     usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    model = _model(camera)._replace(cauchy=_DOUBTED_SIGMAS, sigma_uv=sigma_uv_px)
-    normal = _linearise(part, model)
+    model = model_of(camera)._replace(cauchy=_DOUBTED_SIGMAS, sigma_uv=sigma_uv_px)
+    normal = linearise(part, model)
     inverse = np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
     cross = normal.H_cross[-1]
     folded = (cross @ inverse) @ cross.transpose(0, 2, 1)
     return np.asarray(normal.H_pose[-1] - folded.sum(axis=0))
 
 
-def normal_equations(window: TrackWindow, camera: RectifiedCamera) -> bundle.NormalEquations:
-    """The normal equations of all poses and points of a window, as `bundle.linearise`.
+def linearise(
+    window: TrackWindow, model: bundle.BundleModel, known: KnownPose | None = None
+) -> bundle.NormalEquations:
+    """Return the normal equations of all poses and points of a window, as `bundle.linearise`."""
+    inverse = invert(window.T_world_camera)
+    normal = bundle.linearise(inverse, window.uvd, window.xyz_world, model)
+    if known is not None:
+        # Tracks count as if their errors were independent.
+        weight = known.information / _INDEPENDENCE
+        normal.H_pose[-1] += weight
+        normal.g_pose[-1] += weight @ as_step(inverse[-1] @ known.T_world_camera)
+    return normal
 
-    For the rig of a drive (`rig/fit.py`) alone, which has one more unknown than `adjust`.
-    """
-    return _linearise(window, _model(camera))
 
-
-def _linearise(window: TrackWindow, model: bundle.BundleModel) -> bundle.NormalEquations:
-    return bundle.linearise(invert(window.T_world_camera), window.uvd, window.xyz_world, model)
-
-
-def _cost(window: TrackWindow, model: bundle.BundleModel) -> float:
+def _cost(window: TrackWindow, model: bundle.BundleModel, known: KnownPose | None) -> float:
     T_camera_world = invert(window.T_world_camera)
-    return float(bundle.cost(T_camera_world, window.uvd, window.xyz_world, tuple(model)))
+    cost = float(bundle.cost(T_camera_world, window.uvd, window.xyz_world, tuple(model)))
+    if known is None:
+        return cost
+    off = as_step(T_camera_world[-1] @ known.T_world_camera)
+    return cost + float(off @ known.information @ off) / (_INDEPENDENCE * model.cauchy**2)
 
 
 def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> TrackWindow:
@@ -337,7 +331,8 @@ def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> Trac
     return replace(window, T_world_camera=poses, xyz_world=window.xyz_world + step_point)
 
 
-def _model(camera: RectifiedCamera) -> bundle.BundleModel:
+def model_of(camera: RectifiedCamera) -> bundle.BundleModel:
+    """Return the camera and the weights of observations."""
     return bundle.BundleModel(
         focal=camera.focal_px,
         cx=camera.cx_px,
@@ -360,14 +355,22 @@ _MEDIAN: Final = 1.18
 
 
 def newest_information(
-    window: TrackWindow, camera: RectifiedCamera, sigma_uv_px: float = SIGMA_UV_PX
+    window: TrackWindow,
+    camera: RectifiedCamera,
+    sigma_uv_px: float = SIGMA_UV_PX,
+    known: KnownPose | None = None,
 ) -> Float64:
     """Information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
-    return _INDEPENDENCE * pose_information(window, camera, sigma_uv_px)
+    seen = _INDEPENDENCE * pose_information(window, camera, sigma_uv_px)
+    return seen if known is None else seen + known.information
 
 
 def newest_health(
-    window: TrackWindow, camera: RectifiedCamera, tracks: int, note: str = ""
+    window: TrackWindow,
+    camera: RectifiedCamera,
+    tracks: int,
+    note: str = "",
+    known: KnownPose | None = None,
 ) -> OdometryHealth:
     """The health of the newest pose, to which so many ``tracks`` were followed."""
     newest = window.seen[-1]
@@ -375,7 +378,8 @@ def newest_health(
     reprojection_px = float(np.median(np.linalg.norm(error, axis=1)))
     # What stays with a feature, its disparity, is as uncertain as assumed however well it fits.
     fits_px = max(reprojection_px, _BEST_PX) / _MEDIAN
-    sigma = np.sqrt(np.diag(covariance_of(newest_information(window, camera, fits_px))))
+    information = newest_information(window, camera, fits_px, known)
+    sigma = np.sqrt(np.diag(covariance_of(information)))
     return OdometryHealth(
         tracks=tracks,
         inliers=int(newest.sum()),

@@ -8,9 +8,17 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import RegistrationError
-from recon.core.geometry.se3 import invert, make_transform, orthonormalise, part_of
+from recon.core.geometry.se3 import (
+    Motion,
+    invert,
+    make_transform,
+    orthonormalise,
+    part_of,
+    step_covariance,
+)
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
+from recon.odometry.guide import Guided
 from recon.odometry.settings import PriorSettings
 
 _CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -61,6 +69,13 @@ class MotionPrior:
             turn = make_transform(_CAMERA_FROM_BODY, np.zeros(3))
             T = turn @ T @ invert(turn)
         return orthonormalise(T)
+
+    def guide(self, last: Motion, seen: Motion, to_s: float) -> Guided | None:
+        """Return where the path puts the camera, as sure as of a motion from frame to frame."""
+        T = self.motion(last.timestamp_s, to_s)
+        if T is None:
+            return None
+        return Guided(last.T_world_camera @ T, step_covariance(*self.sigmas(T)))
 
     def sigmas(self, T_from_to: Float64) -> tuple[float, float]:
         """Standard deviations of a motion: translation in metres, rotation in degrees."""

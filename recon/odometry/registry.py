@@ -12,15 +12,16 @@ from recon.core.geometry.se3 import invert
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.odometry.checked import CheckedOdometry
+from recon.odometry.guide import Guide
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.settings import OdometrySettings
 from recon.odometry.visual import VisualOdometry
 
-ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odometry]]] = {
-    "visual": lambda settings, prior: VisualOdometry(prior),
-    "kiss": lambda settings, prior: KissOdometry(settings.max_range_m, VisualOdometry(prior)),
+ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, Guide | None], Odometry]]] = {
+    "visual": lambda settings, guide: VisualOdometry(guide),
+    "kiss": lambda settings, guide: KissOdometry(settings.max_range_m, VisualOdometry(guide)),
 }
 
 
@@ -29,11 +30,13 @@ def make_odometry(
     settings: OdometrySettings | None = None,
     prior: Trajectory | None = None,
     scale: float = 1.0,
+    guide: Guide | None = None,
 ) -> Odometry:
     """Make the odometry of a name in `ODOMETRIES`; its poses are checked (`CheckedOdometry`).
 
     Each odometry uses its own part of the settings; ``prior`` is the path of the rig by other
-    sensors, on the clock of the frames, ``scale`` the size of the scene against a road.
+    sensors, on the clock of the frames, ``scale`` the size of the scene against a road;
+    without a prior ``guide`` says how the rig moves.
     """
     if name == "sfm":
         what, expected = "structure from motion is no odometry frame by frame", "visual or kiss"
@@ -42,8 +45,8 @@ def make_odometry(
         choices = ", ".join(sorted(ODOMETRIES))
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
     settings = settings or OdometrySettings()
-    motion_prior = None if prior is None else MotionPrior(prior, settings.prior)
-    return CheckedOdometry(ODOMETRIES[name](settings, motion_prior), scale)
+    guide = guide if prior is None else MotionPrior(prior, settings.prior)
+    return CheckedOdometry(ODOMETRIES[name](settings, guide), scale)
 
 
 class KnownPoses:

@@ -51,6 +51,10 @@ class OdometrySettings(Settings):
     """visual = features followed from frame to frame; kiss = kiss-icp, which from there registers
     the points that stereo measures well over time, to compare with; sfm = structure from motion by
     COLMAP over all pairs, in any order (extra sfm)."""
+    imu: bool = True
+    """Use the inertial unit of a source that has one, without `--prior`: its gyro says how the
+    camera turns, also where it sees nothing, its accelerometer what is up. Its bias, delay and axes
+    are found from the drive."""
     max_range_m: float = Length(30.0, ge=1e-06, le=100000.0)
     """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
     it with a wide baseline in open country."""

@@ -7,17 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.geometry.se3 import (
-    Motion,
-    as_step,
-    covariance_of,
-    distance_in_sigmas,
-    invert,
-    step_covariance,
-)
+from recon.core.geometry.se3 import Motion, covariance_of, distance_in_sigmas
 from recon.core.text import counted
-from recon.core.values import Disparity
+from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64, tree_of
+from recon.odometry.checked import most_sigma_m
 from recon.odometry.features import (
     VisualState,
     empty_window,
@@ -28,8 +22,11 @@ from recon.odometry.features import (
     points_of,
     replenish,
 )
+from recon.odometry.guide import Guide, Guided
 from recon.odometry.pose import (
     MIN_INLIERS,
+    KnownPose,
+    LocatedCamera,
     TrackWindow,
     adjust,
     enough_agree,
@@ -38,7 +35,7 @@ from recon.odometry.pose import (
     newest_health,
     newest_information,
 )
-from recon.odometry.prior import MAX_SIGMAS, MotionPrior
+from recon.odometry.prior import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.stereo.rectify.features import match_features
 
@@ -66,17 +63,21 @@ class _Seen:
     tracks: int
     note: str = ""
 
+    @property
+    def inliers(self) -> int:
+        return int(self.window.seen[-1].sum())
+
 
 class VisualOdometry:
     """Tracks the camera by features.
 
     Args:
-        prior: Motion by other sensors: it predicts where features are, bridges frames without any,
+        guide: Motion by other sensors: it predicts where features are, bridges frames without any,
             and refuses features that contradict it.
     """
 
-    def __init__(self, prior: MotionPrior | None = None) -> None:
-        self._prior = prior
+    def __init__(self, guide: Guide | None = None) -> None:
+        self._guide = guide
         self._state: VisualState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -94,26 +95,26 @@ class VisualOdometry:
         if state is None:
             return self._first(frame)
         time_s = frame.pair.timestamp_s
-        prior_motion = self._prior_motion(state.motion.timestamp_s, time_s)
+        guided = self._guided(state.motion, state.seen, time_s)
         motion = state.motion.drifted(time_s)
-        if prior_motion is not None:
-            motion = state.motion.moved(state.motion.T_world_camera @ prior_motion, time_s)
-        predicted = motion.T_world_camera
-        seen = self._by_tracking(state, frame, predicted) or self._by_matching(
-            state, frame, predicted
+        if guided is not None:
+            motion = state.motion.moved(guided.T_world_camera, time_s)
+        expected = guided or Guided(motion.T_world_camera, np.eye(6))
+        seen = self._by_tracking(state, frame, expected) or self._by_matching(
+            state, frame, expected
         )
         if seen is None:
-            return self._lost(state, frame, motion, prior_motion)
+            return self._lost(state, frame, motion, guided)
         if self._contradicts(state, seen, frame):
-            what = "features contradict the prior"
-            return self._lost(state, frame, motion, prior_motion, what)
+            what = f"features contradict {expected.name}"
+            return self._lost(state, frame, motion, guided, what)
         T_world_camera = seen.window.T_world_camera[-1].copy()
         window = replenish(seen.window.trimmed(_FRAMES), frame)
         motion = state.motion.moved(T_world_camera, time_s)
-        self._state = VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
-        camera = frame.pair.camera
-        health = newest_health(seen.window, camera, seen.tracks, seen.note)
-        information = newest_information(seen.window, camera)
+        self._state = VisualState(window, frame.pair.left, frame.disparity, motion, motion)
+        camera, known = frame.pair.camera, _held(expected)
+        health = newest_health(seen.window, camera, seen.tracks, seen.note, known)
+        information = newest_information(seen.window, camera, known=known)
         return VisualEstimate(OdometryResult(T_world_camera, health), information)
 
     @property
@@ -125,20 +126,22 @@ class VisualOdometry:
         last = self._state
         if last is None:
             return {"last": None}
-        parts = {name: tree_of(getattr(last, name)) for name in ("window", "disparity", "motion")}
-        return {"last": {**parts, "left": last.left, "seen_s": last.seen_s}}
+        names = ("window", "disparity", "motion", "seen")
+        parts = {name: tree_of(getattr(last, name)) for name in names}
+        return {"last": {**parts, "left": last.left}}
 
     def restore(self, state: dict[str, Any]) -> None:
         last, self._state = state["last"], None
         if last is not None:
-            for name in ("T_world_camera", "T_before_camera"):
-                pose_in(last["motion"], name)
+            for motion in (last["motion"], last["seen"]):
+                for name in ("T_world_camera", "T_before_camera"):
+                    pose_in(motion, name)
             self._state = VisualState(
                 TrackWindow(**last["window"]),
                 last["left"],
                 Disparity(**last["disparity"]),
                 Motion(**last["motion"]),
-                float(last["seen_s"]),
+                Motion(**last["seen"]),
             )
 
     def _first(self, frame: OdometryFrame) -> VisualEstimate:
@@ -154,25 +157,24 @@ class VisualOdometry:
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
         window = replenish(empty_window(motion.T_world_camera), frame)
-        time_s = frame.pair.timestamp_s
-        return VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
+        # How fast the camera moves is not seen in one frame.
+        seen = Motion(motion.T_world_camera, frame.pair.timestamp_s)
+        return VisualState(window, frame.pair.left, frame.disparity, motion, seen)
 
-    def _prior_motion(self, from_s: float, to_s: float) -> Float64 | None:
-        return None if self._prior is None else self._prior.motion(from_s, to_s)
+    def _guided(self, last: Motion, seen: Motion, to_s: float) -> Guided | None:
+        return None if self._guide is None else self._guide.guide(last, seen, to_s)
 
     def _contradicts(self, state: VisualState, seen: _Seen, frame: OdometryFrame) -> bool:
         """Whether the visual motion since the last registration contradicts the prior."""
-        prior_motion = self._prior_motion(state.seen_s, frame.pair.timestamp_s)
-        if prior_motion is None or self._prior is None:
+        guided = self._guided(state.seen, state.seen, frame.pair.timestamp_s)
+        if guided is None:
             return False
-        found = invert(state.window.T_world_camera[-1]) @ seen.window.T_world_camera[-1]
-        off = as_step(invert(prior_motion) @ found)
         information = newest_information(seen.window, frame.pair.camera)
-        both = covariance_of(information) + step_covariance(*self._prior.sigmas(prior_motion))
-        return distance_in_sigmas(off, both) > MAX_SIGMAS
+        both = covariance_of(information) + guided.covariance
+        return distance_in_sigmas(guided.off(seen.window.T_world_camera[-1]), both) > MAX_SIGMAS
 
     def _by_tracking(
-        self, state: VisualState, frame: OdometryFrame, predicted: Float64
+        self, state: VisualState, frame: OdometryFrame, expected: Guided
     ) -> _Seen | None:
         """The frame, registered by tracking; None = that fails.
 
@@ -180,16 +182,20 @@ class VisualOdometry:
         they look from there: those that were lost are found, and the others more closely.
         """
         window = state.window
-        uv = follow_points(state, frame, predicted)
+        uv = follow_points(state, frame, expected.T_world_camera)
         tracks = np.flatnonzero(np.isfinite(uv[:, 0]))
-        rough = locate_camera(window.xyz_world[tracks], uv[tracks], frame.pair.camera, predicted)
+        rough = _locate(window.xyz_world[tracks], uv[tracks], frame.pair.camera, expected)
         if rough is None:
             return None
         uvd = observe_points(state, frame, uv, rough.T_world_camera)
-        return self._register(window, uvd, frame, rough.T_world_camera)
+        if not expected.holds:
+            expected = replace(expected, T_world_camera=rough.T_world_camera)
+        seen = self._register(window, uvd, frame, expected)
+        # Patches drift along edges together: of them, a few that agree with a turn may be wrong.
+        return seen if seen is not None and enough_agree(seen.inliers, seen.tracks) else None
 
     def _by_matching(
-        self, state: VisualState, frame: OdometryFrame, predicted: Float64
+        self, state: VisualState, frame: OdometryFrame, expected: Guided
     ) -> _Seen | None:
         """The frame, registered by matching over the whole image; None = that fails."""
         # Who is in a hurry would lose more frames to SIFT than it saves.
@@ -203,33 +209,56 @@ class VisualOdometry:
         known = np.isfinite(then[:, 2])
         then, now = then[known].astype(np.float64), now[known].astype(np.float64)
         window = empty_window(T_world_then).with_points(then, points_of(then, T_world_then, camera))
-        seen = self._register(window, now, frame, predicted)
+        by_turn = self._by_turn(state, frame, window, now, expected)
+        seen = self._register(window, now, frame, expected)
+        if seen is None or (by_turn is not None and by_turn.inliers > seen.inliers):
+            seen = by_turn
         if seen is None:
             return None
         return replace(seen, note="features were looked for in the whole image")
 
+    def _by_turn(
+        self,
+        state: VisualState,
+        frame: OdometryFrame,
+        matched: TrackWindow,
+        uvd: Float64,
+        expected: Guided,
+    ) -> _Seen | None:
+        """The frame, by what a few matches and a known turn say of where its features are."""
+        rough = None
+        if expected.holds:
+            rough = expected.locate(matched.xyz_world, uvd[:, :2], frame.pair.camera)
+        if rough is None:
+            return None
+        nowhere = np.full((len(state.window.xyz_world), 2), np.nan)
+        uvd = observe_points(state, frame, nowhere, rough.T_world_camera)
+        return self._register(state.window, uvd, frame, expected)
+
     def _register(
-        self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, predicted: Float64
+        self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, expected: Guided
     ) -> _Seen | None:
         """The window with the new frame added, if enough features agree on one motion."""
         camera = frame.pair.camera
         tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
-        found = locate_camera(window.xyz_world[tracks], uvd[tracks, :2], camera, predicted)
+        found = _locate(window.xyz_world[tracks], uvd[tracks, :2], camera, expected)
         if found is None:
             return None
         uvd[tracks[~found.agree]] = np.nan
-        window = adjust(window.with_frame(found.T_world_camera, uvd), camera)
+        window = window.with_frame(found.T_world_camera, uvd)
+        window = adjust(window, camera, _held(expected))
         window = window.without_newest(misfits(window, camera))
-        if not enough_agree(int(window.seen[-1].sum()), len(tracks)):
-            return None
-        return _Seen(window, len(tracks))
+        seen = _Seen(window, len(tracks))
+        agree = (seen.inliers, seen.tracks)
+        held = expected.holds and expected.enough_agree(*agree)
+        return seen if held or enough_agree(*agree) else None
 
     def _lost(
         self,
         state: VisualState,
         frame: OdometryFrame,
         motion: Motion,
-        prior_motion: Float64 | None,
+        guided: Guided | None,
         what: str = "no motion fits",
     ) -> VisualEstimate:
         """Continue the motion; a frame with enough features begins a new path there."""
@@ -238,12 +267,28 @@ class VisualOdometry:
         sees = points >= MIN_INLIERS
         self._state = begun if sees else replace(state, motion=motion)
         why = f"{what if sees else _NOTHING} ({counted(points, 'feature')})"
-        if prior_motion is None or self._prior is None:
+        step_m = float(np.linalg.norm(motion.T_before_camera[:3, 3]))
+        if guided is None or (guided.holds and guided.sigma_m > most_sigma_m(step_m, guided.scale)):
             notes = (f"lost: {why}; {'the path begins anew' if sees else 'skipped'}",)
             health = OdometryHealth(ok=sees, skipped=not sees, begins=sees, notes=notes)
             return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
-        sigma_m, sigma_deg = self._prior.sigmas(prior_motion)
-        note = f"carried by the prior: {why}"
+        note = f"carried by {guided.name}: {why}"
+        sigma_m, sigma_deg = guided.sigma_m, guided.sigma_deg
         health = OdometryHealth(sigma_m=sigma_m, sigma_deg=sigma_deg, notes=(note,))
-        information = np.asarray(np.linalg.inv(step_covariance(sigma_m, sigma_deg)), np.float64)
-        return VisualEstimate(OdometryResult(motion.T_world_camera, health), information)
+        return VisualEstimate(OdometryResult(motion.T_world_camera, health), guided.information)
+
+
+def _locate(
+    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, expected: Guided
+) -> LocatedCamera | None:
+    """Locate a camera by points; what fits more, alone or with a known turn."""
+    held = expected.locate(xyz_world, uv, camera) if expected.holds else None
+    alone = locate_camera(xyz_world, uv, camera, expected.T_world_camera)
+    if held is None or alone is None:
+        return held or alone
+    return max(held, alone, key=lambda found: int(found.agree.sum()))
+
+
+def _held(expected: Guided) -> KnownPose | None:
+    """What an adjustment takes of it."""
+    return expected.known if expected.holds else None

@@ -12,12 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import CalibrationError, SourceError
-from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoPair, check_size
+from recon.core.values import (
+    CameraIntrinsics,
+    ImuRecord,
+    RectifiedCamera,
+    Rig,
+    StereoPair,
+    check_size,
+)
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
 from recon.io.cameras.ros import NS, ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
 from recon.io.files import reading, resolved
-from recon.sources.bag_prior import read_topic
+from recon.sources.bag_prior import find_imu, read_imu_topic, read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.image_names import find_partners, partner_names
 from recon.sources.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag, BagCameraInfo
@@ -57,6 +64,12 @@ class BagSource(Recording):
         if Path(name).is_file():
             return super().read_prior(name)
         return read_topic(self.bag, name, self.topics[0], stamped=self.stamped)
+
+    def read_imu(self) -> ImuRecord | None:
+        name = find_imu(self.bag)
+        if name is None:
+            return None
+        return read_imu_topic(self.bag, name, self.topics[0], stamped=self.stamped)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         if start >= len(self):
@@ -179,7 +192,7 @@ def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str],
 def _list_others(bag: Bag, used: Sequence[str]) -> str:
     """Return a note on unused topics, but for those of images, and on which `--prior` takes."""
     images = [name for name, topic in bag.topics.items() if topic.kind in _IMAGES]
-    named = {*used, *(name for pair in find_partners(images) for name in pair)}
+    named = {*used, find_imu(bag), *(name for pair in find_partners(images) for name in pair)}
     unused = {name for name, topic in bag.topics.items() if topic.kind != CAMERA_INFO} - named
     others = sorted(unused)
     if not others:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -10,10 +11,11 @@ import numpy as np
 from recon.core.errors import FormatError, SourceError
 from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
 from recon.core.text import counted
-from recon.core.values import Trajectory
+from recon.core.values import ImuRecord, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.cameras.ros import NS
-from recon.sources.rosbags import POSES, TRANSFORMS, Bag, BagPose
+from recon.io.imu import imu_of
+from recon.sources.rosbags import IMU, POSES, TRANSFORMS, Bag, BagPose
 from recon.sources.source import ReadPrior
 
 _STATIC: Final = "tf_static"
@@ -36,6 +38,28 @@ def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadP
         return ReadPrior(path, f"{origin}, no static transform to {camera or 'the camera'}")
     moved = Trajectory(path.T_world_camera @ T_child_camera, path.timestamps_s)
     return ReadPrior(moved, f"{origin}, moved to {camera} by the static transforms")
+
+
+def find_imu(bag: Bag) -> str | None:
+    """Return the topic of an inertial unit; of several, one of all that it measures."""
+    found = [topic for topic in bag.topics.values() if topic.kind == IMU and topic.messages]
+    ranked = sorted(found, key=lambda topic: ("accel" in topic.name, "imu" not in topic.name,
+                                              -topic.messages, topic.name))  # fmt: skip
+    return ranked[0].name if ranked else None
+
+
+def read_imu_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ImuRecord:
+    """Read an inertial unit, and where static transforms put it beside the camera."""
+    table = bag.imu(name)
+    where = f"{bag.paths[0]}: {name}"
+    columns = [int(stamped), *range(2, 8)]
+    places = [f"{name}, message {n}" for n in range(len(table))]
+    record = imu_of(table[:, columns], places, where)
+    T_imu_camera = _static_transform(bag, bag.frame_id(name), bag.frame_id(image_topic))
+    if T_imu_camera is not None:
+        return replace(record, T_camera_imu=invert(T_imu_camera))
+    note = f"IMU: no static transform from {name} to the camera: its axes are what the drive shows"
+    return replace(record, notes=(*record.notes, note))
 
 
 def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], list[BagPose]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.core.errors import SourceError
-from recon.core.values import RectifiedCamera, StereoPair, check_size
+from recon.core.values import ImuRecord, RectifiedCamera, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
@@ -36,6 +36,7 @@ class ImageSource(Recording):
     """A drive in image files; ``images`` are those of each frame, in order."""
 
     images: Sequence[ImageFrame]
+    imu: Callable[[], ImuRecord] | None = None  # reads what the inertial unit measured
 
     @cached_property
     def files(self) -> Sequence[Path]:
@@ -45,6 +46,9 @@ class ImageSource(Recording):
     @cached_property
     def stamps_s(self) -> Float64:
         return stamps_of(self.images)
+
+    def read_imu(self) -> ImuRecord | None:
+        return None if self.imu is None else self.imu()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         for index in range(start, len(self.images)):

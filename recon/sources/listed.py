@@ -13,12 +13,17 @@
         data.csv                       time [ns], file name
         data/1403636579763555584.png
         sensor.yaml                    lens, size, T_BS (or a camchain for both cameras)
+      imu0/                            optional: the inertial unit
+        data.csv                       time [ns], rates [rad/s], forces [m/s²]
+        sensor.yaml                    T_BS
       state_groundtruth_estimate0/     optional: ground truth trajectory of the body
         data.csv
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -26,16 +31,18 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.geometry.se3 import invert
-from recon.core.values import Rig, SequenceTruth, StereoCalibration, check_size
+from recon.core.values import ImuRecord, Rig, SequenceTruth, StereoCalibration, check_size
 from recon.core.values.arrays import Float64
 from recon.io.cameras.ros import NS, read_euroc_camera, read_euroc_truth
 from recon.io.files import resolved
+from recon.io.imu import read_axes, read_imu
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.image_names import find_partners
 from recon.sources.images import ImageSource, image_size, is_image, pair_listed, stamps_of
 from recon.sources.settings import SourceSettings
 from recon.sources.times import check_seconds, read_stamped_names, read_tum_truth, truth_at
 
+_IMU: Final = "imu0"
 _TRUTH: Final = "state_groundtruth_estimate0"
 
 
@@ -111,7 +118,8 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
         images=frames,
         listing=listing,
         truth=truth,
-        texts=(*texts, *(view / "data.csv" for view in views)),
+        texts=(*texts, *(view / "data.csv" for view in views), *_imu_files(root)),
+        imu=partial(_read_imu, root, views[0]) if _imu_files(root) else None,
     )
 
 
@@ -127,13 +135,32 @@ def _read_euroc_rig(
 ) -> tuple[Rig, tuple[Path, ...]]:
     paths = [view / "sensor.yaml" for view in views]
     if settings.has_camera or not paths[0].is_file():
-        # TUM VI has one file for both cameras, beside mav0 or in another folder there.
-        places = (root, root.parent, root.parent / "dso")
-        return read_rig(settings, next(filter(find_calibration, places), root), size)
+        chain = _chain(root)
+        return read_rig(settings, root if chain is None else chain.parent, size)
     (left, T_body_left), (right, T_body_right) = (read_euroc_camera(path) for path in paths)
     rig = StereoCalibration(left, right, invert(T_body_right) @ T_body_left)
     check_size(rig, *size, paths[0])
     return as_rectified(rig), tuple(paths)
+
+
+def _imu_files(root: Path) -> list[Path]:
+    """Return the files of the inertial unit; empty = there is none."""
+    files = [root / _IMU / name for name in ("data.csv", "sensor.yaml")]
+    return [path for path in files if path.is_file()] if files[0].is_file() else []
+
+
+def _read_imu(root: Path, left: Path) -> ImuRecord:
+    record = read_imu(root / _IMU / "data.csv")
+    sensor = root / _IMU / "sensor.yaml"
+    T_camera_imu, note = read_axes(sensor, left / "sensor.yaml", _chain(root))
+    notes = (*record.notes, note) if note else record.notes
+    return replace(record, T_camera_imu=T_camera_imu, notes=notes)
+
+
+def _chain(root: Path) -> Path | None:
+    """Return the file for both cameras: TUM VI has it beside mav0 or in another folder there."""
+    found = map(find_calibration, (root, root.parent, root.parent / "dso"))
+    return next((path for path in found if path is not None), None)
 
 
 def _read_euroc_truth(

@@ -25,6 +25,7 @@ from recon.io.images.image import decode_image, pixels_of_ros_image
 IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 POSES: Final = (
     "nav_msgs/msg/Odometry",
@@ -139,6 +140,16 @@ class Bag:
             message = self._parse(content, topic)
             for part in getattr(message, "transforms", [message]):
                 yield _pose_of(part, recorded_ns)
+
+    def imu(self, topic: str) -> Float64:
+        """Return rows (N, 8): times [ns] of recording and of the header, rates, forces."""
+        rows = []
+        for _, recorded_ns, content in self._messages([topic]):
+            message = self._parse(content, topic)
+            vectors = (message.angular_velocity, message.linear_acceleration)
+            values = [value for one in vectors for value in (one.x, one.y, one.z)]
+            rows.append([recorded_ns, self._stamp_ns(content, topic), *values])
+        return np.array(rows, np.float64).reshape(-1, 8)
 
     def _find_topics(self) -> dict[str, BagTopic]:
         found: dict[str, BagTopic] = {}

@@ -13,7 +13,14 @@ from typing import Any, Final, TypeVar
 
 from recon.core.errors import SourceError
 from recon.core.text import counted, is_count
-from recon.core.values import OccupancyTruth, Rig, SequenceTruth, StereoPair, Trajectory
+from recon.core.values import (
+    ImuRecord,
+    OccupancyTruth,
+    Rig,
+    SequenceTruth,
+    StereoPair,
+    Trajectory,
+)
 from recon.core.values.arrays import Float64
 from recon.io.trajectory import read_tum
 from recon.sources.settings import SourceSettings
@@ -117,6 +124,14 @@ class StereoSource(ABC):
         """Read the motion by other sensors: a TUM file, or what else this kind of source has."""
         return ReadPrior(read_tum(name), name)
 
+    def read_imu(self) -> ImuRecord | None:
+        """Read what the inertial unit of the rig measured; None = the source has none.
+
+        Raises:
+            ReconError: There is one, but its file cannot be used.
+        """
+        return None
+
     def occupancy_truth(
         self,
         *,
@@ -213,6 +228,14 @@ class SourcePart(DerivedSource):
 
     def __len__(self) -> int:
         return self.last - self.first
+
+    @cached_property
+    def stamps_s(self) -> Float64 | None:
+        stamps_s = self.source.stamps_s
+        return None if stamps_s is None else stamps_s[self.first : self.last]
+
+    def read_imu(self) -> ImuRecord | None:
+        return self.source.read_imu()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         return islice(self.source.frames(self.first + start), len(self) - start)

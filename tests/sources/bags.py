@@ -89,6 +89,13 @@ class Recorder:
             twist=self.make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36)),
         )  # fmt: skip
 
+    def imu(self, stamp_ns: int, gyro: np.ndarray, accel: np.ndarray, frame_id: str) -> Any:
+        rates, forces = (self.make("geometry_msgs/Vector3", *v.tolist()) for v in (gyro, accel))
+        none = self.make("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+        header = self.header(stamp_ns, frame_id)
+        parts = (header, none, np.zeros(9), rates, np.zeros(9), forces, np.zeros(9))
+        return self.make("sensor_msgs/Imu", *parts)
+
     def transform(self, stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
         moved = self.make("geometry_msgs/Transform", *self.place(T, "Vector3"))
         header = self.header(stamp_ns, parent)

@@ -217,6 +217,14 @@ class Motion:
     T_before_camera: Float64 = field(default_factory=lambda: np.eye(4))
     interval_s: float = 0.0  # time that the motion took; 0 = not known
 
+    @property
+    def velocity(self) -> Float64:
+        """(3,), metres per second in the axes of the last pose; 0 where times are not known."""
+        if not self.interval_s > 0.0:
+            return np.zeros(3)
+        T = self.T_before_camera
+        return np.asarray(T[:3, :3].T @ T[:3, 3] / self.interval_s)
+
     def predict(self, timestamp_s: float) -> Float64:
         """The pose (4, 4) at a time: with constant velocity, where times are known."""
         passed_s = timestamp_s - self.timestamp_s

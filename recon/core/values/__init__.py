@@ -26,6 +26,7 @@ from recon.core.values.image import Disparity as Disparity
 from recon.core.values.image import Reason as Reason
 from recon.core.values.image import RectifiedPair as RectifiedPair
 from recon.core.values.image import StereoPair as StereoPair
+from recon.core.values.imu import ImuRecord as ImuRecord
 from recon.core.values.trajectory import Trajectory as Trajectory
 from recon.core.values.truth import DepthMetrics as DepthMetrics
 from recon.core.values.truth import DisparityMetrics as DisparityMetrics

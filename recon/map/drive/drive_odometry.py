@@ -8,10 +8,14 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.errors import RegistrationError
+from recon.core.errors import ReconError, RegistrationError
+from recon.core.geometry.se3 import make_transform
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.map.settings import DriveSettings
+from recon.odometry.guide import Guide
+from recon.odometry.imu_fit import FittedImu, fit_imu
+from recon.odometry.imu_runs import seen_runs
 from recon.odometry.prior import MotionPrior
 from recon.odometry.prior_axes import find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame
@@ -19,6 +23,7 @@ from recon.odometry.registry import KnownPoses, make_odometry
 from recon.odometry.settings import PriorSettings
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
+from recon.stereo.rectify.rectifier import turns_of
 
 _KNOWN: Final = PriorSettings(sigma_share=0.01)
 """How well poses are expected to be known; only where they are much worse is it said."""
@@ -70,6 +75,7 @@ def odometry_of(
     known_poses: Trajectory | None,
     prior: Trajectory | None,
     used: UsedPrior | None,
+    guide: Guide | None = None,
 ) -> Odometry:
     """Return the odometry of a drive, or known poses, one per frame, that take its place."""
     if known_poses is None:
@@ -77,8 +83,30 @@ def odometry_of(
         if used is not None:
             axes = settings.prior.model_copy(update={"axes": used.axes})
             settings = settings.model_copy(update={"prior": axes})
-        return make_odometry(settings.method, settings, prior, config.scale)
+        return make_odometry(settings.method, settings, prior, config.scale, guide)
     return KnownPoses(_of_frames(known_poses, source))
+
+
+def imu_of(
+    source: StereoSource, reconstructor: FrameReconstructor, config: DriveSettings
+) -> FittedImu | None:
+    """Return what the drive shows of its inertial unit; None = it has none, or it is not wanted."""
+    stamps_s = source.stamps_s
+    if source.live or not config.odometry.imu or stamps_s is None or len(stamps_s) < 2:
+        return None
+    try:
+        record = source.read_imu()
+    except ReconError as error:
+        return FittedImu(None, (f"IMU not used: {error}",))
+    if record is None:
+        return None
+    T_camera_imu = record.T_camera_imu
+    if T_camera_imu is not None:
+        R_left = turns_of(source.calibration, config.rectification).R_left
+        T_camera_imu = make_transform(R_left, np.zeros(3)) @ T_camera_imu
+    fitted = fit_imu(record, stamps_s, lambda: seen_runs(source, reconstructor), T_camera_imu)
+    guide = fitted.guide
+    return replace(fitted, guide=guide and replace(guide, scale=config.scale))
 
 
 def doubt_poses(

@@ -35,7 +35,8 @@ from recon.stereo.frame import ReconstructedFrame
 class Mapper:
     """Registers frames; integrates each into the current submap while the next is registered.
 
-    What it makes is kept in the session, whose frames, submaps and rays are those before.
+    What it makes is kept in the session, whose frames, submaps and rays are those before. ``up``,
+    float64 (3,), is upwards in the axes of the first camera; None = as the ground below it shows.
     """
 
     def __init__(
@@ -45,8 +46,10 @@ class Mapper:
         odometry: Odometry,
         session: Session,
         stopwatch: Stopwatch,
+        up: Float64 | None = None,
     ) -> None:
         self._config, self._camera, self._odometry = config, camera, odometry
+        self._up = up
         self.session, self._stage = session, stopwatch.stage
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
         self._behind = OneBehind()
@@ -141,8 +144,8 @@ class Mapper:
 
     def fix_axes(self, cloud: PointCloud) -> SubmapBuilder:
         """Lay the axes of the map by the ground in a cloud, world axes; begin the first submap."""
-        config, ground = self._config, estimate_ground(cloud, self._config.scale)
-        T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m)
+        config, ground = self._config, estimate_ground(cloud, self._config.scale, self._up)
+        T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m, self._up)
         self.session.set_axes(T_map_world, self._camera)
         self._behind.wait()
         before, builder = self._builder, self._new_builder()

@@ -28,7 +28,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import depth_from_disparity
 from recon.map.drive.drive import Drive, Workspace
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
-from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of
+from recon.map.drive.drive_odometry import UsedPrior, axes_of, imu_of, odometry_of
 from recon.map.drive.mapper import Mapper
 from recon.map.fusion import fusion_range_m
 from recon.map.map import Map
@@ -37,6 +37,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 from recon.odometry.health import name_frames, stretches
+from recon.odometry.imu_fit import FittedImu
 from recon.odometry.protocol import Odometry, OdometryHealth
 from recon.odometry.sfm.find import SfmOptions, find_poses
 from recon.odometry.sfm.found import FoundOdometry, FoundPoses
@@ -68,6 +69,7 @@ class MappedSequence:
         seconds: Wall-clock time from the first frame to the last.
         loops: Result of loop closure; None = it was not run.
         prior: How the external trajectory was used; None = there was none.
+        imu: What the drive shows of its inertial unit; None = it has none, or is not used.
         sfm: What structure from motion found; None = it was not asked.
         threads: Threads with which rays are cast.
     """
@@ -78,6 +80,7 @@ class MappedSequence:
     seconds: float
     loops: DriveLoops | None = None
     prior: UsedPrior | None = None
+    imu: FittedImu | None = None
     sfm: FoundPoses | None = None
     threads: int = 1
 
@@ -209,21 +212,25 @@ def map_sequence(
     reconstructor = FrameReconstructor(
         source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
     )
-    used = None
+    by_sfm = config.odometry.method == "sfm" and known_poses is None
+    used = imu = None
     if prior is not None and known_poses is None:
         used = axes_of(prior, source, reconstructor, config.odometry.prior)
+    elif known_poses is None and not by_sfm:
+        imu = imu_of(source, reconstructor, config)
+    guide = None if imu is None else imu.guide
     session = work.session(source, config)
-    by_sfm = config.odometry.method == "sfm" and known_poses is None
     odometry: Odometry
     if by_sfm:
         progress.on_stage("sfm")
         odometry = _photos(source, config, work, session)
     else:
-        odometry = odometry_of(config, source, known_poses, prior, used)
+        odometry = odometry_of(config, source, known_poses, prior, used, guide)
     looking = config.loops.enabled and known_poses is None and not by_sfm
     how: Any = {"search": looking, "scale": config.scale}
     watch = LoopWatch(session.keyframes, reconstructor.camera, work.stopwatch, **how)
-    mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
+    up = None if guide is None else guide.up
+    mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch, up)
     drive = Drive(source, reconstructor, mapper, watch, config, work)
     if isinstance(odometry, FoundOdometry) and not len(mapper):
         drive.begin_at(int(odometry.found.models[0].frames[0]))
@@ -245,6 +252,7 @@ def map_sequence(
         seconds=drive.seconds,
         loops=drive.close_loops(session.odometry),
         prior=used,
+        imu=imu,
         sfm=odometry.found if isinstance(odometry, FoundOdometry) else None,
         threads=work.threads or 1,
     )

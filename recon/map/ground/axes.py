@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
-from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
 from recon.core.settings import Settings
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, freeze
@@ -59,25 +59,37 @@ class GroundPlane:
 
 
 def map_axes(
-    ground: GroundPlane | None, settings: AxesSettings, camera_height_m: float | None = None
+    ground: GroundPlane | None,
+    settings: AxesSettings,
+    camera_height_m: float | None = None,
+    up: Float64 | None = None,
 ) -> Float64:
     """Return ``T_map_world``, float64 (4, 4), from world to map axes.
 
     Without a ground below the first camera (None), or with a tilt below the limit, exactly x_map =
     z_world, y_map = -x_world, z_map = -y_world; else also turned the short way so that the ground's
-    normal is z_map. With its origin on the ground, also moved up along z, by ``camera_height_m`` or
-    else by the height above the plane.
+    normal is z_map, or ``up`` (3,), world axes, where that is known. With its origin on the ground,
+    also moved up along z, by ``camera_height_m`` or else by the height above the plane.
     """
     turn = AXES_MAP_WORLD
-    if ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
-        normal_map = AXES_MAP_WORLD @ ground.normal
-        axis = np.cross(normal_map, [0.0, 0.0, 1.0])
-        axis /= np.linalg.norm(axis)
-        turn = exp_so3(axis * math.radians(ground.tilt_deg)) @ AXES_MAP_WORLD
+    if up is None and ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
+        up = ground.normal
+    if up is not None:
+        turn = _short_turn(AXES_MAP_WORLD @ up, np.array([0.0, 0.0, 1.0])) @ AXES_MAP_WORLD
     height_m = 0.0
     if settings.origin == "ground":
         height_m = _height_along_z(ground, turn) if camera_height_m is None else camera_height_m
     return make_transform(turn, np.array([0.0, 0.0, height_m]))
+
+
+def _short_turn(first: Float64, second: Float64) -> Float64:
+    """Return the smallest rotation (3, 3) that takes one direction to another."""
+    axis = np.cross(first, second)
+    angle = math.acos(min(1.0, max(-1.0, float(first @ second))))
+    size = float(np.linalg.norm(axis))
+    if size == 0.0:  # the same, or opposite: then about any axis across
+        return exp_so3(angle * np.roll(second, 1))
+    return exp_so3(axis / size * angle)
 
 
 def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
@@ -98,14 +110,20 @@ def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
     return ground.height_m / float(turn[2] @ ground.normal)
 
 
-def estimate_ground(cloud: PointCloud, scale: float = 1.0) -> GroundPlane | None:
+def estimate_ground(
+    cloud: PointCloud, scale: float = 1.0, up: Float64 | None = None
+) -> GroundPlane | None:
     """Find the plane that the camera stands above in a cloud of one frame, camera axes.
 
     RANSAC, then least squares: the plane within 30 degrees of level with the most support, or None.
-    The same cloud gives the same plane.
+    The same cloud gives the same plane. ``up`` (3,) is upwards, camera axes; None = their own.
 
     Ref: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981.
     """
+    if up is not None:
+        turn = make_transform(_short_turn(up, _UP_CAMERA), np.zeros(3))
+        plane = estimate_ground(transform_cloud(cloud, turn, frame="camera"), scale)
+        return None if plane is None else replace(plane, normal=plane.normal @ turn[:3, :3])
     xyz, inlier_m = _candidates(cloud, scale * _MAX_RANGE_M), scale * _INLIER_M
     if len(xyz) < _MIN_INLIERS:
         return None

@@ -22,8 +22,9 @@ from recon.odometry.pose import (
     SIGMA_UV_PX,
     TrackWindow,
     adjust,
-    normal_equations,
-    weighted,
+    linearise,
+    model_of,
+    reprojection,
 )
 from recon.odometry.rig.fault import Places, RigFault, shrink
 from recon.odometry.rig.tracks import THREADS, StereoTracks
@@ -226,7 +227,7 @@ class _System(NamedTuple):
 
 def _system(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _System:
     """Return the normal equations of a further correction, poses and points eliminated."""
-    normal = normal_equations(window, camera)
+    normal = linearise(window, model_of(camera))
     shared = _of_places(window, places, camera)
     H_rows, g_rows = _of_rows(places)
     frames, points = window.uvd.shape[:2]
@@ -272,7 +273,7 @@ def _of_rows(places: Places) -> tuple[Float64, Float64]:
 
 def _of_places(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _Shared:
     T_camera_world = invert(window.T_world_camera)
-    residual, weight = weighted(window, camera)
+    residual, weight = _weighted(window, camera)
     frames, points = weight.shape
     xyz = np.stack([apply(T, window.xyz_world) for T in T_camera_world])
     by_place = _derivative(xyz, camera)
@@ -303,3 +304,11 @@ def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
     x, y, zero = xyz[..., 0] / z, xyz[..., 1] / z, np.zeros_like(z)
     rows = [f / z, zero, -f * x / z], [zero, f / z, -f * y / z], [zero, zero, -fb / z**2]
     return np.stack([np.stack(row, -1) for row in rows], axis=-2)
+
+
+def _weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
+    """Residuals (W, N, 3) in sigmas, 0 where unseen, and weights of `adjust` (W, N)."""
+    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
+    residual = np.nan_to_num(reprojection(window, camera) / sigmas)
+    square = np.square(residual).sum(axis=2)
+    return residual, window.seen / (1.0 + square / CAUCHY_SIGMAS**2)

@@ -1,0 +1,224 @@
+"""An inertial unit as a guide: its gyro says how the camera turns, its accelerometer what is up.
+
+Where it goes is not integrated: the camera goes on as it did, as surely as it does in this drive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.geometry.se3 import Motion, hat, make_transform
+from recon.core.values import ImuRecord
+from recon.core.values.arrays import Float64
+from recon.odometry.guide import Guided
+from recon.odometry.imu_runs import SeenRun
+
+_SIGMAS: Final = 4.7
+_MOST_STEPS: Final = 5.0  # usual steps between two samples; over a longer gap nothing is known
+
+
+@dataclass(frozen=True, eq=False)
+class Gyro:
+    """How a gyro says that a camera turned.
+
+    Unknowns are ordered as steps of: the turn to camera axes (3), the bias (3), the delay (1).
+    """
+
+    record: ImuRecord
+    R_camera_imu: Float64  # (3, 3), to the axes of the rectified left camera
+    bias: Float64  # (3,), radians per second, in its own axes
+    late_s: float = 0.0  # its stamps are later than those of images of the same moment
+
+    def knows(self, from_s: float, to_s: float) -> bool:
+        """Return whether it measured all the time between two times of images."""
+        first, last = self._samples(from_s, to_s)
+        times_s = self.record.timestamps_s[first : last + 1]
+        covered = len(times_s) > 1 and times_s[0] <= from_s + self.late_s
+        covered = covered and times_s[-1] >= to_s + self.late_s
+        return bool(covered and np.diff(times_s).max() <= _MOST_STEPS * self._step_s)
+
+    def turned(self, from_s: float, to_s: float) -> tuple[Float64, Float64]:
+        """Return ``R_from_to`` (3, 3) of the camera, and its derivative (3, 7) by the unknowns.
+
+        The derivative is of a small turn in the axes at the end.
+        """
+        first, last = self._samples(from_s, to_s)
+        times_s = self.record.timestamps_s[first : last + 1] + 0.0
+        rates = self.record.gyro[first : last + 1] - self.bias
+        ends = np.array([from_s, to_s]) + self.late_s
+        inside = (times_s > ends[0]) & (times_s < ends[1])
+        at_ends = np.stack([np.interp(ends, times_s, rate) for rate in rates.T], axis=1)
+        times_s = np.concatenate([ends[:1], times_s[inside], ends[1:]])
+        rates = np.concatenate([at_ends[:1], rates[inside], at_ends[1:]])
+        steps_s = np.diff(times_s)
+        R = turns_after(0.5 * (rates[1:] + rates[:-1]) * steps_s[:, None])
+        C, R_end = self.R_camera_imu, R[-1]
+        lasting = np.einsum("n,nij->ij", steps_s, 0.5 * (R[1:] + R[:-1]))
+        turn = C @ R_end @ C.T
+        by_turn = turn.T - np.eye(3)
+        by_bias = -C @ R_end.T @ lasting
+        by_late = C @ (at_ends[1] - R_end.T @ at_ends[0])
+        return turn, np.column_stack([by_turn, by_bias, by_late])
+
+    def stepped(self, step: Float64) -> Gyro:
+        """Return the gyro after a step (7,) of the unknowns."""
+        turn = turns_after(step[None, :3])[-1] @ self.R_camera_imu
+        return Gyro(self.record, turn, self.bias + step[3:6], self.late_s + float(step[6]))
+
+    def _samples(self, from_s: float, to_s: float) -> tuple[int, int]:
+        """Return the samples before and after, as far as there are any."""
+        times_s, late_s = self.record.timestamps_s, self.late_s
+        first = int(np.searchsorted(times_s, from_s + late_s, side="right")) - 1
+        return max(first, 0), int(np.searchsorted(times_s, to_s + late_s, side="left"))
+
+    @cached_property
+    def _step_s(self) -> float:
+        return float(np.median(np.diff(self.record.timestamps_s)))
+
+
+def turns_after(vectors: Float64) -> Float64:
+    """Return the rotations (N + 1, 3, 3) after none, one, … all of the rotation vectors (N, 3)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    K = hat(vectors)
+    # sinc is 1 at 0
+    half = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    steps = np.eye(3) + np.sinc(angle / np.pi) * K + half * (K @ K)
+    turns = np.empty((len(vectors) + 1, 3, 3))
+    turns[0] = np.eye(3)
+    for k, step in enumerate(steps):
+        np.matmul(turns[k], step, out=turns[k + 1])
+    return turns
+
+
+@dataclass(frozen=True, eq=False)
+class ImuGuide:
+    """A gyro whose errors are known, and how steadily the camera moves."""
+
+    gyro: Gyro
+    covariance: Float64  # (7, 7) of the unknowns of the gyro
+    noise: float  # radians per square root of a second
+    unsteady: float  # acceleration of the camera along an axis, rms, metres per second squared
+    step_m: float  # standard deviation of a motion that is seen
+    up: Float64 | None = None  # (3,), upwards in the axes of the first frame; None = not known
+    scale: float = 1.0  # size of the scene against a road
+
+    def guide(self, last: Motion, seen: Motion, to_s: float) -> Guided | None:
+        """Return the turn since the last frame that was seen, and the same velocity as before."""
+        del last
+        lasting_s = to_s - seen.timestamp_s
+        if not lasting_s > 0 or not self.gyro.knows(seen.timestamp_s, to_s):
+            return None
+        R, J = self.gyro.turned(seen.timestamp_s, to_s)
+        covariance = np.zeros((6, 6))
+        covariance[3:, 3:] = J @ self.covariance @ J.T + self.noise**2 * lasting_s * np.eye(3)
+        sigma_m = _UNKNOWN_M
+        if seen.interval_s > 0:
+            # A velocity is the mean since the frame before, and changes meanwhile.
+            changed_m = self.unsteady * lasting_s * 0.5 * (lasting_s + seen.interval_s)
+            sigma_m = float(np.hypot(changed_m, self.step_m * lasting_s / seen.interval_s))
+        covariance[:3, :3] = sigma_m**2 * np.eye(3)
+        moved_m = lasting_s * seen.velocity
+        return Guided(
+            seen.T_world_camera @ make_transform(R, moved_m), covariance, True, self.scale
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """Return what is known of the unit and of the motion, for ``summary.json``."""
+        return {
+            "bias_rad_per_s": self.gyro.bias.tolist(),
+            "bias_sigma_rad_per_s": float(np.sqrt(np.diag(self.covariance)[3:6].max())),
+            "noise_deg_per_root_s": float(np.rad2deg(self.noise)),
+            "acceleration_m_per_s2": self.unsteady,
+        }
+
+
+_UNKNOWN_M: Final = 1e3  # how far off a position is that nothing is known of
+
+
+_G: Final = 9.81  # metres per second squared; on Earth within 0.03
+_UP_SPAN_S: Final = 10.0  # how long accelerations are integrated
+_LEAST_SPAN_S: Final = 0.3
+_PLACE_M: Final = 0.005  # standard deviation of a position, beside what the path adds up
+_FORCE: Final = 0.1  # that of the bias of an accelerometer, metres per second squared
+_SHAKEN_S: Final = 0.2  # over which forces are averaged: frames are not lost for less
+_PARTS: Final = 6  # parts of a drive that are looked at
+_MOST_UP_DEG: Final = 2.0  # standard deviation up to which up is known
+
+
+def find_up(gyro: Gyro, run: SeenRun, arm_m: Float64) -> tuple[Float64 | None, float]:
+    """Return what is up (3,) in the axes of the first pose, and how well that is known, degrees.
+
+    The forces that were measured, turned by the gyro and integrated twice, and gravity, take the
+    camera from pose to pose; ``arm_m`` is where the unit is in camera axes. None = it is not known.
+    """
+    path, begin_s = run.path, float(run.path.timestamps_s[0])
+    near = path.timestamps_s <= begin_s + _UP_SPAN_S
+    ends_s = path.timestamps_s[near] - begin_s
+    if (
+        near.sum() < 4
+        or ends_s[-1] < _LEAST_SPAN_S
+        or not gyro.knows(begin_s, begin_s + ends_s[-1])
+    ):
+        return None, float("nan")
+    times_s, speed = _integrated(gyro, begin_s, float(ends_s[-1]))
+    fallen_m = _summed(speed, times_s)
+    arms_m = path.T_world_camera[near, :3, :3] @ arm_m
+    moved_m = path.positions_m[near] + arms_m - (path.positions_m[0] + arms_m[0])
+    by_force = np.stack([np.interp(ends_s, times_s, axis) for axis in fallen_m.T], axis=1)
+    # Unknown are the first velocity and gravity.
+    A = np.column_stack([ends_s, 0.5 * ends_s**2])[1:]
+    place_m = np.sqrt(np.cumsum(run.sigma_m**2))[: len(A)] + _PLACE_M
+    weight = 1.0 / np.hypot(place_m, 0.5 * _FORCE * ends_s[1:] ** 2)
+    found = np.linalg.lstsq(weight[:, None] * A, weight[:, None] * (moved_m - by_force)[1:])[0]
+    covariance = np.linalg.inv((weight[:, None] * A).T @ (weight[:, None] * A))
+    gravity, sigma = found[1], float(np.hypot(np.sqrt(covariance[1, 1]), _FORCE))
+    sigma_deg = float(np.rad2deg(sigma / _G))
+    wrong = abs(float(np.linalg.norm(gravity)) - _G) > _SIGMAS * sigma
+    if wrong or sigma_deg > _MOST_UP_DEG:
+        return None, sigma_deg
+    return -gravity / np.linalg.norm(gravity), sigma_deg
+
+
+def accelerations(gyro: Gyro) -> float:
+    """Return the acceleration of the camera along an axis, rms over parts of a drive.
+
+    What changes of the forces, beside the turn, is of the motion; what shakes it is averaged out.
+    """
+    begin_s, end_s = gyro.record.timestamps_s[[0, -1]] - gyro.late_s
+    found = []
+    for start_s in np.linspace(begin_s, max(begin_s, end_s - _UP_SPAN_S), _PARTS):
+        span_s = min(_UP_SPAN_S, float(end_s - start_s))
+        if span_s > 2 * _SHAKEN_S and gyro.knows(start_s, start_s + span_s):
+            times_s, speed = _integrated(gyro, start_s, span_s)
+            at_s = np.arange(0.0, span_s, _SHAKEN_S)
+            at = np.stack([np.interp(at_s, times_s, axis) for axis in speed.T], axis=1)
+            found.append(np.var(np.diff(at, axis=0) / _SHAKEN_S, axis=0))
+    return float(np.sqrt(np.mean(found))) if found else float("inf")
+
+
+def _integrated(gyro: Gyro, begin_s: float, span_s: float) -> tuple[Float64, Float64]:
+    """Return times (N,) since a moment, and the speed (N, 3) that the measured forces give by then.
+
+    In the axes of the camera at that moment; gravity is among the forces.
+    """
+    times_s = gyro.record.timestamps_s - gyro.late_s - begin_s
+    inside = (times_s > 0) & (times_s < span_s)
+    at_s = np.concatenate([[0.0], times_s[inside], [span_s]])
+    rates, forces = (
+        np.stack([np.interp(at_s, times_s, axis) for axis in values.T], axis=1)
+        for values in (gyro.record.gyro - gyro.bias, gyro.record.accel)
+    )
+    R = turns_after(0.5 * (rates[1:] + rates[:-1]) * np.diff(at_s)[:, None])
+    return at_s, _summed(np.einsum("nij,nj->ni", R, forces) @ gyro.R_camera_imu.T, at_s)
+
+
+def _summed(values: Float64, times_s: Float64) -> Float64:
+    """Return the integral (N, 3) of values at some times."""
+    summed = np.zeros_like(values)
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times_s)[:, None]
+    summed[1:] = np.cumsum(steps, axis=0)
+    return summed
