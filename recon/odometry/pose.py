@@ -308,7 +308,7 @@ def linearise(
     normal = bundle.linearise(inverse, window.uvd, window.xyz_world, model)
     if known is not None:
         # Tracks count as if their errors were independent.
-        weight = known.information / _INDEPENDENCE
+        weight = known.information / INDEPENDENCE
         normal.H_pose[-1] += weight
         normal.g_pose[-1] += weight @ as_step(inverse[-1] @ known.T_world_camera)
     return normal
@@ -320,7 +320,7 @@ def _cost(window: TrackWindow, model: bundle.BundleModel, known: KnownPose | Non
     if known is None:
         return cost
     off = as_step(T_camera_world[-1] @ known.T_world_camera)
-    return cost + float(off @ known.information @ off) / (_INDEPENDENCE * model.cauchy**2)
+    return cost + float(off @ known.information @ off) / (INDEPENDENCE * model.cauchy**2)
 
 
 def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> TrackWindow:
@@ -345,7 +345,7 @@ def model_of(camera: RectifiedCamera) -> bundle.BundleModel:
     )
 
 
-_INDEPENDENCE: Final = 0.25  # share of the tracks whose errors count as independent
+INDEPENDENCE: Final = 0.25  # share of the tracks whose errors count as independent
 _BEST_PX: Final = 0.05
 """However well features fit, they count as no better: on planes with exact truth they are off by
 0.03 px to 0.12 px."""
@@ -361,7 +361,7 @@ def newest_information(
     known: KnownPose | None = None,
 ) -> Float64:
     """Information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
-    seen = _INDEPENDENCE * pose_information(window, camera, sigma_uv_px)
+    seen = INDEPENDENCE * pose_information(window, camera, sigma_uv_px)
     return seen if known is None else seen + known.information
 
 

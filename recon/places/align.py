@@ -20,12 +20,12 @@ _MOST: Final = 300  # matches that are compared with one another, those of the n
 _SEEDS: Final = 6  # matches whose companions are tried
 _ROUGH: Final = 4  # steps of the fit to them
 _FEWEST: Final = 8  # least number of companions
-_SIGMA_D_PX: Final = 1.0  # standard deviation of a disparity
+SIGMA_D_PX: Final = 1.0  # standard deviation of a disparity
 _STEPS: Final = 15
 _ROUNDS: Final = 3
 _STILL: Final = 1e-5  # baselines and radians: a step that ends the fit
 _NEAREST: Final = 0.2  # of the baseline: what is nearer is not in both views
-_CAUCHY_SIGMAS: Final = 2.0
+CAUCHY_SIGMAS: Final = 2.0
 _SHARED: Final = 0.5  # both directions see the same matches, so together they count once
 
 
@@ -46,7 +46,7 @@ class Seen:
     def sigma_m(self) -> Float64:
         """float64 (N,), about how far each point may be off."""
         depth, camera = self.xyz[:, 2], self.camera
-        along = depth**2 / (camera.focal_px * camera.baseline_m) * _SIGMA_D_PX
+        along = depth**2 / (camera.focal_px * camera.baseline_m) * SIGMA_D_PX
         return np.asarray(np.hypot(along, depth / camera.focal_px * self.sigma_px))
 
 
@@ -156,7 +156,7 @@ def _normal_equations(first: Seen, last: Seen, T: Float64) -> tuple[Float64, Flo
     back = apply(invert(T), first.xyz)
     for xyz, d_xyz, seen in ((moved, turn, first), (back, -step_jacobian(back), last)):
         r, J = _residuals(xyz, d_xyz, seen)
-        weight = 1.0 / (1.0 + np.einsum("nk,nk->n", r, r) / _CAUCHY_SIGMAS**2)
+        weight = 1.0 / (1.0 + np.einsum("nk,nk->n", r, r) / CAUCHY_SIGMAS**2)
         H += np.einsum("nki,n,nkj->ij", J, weight, J)
         g += np.einsum("nki,n,nk->i", J, weight, r)
     return H, g
@@ -164,7 +164,7 @@ def _normal_equations(first: Seen, last: Seen, T: Float64) -> tuple[Float64, Flo
 
 def _residuals(xyz: Float64, d_xyz: Float64, seen: Seen) -> tuple[Float64, Float64]:
     """Return whitened residuals (N, 3) and derivatives (N, 3, 6); 0 for points behind a camera."""
-    sigma, camera = np.array([seen.sigma_px, seen.sigma_px, _SIGMA_D_PX]), seen.camera
+    sigma, camera = np.array([seen.sigma_px, seen.sigma_px, SIGMA_D_PX]), seen.camera
     f, b = camera.focal_px, camera.baseline_m
     front = xyz[:, 2] > _NEAREST * b
     z = np.where(front, xyz[:, 2], 1.0)

@@ -38,7 +38,7 @@ _MAX_CHI2: Final = 22.5
 """Chi-square at which the weight of a loop is a quarter: 0.1 % of right ones are beyond."""
 
 _MAX_BEND_CHI2: Final = 6.0  # mean chi-square of the odometry edges above which no loop is believed
-_USUAL: Final = 0.3
+USUAL: Final = 0.3
 """What odometry usually drifts, as a share of what it may: measured positions, whose errors do not
 grow, would make a path as rough as they are if it counted for less."""
 
@@ -150,9 +150,9 @@ def join_drives(
     ties_of = [_tied_frames(ties, number) for number in range(len(drives))]
     nodes = _spaced(drives, ties_of)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
-    share = 1.0 if held is None else _USUAL
+    share = 1.0 if held is None else USUAL
     chains = [
-        _odometry_edges(drive, own, begin, share)
+        odometry_edges(drive, own, begin, share)
         for drive, own, begin in zip(drives, nodes, begins[:-1], strict=True)
     ]
     edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
@@ -160,7 +160,7 @@ def join_drives(
     parts = [
         _numbered(d.stretch[own], k) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
     ]
-    root = _longest(drives[0].stretch)
+    root = longest_stretch(drives[0].stretch)
     begun = _beside(np.concatenate(start), np.concatenate(parts), root, ties, edges)
     anchor = int(np.argmax(drives[0].stretch[nodes[0]] == root))
     steps = [edge for chain in chains for edge in chain]
@@ -176,11 +176,7 @@ def join_drives(
     if share**2 * max(bends, default=0.0) > _MAX_BEND_CHI2 or (ties and not kept.any()):
         return None
     solved = [poses[a:b] for a, b in pairwise(begins)]
-    paths = [_bent(*each) for each in zip(drives, nodes, solved, strict=True)]
-    fixed = int(nodes[0][anchor])
-    exact = paths[0].T_world_camera.copy()
-    exact[fixed] = drives[0].trajectory.T_world_camera[fixed]  # which rounding has moved
-    paths[0] = replace(paths[0], T_world_camera=exact)
+    paths = [bend_path(*each) for each in zip(drives, nodes, solved, strict=True)]
     return JoinedDrives(tuple(paths), kept)
 
 
@@ -200,7 +196,7 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     return float(step @ edge.information @ step)
 
 
-def _longest(stretch: NDArray[np.int64]) -> int:
+def longest_stretch(stretch: NDArray[np.int64]) -> int:
     """Return the stretch of a drive that has most frames."""
     return int(np.bincount(stretch + 1, minlength=2)[1:].argmax())
 
@@ -222,10 +218,10 @@ def _spaced(drives: Sequence[DrivePath], tied: Sequence[list[int]]) -> list[NDAr
     gap_m = max(min(drive.scale for drive in drives) * _NODE_M, 2.0 * length_m / _MAX_NODES)
     if 2 * sum(map(len, tied)) > _MAX_NODES:
         tied = [[] for _ in drives]
-    return [_nodes(drive, gap_m, frames) for drive, frames in zip(drives, tied, strict=True)]
+    return [nodes_along(drive, gap_m, frames) for drive, frames in zip(drives, tied, strict=True)]
 
 
-def _nodes(drive: DrivePath, gap_m: float, tied: list[int]) -> NDArray[np.intp]:
+def nodes_along(drive: DrivePath, gap_m: float, tied: Sequence[int]) -> NDArray[np.intp]:
     """Return frames at even distances along each stretch, its first and last, and those tied."""
     nodes = [np.array(tied, np.intp)]
     if drive.stretch.max() < 0:
@@ -274,18 +270,12 @@ def _solve(
     start: Float64, steps: list[PoseEdge], ties: list[PoseEdge], anchor: int = 0
 ) -> tuple[Float64, Float64]:
     """Return poses of the nodes, of which one is fixed, and the weights of the ties."""
-    order = np.arange(len(start))
-    order[[0, anchor]] = order[[anchor, 0]]
-    edges = [
-        replace(edge, first=int(order[edge.first]), last=int(order[edge.last]))
-        for edge in (*steps, *ties)
-    ]
+    edges, poses = [*steps, *ties], start
     worst = max((misfit(edge, start) for edge in ties), default=0.0)
     rounds = math.ceil(math.log(max(worst / _MAX_CHI2, 1.0), _EASING))
-    poses = start[order]
     for k in range(rounds, -1, -1):
-        poses, weights = optimise_poses(poses, edges, _MAX_CHI2 * _EASING**k)
-    return poses[order], weights[len(steps) :]
+        poses, weights = optimise_poses(poses, edges, _MAX_CHI2 * _EASING**k, anchor)
+    return poses, weights[len(steps) :]
 
 
 def _solve_held(
@@ -304,10 +294,13 @@ def _solve_held(
     return poses[:-1], weights
 
 
-def _odometry_edges(
+def odometry_edges(
     drive: DrivePath, nodes: NDArray[np.intp], begin: int, share: float
 ) -> list[PoseEdge]:
-    """The edges along a drive, with a share of its drift; nodes are numbered from ``begin``."""
+    """The edges along a drive, with a share of the drift that is possible, and all that is stated.
+
+    Nodes are numbered from ``begin``.
+    """
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes), begin):
@@ -318,7 +311,7 @@ def _odometry_edges(
         drift = drift_over(between_m, drive.scale)
         stated = np.repeat(drive.variance[last] - drive.variance[first], 3)
         T = invert(poses[first]) @ poses[last]
-        information = _inverse(share**2 * (drift.covariance + np.diag(stated)))
+        information = _inverse(share**2 * drift.covariance + np.diag(stated))
         edges.append(PoseEdge(k, k + 1, T, information))
     return edges
 
@@ -354,7 +347,7 @@ def _inverse(covariance: Float64) -> Float64:
     return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
-def _bent(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
+def bend_path(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
     """Return every pose moved with the nodes before and after it, interpolated by distance."""
     old, path_m = drive.trajectory.T_world_camera, drive.path_m
     before = np.searchsorted(nodes, np.arange(len(old)), side="right") - 1
@@ -371,4 +364,6 @@ def _bent(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> T
         span = float(path_m[b] - path_m[a])
         share = float(path_m[frame] - path_m[a]) / span if span > 0 else 0.0
         new[frame] = orthonormalise(pose_between(from_a, from_b, share))
+    still = nodes[(T_world_node == old[nodes]).all(axis=(1, 2))]
+    new[still] = old[still]  # which rounding has moved
     return replace(drive.trajectory, T_world_camera=new)

@@ -83,7 +83,7 @@ def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyf
     and Zisserman, "Three things everyone should know to improve object retrieval", CVPR 2012;
     Charikar, "Similarity estimation techniques from rounding algorithms", STOC 2002.
     """
-    sift = cv2.SIFT.create(contrastThreshold=_CONTRAST)
+    sift = cv2.SIFT.create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     image, zoom = _reduced(pair.left)
     corners, sifts = sift.detectAndCompute(image, None)
     uv = ((_places_of(corners) + 0.5) / zoom - 0.5).astype(np.float32)

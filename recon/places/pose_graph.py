@@ -67,18 +67,18 @@ class PoseEdge:
 
 
 def optimise_poses(
-    T_world_node: Float64, edges: Sequence[PoseEdge], half_chi2: float
+    T_world_node: Float64, edges: Sequence[PoseEdge], half_chi2: float, anchor: int = 0
 ) -> tuple[Float64, Float64]:
-    """Optimise a pose graph whose first node is fixed.
+    """Optimise a pose graph of which one node, the ``anchor``, is fixed.
 
     Returns the poses (N, 4, 4), and the weight (E,) of each edge. ``half_chi2`` is the misfit at
     which that of a doubtful edge has dropped to a quarter. Nodes that no path of edges links to the
-    first one keep their place: of each such part, its first node is fixed.
+    anchor keep their place: of each such part, its first node is fixed.
 
     Raises:
         RegistrationError: The graph has no finite solution.
     """
-    graph = PoseGraph.of(edges, half_chi2, len(T_world_node))
+    graph = PoseGraph.of(edges, half_chi2, len(T_world_node), anchor)
     if not np.isfinite(graph.cost(T_world_node)):
         raise RegistrationError("the pose graph has no solution")
     problem = Problem(graph.cost, graph.linearise, graph.step)
@@ -90,18 +90,21 @@ def optimise_poses(
 class PoseGraph:
     """The edges of a graph, in arrays."""
 
-    count: int  # of nodes
+    free: Bool  # (N,), nodes that are not fixed
     ends: NDArray[np.intp]  # (E, 2), first and last node of each edge
     T_last_first: Float64  # (E, 4, 4), inverse of the measured motion
     information: Float64  # (E, 6, 6)
     half_chi2: Float64  # (E,), infinite where an edge is not doubtful
 
     @classmethod
-    def of(cls, edges: Sequence[PoseEdge], half_chi2: float, count: int) -> PoseGraph:
-        """Return the graph of some edges between so many nodes."""
+    def of(
+        cls, edges: Sequence[PoseEdge], half_chi2: float, count: int, anchor: int = 0
+    ) -> PoseGraph:
+        """Return the graph of some edges between so many nodes, of which one is fixed."""
+        ends = np.array([(edge.first, edge.last) for edge in edges], np.intp).reshape(-1, 2)
         return cls(
-            count,
-            np.array([(edge.first, edge.last) for edge in edges], np.intp).reshape(-1, 2),
+            free_nodes(ends, count, anchor),
+            ends,
             invert(np.array([edge.T_first_last for edge in edges]).reshape(-1, 4, 4)),
             np.array([edge.information for edge in edges]).reshape(-1, 6, 6),
             np.array([half_chi2 if edge.doubtful else np.inf for edge in edges]),
@@ -134,20 +137,26 @@ class PoseGraph:
         self, T_world_node: Float64, linear: tuple[Float64, Float64], damping: float
     ) -> Float64 | None:
         """Return poses after a step; None where the damped equations have no solution."""
-        pattern = self._pattern
-        found = pattern.solve(*linear, damping)
-        if found is None:
-            return None
-        steps = np.zeros((self.count, 6))
-        steps[pattern.free] = -found.reshape(-1, 6)
-        moves = np.tile(np.eye(4), (self.count, 1, 1))
+        found = solve_damped(*self.equations(linear), damping)
+        return None if found is None else self.moved(T_world_node, -found)
+
+    def equations(self, linear: tuple[Float64, Float64]) -> tuple[csc_array, Float64]:
+        """Return the matrix (K, K) and half the gradient (K,) of the steps of all free nodes."""
+        return self._pattern.equations(*linear)
+
+    def moved(self, T_world_node: Float64, found: Float64) -> Float64:
+        """Return poses after steps (K,) of the free nodes."""
+        steps = found.reshape(-1, 6)
+        moves = np.tile(np.eye(4), (len(steps), 1, 1))
         moves[:, :3, :3] = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
         moves[:, :3, 3] = steps[:, :3]
-        return np.asarray(T_world_node @ moves)
+        moved = T_world_node.copy()
+        moved[self.free] = moved[self.free] @ moves
+        return np.asarray(moved)
 
     @cached_property
     def _pattern(self) -> _Pattern:
-        return _Pattern.of(self.ends, self.count)
+        return _Pattern.of(self.ends, self.free)
 
     def _motions(self, T_world_node: Float64) -> Float64:
         """``T_first_last`` (E, 4, 4) of the poses."""
@@ -169,7 +178,6 @@ class PoseGraph:
 class _Pattern:
     """Where the equations of edges stand in those of the whole graph, column after column."""
 
-    free: Bool  # (N,), nodes that are not fixed
     indices: NDArray[np.intp]  # (M,), row of each entry
     indptr: NDArray[np.intp]  # (K + 1,), first entry of each column
     kept: Bool  # (E, 12, 12), entries of edges that concern no fixed node
@@ -177,12 +185,8 @@ class _Pattern:
     unknowns: NDArray[np.intp]  # (E, 12), K where the node is fixed
 
     @classmethod
-    def of(cls, ends: NDArray[np.intp], count: int) -> _Pattern:
-        """Return the pattern of edges (E, 2) between so many nodes."""
-        links = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
-        _, part = connected_components(links, directed=False)
-        free = np.ones(count, np.bool_)
-        free[np.unique(part, return_index=True)[1]] = False
+    def of(cls, ends: NDArray[np.intp], free: Bool) -> _Pattern:
+        """Return the pattern of edges (E, 2) between nodes (N,)."""
         size = 6 * int(free.sum())
         number = np.where(free, 6 * np.cumsum(free) - 6, size)
         unknowns = np.minimum(number[ends][:, :, None] + np.arange(6), size).reshape(-1, 12)
@@ -190,26 +194,45 @@ class _Pattern:
         kept = np.maximum(rows, columns) < size
         entries, slots = np.unique(columns[kept] * size + rows[kept], return_inverse=True)
         indptr = np.searchsorted(entries, size * np.arange(size + 1))
-        return cls(free, entries % max(size, 1), indptr, kept, slots, unknowns)
+        return cls(entries % max(size, 1), indptr, kept, slots, unknowns)
 
-    def solve(self, normal: Float64, gradient: Float64, damping: float) -> Float64 | None:
-        """Return the unknowns (K,) of equations (E, 12, 12) and (E, 12); None = no solution."""
+    def equations(self, normal: Float64, gradient: Float64) -> tuple[csc_array, Float64]:
+        """Return the equations (K, K) and (K,) of the graph from those of its edges."""
         size = len(self.indptr) - 1
-        if size == 0:
-            return None
         right = np.bincount(self.unknowns.ravel(), gradient.ravel(), size + 1)[:size]
         values = np.bincount(self.slots, normal[self.kept], len(self.indices))
         matrix = csc_array((values, self.indices, self.indptr), shape=(size, size))
-        diagonal = matrix.diagonal()
-        # A direction of which no edge knows anything stays as it is.
-        matrix.setdiag(diagonal + np.where(diagonal > 0.0, damping * diagonal, 1.0))
-        try:
-            factors = splu(
-                matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
-        except RuntimeError:  # singular
-            return None
-        return np.asarray(factors.solve(right))
+        return matrix, np.asarray(right, np.float64)
+
+
+def free_nodes(ends: NDArray[np.intp], count: int, anchor: int) -> Bool:
+    """Return bool (N,), all nodes but the anchor, and but the first of each part without it.
+
+    Parts are what edges (E, 2) hold together.
+    """
+    links = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(count, count))
+    _, part = connected_components(links, directed=False)
+    fixed = np.unique(part, return_index=True)[1]
+    fixed[part[anchor]] = anchor
+    free = np.ones(count, np.bool_)
+    free[fixed] = False
+    return free
+
+
+def solve_damped(matrix: csc_array, right: Float64, damping: float) -> Float64 | None:
+    """Solve sparse, symmetric equations (K, K) with a raised diagonal; None = no solution."""
+    if not len(right):
+        return None
+    diagonal = matrix.diagonal()
+    # A direction of which nothing is known stays as it is.
+    matrix.setdiag(diagonal + np.where(diagonal > 0.0, damping * diagonal, 1.0))
+    try:
+        factors = splu(
+            matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError:  # singular
+        return None
+    return np.asarray(factors.solve(right))
 
 
 def _right_inverse(turns: Float64) -> Float64:

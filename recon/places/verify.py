@@ -74,16 +74,29 @@ def _aligned(first: Matchable, last: Matchable, scale: float) -> Alignment | str
     found = find_motion(*_seen(first, last, first.mutual(last)))
     if found is None:
         return "no common motion"
-    # Once it is known where features should be, fewer have to be told apart.
-    seen = _seen(first, last, first.guided(last, found.T_first_last))
-    aligned = settle(*seen, found.T_first_last)
-    if aligned is None or int(aligned.agree.sum()) < MIN_INLIERS:
+    near = match_near(first, last, found.T_first_last)
+    if near is None:
         return "few inliers"
-    if min(_spread(one.select(aligned.agree)) for one in seen) < _SPREAD_CELLS:
+    pairs, aligned = near
+    if min(_spread(one) for one in _seen(first, last, pairs)) < _SPREAD_CELLS:
         return "inliers in one corner"
     if _sigma_m(aligned.information) > scale * _MAX_SIGMA_M:
         return "motion not fixed"
     return aligned
+
+
+def match_near(
+    first: Matchable, last: Matchable, T_first_last: Float64
+) -> tuple[NDArray[np.intp], Alignment] | None:
+    """Return the features (M, 2) that agree on a motion near a given one, and it; None = too few.
+
+    Where it is known where features should be, fewer have to be told apart.
+    """
+    pairs = first.guided(last, T_first_last)
+    aligned = settle(*_seen(first, last, pairs), T_first_last)
+    if aligned is None or int(aligned.agree.sum()) < MIN_INLIERS:
+        return None
+    return pairs[aligned.agree], aligned
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +132,7 @@ class Matchable:
         u, v, _ = project(apply(T_self_other, other.xyz), self.camera)
         radius_px = _GUIDED_SIGMAS * feature_sigma_px(self.camera)
         with np.errstate(invalid="ignore"):
-            near = np.hypot(self.uvd[:, :1] - u, self.uvd[:, 1:2] - v) <= radius_px
+            near = (self.uvd[:, :1] - u) ** 2 + (self.uvd[:, 1:2] - v) ** 2 <= radius_px**2
         rows, columns = np.nonzero(near)
         bits = np.full(near.shape, 8 * _GUIDED_HAMMING)
         differ = self.descriptors[rows] ^ other.descriptors[columns]

@@ -39,6 +39,10 @@ class KeyframeMemory(dict[int, StoredKeyframe]):
 
     get = dict.__getitem__
 
+    @property
+    def frames(self) -> list[int]:
+        return sorted(self.keys())
+
 
 class Filmed:
     """A drive whose frames are rendered once, when they are first asked for, and its true path."""

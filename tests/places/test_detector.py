@@ -42,9 +42,8 @@ def test_behind_a_break_a_place_is_recognised_wherever_odometry_begins_anew(bloc
     path = replace(block.truth, T_world_camera=poses)
     loops = block.detect([*FIRST, *AGAIN], path, dict.fromkeys(AGAIN, 1))[0].agreeing()
     assert len({loop.last for loop in loops}) >= 5
-    for loop in loops:
-        off = se3.invert(block.motion(loop.first, loop.last)) @ loop.T_first_last
-        assert np.linalg.norm(off[:3, 3]) < 0.3
+    offs = [se3.invert(block.motion(one.first, one.last)) @ one.T_first_last for one in loops]
+    assert np.quantile([np.linalg.norm(off[:3, 3]) for off in offs], 0.95) < 0.2
 
 
 def test_a_camera_that_goes_back_leaves_keyframes_as_one_that_goes_on(block):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.session import Keyframes
 from recon.odometry.protocol import OdometryHealth
+from recon.places.adjustment import Adjustment, adjust_path
 from recon.places.closure import Closure, DrivePath, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.places import path_lengths
@@ -39,6 +40,7 @@ class DriveLoops:
     keyframes: int
     found: int
     refused: dict[str, int]
+    adjustment: Adjustment | None = None  # of the path after closure; None = there is none
 
     @property
     def corrections_m(self) -> Float64:
@@ -56,6 +58,7 @@ class DriveLoops:
             "refused_by_graph": len(self.closure.refused),
             "refused": dict(sorted(self.refused.items())),
             "largest_correction_m": float(self.corrections_m.max(initial=0.0)),
+            "adjusted": None if self.adjustment is None else self.adjustment.figures(),
         }
 
     def record(self) -> dict[str, Any]:
@@ -105,7 +108,7 @@ class LoopWatch:
         self._stage = (stopwatch or Stopwatch()).stage
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
-        self._keyframes = keyframes
+        self._keyframes, self._camera = keyframes, camera
         self._detector = LoopDetector(keyframes, camera, search=search, scale=scale)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
@@ -144,16 +147,20 @@ class LoopWatch:
             self._detector.restore(stored)
 
     def close(self, trajectory: Trajectory, health: Sequence[OdometryHealth]) -> DriveLoops:
-        """Close the loops of a path by odometry."""
+        """Close the loops of a path by odometry, and adjust it to what its keyframes see."""
         self.wait()
         path = DrivePath.of(trajectory, health, self._scale)
-        loops = self._detector.agreeing()
+        closure = close_loops(path, self._detector.agreeing())
+        adjusted = adjust_path(path, closure, self._keyframes, self._camera)
+        if adjusted is not None:
+            closure = replace(closure, trajectory=adjusted.trajectory)
         return DriveLoops(
             odometry=trajectory,
-            closure=close_loops(path, loops),
+            closure=closure,
             keyframes=len(self._detector),
             found=len(self._detector.loops),
             refused=dict(self._detector.refused),
+            adjustment=adjusted,
         )
 
     def _wait(self, left: int) -> None:
