@@ -26,6 +26,7 @@ _SIZE_PX: Final = 300.0
 doubles it. Smaller details cost more time, and are not seen again from farther away."""
 
 _SIGMA_PX: Final = 0.5  # standard deviation of a feature's column or row in that image
+_DOUBLED_PX: Final = 0.25  # by how much OpenCV places features of SIFT too far right and down
 _CONTRAST: Final = 0.015  # least contrast of a feature
 _MIN_DISPARITY_PX: Final = 1.0  # features with less disparity have no usable depth
 _MAX_DISPARITY_STEP_PX: Final = 1.0  # largest difference between a disparity and its neighbours
@@ -83,10 +84,11 @@ def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyf
     and Zisserman, "Three things everyone should know to improve object retrieval", CVPR 2012;
     Charikar, "Similarity estimation techniques from rounding algorithms", STOC 2002.
     """
-    sift = cv2.SIFT.create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(contrastThreshold=_CONTRAST)
     image, zoom = _reduced(pair.left)
     corners, sifts = sift.detectAndCompute(image, None)
-    uv = ((_places_of(corners) + 0.5) / zoom - 0.5).astype(np.float32)
+    # OpenCV halves places in its doubled image as if pixels had their centres at a corner.
+    uv = ((_places_of(corners) - _DOUBLED_PX + 0.5) / zoom - 0.5).astype(np.float32)
     chosen = _spread(corners, uv, pair.left.shape)
     uv = uv[chosen]
     descriptors = _signs(np.zeros((0, 128), np.float32) if sifts is None else sifts[chosen])
