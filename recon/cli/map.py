@@ -256,8 +256,9 @@ def live(
     A recording is played at its time stamps. The pose of each frame comes first;
     matching follows as far as there is time. Where even poses take too long,
     frames are dropped. summary.json counts both, and the time from an image to
-    its pose. Ctrl-C ends the drive, and its map is completed. With --map, the rig
-    is as the last drive of the map with the same calibration showed it.
+    its pose. Ctrl-C ends the drive, and its map is completed. The rig is as it is
+    calibrated; what the drive shows of it is in rig.yaml, for the next one. With
+    --map, it is as the last drive of the map with this calibration showed it.
 
     Examples:
       recon live 0 2 --calib stereo.yaml

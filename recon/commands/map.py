@@ -42,7 +42,7 @@ from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
 from recon.odometry.prior import MotionPrior
 from recon.odometry.rig.length import check_length, see_baseline
-from recon.odometry.rig.refine import KnownRig, RefinedRig, refine_rig
+from recon.odometry.rig.refine import DEPTHS_M, KnownRig, RefinedRig, refine_rig, rig_shown
 from recon.odometry.sfm.find import check_sfm
 from recon.report.map_page import map_content
 from recon.report.page import write_page
@@ -118,16 +118,17 @@ def run_map(
     if options.audit and options.known_poses is not None:
         findings += doubt_poses(options.known_poses, source, config)
     options.warn(findings)
-    with _begun(source, config, options) as (run, map_, rig, scene, config):
+    with _begun(source, config, options) as (run, map_, found, scene, config):
         if config.rig.refine:
-            map_.session().set_rig(rig)
-        source = rig.applied(source)
-        if options.known_poses is not None and rig.refined:
-            poses = rig.poses(options.known_poses, config.rectification)
+            map_.session().set_rig(found)
+        source = found.applied(source)
+        if options.known_poses is not None and found.refined:
+            poses = found.poses(options.known_poses, config.rectification)
             options = replace(options, known_poses=poses)
         if options.workers is not None or begun_in_pieces(run):
             map_pieces(source, config, options, run, map_)
         mapped = map_drive(source, config, options, run, map_)
+        rig = _shown_live(mapped, source, config, run) if source.live else found
         with run.stage("cloud"):
             check_map(mapped, source.name, findings)
         made = make(Order(map_, mapped.placed, run, config.mesh), options.products)
@@ -135,7 +136,8 @@ def run_map(
             given = options.known_poses is not None
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
         drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_share)
-        doubts = [*rig.warnings(findings), *_warnings(source, mapped, drift)]
+        said = [*rig.warnings(findings), *_next_drive(source, config, rig)]
+        doubts = [*said, *_warnings(source, mapped, drift)]
         breaks = break_warnings(mapped)
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
         warnings = [*first, *breaks, *findings, *doubts, *made.warnings, *errors.warnings]
@@ -206,6 +208,26 @@ def refine_drive(
         if rig.refined:
             write_recon_calibration(run.path(RIG_FILE), rig.calibration)
         return rig
+
+
+def _shown_live(
+    mapped: MappedSequence, source: StereoSource, config: ReconConfig, run: Run
+) -> RefinedRig:
+    """Measure the rig of a drive that has arrived, for the next one: this one is mapped."""
+    with run.stage("rig"):
+        rig = rig_shown(mapped.tracks, source.calibration, config.rectification)
+    if config.rig.refine:
+        mapped.session.set_rig(rig)
+        if rig.refined:
+            write_recon_calibration(run.path(RIG_FILE), rig.calibration)
+    return replace(rig, calibration=source.calibration)
+
+
+def _next_drive(source: StereoSource, config: ReconConfig, rig: RefinedRig) -> list[str]:
+    """Return what to do about a rig that the drive was mapped with, and showed to be wrong."""
+    if not (source.live and config.rig.refine and rig.wrong_at(DEPTHS_M[0])):
+        return []
+    return [f"{RIG_FILE} is the rig that this drive showed: the next one takes it with --calib"]
 
 
 def map_drive(

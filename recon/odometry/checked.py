@@ -52,11 +52,11 @@ class CheckedOdometry:
     """
 
     def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
-        self._odometry, self._scale = odometry, scale
+        self.odometry, self._scale = odometry, scale
         self._state: CheckedState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        result, state = self._odometry.register(frame), self._state
+        result, state = self.odometry.register(frame), self._state
         if state is None and not result.health.ok:
             return result
         sight = Sight(frame.pair.left, frame.disparity)
@@ -72,9 +72,9 @@ class CheckedOdometry:
     def state(self) -> dict[str, Any]:
         last = self._state
         if last is None:
-            return {"odometry": self._odometry.state(), "last": None}
+            return {"odometry": self.odometry.state(), "last": None}
         return {
-            "odometry": self._odometry.state(),
+            "odometry": self.odometry.state(),
             "last": {
                 "left": last.sight.left,
                 "disparity": tree_of(last.sight.disparity),
@@ -83,7 +83,7 @@ class CheckedOdometry:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        self._odometry.restore(state["odometry"])
+        self.odometry.restore(state["odometry"])
         last, self._state = state["last"], None
         if last is not None:
             sight = Sight(last["left"], Disparity(**last["disparity"]))

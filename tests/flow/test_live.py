@@ -15,9 +15,11 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError, SettingsError, SourceError
 from recon.core.values import RectifiedCamera
+from recon.io.cameras.calibration import read_calibration
 from recon.io.trajectory import read_tum
 from recon.map.drive.drive import MapBehind
 from recon.map.drive.mapper import FrameResult
+from recon.map.map import Map
 from recon.rig.cameras import CameraSource, is_camera, open_camera_source
 from recon.rig.capture import CaptureSettings, RecordingSettings
 from recon.run.work import Silent
@@ -28,6 +30,7 @@ from recon.street.settings import StreetScene
 from tests.commands.test_cameras import FakeCamera
 from tests.flow.runs import all_files, keep_turned_rig, summary_of
 from tests.hostile.refusals import assert_refused, run
+from tests.rig.audit import faults
 from tests.scenery.film import RIG, film
 from tests.scenery.kitti import write_kitti
 from tests.scenery.patience import be_patient
@@ -126,6 +129,24 @@ def test_a_drive_is_found_in_a_map_while_it_arrives(street, mapped, patient, pla
     assert summary["frames_tracking"] + summary["frames_coasting"] >= 7
     assert summary["live"]["frames_arrived"] == 8
     assert (tmp_path / "live" / "states.csv").is_file()
+
+
+@pytest.mark.slow
+def test_a_drive_without_a_map_says_what_is_wrong_with_its_rig_and_keeps_it(
+    patient, play, tmp_path
+):
+    size = {"width_px": 400, "height_px": 136, "focal_px": 225.0, "smooth_edges": False}
+    turned = faults.turned(film(StreetScene(frames=96, seed=3, **size)), yaw_deg=0.25)
+    summary, out = play(turned), tmp_path / "live"
+    assert not summary["rig"]["refined"]
+    assert summary["rig"]["yaw_deg"] == pytest.approx(-0.25, abs=0.1)
+    said = "\n".join(summary["warnings"])
+    assert "used is the calibration as it is" in said
+    assert "rig.yaml is the rig that this drive showed" in said
+    with Map.open(out) as map_:
+        kept = map_.known_rig(turned.calibration).calibration
+    found = read_calibration(out / "rig.yaml")
+    np.testing.assert_allclose(found.T_right_left, kept.T_right_left, atol=1e-9)
 
 
 def test_what_cannot_be_played_is_refused(street, play):

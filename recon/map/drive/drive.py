@@ -28,6 +28,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
 from recon.odometry.health import stretches
 from recon.odometry.protocol import OdometryFrame, OdometryResult
+from recon.odometry.rig.tracks import LiveTracks
 from recon.run.machine import versions
 from recon.run.work import Stopwatch, look_ahead, work_in_background
 from recon.sources.source import StereoSource
@@ -71,11 +72,18 @@ class Drive:
         self.mapper.fix_axes(self.reconstructor.reconstruct(pair).cloud)
         self._save()
 
-    def frames(self) -> Generator[FrameResult]:
-        """Yield the pose of each frame that is left, which becomes part of the map."""
+    def frames(self, tracks: LiveTracks | None = None) -> Generator[FrameResult]:
+        """Yield the pose of each frame that is left, which becomes part of the map.
+
+        Of a drive that arrives, ``tracks`` keep what shows its rig.
+        """
         if self.source.live:
             return poses_first(
-                self.source, self.reconstructor, self.mapper.register, self._map_behind
+                self.source,
+                self.reconstructor,
+                self.mapper.register,
+                self._map_behind,
+                tracks,
             )
         return self._in_order()
 
@@ -189,21 +197,25 @@ def poses_first(
     reconstructor: FrameReconstructor,
     register: Callable[[OdometryFrame], OdometryResult],
     map_frame: MapFrame,
+    tracks: LiveTracks | None = None,
 ) -> Generator[FrameResult]:
     """Yield the pose of each frame as soon as it is known, by odometry on rough disparities.
 
-    ``map_frame`` is called in another thread, in order.
+    ``map_frame`` is called in another thread, in order; ``tracks`` keep what shows the rig.
     """
     behind = MapBehind(source, map_frame)
     try:
         for index, pair in enumerate(source.frames()):
             rectified, disparity = reconstructor.match_roughly(pair)
-            found = register(OdometryFrame(rectified, disparity, rough=True))
+            frame = OdometryFrame(rectified, disparity, rough=True)
+            found = register(frame)
             source.note_located(index)
             valid_share = float(np.mean(disparity.valid))
             T = found.T_world_camera
             yield FrameResult(index, len(source), 0.0, valid_share, 0, T, found.health)
             behind.add((rectified, found))
+            if tracks is not None:
+                tracks.add(index, frame, found)
         behind.wait()
     finally:
         behind.stop()

@@ -36,11 +36,14 @@ from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
+from recon.odometry.checked import CheckedOdometry
 from recon.odometry.health import name_frames, stretches
 from recon.odometry.imu_fit import FittedImu
 from recon.odometry.protocol import Odometry, OdometryHealth
+from recon.odometry.rig.tracks import LiveTracks, StereoTracks
 from recon.odometry.sfm.find import SfmOptions, find_poses
 from recon.odometry.sfm.found import FoundOdometry, FoundPoses
+from recon.odometry.visual import VisualOdometry
 from recon.run.machine import available_cores
 from recon.run.work import SILENT, Progress, serial_algebra
 from recon.sources.source import StereoSource, check_source
@@ -72,6 +75,7 @@ class MappedSequence:
         imu: What the drive shows of its inertial unit; None = it has none, or is not used.
         sfm: What structure from motion found; None = it was not asked.
         threads: Threads with which rays are cast.
+        tracks: What a drive showed of its rig while it arrived; empty of any other.
     """
 
     map: Map
@@ -83,6 +87,7 @@ class MappedSequence:
     imu: FittedImu | None = None
     sfm: FoundPoses | None = None
     threads: int = 1
+    tracks: Sequence[StereoTracks] = ()
 
     def __repr__(self) -> str:
         trusted = int(self.trusted.sum())
@@ -231,10 +236,12 @@ def map_sequence(
     watch = LoopWatch(session.keyframes, reconstructor.camera, work.stopwatch, **how)
     up = None if guide is None else guide.up
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch, up)
+    checked = odometry.odometry if isinstance(odometry, CheckedOdometry) else None
+    tracks = LiveTracks(checked) if source.live and isinstance(checked, VisualOdometry) else None
     drive = Drive(source, reconstructor, mapper, watch, config, work)
     if isinstance(odometry, FoundOdometry) and not len(mapper):
         drive.begin_at(int(odometry.found.models[0].frames[0]))
-    steps = drive.frames()
+    steps = drive.frames(tracks)
     progress.on_start(source.name, len(source))
     try:
         with serial_algebra(), closing(steps):
@@ -255,6 +262,7 @@ def map_sequence(
         imu=imu,
         sfm=odometry.found if isinstance(odometry, FoundOdometry) else None,
         threads=work.threads or 1,
+        tracks=() if tracks is None else tracks.windows,
     )
 
 

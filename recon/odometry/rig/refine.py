@@ -22,7 +22,7 @@ from recon.core.values.arrays import Float64
 from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.length import SeenBaseline
-from recon.odometry.rig.tracks import FRAMES, plan_stretches, track_stretches
+from recon.odometry.rig.tracks import FRAMES, StereoTracks, plan_stretches, track_stretches
 from recon.odometry.settings import RigSettings
 from recon.run.run import plain
 from recon.sources.source import StereoSource
@@ -292,6 +292,17 @@ def refine_rig(
     if not rig.refine:
         described = replace(described, calibration=given)
     return replace(described, begun_with=found.begun_with, period_s=period_s)
+
+
+def rig_shown(
+    tracks: Sequence[StereoTracks], given: Rig, settings: RectificationSettings
+) -> RefinedRig:
+    """Return the rig as a drive showed it that was mapped with the one given, while it arrived."""
+    turns = turns_of(given, settings)
+    if len(tracks) < MIN_WINDOWS:
+        return RefinedRig(given, given, turns.camera)
+    fitted = fit_fault(tracks, RigFault(turns.camera), active(given))
+    return _described(given, without_fault(given, turns, fitted.values), fitted, settings)
 
 
 def _described(

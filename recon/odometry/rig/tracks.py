@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Final
@@ -13,7 +13,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.pose import TrackWindow
-from recon.odometry.protocol import OdometryFrame
+from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
 from recon.run.machine import available_cores
 from recon.run.work import serial_algebra, side_by_side
@@ -58,25 +58,66 @@ def track_stretches(
     def tracked(stretch: tuple[int, int]) -> list[StereoTracks]:
         start, stop = stretch
         pairs = islice(source.frames(start), stop - start)
-        matched = (reconstructor.match_roughly(pair) for pair in pairs)
-        return list(stereo_tracks(OdometryFrame(*found) for found in matched))
+        odometry = VisualOdometry()
+        tracker = StereoTracker(odometry)
+        frames = (OdometryFrame(*reconstructor.match_roughly(pair)) for pair in pairs)
+        found = (tracker.add(frame, odometry.register(frame)) for frame in frames)
+        return [window for window in found if window is not None]
 
     with serial_algebra():
         found = side_by_side(tracked, plan_stretches(len(source)), threads=THREADS)
         return tuple(window for stretch in found for window in stretch)
 
 
-def stereo_tracks(frames: Iterable[OdometryFrame]) -> Iterator[StereoTracks]:
-    """Track features through consecutive frames, in windows without common frames."""
-    odometry, recent = VisualOdometry(), list[OdometryFrame]()
-    for frame in frames:
-        result = odometry.register(frame)
-        recent = [*recent, frame] if result.health.ok else []
-        if len(recent) == FRAMES:
-            window = _often_seen(odometry.window)
-            if len(window.T_world_camera) >= _MIN_FRAMES and _moves(window, frame.pair.camera):
-                yield StereoTracks(window, _in_right(window, recent))
-            recent = []
+class StereoTracker:
+    """Windows of tracks without common frames, of frames that an odometry registers in turn."""
+
+    def __init__(self, odometry: VisualOdometry) -> None:
+        self._odometry = odometry
+        self._recent = list[OdometryFrame]()
+
+    def add(self, frame: OdometryFrame, found: OdometryResult) -> StereoTracks | None:
+        """Add the frame that was registered last; returns the window that it completes, if any."""
+        self._recent = [*self._recent, frame] if found.health.ok else []
+        if len(self._recent) < FRAMES:
+            return None
+        frames, self._recent = self._recent, []
+        window = _often_seen(self._odometry.window)
+        if len(window.T_world_camera) < _MIN_FRAMES or not _moves(window, frame.pair.camera):
+            return None
+        return StereoTracks(window, _in_right(window, frames))
+
+
+class LiveTracks:
+    """Windows of tracks from all over a drive while it arrives.
+
+    Where it ends is not known: of parts of the drive every second is looked at, and where these are
+    too many, every second of them is forgotten.
+    """
+
+    def __init__(self, odometry: VisualOdometry) -> None:
+        self._odometry = odometry
+        self._tracker = StereoTracker(odometry)
+        self._stretches = list[list[StereoTracks]]()
+        self._every = 2
+
+    @property
+    def windows(self) -> list[StereoTracks]:
+        return [window for stretch in self._stretches for window in stretch]
+
+    def add(self, index: int, frame: OdometryFrame, found: OdometryResult) -> None:
+        """Add the frame that was registered last."""
+        part, place = divmod(index, _READ // _STRETCHES)
+        if part % self._every:
+            return
+        if place == 0:
+            self._tracker = StereoTracker(self._odometry)
+            self._stretches.append([])
+        if len(self._stretches) > _STRETCHES:
+            self._stretches, self._every = self._stretches[::2], 2 * self._every
+        window = self._tracker.add(frame, found)
+        if window is not None:
+            self._stretches[-1].append(window)
 
 
 def _moves(window: TrackWindow, camera: RectifiedCamera) -> bool:

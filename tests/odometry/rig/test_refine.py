@@ -11,10 +11,22 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, Rig, StereoPair, Trajectory
-from recon.odometry.rig.refine import KnownRig, RefinedRig, RigChange, compare_rigs, refine_rig
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.rig.refine import (
+    MIN_WINDOWS,
+    KnownRig,
+    RefinedRig,
+    RigChange,
+    compare_rigs,
+    refine_rig,
+    rig_shown,
+)
+from recon.odometry.rig.tracks import LiveTracks
 from recon.odometry.settings import RigSettings
+from recon.odometry.visual import VisualOdometry
 from recon.sources.live import LiveSource
 from recon.sources.source import SourcePart, StereoSource
+from recon.stereo.frame import FrameReconstructor
 from recon.stereo.rectify.rectifier import turns_of
 from recon.stereo.rectify.row_alignment import correct_rig
 from recon.street.render import StreetCamera
@@ -90,6 +102,24 @@ def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
         assert again.figures() == {**figures, **begun}
         assert "session 0 (film) showed" in again.warnings()[0]
     assert not refine_rig(source, CONFIG, RigSettings(refine=False), known).refined
+
+
+def test_a_drive_that_arrives_shows_its_rig_by_every_second_part_of_it(street):
+    source = faults.turned(street, yaw_deg=0.25)
+    reconstructor, odometry = FrameReconstructor(source.calibration, CONFIG), VisualOdometry()
+    tracks, lost = LiveTracks(odometry), OdometryResult(np.eye(4), OdometryHealth(ok=False))
+    there = [OdometryFrame(*reconstructor.match(pair), rough=True) for pair in source.frames()]
+    for n, frame in enumerate([*there, *there[::-1]]):
+        tracks.add(n, frame, odometry.register(frame))
+    rig = rig_shown(tracks.windows, source.calibration, CONFIG.rectification)
+    assert rig.fitted.windows == len(tracks.windows) == MIN_WINDOWS
+    assert np.degrees(rig.fitted.values[1]) == pytest.approx(-0.25, abs=0.1)
+    few = rig_shown(tracks.windows[1:], source.calibration, CONFIG.rectification)
+    assert (few.refined, few.figures()) == (False, {"refined": False})
+    # A long drive is as few parts as a short one; where it is lost, nothing is seen.
+    for n in range(2 * FRAMES, 10 * FRAMES):
+        tracks.add(n, there[0], lost)
+    assert len(tracks.windows) == 2
 
 
 def test_a_clean_street_keeps_its_calibration(street):
