@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from recon.core.errors import OutputError, require
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
-from recon.io.models.las import SURVEY_EXTRA, check_crs
+from recon.io.models.las import check_crs
 
+_EXTRA: Final = "survey"
 _BLOCK_PX: Final = 256  # a multiple of 16, by the specification
 _MOST_CELLS: Final = 4_000_000_000  # 6 by 6 km at 0.1 m
 
@@ -72,8 +73,7 @@ def write_geotiff(
 
     Ref: OGC 19-008r4, "OGC GeoTIFF Standard", 2019.
     """
-    rasterio = require("rasterio", extra=SURVEY_EXTRA)
-    windows = require("rasterio.windows", extra=SURVEY_EXTRA)
+    rasterio = require("rasterio", extra=_EXTRA)
     if place.columns * place.rows > _MOST_CELLS:
         got, expected = f"{place.columns} x {place.rows} cells", f"at most {_MOST_CELLS:g} cells"
         raise OutputError("the raster is too large", where=path, got=got, expected=expected)
@@ -90,4 +90,4 @@ def write_geotiff(
             blockysize=_BLOCK_PX, compress="deflate", bigtiff="if_safer", sparse_ok=True, **kind,
         ) as dataset,
     ):  # fmt: skip
-        yield RasterFile(dataset, windows.Window, place)
+        yield RasterFile(dataset, rasterio.windows.Window, place)

@@ -15,7 +15,7 @@ from recon.core.values.arrays import Float64
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
 
-SURVEY_EXTRA: Final = "survey"
+_EXTRA: Final = "survey"
 _COLOURED: Final = 7  # point format with colours, of LAS 1.4
 _STEP_M: Final = 0.001
 _MARGIN_DEG: Final = 6.0  # systems are used as far outside their area as a zone of UTM is wide
@@ -39,7 +39,7 @@ def write_las(
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
-    laspy = require("laspy", extra=SURVEY_EXTRA)
+    laspy = require("laspy", extra=_EXTRA)
     header = laspy.LasHeader(point_format=_COLOURED, version="1.4")
     header.generating_software = "recon"
     header.scales, header.offsets = np.full(3, step_m), np.floor(T_to_from[:3, 3])
@@ -61,7 +61,7 @@ def write_las(
 
 def check_crs(crs: str) -> Any:
     """Return the coordinate system of a name such as ``EPSG:25832``."""
-    pyproj = require("pyproj", extra=SURVEY_EXTRA)
+    pyproj = require("pyproj", extra=_EXTRA)
     try:
         found = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
@@ -81,7 +81,7 @@ def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
     """Check that a position (east, north, up) lies where its coordinate system is used."""
     system = check_crs(crs)
     area = system.area_of_use
-    pyproj = require("pyproj", extra=SURVEY_EXTRA)
+    pyproj = require("pyproj", extra=_EXTRA)
     to_degrees = pyproj.Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
     east_m, north_m = (position_m[:2] + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])).T
     lons, lats = to_degrees.transform(east_m, north_m)

@@ -12,7 +12,7 @@ from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
-from recon.export.mesh.view import check_coverage
+from recon.export.mesh.grid import check_coverage
 from recon.run.work import Silent
 from recon.sources.one_pair import PairInput
 
