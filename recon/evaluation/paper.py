@@ -35,7 +35,7 @@ from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import usual_ndisp
 from recon.stereo.rectify.rectifier import Rectifier, to_grey
 
-# Scene of each experiment, identified by Table 1: docs/paper.md.
+# Scene of each experiment, identified by Table 1: docs/walk-research.md.
 EXPERIMENTS: Final[Mapping[int, str]] = {2: "ArtL", 3: "Jadeplant", 4: "Pipes"}
 CORRECTED, ABSOLUTE, AS_PRINTED = "corrected", "absolute", "as_printed"
 TITLES: Final[Mapping[str, str]] = {
@@ -109,7 +109,7 @@ class PrintedMatcher:
     A pixel has no value only where no patch lies within both images. Every other pixel keeps
     its minimum, however doubtful: confidence 1 says that nothing was asked, not that it is right.
 
-    Ref: Eq. 9-10 of the seed paper, see docs/paper.md.
+    Ref: Eq. 9-10 of the seed paper, see docs/walk-research.md.
     """
 
     patch_px: int  # edge of the patch; odd

@@ -1,7 +1,7 @@
 """How vectors compile: each function of `vectors` as the LLVM instructions that stand for it.
 
 A vector is a numba type whose values are LLVM vectors, so that it stays in a register. What this
-relies on in numba and llvmlite, and what breaks it, is in ``docs/simd.md``.
+relies on in numba and llvmlite, and what breaks it, is in ``docs/architecture.md``.
 
 Ref: LLVM Language Reference Manual, "Vector Operations"; numba manual, "Low-level extension API".
 """
