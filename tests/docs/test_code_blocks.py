@@ -25,7 +25,6 @@ NOT_RUN = {
     r"source .venv/bin/activate": "the tests run in an environment that is active",
     r"pip install": "changes the environment; tests/docs/stand_ins.py installs the package",
     r"recon datasets (fetch|verify)": "needs a network; tests/commands/test_datasets.py has one",
-    r"python benchmarks/": "measures on a machine that does nothing else",
     r"dask |for host in |sbatch |kubectl |recon (batch|map) .* --scheduler": "needs a cluster",
     r"recon capture 0 2": "needs two cameras; tests/commands/test_cameras.py records from videos",
     r"recon live (0|/dev/)": "needs cameras; tests/flow/test_live.py plays videos as such",
