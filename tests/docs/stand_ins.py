@@ -97,8 +97,9 @@ def body_path(frames: int) -> np.ndarray:
 
 
 def recording(folder: Path) -> None:
-    """What `recon capture --calib` leaves; slow enough to be mapped by every second frame."""
-    size = {"width_px": 256, "height_px": 96, "focal_px": 150.0}
+    """What `recon capture --calib` leaves; slow enough to be mapped by every second frame, and
+    large enough for `recon live`, which matches at half size."""
+    size = {"width_px": 320, "height_px": 120, "focal_px": 190.0}
     pairs, camera = drives.rendered(12, speed_m_per_frame=0.4, **size)
     for pair in pairs:
         for side in ("left", "right"):
