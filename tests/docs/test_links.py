@@ -1,10 +1,12 @@
-"""Links between pages lead to a file, and to a heading in it."""
+"""Links between pages lead to a file, and to a heading in it; no command is without a row."""
 
 import re
 from pathlib import Path
 
 import pytest
+import typer.main
 
+from recon import cli
 from tests.docs.blocks import PAGES, ROOT
 
 LINK = re.compile(r"\]\(((?!https?:|mailto:)[^)\s]*)\)")
@@ -32,3 +34,9 @@ def test_the_code_names_pages_that_there_are():
     files = [*(ROOT / "recon").rglob("*.py"), *(ROOT / "recon").rglob("*.j2")]
     named = {page for file in files for page in re.findall(r"docs/[\w/-]+\.md", file.read_text())}
     assert [page for page in sorted(named) if not (ROOT / page).exists()] == []
+
+
+def test_the_page_of_commands_has_a_row_of_each():
+    app = typer.main.get_command(cli.app)
+    rows = set(re.findall(r"`recon ([a-z]+)", (ROOT / "docs" / "cli.md").read_text()))
+    assert rows >= {name for name, command in app.commands.items() if not command.hidden}
