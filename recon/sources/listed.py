@@ -16,7 +16,7 @@
       imu0/                            optional: the inertial unit
         data.csv                       time [ns], rates [rad/s], forces [m/s²]
         sensor.yaml                    T_BS
-      state_groundtruth_estimate0/     optional: ground truth trajectory of the body
+      state_groundtruth_estimate0/     optional: ground truth trajectory of the body (or mocap0)
         data.csv
 """
 
@@ -35,7 +35,7 @@ from recon.core.values import ImuRecord, Rig, SequenceTruth, StereoCalibration, 
 from recon.core.values.arrays import Float64
 from recon.io.cameras.ros import NS, read_euroc_camera, read_euroc_truth
 from recon.io.files import resolved
-from recon.io.imu import read_axes, read_imu
+from recon.io.imu import read_axes, read_imu, read_kalibr_imu
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.image_names import find_partners
 from recon.sources.images import ImageSource, image_size, is_image, pair_listed, stamps_of
@@ -43,7 +43,7 @@ from recon.sources.settings import SourceSettings
 from recon.sources.times import check_seconds, read_stamped_names, read_tum_truth, truth_at
 
 _IMU: Final = "imu0"
-_TRUTH: Final = "state_groundtruth_estimate0"
+_TRUTHS: Final = "state_groundtruth_estimate0", "mocap0"  # of EuRoC, and of TUM VI
 
 
 def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
@@ -166,7 +166,20 @@ def _chain(root: Path) -> Path | None:
 def _read_euroc_truth(
     root: Path, left: Path, stamps_s: Float64
 ) -> tuple[SequenceTruth | None, str]:
-    path, sensor = root / _TRUTH / "data.csv", left / "sensor.yaml"
-    if not (path.is_file() and sensor.is_file()):
+    path = next((p for name in _TRUTHS if (p := root / name / "data.csv").is_file()), None)
+    T_body_camera = None if path is None else _camera_in_body(root, left)
+    if path is None or T_body_camera is None:
         return None, ""
-    return truth_at(read_euroc_truth(path), stamps_s, read_euroc_camera(sensor)[1])
+    return truth_at(read_euroc_truth(path), stamps_s, T_body_camera)
+
+
+def _camera_in_body(root: Path, left: Path) -> Float64 | None:
+    """Return ``T_body_camera`` of the left camera; without a file of its own the body is the IMU.
+
+    Ref: Schubert et al., "The TUM VI benchmark for evaluating visual-inertial odometry", IROS 2018.
+    """
+    sensor, chain = left / "sensor.yaml", _chain(root)
+    if sensor.is_file():
+        return read_euroc_camera(sensor)[1]
+    T_camera_imu = None if chain is None else read_kalibr_imu(chain)
+    return None if T_camera_imu is None else invert(T_camera_imu)

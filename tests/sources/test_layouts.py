@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
-from recon.core.geometry.se3 import make_transform
+from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
-from recon.io.cameras.ros import write_kalibr
+from recon.io.cameras.ros import read_euroc_camera, write_kalibr
 from recon.io.images.image import write_image
 from recon.sources.image_names import find_partners, pair_images
 from recon.sources.kitti import open_kitti
@@ -310,6 +311,22 @@ def test_the_true_path_of_euroc_is_that_of_the_left_camera(noise, tmp_path):
     expected = np.stack([ahead * np.sin(turn), 0 * ahead, ahead * np.cos(turn)], axis=1)
     # Stamps of today have 0.2 µs in a double: 0.4 µm at 2 m/s.
     np.testing.assert_allclose(found.trajectory.positions_m, expected, atol=2e-6)
+    # TUM VI: of its inertial unit, which a camchain places.
+    left = CameraIntrinsics(CAMERA.matrix, np.zeros(4), 64, 32)
+    T_body_left = read_euroc_camera(tmp_path / "mav0" / "cam0" / "sensor.yaml")[1]
+    T = make_transform(np.eye(3), np.array([-CAMERA.baseline_m, 0, 0]))
+    for path in tmp_path.rglob("sensor.yaml"):
+        path.unlink()
+    chain = tmp_path / "camchain.yaml"
+    write_kalibr(chain, StereoCalibration(left, left, T))
+    truth.parent.rename(truth.parent.with_name("mocap0"))
+    assert open_source(tmp_path).truth is None
+    cameras = yaml.safe_load(chain.read_text())
+    cameras["cam0"]["T_cam_imu"] = invert(T_body_left).tolist()
+    chain.write_text(yaml.safe_dump(cameras))
+    found = open_source(tmp_path).truth
+    np.testing.assert_allclose(found.trajectory.positions_m, expected, atol=2e-6)
+    truth = tmp_path / "mav0" / "mocap0" / "data.csv"
     truth.write_text("\n".join(rows[3:]) + "\n")
     source = open_source(tmp_path)
     assert source.truth is None
