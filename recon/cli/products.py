@@ -23,7 +23,7 @@ def export(
         list[str] | None,
         opt.option(
             "cloud, grid, octomap, mesh; for surveying programs las, laz, and dsm, dtm, slope, "
-            "orthophoto (GeoTIFF); several with commas.",
+            "orthophoto (GeoTIFF); mcap (ROS 2), colmap, nerfstudio; several with commas.",
             default="the first four",
         ),
     ] = None,
@@ -41,6 +41,10 @@ def export(
     crs: Annotated[
         str | None, opt.option("Coordinate system of the positions, such as EPSG:25832.")
     ] = None,
+    images: Annotated[
+        list[Path] | None,
+        opt.option("The drive whose images are needed.", default="where it was mapped"),
+    ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
     *,
@@ -48,8 +52,8 @@ def export(
 ) -> None:
     """Make the cloud, grid, OctoMap or mesh of a run again, with other settings or formats.
 
-    Nothing is matched again: products are made from the cloud and the rays that
-    the run has kept, in one pass. Settings of occupancy, grid, ground, submaps
+    Nothing is matched again (but for nerfstudio): products are made from the cloud
+    and the rays that the run has kept. Settings of occupancy, grid, ground, submaps
     and mesh can be changed; all others are those of the run.
 
     Examples:
@@ -73,6 +77,7 @@ def export(
             threads=shared.threads,
             workers=open_workers(workers, scheduler, shared),
             survey=opt.survey_of(georeference, antenna, crs),
+            images=images or (),
         )
     shared.show(summary)
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.core.errors import FormatError, SettingsError
+from recon.export.images import open_images
 from recon.export.make import PRODUCTS, known_products, make, need_rays
 from recon.export.pair import export_pair, finish_cloud_run, mesh_cloud
 from recon.export.product import Order
@@ -44,6 +45,7 @@ def run_export(
     threads: int | None = None,
     workers: BatchOptions | None = None,
     survey: Survey | None = None,
+    images: Sequence[Path] = (),
     command: str = "export",
 ) -> dict[str, Any]:
     """Make products of a finished run, and write them: what `recon export` does.
@@ -57,8 +59,9 @@ def run_export(
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores.
         workers: Where the tiles of the map are made; None = here. Changes no product.
-        survey: Measured positions in whose coordinates LAS and LAZ are written; None = in those
-            of the map.
+        survey: Measured positions in whose coordinates products of surveys are written; None = in
+            those of the map.
+        images: Where drives are now whose images are needed, if not where they were mapped.
         command: Command name, for the record and the default folder.
 
     Returns:
@@ -91,9 +94,11 @@ def run_export(
             return export_pair(source, settings.mesh, wanted, run, formats)
     check_changes(ran, settings, (*(REMADE if need_rays(wanted) else ()), "mesh"))
     with Map.open(source) as map_, Run(command, out, settings, threads=threads) as run:
+        if any(PRODUCTS[name].needs_images for name in wanted):
+            open_images(map_, images)
         with run.stage("map"):
             placed = _placed(map_, settings, run, workers)
-        made = make(Order(map_, placed, run, settings.mesh, formats, survey), wanted)
+        made = make(Order(map_, placed, run, settings.mesh, formats, survey, images), wanted)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
         figures = {
             "run": str(source),

@@ -25,20 +25,20 @@ from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_trajectory
 from recon.map.drive.drive import ANEW, resuming, session_info
 from recon.map.map import Map
+from recon.map.store.session import IMAGES
 from recon.run.batch.cluster import BatchOptions
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.machine import versions
-from recon.run.run import Run, fingerprint
+from recon.run.run import Run
 from recon.run.work import SILENT, Progress
 from recon.sources.registry import open_source
-from recon.sources.source import StereoSource
+from recon.sources.source import StereoSource, mark_of
 from recon.stereo.rectify.rectifier import turns_of
 
 _OTHER: Final = {
     "config": "other settings", "source": "another source", "poses": "other poses",
     "prior": "another prior", "versions": "other versions",
 }  # fmt: skip
-_HEAD_BYTES: Final = 4096
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,13 @@ class MapOptions:
             "prior": _absolute(prior) if prior and Path(prior).is_file() else prior,
             "mesh": self.mesh,
         }
+
+    def images_of(self, source: StereoSource) -> dict[str, Any]:
+        """Return where the images of a drive are, for its map; empty where no file is mapped."""
+        if source.live or self.source is None:
+            return {}
+        found = {"source": _absolute(self.source), "kind": self.kind}
+        return {IMAGES: {**found, "mark": mark_of(source)}}
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> Self:
@@ -162,7 +169,7 @@ class MapOptions:
         path, memory = run.state(STARTED), config.memory.cache_bytes
         identity = {
             "config": config.model_dump(mode="json"),
-            "source": {"frames": len(source), **fingerprint(source.files, head_bytes=_HEAD_BYTES)},
+            "source": mark_of(source),
             "poses": _digest(self.known_poses),
             "prior": _digest(self.prior),
             "versions": versions(),
@@ -173,8 +180,8 @@ class MapOptions:
                 return Map.open(path, read_only=False, cache_bytes=memory)
         map_ = Map.create(path, cache_bytes=memory)
         # What arrives in its own time will not arrive again.
-        start = {} if source.live else {"identity": identity, "arguments": self.arguments}
-        map_.begin(session_info(source, config, start))
+        start = {"identity": identity, "arguments": self.arguments, **self.images_of(source)}
+        map_.begin(session_info(source, config, {} if source.live else start))
         map_.commit()
         run.begun = run.command != "demo"  # whose street no command line names
         return map_

@@ -22,6 +22,7 @@ from recon.export.make import make
 from recon.export.product import Order
 from recon.export.trajectories import export_sessions
 from recon.io.files import resolved
+from recon.map.drive.drive import session_info
 from recon.map.drive.sequence import check_map
 from recon.map.map import Map
 from recon.map.sessions.copying import check_session, copy_sessions, read_all
@@ -105,6 +106,7 @@ def run_map_into(
         known = map_.known_rig(source.calibration)
         rig = refine_drive(source, settings, run, known, options.prior)
         with Map.create(run.state("drive.recon")) as drive:
+            drive.begin(session_info(source, settings, options.images_of(source)))
             mapped = map_drive(rig.applied(source), settings, options, run, drive)
             check_map(mapped, source.name)
             if settings.rig.refine:

@@ -48,6 +48,14 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
     return Made(figures, _doubts(tiles, points, left_out), sample.cloud())
 
 
+def even_sample(tiles: Tiles) -> PointCloud:
+    """Return an even sample of the cloud of a map, all points of a small one; frame ``map``."""
+    sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
+    for cloud in filter(len, (tile.cloud for tile in tiles)):
+        sample.add(cloud)
+    return sample.cloud()
+
+
 def _doubts(tiles: Tiles, points: int, removed: int) -> list[str]:
     """Return a warning where much was left out, or nothing could be."""
     if tiles.config.fusion.remove_moving and not tiles.have_looks:

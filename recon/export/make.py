@@ -9,7 +9,10 @@ from typing import Any, Final, cast
 from recon.core.errors import MeshingError, SettingsError
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 from recon.export.cloud import cloud_product
+from recon.export.colmap import colmap_product
+from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
+from recon.export.nerfstudio import nerfstudio_product
 from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import Made, Order, Product
 from recon.export.rasters import RASTERS, raster_product
@@ -29,6 +32,9 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     },
     "las": Product(survey_product("las"), surveyed=True),
     "laz": Product(survey_product("laz"), surveyed=True),
+    "mcap": Product(mcap_product, needs_occupancy=True, surveyed=True),
+    "colmap": Product(colmap_product, needs_images=True),
+    "nerfstudio": Product(nerfstudio_product, needs_images=True),
 }
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")

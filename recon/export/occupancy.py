@@ -59,8 +59,8 @@ def grid_product(order: Order) -> Made:
     return Made(figures, warnings, grid)
 
 
-def export_grid(placed: PlacedMap, stem: Path) -> WrittenGrid:
-    """Flatten the voxels of a map above its ground, and write ``stem.pgm`` and ``stem.yaml``.
+def export_grid(placed: PlacedMap, stem: Path | None) -> WrittenGrid:
+    """Flatten the voxels of a map above its ground, and perhaps write ``stem.pgm``, ``stem.yaml``.
 
     Returns:
         The grid, the height at which something carried the camera above the ground (None = unknown,
@@ -69,7 +69,8 @@ def export_grid(placed: PlacedMap, stem: Path) -> WrittenGrid:
     if placed.tiles.extent[0] == placed.tiles.extent[1]:
         raise MappingError("nothing was observed: there is no map to flatten")
     written = _Flattening(placed).grid()
-    write_nav2(stem, written[0])
+    if stem is not None:
+        write_nav2(stem, written[0])
     return written
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from recon.export.mesh.poisson import MeshSettings
@@ -22,8 +23,9 @@ class Order:
     run: Run  # the run, whose folder they go to
     mesh: MeshSettings  # settings of the mesh
     formats: Sequence[str] = ("ply",)  # formats of the mesh
-    # In whose coordinates LAS and LAZ are written; None = in those of the map
+    # In whose coordinates products of surveys are written; None = in those of the map
     survey: Survey | None = None
+    images: Sequence[Path] = ()  # where drives are now, if not where the map says
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,3 +44,4 @@ class Product:
     write: Callable[[Order], Made]
     needs_occupancy: bool = False  # whether it is made of what is free and occupied
     surveyed: bool = False  # whether it can be in the coordinates of a survey
+    needs_images: bool = False  # whether it is made of the images of the drives, too

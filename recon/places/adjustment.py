@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,7 @@ _MOST_KEYFRAMES: Final = 4000  # of longer drives fewer are adjusted, evenly spa
 _MOST_SIGHTINGS: Final = 200_000  # more points are not adjusted: 200 MB, and some seconds a step
 _HELD_OUT: Final = 10  # of so many points one is not adjusted, but tells whether the rest should be
 _CACHED: Final = 64  # keyframes in memory
+_CONTRADICTED: Final = 4.0  # standard deviations off at which a sighting contradicts its point
 
 
 class StoredKeyframes(Protocol):
@@ -123,6 +124,41 @@ def adjust_path(
         _median_px(test, before),
         _median_px(test, after),
     )
+
+
+class SharedPoints(NamedTuple):
+    """Points that several keyframes see, where a path as it is puts them."""
+
+    frames: NDArray[np.intp]  # (N,), the keyframes
+    seen: Sightings  # of the points, by number of the keyframe
+    xyz: Float64  # (P, 3), world
+
+
+def shared_points(
+    path: DrivePath,
+    closure: Closure,
+    keyframes: StoredKeyframes,
+    camera: RectifiedCamera,
+    among: Sequence[int],
+) -> SharedPoints:
+    """Return what several of the keyframes ``among`` those of a drive see.
+
+    The path stays as it is. Points that one of the keyframes contradicts are left out.
+    """
+    frames = list(among)[:: max(1, math.ceil(len(among) / _MOST_KEYFRAMES))]
+    pairs = list(_matched(path, closure, frames, keyframes, camera))
+    nodes = np.array(frames, np.intp)
+    if not pairs:
+        none, nowhere = np.zeros(0, np.intp), np.zeros((0, 3))
+        return SharedPoints(nodes, Sightings(none, none, nowhere), nowhere)
+    seen, (uv_px, d_px) = _tracks(pairs, nodes), (feature_sigma_px(camera), SIGMA_D_PX)
+    fixed = PoseGraph.of([], math.inf, len(nodes))
+    bundle = Bundle(fixed, seen, camera, (uv_px, d_px), CAUCHY_SIGMAS)
+    state = bundle.fit(closure.trajectory.T_world_camera[nodes])
+    off = np.abs(bundle.residuals_px(state)) / [uv_px, uv_px, d_px]
+    agree = np.ones(seen.points, np.bool_)
+    agree[seen.point[~(off < _CONTRADICTED).all(axis=1)]] = False
+    return SharedPoints(nodes, seen.of_points(agree), state[1][agree])
 
 
 @dataclass(frozen=True, eq=False)

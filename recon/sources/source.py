@@ -23,6 +23,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64
 from recon.io.trajectory import read_tum
+from recon.run.run import fingerprint
 from recon.sources.settings import SourceSettings
 
 
@@ -169,6 +170,14 @@ def check_source(source: object) -> None:
         what = "not a source of stereo pairs"
         expected = "what recon.open_source returns, or a subclass of recon.StereoSource"
         raise SourceError(what, got=type(source).__name__, expected=expected)
+
+
+_HEAD_BYTES: Final = 4096
+
+
+def mark_of(source: StereoSource) -> dict[str, Any]:
+    """Return what a source is known again by: its number of pairs, names and heads of its files."""
+    return {"frames": len(source), **fingerprint(source.files, head_bytes=_HEAD_BYTES)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

@@ -12,7 +12,7 @@ from recon.core.geometry.se3 import apply, as_step, as_transform, invert
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.camera import project
 from recon.places import adjustment
-from recon.places.adjustment import adjust_path
+from recon.places.adjustment import adjust_path, shared_points
 from recon.places.bundle import Bundle, Sightings
 from recon.places.closure import Closure
 from recon.places.detector import StoredKeyframe
@@ -34,12 +34,17 @@ def _circle() -> Trajectory:
     return Trajectory(np.stack(poses), np.arange(FRAMES) * 1.0)
 
 
-def _keyframes(truth: Trajectory, seed: int, wrong: float = 0.0) -> KeyframeMemory:
-    """What a camera sees of the walls of a round room; some features are where others are."""
-    rng, store = np.random.default_rng(seed), KeyframeMemory()
+def _walls(rng: np.random.Generator) -> np.ndarray:
+    """Points on the walls of a round room."""
     around, height = rng.uniform(0, 2 * math.pi, 3000), rng.uniform(-2.5, 2.5, 3000)
     far = rng.uniform(5.0, 9.0, 3000)
-    xyz = np.column_stack([far * np.sin(around), height, far * np.cos(around)])
+    return np.column_stack([far * np.sin(around), height, far * np.cos(around)])
+
+
+def _keyframes(truth: Trajectory, seed: int, wrong: float = 0.0) -> KeyframeMemory:
+    """What a camera sees of the walls; some features are where others are."""
+    rng, store = np.random.default_rng(seed), KeyframeMemory()
+    xyz = _walls(rng)
     words = rng.integers(0, 256, (len(xyz), 32), np.uint8)
     for frame, T in enumerate(truth.T_world_camera):
         uvd = np.stack(project(apply(invert(T), xyz), CAMERA), axis=1)
@@ -109,6 +114,19 @@ def test_a_drive_of_too_many_keyframes_is_thinned(truth, closed, monkeypatch):
     assert found is not None
     assert found.keyframes <= 15
     assert found.points < 500
+
+
+def test_points_that_keyframes_share_are_where_a_path_puts_them(truth, closed):
+    path, store = drive_path(truth), _keyframes(truth, 4, 0.1)
+    exact = replace(closed, trajectory=truth)
+    found = shared_points(path, exact, store, CAMERA, range(5, FRAMES))
+    assert found.frames.tolist() == [*range(5, FRAMES)]
+    assert len(found.xyz) == found.seen.points > 500
+    walls = _walls(np.random.default_rng(4))
+    off_m = [np.linalg.norm(walls - one, axis=1).min() for one in found.xyz[::10]]
+    assert np.median(off_m) < 0.15
+    assert min(np.bincount(found.seen.point)) >= 2
+    assert not len(shared_points(path, exact, store, CAMERA, [7]).xyz)
 
 
 def _bundle(seed: int) -> tuple[Bundle, np.ndarray, np.ndarray]:

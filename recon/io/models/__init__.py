@@ -1,1 +1,1 @@
-"""Point clouds and meshes."""
+"""Point clouds and meshes; models of COLMAP, bags of ROS 2."""

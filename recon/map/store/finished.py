@@ -15,7 +15,7 @@ from recon.map.kernels import clamped
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
-from recon.map.store.session import AXES, KEYFRAME, LOOPS, Session
+from recon.map.store.session import AXES, IMAGES, KEYFRAME, LOOPS, Session
 from recon.map.store.trees import RAYS, RIG
 from recon.map.submaps import Submap
 
@@ -93,7 +93,8 @@ def keep_map(mapped: MapFile, path: Path) -> None:
     """
     with MapFile.create(path) as kept:
         for session in mapped.sessions:
-            new = kept.begin(replace(session.info, start={}))
+            start = {name: kept_ for name, kept_ in session.info.start.items() if name == IMAGES}
+            new = kept.begin(replace(session.info, start=start))
             for number, T_world_camera in enumerate(session.odometry.T_world_camera):
                 time_s = float(session.odometry.timestamps_s[number])
                 new.add_frame(T_world_camera, time_s, session.health[number])

@@ -41,6 +41,7 @@ from recon.places.keyframe import Keyframe
 
 SESSION: Final = "session"
 AXES: Final = "axes"
+IMAGES: Final = "images"  # path and kind of the source, and its `mark_of`
 LOOPS: Final = "loops"
 BENT: Final = "T_world_camera"
 """The path of a drive after loops, links and measured positions; None = that of odometry."""
@@ -55,7 +56,7 @@ class SessionInfo:
     """What a session is a drive of.
 
     ``config`` are the settings of the drive as plain values, ``versions`` those of recon and its
-    libraries, ``start`` what the run was started with, to resume it; empty in a finished map.
+    libraries, ``start`` what the run was started with; in a finished map, where the images are.
     """
 
     source: str = ""

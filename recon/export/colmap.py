@@ -1,0 +1,89 @@
+"""The drives of a map as a model of COLMAP, with the rectified images that it is of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from recon.core.geometry.se3 import apply, invert
+from recon.core.values.arrays import UInt8
+from recon.export.images import DriveImages, open_images
+from recon.export.product import Made, Order
+from recon.io.images.image import write_image
+from recon.io.models.colmap import ColmapModel, Seen, write_colmap
+from recon.map.store.trees import loop_in
+from recon.places.adjustment import SharedPoints, shared_points
+from recon.places.closure import Closure, DrivePath
+
+
+def colmap_product(order: Order) -> Made:
+    """Write ``colmap/images`` and ``colmap/sparse/0``, in map axes.
+
+    Cameras are those of the rectified images: pinholes without distortion, the right one a baseline
+    beside the left one, which is the reference of the rig. The points are features of keyframes.
+    """
+    images = points = 0
+    with write_colmap(order.run.path("colmap/sparse/0/points3D.txt").parent) as model:
+        for drive in open_images(order.map, order.images):
+            written = _Written(drive, model, first=points + 1)
+            for names, pair in written.frames():
+                for name, image in zip(names, pair, strict=True):
+                    write_image(order.run.path(f"colmap/images/{name}"), image)
+                    images += 1
+            points += written.add_points()
+    warnings = [] if points else ["no points in the COLMAP model: no keyframes share any"]
+    return Made({"colmap_images": images, "colmap_points": points}, warnings)
+
+
+def _points(drive: DriveImages) -> SharedPoints:
+    session = drive.session
+    path = DrivePath.of(session.odometry, session.health, session.scale)
+    loops = tuple(loop_in(tree) for tree in session.loops.get("closed", ()))
+    closure = Closure(session.trajectory, loops, ())
+    among = [frame for frame in session.keyframes.frames if drive.placed[frame]]
+    return shared_points(path, closure, session.keyframes, session.camera, among)
+
+
+class _Written:
+    """A drive on its way into a model: its frames, then the points that they see."""
+
+    def __init__(self, drive: DriveImages, model: ColmapModel, first: int) -> None:
+        self._drive, self._model, self._first = drive, model, first
+        self._points = _points(drive)
+        self._rgb = np.zeros((len(self._points.xyz), 3), np.uint8)
+        self._tracks: list[list[tuple[int, int]]] = [[] for _ in self._rgb]
+
+    def frames(self) -> Iterator[tuple[list[str], tuple[UInt8, UInt8]]]:
+        """Add all frames, one after the other; yield the names of their images, and these."""
+        drive, rig = self._drive, self._model.add_rig(self._drive.session.camera)
+        for frame, pair in drive.pairs():
+            images = drive.rectifier.warp(pair)
+            names = [drive.file(side, frame) for side in ("left", "right")]
+            seen, T_camera_map = self._seen(frame, images[0]), invert(drive.T_map_camera[frame])
+            numbers = self._model.add_frame(rig, T_camera_map, names, seen)
+            for number, (_, points) in zip(numbers, seen, strict=True):
+                for place, point in enumerate((points - self._first).tolist()):
+                    self._tracks[point].append((number, place))
+            yield names, images
+
+    def _seen(self, frame: int, left: UInt8) -> list[Seen]:
+        """Return what the left and the right image see, and note its colours."""
+        seen, node = self._points.seen, np.flatnonzero(self._points.frames == frame)
+        rows = np.isin(seen.node, node)
+        (u, v, d), points = seen.uvd[rows].T, seen.point[rows]
+        height_px, width_px = left.shape[:2]
+        column, row = (np.rint(x).astype(np.intp) for x in (u, v))
+        column, row = np.clip(column, 0, width_px - 1), np.clip(row, 0, height_px - 1)
+        self._rgb[points] = left.reshape(height_px, width_px, -1)[row, column]
+        inside = (u - d >= 0) & (u - d <= width_px - 1)
+        views = (u, np.full(len(u), True)), (u - d, inside)
+        return [(np.column_stack([x, v])[k], points[k] + self._first) for x, k in views]
+
+    def add_points(self) -> int:
+        """Add the points; their number."""
+        places = apply(self._drive.session.T_map_world, self._points.xyz)
+        each = zip(places, self._rgb.tolist(), self._tracks, strict=True)
+        for number, (xyz, rgb, track) in enumerate(each, start=self._first):
+            self._model.add_point(number, xyz, rgb, track)
+        return len(places)

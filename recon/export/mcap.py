@@ -1,0 +1,150 @@
+"""A map and its drives as a bag of ROS 2: what Foxglove shows, and RViz plays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import FormatError, ReconError
+from recon.core.geometry.se3 import invert, make_transform
+from recon.core.values import OccupancyGrid
+from recon.core.values.arrays import Float64, UInt8
+from recon.export.cloud import even_sample
+from recon.export.images import DriveImages, open_images
+from recon.export.occupancy import export_grid
+from recon.export.product import Made, Order
+from recon.export.survey import placed_in_survey
+from recon.io.atomic import write_text
+from recon.io.images.image import encode_image
+from recon.io.models.ros_bag import Message, RosBag, header, points, pose, write_bag
+from recon.map.ground.axes import base_axes
+from recon.map.store.session import Session
+from recon.places.closure import USUAL, DrivePath
+from recon.places.places import spread_over
+
+_LAYOUT: Final = Path(__file__).with_name("foxglove.json")
+
+
+def mcap_product(order: Order) -> Made:
+    """Write ``bag/bag.mcap``: transforms, odometry, what each frame saw, cloud, grid, images.
+
+    Images are there if they can be read again. Beside it is a layout for Foxglove. Coordinates of
+    a survey are a frame, ``survey``, in which that of the map lies.
+    """
+    T_survey_map, figures, warnings = placed_in_survey(order)
+    grid, height_m, _ = export_grid(order.placed, None)
+    images: dict[int, DriveImages] = {}
+    try:
+        images = {one.session.number: one for one in open_images(order.map, order.images)}
+    except ReconError as error:
+        if order.images:
+            raise
+        warnings = [*warnings, f"no images in the bag: {error}"]
+    drives = [_Drive(order, session, height_m) for session in order.map.linked]
+    fixed = [] if order.survey is None else [("survey", "map", T_survey_map)]
+    fixed += [edge for drive in drives for edge in drive.mounted()]
+    start_ns, frames = min(drive.times_ns[0] for drive in drives), 0
+    with write_bag(order.run.path("bag")) as bag:
+        bag.write("/tf_static", start_ns, _transforms(start_ns, fixed), kept=True)
+        bag.write("/map/grid", start_ns, _grid(start_ns, grid), kept=True)
+        cloud = points(header("map", start_ns), even_sample(order.placed.tiles))
+        bag.write("/map/cloud", start_ns, cloud, kept=True)
+        for drive in drives:
+            for frame, views in drive.frames(images.get(drive.session.number)):
+                drive.write(bag, frame, views)
+                frames += 1
+    layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", drives[0].name)
+    write_text(order.run.path("bag/foxglove.json"), layout)
+    return Made({**figures, "bag_frames": frames}, warnings)
+
+
+def _transforms(time_ns: int, edges: Sequence[tuple[str, str, Float64]]) -> Message:
+    """Return where frames lie: parent, child, and ``T_parent_child`` of each."""
+    made = [
+        {"header": header(parent, time_ns), "child_frame_id": child,
+         "transform": pose(T, "translation", "rotation")}
+        for parent, child, T in edges
+    ]  # fmt: skip
+    return "tf2_msgs/msg/TFMessage", {"transforms": made}
+
+
+def _grid(time_ns: int, grid: OccupancyGrid) -> Message:
+    rows, columns = grid.cells.shape
+    corner = make_transform(np.eye(3), np.array([*grid.origin_m, 0.0]))
+    size = {"width": columns, "height": rows, "resolution": grid.resolution_m}
+    content = {"info": {**size, "origin": pose(corner)}, "data": grid.cells.ravel()}
+    return "nav_msgs/msg/OccupancyGrid", {"header": header("map", time_ns), **content}
+
+
+class _Drive:
+    """What is written of a drive, by frame."""
+
+    def __init__(self, order: Order, session: Session, height_m: float | None) -> None:
+        self.session, self.placed = session, order.map.placed[session.number]
+        # Of its topics and frames, with a slash.
+        self.name = f"drive{session.number}/" if len(order.map.linked) > 1 else ""
+        self._T_base_camera = base_axes(order.map.first.T_map_world, height_m)
+        path = session.trajectory
+        if not (path.timestamps_s[0] >= 0.0 and path.timestamps_s[-1] < 2.0**31):
+            what, got = "times of the frames do not fit into a bag", f"{path.timestamps_s[0]:g} s"
+            raise FormatError(what, where=session.where, got=got, expected="seconds since 1970")
+        self.times_ns = np.rint(1e9 * path.timestamps_s).astype(np.int64).tolist()
+        T_camera_base = invert(self._T_base_camera)
+        self._T_map_base = session.T_map_world @ path.T_world_camera @ T_camera_base
+        self._variance = _variance(session)
+
+    def mounted(self) -> list[tuple[str, str, Float64]]:
+        """Return where the cameras are on the vehicle."""
+        beside = make_transform(np.eye(3), np.array([self.session.camera.baseline_m, 0.0, 0.0]))
+        base, left, right = (f"{self.name}{one}" for one in ("base_link", "left", "right"))
+        return [(base, left, self._T_base_camera), (left, right, beside)]
+
+    def frames(self, images: DriveImages | None) -> Iterator[tuple[int, tuple[UInt8, ...]]]:
+        """Yield the frames that have a place, with rectified images if they can be read."""
+        if images is None:
+            yield from ((frame, ()) for frame in np.flatnonzero(self.placed).tolist())
+        else:
+            yield from ((frame, images.rectifier.warp(pair)) for frame, pair in images.pairs())
+
+    def write(self, bag: RosBag, frame: int, views: tuple[UInt8, ...]) -> None:
+        """Write all messages of a frame."""
+        time_ns, T, base = self.times_ns[frame], self._T_map_base[frame], f"{self.name}base_link"
+        bag.write("/tf", time_ns, _transforms(time_ns, [("map", base, T)]))
+        spread = np.diag(np.repeat(self._variance[frame], 3)).ravel()
+        content = {
+            "header": header("map", time_ns), "child_frame_id": base,
+            "pose": {"pose": pose(T), "covariance": spread}, "twist": {"covariance": 0 * spread},
+        }  # fmt: skip
+        bag.write(f"/{self.name}odometry", time_ns, ("nav_msgs/msg/Odometry", content))
+        if self.session.ray_frames == len(self.placed):
+            seen = points(header(f"{self.name}left", time_ns), self.session.rays(frame)[0].cloud())
+            bag.write(f"/{self.name}points", time_ns, seen)
+        camera = self.session.camera
+        shift = -camera.focal_px * camera.baseline_m * np.eye(3)[:, :1]
+        lenses = ("left", camera.matrix, 0 * shift), ("right", camera.right_matrix, shift)
+        for image, (side, matrix, last) in zip(views, lenses, strict=False):
+            name = f"{self.name}{side}"
+            head, jpeg = header(name, time_ns), encode_image(image, ".jpg", name)
+            content = {"header": head, "format": "jpeg", "data": np.frombuffer(jpeg, np.uint8)}
+            message = "sensor_msgs/msg/CompressedImage", content
+            bag.write(f"/{name}/image/compressed", time_ns, message)
+            info = {
+                "header": head, "width": camera.width_px, "height": camera.height_px,
+                "distortion_model": "plumb_bob", "d": np.zeros(5), "k": matrix.ravel(),
+                "r": np.eye(3).ravel(), "p": np.hstack([matrix, last]).ravel(),
+            }  # fmt: skip
+            bag.write(f"/{name}/camera_info", time_ns, ("sensor_msgs/msg/CameraInfo", info))
+
+
+def _variance(session: Session) -> Float64:
+    """Return (N, 2), variances of positions and rotations since the beginning of each stretch.
+
+    They are what odometry states, and what it usually drifts; loops that were closed make less.
+    """
+    path = DrivePath.of(session.odometry, session.health, session.scale)
+    begins = np.searchsorted(np.maximum.accumulate(path.stretch), path.stretch)
+    drift = np.stack(spread_over(path.path_m - path.path_m[begins], path.scale), axis=1)
+    return np.asarray((USUAL * drift) ** 2 + path.variance - path.variance[begins])
