@@ -21,7 +21,8 @@ _ROWS: Final = ([0, 0, 1, 1], [0, 1, 1, 2])
 _DIGITS_TOLERANCE: Final = 1e-9  # deviation from a rectified pair, given the digits of files
 # What to do where a source lacks a calibration.
 CALIBRATE: Final = (
-    "name one with --calib FILE; of rectified images --focal PX and --baseline M are enough"
+    "name one with --calib FILE; of rectified images (recon rectify makes them of two folders) "
+    "--focal PX and --baseline M are enough"
 )
 _WIDEST_DEG: Final = 165.0  # flat images see no more: pixels at the side would be 60 times as wide
 
