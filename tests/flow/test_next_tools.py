@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from recon.io.images.image import read_image, read_levels
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_tum
 from recon.map.map import Map
+from recon.map.store.session import SESSION
 from tests.flow.runs import content, summary_of
 from tests.hostile.refusals import assert_refused, run
 from tests.scenery.kitti import street_drive
@@ -138,7 +140,11 @@ def test_a_bag_says_in_messages_of_ros_what_the_map_is(small_demo, mapped, tmp_p
     from rosbags.typesys import Stores, get_typestore
 
     camera, poses = mapped
-    done = run("export", small_demo, "--to", "mcap,grid", "--out", tmp_path / "out")
+    based = read_tum(small_demo / "trajectory_map_base_tum.txt")
+    there = np.column_stack([based.timestamps_s, based.positions_m + np.array([4e5, 5e6, 100])])
+    np.savetxt(tmp_path / "gnss.txt", there, fmt="%.6f")
+    words = ["--to", "mcap,grid", "--georeference", tmp_path / "gnss.txt"]
+    done = run("export", small_demo, *words, "--out", tmp_path / "out")
     assert done.code == 0, done.err
     out, store = tmp_path / "out", get_typestore(Stores.ROS2_HUMBLE)
     found: dict[str, list] = {}
@@ -154,7 +160,11 @@ def test_a_bag_says_in_messages_of_ros_what_the_map_is(small_demo, mapped, tmp_p
         "/points": frames, "/left/image/compressed": frames, "/right/image/compressed": frames,
         "/left/camera_info": frames, "/right/camera_info": frames,
     }  # fmt: skip
-    based = read_tum(small_demo / "trajectory_map_base_tum.txt")
+    edges = {edge.child_frame_id: edge for edge in found["/tf_static"][0][1].transforms}
+    assert {child: edge.header.frame_id for child, edge in edges.items()} == {
+        "map": "survey", "left": "base_link", "right": "left",
+    }  # fmt: skip
+    assert edges["map"].transform.translation.y == pytest.approx(5e6, abs=5)
     for frame, (time_ns, message) in enumerate(found["/odometry"]):
         assert time_ns == round(1e9 * based.timestamps_s[frame])
         place, spread = message.pose.pose.position, message.pose.covariance.reshape(6, 6)
@@ -236,3 +246,22 @@ def test_a_drive_is_read_again_from_where_it_is_now(drive_run, tmp_path):
     done = run("export", mapped, "--to", "colmap", "--images", moved, "--out", tmp_path / "no")
     assert_refused(done, str(moved), "changed")
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(("start", "said"), [
+    ({}, "does not say where the images"),
+    ({"images": [1]}, "map.recon"),
+    ({"images": {"source": 5}}, "map.recon"),
+    ({"images": {"source": "/nowhere", "mark": None}}, "map.recon"),
+    ({"images": {"source": "/nowhere", "kind": "none"}}, "unknown kind of source"),
+    ({"images": {"source": "/nowhere", "kind": "kitti"}}, "/nowhere"),
+])  # fmt: skip
+def test_a_map_that_says_nothing_or_nonsense_of_its_images_is_refused(
+    drive_run, tmp_path, start, said
+):
+    shutil.copytree(drive_run[1], tmp_path / "run")
+    with Map.open(tmp_path / "run", read_only=False) as map_:
+        map_.store.put(SESSION, 0, asdict(replace(map_.first.info, start=start)))
+        map_.commit()
+    done = run("export", tmp_path / "run", "--to", "nerfstudio", "--out", tmp_path / "out")
+    assert_refused(done, said, "" if "recon" in said else "--images")
