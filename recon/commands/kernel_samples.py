@@ -22,7 +22,7 @@ _POINT: Final = np.zeros((1, 3))
 _ONE: Final = np.ones(1)
 _VOXEL: Final = voxels.VoxelPoints(_POINT, np.ones(1, np.float32), np.zeros((1, 0), np.float32))
 _CELLS: Final = np.array([[-1, 0, 0], [0, 0, 0], [1, 0, 0]], np.int32)
-_SUMS: Final = np.tile(np.array([1, 0, 0, 0], np.float32), (3, 1))
+_SUMS: Final = np.tile(np.array([1, 0, 0, 0, 1], np.float32), (3, 1))
 _POSES: Final = bundle.NormalEquations(
     np.zeros((2, 6, 6)), np.zeros((2, 6)), np.zeros((1, 3, 3)), _POINT, np.zeros((2, 1, 6, 3))
 )

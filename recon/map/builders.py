@@ -158,7 +158,7 @@ class OccupancyBuilder:
         self._T_map_world = np.asarray(T_map_world, dtype=np.float64)
         self._map = clamped.make_clamped(256)
         self._evidence = raycast.make_blocks(256)
-        self._points = voxels.make_sums(_FIRST_POINTS, 0)
+        self._points = voxels.make_sums(_FIRST_POINTS, 1)
 
     def integrate(self, cloud: PointCloud, T_world_camera: NDArray[Any]) -> None:
         """Add what one frame saw from the pose ``T_world_camera`` of the camera.
@@ -186,7 +186,7 @@ class OccupancyBuilder:
     def take(self) -> OccupancyPart:
         """Return the part so far; the builder starts a new one."""
         part, self._map = self.part(), clamped.make_clamped(256)
-        self._points = voxels.make_sums(_FIRST_POINTS, 0)
+        self._points = voxels.make_sums(_FIRST_POINTS, 1)
         return part
 
     def resume(self, part: OccupancyPart) -> None:
@@ -228,10 +228,9 @@ def frame_rays(cloud: PointCloud, T_map_camera: Float64, s: OccupancySettings) -
 def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:
     """Return the ends of the rays that hit something, precise ones with more weight."""
     hit = np.flatnonzero(rays.hit > 0)
-    weights = 1.0 / (rays.sigma[hit] ** 2 + _LEAST_SIGMA_CELLS**2)
-    return voxels.VoxelPoints(
-        rays.ends[hit], weights.astype(np.float32), np.zeros((len(hit), 0), np.float32)
-    )
+    variances = rays.sigma[hit] ** 2 + _LEAST_SIGMA_CELLS**2
+    weights, values = (1 / variances).astype(np.float32), variances[:, None].astype(np.float32)
+    return voxels.VoxelPoints(rays.ends[hit], weights, values)
 
 
 def _reduce(

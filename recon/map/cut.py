@@ -115,8 +115,9 @@ class Cutter:
         # depends on the points in the voxels that touch those through which it may have grown.
         beyond = 3 + GROWTH_CELLS
         self._filter_margin_m = margin_m + config.fusion.voxel_m + beyond * resolution_m
-        # A cell of a grid depends on the cells joined to it, on their blob, and on adjacent cells.
-        beyond = config.grid.min_blob_cells + JOINED_CELLS + 2
+        # A cell of a grid depends on the cells joined to it, on their blob, on as many around them,
+        # and on adjacent cells; and a surface in a block on the blocks that touch it.
+        beyond = config.grid.min_blob_cells + 2 * JOINED_CELLS + 1 + BLOCK_EDGE
         beyond = max(beyond, math.ceil(self._filter_margin_m / resolution_m) + 1)
         self.grid_margin_m = math.ceil(beyond / BLOCK_EDGE) * BLOCK_EDGE * resolution_m
         least_m = max(

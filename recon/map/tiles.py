@@ -336,7 +336,7 @@ class DriveChain:
     ) -> OccupancyVoxels:
         """Make the voxels of a tile again where ``after`` the end of submaps more was observed."""
         blocks = distinct_keys(np.concatenate([part.rows.blocks for part in after.values()]))
-        # Whether a surface crosses a voxel depends on what hit those that touch it.
+        # Whether a surface crosses a voxel depends on what hit the blocks that touch its own.
         changed, needed = _grown(blocks, 1), _grown(blocks, 2)
         joined = _outdone(part for _, part in self._drives(key, after, needed))
         anew = joined.voxels(seen.resolution_m)

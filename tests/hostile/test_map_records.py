@@ -70,7 +70,7 @@ def _add_drive(map_: Map) -> None:
     fused = FusedPart(KEYS, np.ones((2, 11), np.float32), two, np.ones(2, np.int32))
     starts, cells = np.array([0, 1, 2], np.int64), np.array([0, 511], np.uint16)
     rows = CellRows(KEYS, starts, cells, np.ones((2, 3), np.float32))
-    occupancy = OccupancyPart(rows, SurfacePoints(KEYS, np.ones((2, 4), np.float32)))
+    occupancy = OccupancyPart(rows, SurfacePoints(KEYS, np.ones((2, 5), np.float32)))
     session.submaps.add(Submap(0, 0, FRAMES, fused, occupancy))
     path = np.stack([np.eye(4)] * FRAMES)
     session.set_loops({"closed": [asdict(LOOP)], "refused": [], BENT: path, ALONE: path})

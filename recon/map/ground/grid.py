@@ -11,13 +11,16 @@ from pydantic import Field
 from recon.core.errors import MappingError
 from recon.core.settings import Settings
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
-from recon.core.values.arrays import Bool, Float64, Int64
+from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
 from recon.map.ground.surface import WINDOW_M, GroundSurface
 
 JOINED_CELLS: Final = 2
 """Cells that were hit, but not surely, belong to an obstacle that they hang together with over so
 many cells, unless they touch a free one."""
+SMEAR_SHARE: Final = 1 / 8
+"""Of the voxels of a column within so many cells, in a column that shows where hits of that one
+scatter, and no obstacle of its own."""
 FREE_HEIGHT_M: Final = 0.8
 """Free voxels below this height make a cell free; higher ones may be seen over an obstacle that
 hides what is behind it."""
@@ -48,12 +51,42 @@ def flatten(
     """Flatten an occupancy map to a grid with the resolution of the voxels that spans all of them.
 
     A cell is occupied where an occupied voxel lies in the height band above the ground of that
-    place. It is free where nothing is occupied and a free voxel lies low enough. That the ground
+    place; not where there are few of them near a column of many, at which the hits of that one
+    scatter. It is free where nothing is occupied and a free voxel lies low enough. That the ground
     was seen is no proof: it is also seen below a parked car. Where voxels in the band were hit, but
-    none surely, it belongs to the obstacle beside it if nothing free is beside it: no ray came out
-    between the two; and it is not free if it lies beside an obstacle and was hit as low as it is
+    none surely, it belongs to the obstacle beside it if nothing free is beside it, no ray came out
+    between the two, and it was seen from above; behind a wall, hits of uncertain depth are only
+    those of the wall. It is not free if it lies beside an obstacle and was hit as low as it is
     free. Everything else, and every cell without a known ground, is unknown.
     """
+    _check(voxels, settings)
+    low, (rows, columns), cell = _columns(voxels)
+    height = _heights(voxels, ground)
+
+    def number_in(which: Bool) -> Int64:
+        return np.bincount(cell[which], minlength=rows * columns).reshape(rows, columns)
+
+    s = settings
+    hit = (height >= s.min_height_m) & (height <= s.max_height_m) & (voxels.log_odds > 0)
+    low_air = (height >= 0) & (height <= FREE_HEIGHT_M)
+    full = voxels.log_odds >= log_odds(OCCUPIED_PROBABILITY)
+    empty = voxels.log_odds <= log_odds(FREE_PROBABILITY)
+    solid = number_in(hit & full)
+    blocked = _without_small_blobs(solid > 0, s.min_blob_cells)
+    hit_low = number_in(hit & low_air) > 0
+    free = (number_in(empty & low_air) > 0) & ~blocked & ~(hit_low & _beside(blocked))
+    seen = number_in(empty & (height >= 0)) > 0
+    unsure = (number_in(hit) > 0) & seen & ~blocked & ~free & ~_beside(free)
+    blocked &= solid >= SMEAR_SHARE * _largest_around(solid)
+    for _ in range(JOINED_CELLS):
+        blocked |= unsure & _beside(blocked)
+    cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
+    cells[blocked] = OCCUPIED
+    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
+    return OccupancyGrid(cells, voxels.resolution_m, origin)
+
+
+def _check(voxels: OccupancyVoxels, settings: GridSettings) -> None:
     if len(voxels) == 0:
         raise MappingError("nothing was observed: there is no map to flatten")
     if settings.max_height_m <= settings.min_height_m:
@@ -61,27 +94,6 @@ def flatten(
             "the height band of the grid is empty",
             got=f"{settings.min_height_m:g} to {settings.max_height_m:g} m",
         )
-    low, (rows, columns), cell = _columns(voxels)
-    height = _heights(voxels, ground)
-
-    def any_in(which: Bool) -> Bool:
-        found = np.bincount(cell[which], minlength=rows * columns) > 0
-        return np.asarray(found.reshape(rows, columns))
-
-    s = settings
-    hit = (height >= s.min_height_m) & (height <= s.max_height_m) & (voxels.log_odds > 0)
-    low_air = (height >= 0) & (height <= FREE_HEIGHT_M)
-    full = voxels.log_odds >= log_odds(OCCUPIED_PROBABILITY)
-    empty = voxels.log_odds <= log_odds(FREE_PROBABILITY)
-    blocked = _without_small_blobs(any_in(hit & full), s.min_blob_cells)
-    free = any_in(empty & low_air) & ~blocked & ~(any_in(hit & low_air) & _beside(blocked))
-    unsure = any_in(hit) & ~free & ~_beside(free)
-    for _ in range(JOINED_CELLS):
-        blocked |= unsure & _beside(blocked)
-    cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
-    cells[blocked] = OCCUPIED
-    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
-    return OccupancyGrid(cells, voxels.resolution_m, origin)
 
 
 def ground_depths(voxels: OccupancyVoxels, ground: GroundSurface) -> Float64:
@@ -129,6 +141,12 @@ def _beside(cells: Bool) -> Bool:
     """Return the cells of a mask, and those that share a side with one."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return np.asarray(cv2.dilate(cells.astype(np.uint8), cross) > 0)
+
+
+def _largest_around(numbers: Int64) -> Float32:
+    """Return the largest number within `JOINED_CELLS` of each cell."""
+    window = np.ones((2 * JOINED_CELLS + 1, 2 * JOINED_CELLS + 1), np.uint8)
+    return np.asarray(cv2.dilate(numbers.astype(np.float32), window))
 
 
 def _without_small_blobs(blocked: Bool, least: int) -> Bool:

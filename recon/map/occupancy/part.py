@@ -149,7 +149,7 @@ def free_part(keys: Int32, log_odds: float) -> OccupancyPart:
         # x -> min(max(x + 0, low), high) with low = high.
         np.tile(np.array([0.0, log_odds, log_odds], np.float32), (len(keys), 1)),
     )
-    nothing = SurfacePoints(np.zeros(0, np.int64), np.zeros((0, 4), np.float32))
+    nothing = SurfacePoints(np.zeros(0, np.int64), np.zeros((0, 5), np.float32))
     return OccupancyPart(rows, nothing)
 
 
@@ -159,8 +159,8 @@ class SurfacePoints:
 
     # int64 (N,), packed cells in map axes (`recon.core.kernels.voxels`), each once
     keys: Int64
-    # float32 (N, 4), sum of weights, and weighted sums of the offset from the centre of the cell,
-    # in cells
+    # float32 (N, 5), sum of weights, and weighted sums of the offset from the centre of the cell,
+    # in cells, and of the variance along the ray
     sums: Float32
 
     def __len__(self) -> int:
@@ -170,8 +170,8 @@ class SurfacePoints:
     def from_tree(cls, tree: Mapping[str, Any]) -> SurfacePoints:
         """Return the points in a tree of their arrays."""
         keys = array_in(tree, "keys", np.int64, (None,))
-        sums = array_in(tree, "sums", np.float32, (len(keys), 4))
-        if keys.min(initial=0) < 0 or sums[:, 0].min(initial=1) <= 0:
+        sums = array_in(tree, "sums", np.float32, (len(keys), 5))
+        if keys.min(initial=0) < 0 or sums[:, ::4].min(initial=1) <= 0:
             raise FormatError("a submap of the map has an impossible hit")
         return cls(keys, sums)
 
@@ -188,9 +188,9 @@ class SurfacePoints:
         """Return the sums after a rigid motion in cells; a cell moves as its mean point does."""
         weight = self.sums[:, :1]
         centres = voxels.unpack_keys(self.keys) + 0.5
-        places = apply(T_new_map, centres + self.sums[:, 1:] / weight)
+        places = apply(T_new_map, centres + self.sums[:, 1:4] / weight)
         cells = np.floor(places).astype(np.int64)
-        sums = np.concatenate([weight, weight * (places - cells - 0.5)], axis=1)
+        sums = np.concatenate([weight, weight * (places - cells - 0.5), self.sums[:, 4:]], axis=1)
         return join_points([SurfacePoints(voxels.pack_keys(cells), sums.astype(np.float32))])
 
 
@@ -201,7 +201,7 @@ def join_points(parts: Iterable[SurfacePoints]) -> SurfacePoints:
 
 def sum_points(parts: Iterable[SurfacePoints]) -> voxels.VoxelSums:
     """Return sums to which more can be added, in cells of edge 1."""
-    total = voxels.make_sums(1, 0)
+    total = voxels.make_sums(1, 1)
     for part in parts:
         none = np.zeros(len(part), np.float32)
         total = voxels.add_rows(total, part.keys, part.sums, none, none.astype(np.int32))

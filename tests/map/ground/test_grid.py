@@ -118,7 +118,11 @@ def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch):
     # The wall at x = 2 is sure; behind it the hits of an uncertain depth, then nothing.
     wall = (_box((2, 0, -1.0), (2.2, 4, -0.6)), 2.0)
     behind = (_box((2.2, 0, -1.0), (3.4, 4, -0.6)), 0.01)
-    voxels = _voxels(*_road((0, 0), (2, 4)), wall, behind)
+    # Seen from above; what is behind a higher wall is that of the wall.
+    above = (_box((2.2, 0, 0.6), (3.4, 4, 0.8)), -1.0)
+    dark = _flatten(_voxels(*_road((0, 0), (2, 4)), wall, behind), _ground())
+    assert dark.cells[10].tolist() == [FREE] * 10 + [OCCUPIED] + [UNKNOWN] * 6
+    voxels = _voxels(*_road((0, 0), (2, 4)), wall, behind, above)
     cells = []
     for joined in (0, 1, 2):
         monkeypatch.setattr(grid_file, "JOINED_CELLS", joined)
@@ -132,8 +136,8 @@ def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch):
 def test_what_was_hit_before_a_wall_makes_it_no_thicker_but_is_not_free_either():
     wall = (_box((2.4, 0, -1.0), (2.6, 4, -0.6)), 2.0)
     for road_m, low, high, value, row in (
-        # The cell beside the free road may hold nothing; the next one touches no free cell.
-        (2.0, -1.0, -0.6, 0.01, [FREE, UNKNOWN, OCCUPIED, OCCUPIED]),
+        # Hit alone is no obstacle, and not free.
+        (2.0, -1.0, -0.6, 0.01, [FREE, UNKNOWN, UNKNOWN, OCCUPIED]),
         (2.0, -1.0, -0.8, -1.0, [FREE, FREE, FREE, OCCUPIED]),
         # A cell of a free road that was hit low is not free.
         (2.4, -1.0, -0.8, 0.1, [FREE, FREE, UNKNOWN, OCCUPIED]),
@@ -142,6 +146,18 @@ def test_what_was_hit_before_a_wall_makes_it_no_thicker_but_is_not_free_either()
         before = (_box((2.0, 0, low), (2.4, 4, high)), value)
         grid = _flatten(_voxels(*_road((0, 0), (road_m, 4)), wall, before), _ground())
         assert grid.cells[10, 9:13].tolist() == row
+
+
+def test_a_few_voxels_near_a_wall_are_its_smear_and_not_free():
+    wall, kerb = _box((2.4, 0, -1.4), (2.6, 4, 0.4)), _box((2.0, 0, -1.2), (2.2, 4, -1.0))
+    rows = []
+    for smear in (kerb, kerb - np.array([2, 0, 0]), np.vstack([kerb, kerb + np.array([0, 0, 1])])):
+        voxels = _voxels(*_road((0, 0), (2.4, 4)), (wall, 2.0), (smear, 2.0))
+        rows.append(_flatten(voxels, _ground()).cells[10, 8:13].tolist())
+    # One voxel of a column of nine; one too far away; and two.
+    assert rows[0] == [FREE, FREE, UNKNOWN, FREE, OCCUPIED]
+    assert rows[1] == [OCCUPIED, FREE, FREE, FREE, OCCUPIED]
+    assert rows[2] == [FREE, FREE, OCCUPIED, FREE, OCCUPIED]
 
 
 def test_undecided_voxels_are_dropped():

@@ -1,6 +1,7 @@
 """Reference implementations of the kernels of the map, with cells in a dictionary."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from itertools import product
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import unpack_keys
 from recon.map.kernels.clamped import ClampedBlocks, observed_rows
-from recon.map.kernels.facets import LEAST
+from recon.map.kernels.facets import DOUBLINGS, LEAST, REACH
 from recon.map.kernels.raycast import MIN_DEPTH_M, Rays
 
 Cell = tuple[int, int, int]
@@ -117,24 +118,52 @@ def move_reference(cells: dict[Cell, Clamped], T_new_old: Array) -> dict[Cell, C
     return moved
 
 
-def is_crossed(cell: Cell, points: dict[Cell, tuple[float, Array]]) -> bool:
-    """Whether a cell is crossed, as `recon.map.kernels.facets.crossed_cells` defines it.
+Points = dict[Cell, tuple[float, Array, float]]
+"""Sum of weights, mean (3,) in space, and mean variance of each cell that holds points."""
 
-    ``points`` are the sum of weights and the mean (3,) in space of each cell that holds any.
-    """
-    steps = product((-1, 0, 1), repeat=3)
-    around = [points.get((cell[0] + i, cell[1] + j, cell[2] + k)) for i, j, k in steps]
-    known = [point for point in around if point is not None]
-    if len(known) < LEAST:
-        return cell in points
-    weights = np.array([weight for weight, _ in known])
-    places = np.array([place for _, place in known]) - (np.array(cell) + 0.5)
-    spread = np.cov(places.T, aweights=weights, ddof=0)
+
+def is_crossed(cell: Cell, points: Points) -> bool:
+    """Whether a cell is crossed, as `recon.map.kernels.facets.crossed_cells` defines it."""
+    centre, windows = np.array(cell) + 0.5, [points]
+    for doublings in range(DOUBLINGS + 1):
+        known = _around(centre / 2**doublings, 1, windows[-1])
+        weights = np.array([weight for weight, _, _ in known])
+        if not known or np.average([v for _, _, v in known], weights=weights) <= 1:
+            break
+        windows.append(_doubled(windows[-1]))
+    finer = max(0, doublings - 1)
+    near = _around(centre / 2**finer, REACH if doublings else 1, windows[finer])
+    half = 0.5 / 2**finer
+    if len(known) < LEAST or not near:
+        return any(np.abs(place).max() <= half for _, place, _ in near)
+    spread = np.cov(np.array([place for _, place, _ in known]).T, aweights=weights, ddof=0)
     normal = np.linalg.eigh(spread)[1][:, 0]
+    weights, places = np.array([w for w, _, _ in near]), np.array([place for _, place, _ in near])
     along = places @ normal
     beside = (places**2).sum(axis=1) - along**2
     distance = np.average(along, weights=weights * np.exp(-beside))
-    return bool(abs(distance) <= 0.5 * np.abs(normal).sum())
+    return bool(abs(distance) <= half * np.abs(normal).sum())
+
+
+def _around(place: Array, reach: int, points: Points) -> list[tuple[float, Array, float]]:
+    home = np.floor(place).astype(int)
+    cells = (home + step for step in product(range(-reach, reach + 1), repeat=3))
+    found = [points[tuple(cell.tolist())] for cell in cells if tuple(cell.tolist()) in points]
+    return [(weight, mean - place, variance) for weight, mean, variance in found]
+
+
+def _doubled(points: Points) -> Points:
+    held: dict[Cell, list[tuple[float, Array, float]]] = defaultdict(list)
+    for (i, j, k), (weight, mean, variance) in points.items():
+        held[i // 2, j // 2, k // 2].append((weight, mean / 2, variance / 4))
+    return {
+        cell: (
+            sum(weights := [weight for weight, _, _ in several]),
+            np.average([mean for _, mean, _ in several], axis=0, weights=weights),
+            float(np.average([variance for _, _, variance in several], weights=weights)),
+        )
+        for cell, several in held.items()
+    }
 
 
 def cells_of(blocks: ClampedBlocks) -> dict[Cell, Clamped]:

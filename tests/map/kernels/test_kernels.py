@@ -124,43 +124,39 @@ def test_moved_cells_equal_those_of_the_reference(seed):
     )
 
 
-BLOCK = np.stack(np.meshgrid(*[np.arange(-3, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+BLOCK = np.stack(np.meshgrid(*[np.arange(-3, 3, dtype=np.int32)] * 3, indexing="ij"), -1)
+BLOCK = BLOCK.reshape(-1, 3)
 
 
-def _summed(xyz: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    nothing = np.zeros((len(xyz), 0), np.float32)
-    points = voxels.VoxelPoints(xyz, weights.astype(np.float32), nothing)
-    total = voxels.add_points(voxels.make_sums(1, 0), points, 1.0, 0)
-    used = int(total.used[0])
-    return total.keys[:used], total.sums[:used]
-
-
-def _crossed(cells: np.ndarray, xyz: np.ndarray, weights: np.ndarray | float = 1.0) -> np.ndarray:
-    summed = _summed(xyz, np.broadcast_to(weights, len(xyz)))
-    return facets.crossed_cells(cells.astype(np.int32), *summed)
+def _summed(xyz: np.ndarray, weights: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, ...]:
+    values = variances[:, None].astype(np.float32)
+    points = voxels.VoxelPoints(xyz, weights.astype(np.float32), values)
+    return voxels.copy_sums(voxels.add_points(voxels.make_sums(1, 1), points, 1.0, 0))
 
 
 @settings(max_examples=20)
-@given(SEEDS, st.integers(0, 60))
-def test_crossed_cells_are_those_of_the_reference(seed, number):
+@given(SEEDS, st.integers(0, 60), st.sampled_from([0.1, 1.0, 10.0]))
+def test_crossed_cells_are_those_of_the_reference(seed, number, variance):
     rng = np.random.default_rng(seed)
-    xyz, weights = rng.normal(0, 1.5, (number, 3)), rng.uniform(0.1, 50, number)
-    keys, sums = _summed(xyz, weights)
-    cells, sums = voxels.unpack_keys(keys), sums.astype(np.float64)
-    means = cells + 0.5 + sums[:, 1:] / sums[:, :1]
-    held = zip(sums[:, 0].tolist(), means, strict=True)
+    xyz, weights = rng.normal(0, 3.0, (number, 3)), rng.uniform(0.1, 50, number)
+    keys, summed = _summed(xyz, weights, variance * rng.uniform(0.1, 2, number))
+    cells, sums = voxels.unpack_keys(keys), summed.astype(np.float64)
+    means, variances = cells + 0.5 + sums[:, 1:4] / sums[:, :1], sums[:, 4] / sums[:, 0]
+    held = zip(sums[:, 0].tolist(), means, variances.tolist(), strict=True)
     points = dict(zip(map(tuple, cells.tolist()), held, strict=True))
     expected = [reference.is_crossed(tuple(cell), points) for cell in BLOCK.tolist()]
-    np.testing.assert_array_equal(_crossed(BLOCK, xyz, weights), expected)
+    np.testing.assert_array_equal(facets.crossed_cells(BLOCK, keys, summed), expected)
 
 
+@pytest.mark.parametrize("sigma", [0.1, 3.0])
 @pytest.mark.parametrize("slope", [0.0, 0.3, 0.9])
-def test_a_plane_crosses_the_cells_that_it_passes_through(slope):
+def test_a_plane_crosses_the_cells_that_it_passes_through(slope, sigma):
     x, y = np.random.default_rng(0).uniform(-4, 4, (2, 8000))
     xyz = np.stack([x, y, 0.37 + slope * x + 0.1 * y], axis=1)
     normal = np.array([slope, 0.1, -1.0])
     # The corner of a cube that is nearest to a plane is half of the normal's sum of parts away.
     beyond = np.abs((BLOCK + 0.5) @ normal + 0.37) - 0.5 * np.abs(normal).sum()
-    found, hit = _crossed(BLOCK, xyz), np.isin(voxels.pack_keys(BLOCK), _summed(xyz, x * 0 + 1)[0])
-    assert found[hit].all()
+    keys, sums = _summed(xyz, np.ones(8000), np.full(8000, sigma**2))
+    found = facets.crossed_cells(BLOCK, keys, sums)
+    assert found[np.isin(voxels.pack_keys(BLOCK), keys)].all()
     assert (beyond[found] < 1e-5).all()

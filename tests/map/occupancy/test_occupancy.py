@@ -122,6 +122,15 @@ def _wall_ahead(frames: int, error: float) -> list[tuple[PointCloud, np.ndarray]
     return seen
 
 
+def test_a_wall_that_is_seen_roughly_is_thin():
+    # Errors of 7 voxels at first and 1.8 at last.
+    cells = _cells(_part(*_wall_ahead(20, 0.01)).voxels(0.2))
+    sure = {cell for cell, value in cells.items() if value > 0.2}
+    # Nineteen layers with a window of 27 voxels.
+    assert {k for i, j, k in sure if -6 <= i < 6 and -6 <= j < 6} <= {59, 60}
+    assert all({(i, j, 59), (i, j, 60)} & sure for i in range(-6, 6) for j in range(-6, 6))
+
+
 def test_a_wall_seen_often_is_thin_and_has_no_holes():
     part = _part(*_wall_ahead(20, 0.002))
     thin, thick = (_cells(each.voxels(0.2)) for each in (part, replace(part, points=None)))
