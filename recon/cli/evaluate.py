@@ -309,7 +309,8 @@ def paper(
     """Repeat experiments 2 to 4 of the paper that this project is based on.
 
     Writes disparity and depth maps, surfaces, clouds, depth curves, Table 1 and
-    a report. What the paper misprints, and how it is corrected: docs/walk-research.md.
+    a report. What the paper misprints, and how it is corrected:
+    docs/walk-research.md.
 
     Examples:
       recon paper MiddEval3/trainingQ

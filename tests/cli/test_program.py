@@ -51,7 +51,7 @@ SOURCES = {
 
 INPUTS = {
     "--poses", "--calib", "--config", "--map", "--georeference", "--truth", "--align-to", "--mask",
-    "--confidence", "--results", "--times",
+    "--confidence", "--images", "--results", "--times",
 }  # fmt: skip
 """Options that name files which are read."""
 
