@@ -25,6 +25,7 @@ from recon.commands.config import load_config
 from recon.core.geometry import se3
 from recon.core.values import SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.camera import Rig
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
 from recon.run.work import serial_algebra
@@ -140,9 +141,12 @@ class Kept(DerivedSource):
         return iter(self.pairs[start:])
 
 
-def run(altered: Altered, odometries: Mapping[str, Odometry]) -> dict[str, dict[str, Any]]:
-    """Errors of each odometry on the same frames."""
-    reconstructor = FrameReconstructor(altered.calibration, load_config(None, []), threads=1)
+def run(
+    altered: Altered, odometries: Mapping[str, Odometry], rig: Rig | None = None
+) -> dict[str, dict[str, Any]]:
+    """Errors of each odometry on the same frames, with the rig as it is or another one."""
+    given = altered.calibration if rig is None else rig
+    reconstructor = FrameReconstructor(given, load_config(None, []), threads=1)
     results: dict[str, list[OdometryResult]] = {name: [] for name in odometries}
     with serial_algebra():
         for pair in altered.frames():

@@ -1,8 +1,9 @@
 """How much the drift of kiss-icp depends on what should not matter: its range, by half a metre.
 
-A frame is matched once, and its points go to several odometries that differ in nothing but
-`odometry.max_range_m`. A last bit of a point or the order of the points changes the path as much:
-a single figure of kiss-icp is one draw, so the median and the range are given.
+The rig is refined first, as `recon map` does it. A frame is matched once, and its points go to
+several odometries that differ in nothing but `odometry.max_range_m`. A last bit of a point or the
+order of the points changes the path as much: a single figure of kiss-icp is one draw, so the
+median and the range are given.
 
 Example: python benchmarks/kiss_spread.py DRIVE --json
 """
@@ -20,7 +21,9 @@ import checkout  # noqa: F401 - what is measured
 from altered_drives import alterations
 from degraded_drives import run
 
+from recon.commands.config import load_config
 from recon.odometry.registry import make_odometry
+from recon.odometry.rig.refine import refine_rig
 from recon.odometry.settings import OdometrySettings
 from recon.sources.registry import open_source
 
@@ -34,7 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{range_m:g}": make_odometry("kiss", OdometrySettings(max_range_m=range_m))
         for range_m in options.ranges
     }
-    found = run(alterations(open_source(options.drive))["as it is"], odometries)
+    drive, config = alterations(open_source(options.drive))["as it is"], load_config(None, [])
+    rig = refine_rig(drive, config, config.rig)
+    found = run(drive, odometries, rig.calibration)
     result = {"spread": spread(list(found.values())), "ranges_m": found}
     print(json.dumps(result, indent=2) if options.json else table(result))
 
