@@ -14,7 +14,7 @@ from recon.io.cameras.calibration import read_calibration
 from recon.sources.settings import SourceSettings
 
 _NAME: Final = re.compile(
-    r"(calib|calibration|stereo|cam_?chain|intrinsics|cameras?)([._-].*)?\.(txt|ya?ml|xml|json)"
+    r"(calib|calibration|rig|stereo|cam_?chain|intrinsics|cameras?)([._-].*)?\.(txt|ya?ml|xml|json)"
 )
 # Focal lengths, skew and principal row: all of a camera matrix but the principal column.
 _ROWS: Final = ([0, 0, 1, 1], [0, 1, 1, 2])

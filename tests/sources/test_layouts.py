@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
+from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import read_euroc_camera, write_kalibr
 from recon.io.images.image import write_image
 from recon.sources.image_names import find_partners, pair_images
@@ -384,6 +385,10 @@ def test_folders_without_pairs_or_calibration_are_refused(noise, tmp_path):
     (folder / "calib.txt").unlink()
     with pytest.raises(SourceError, match=r"calibration is missing.*--calib FILE"):
         open_source(folder)
+    # What `recon map` writes is found, also beside the file of another program.
+    write_recon_calibration(folder / "rig.yaml", CAMERA)
+    (folder / "stereo_params.xml").write_text("<boofcv.struct.calib.StereoParameters/>")
+    assert open_source(folder).calibration == CAMERA
     for number, path in enumerate(sorted((folder / "right").iterdir())[1:]):
         path.rename(path.with_stem(f"photo{100 + 7 * number}"))
     (folder / "right" / "right0.png").unlink()
