@@ -75,7 +75,7 @@ def read_calibration(
         raise FormatError(
             "not a calibration file",
             expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
-            "OpenCV YAML/XML (M1 …), ROS CameraInfo or a kalibr camchain (cam0: …)",
+            "OpenCV YAML/XML/JSON (M1 …, or P1 P2), ROS CameraInfo or a kalibr camchain (cam0: …)",
         )
     if size is not None:
         check_size(rig, *size, path)

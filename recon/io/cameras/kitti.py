@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -37,14 +38,23 @@ def read_kitti_calib(
     path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int] = GREY_CAMERAS
 ) -> RectifiedCamera:
     """Read the rectified camera of one stereo pair from either kind of file."""
-    left, right = (_projection(path, camera) for camera in cameras)
+    found = {f"P{camera}": _projection(path, camera) for camera in cameras}
+    left = next(iter(found.values()))
+    check_unsized((float(left[0, 2]), float(left[1, 2])), width_px, height_px, path)
+    return projected_rig(found, width_px, height_px)
+
+
+def projected_rig(
+    projections: Mapping[str, Float64], width_px: int, height_px: int
+) -> RectifiedCamera:
+    """Return the rectified camera of two projection matrices (3, 4), left and right, by name."""
+    left, right = (_checked(*named) for named in projections.items())
     if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
         raise CalibrationError(
-            f"P{cameras[0]} and P{cameras[1]} have different focal lengths or rows",
+            f"{' and '.join(projections)} have different focal lengths or rows",
             hint="a rectified pair shares them; rectify the images first",
         )
-    check_unsized((float(left[0, 2]), float(left[1, 2])), width_px, height_px, path)
-    # ``t`` is relative to camera 0, also of the colour pair.
+    # ``t`` is relative to camera 0, also of the colour pair of KITTI.
     baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
     return RectifiedCamera.from_matrices(left, right, baseline_m, width_px, height_px)
 
@@ -79,13 +89,16 @@ def _projection(path: StrPath, camera: int) -> Float64:
         got = ", ".join(f"P{number}" for number in sorted(rows)) or "no projection matrix"
         hint = "a stereo pair needs P0 and P1, or P2 and P3"
         raise FormatError(f"calibration has no {name}", got=got, hint=hint)
-    matrix = Fields({name: rows[camera]}).numbers(name, (3, 4))
-    if not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+    return _checked(name, Fields({name: rows[camera]}).numbers(name, (3, 4)))
+
+
+def _checked(name: str, projection: Float64) -> Float64:
+    if not np.allclose(projection[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise FormatError(f"{name} is not the projection matrix of a rectified camera")
-    if min(matrix[0, 0], matrix[1, 1]) <= 0:
-        got = f"{matrix[0, 0]:g} px"
+    if min(projection[0, 0], projection[1, 1]) <= 0:
+        got = f"{projection[0, 0]:g} px"
         raise CalibrationError(f"focal length of {name} is not positive", got=got)
-    return matrix
+    return projection
 
 
 def _centre_m(projection: Float64) -> Float64:

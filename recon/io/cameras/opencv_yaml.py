@@ -15,9 +15,17 @@ import numpy as np
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import make_transform
 from recon.core.text import counted
-from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration, check_unsized
+from recon.core.values import (
+    CameraIntrinsics,
+    LensModel,
+    RectifiedCamera,
+    Rig,
+    StereoCalibration,
+    check_unsized,
+)
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
+from recon.io.cameras.kitti import projected_rig
 from recon.io.fields import numbers_of, parse_yaml, plain_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader, reading
 
@@ -30,6 +38,7 @@ _DISTORTIONS: Final = (
     ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL"),
     ("D2", "distCoeffs2", "dist_coeffs_right", "distCoeffsR"),
 )
+_PROJECTIONS: Final = frozenset({"P1", "P2"})  # of rectified cameras
 _ROTATION: Final = ("R", "rotation_matrix")
 _TRANSLATION: Final = ("T", "translation_vector")
 _SIZE: Final = ("image_size", "imageSize", "img_size")
@@ -50,12 +59,13 @@ Nodes = dict[str, Float64 | str]
 @reader
 def read_opencv_calibration(
     path: StrPath, *, size_px: tuple[int, int] | None = None, metres_per_unit: float = 1.0
-) -> StereoCalibration:
+) -> Rig:
     """Read two raw cameras (``M1 D1 M2 D2``, or ``cameraMatrix1`` …) and their pose (``R T``).
 
     Of OpenCV's pair, a file without ``R``, the file with ``extrinsics`` in place of ``intrinsics``
-    in its name is read too. ``size_px`` (width, height) is for files that do not state it;
-    ``metres_per_unit`` is the unit of ``T``, such as the square size of a board of squares of 1.
+    in its name is read too. A file of ``P1`` and ``P2`` alone is of rectified images. ``size_px``
+    (width, height) is for files that do not state it; ``metres_per_unit`` is the unit of ``T``,
+    such as the square size of a board of squares of 1.
     """
     nodes = read_file_storage(path)
     stated = _size(nodes)
@@ -67,6 +77,10 @@ def read_opencv_calibration(
             hint="from Python: pass width_px and height_px, or give the file itself to "
             "recon.reconstruct or recon.match, which take the size from the images",
         )
+    # With a pose of raw cameras, they are of what those become, not of the images.
+    raw = any(_find(nodes, names) is not None for names in (_MATRICES[0], _ROTATION))
+    if not raw and nodes.keys() >= _PROJECTIONS:
+        return _rectified(nodes, size, metres_per_unit, path if stated is None else None)
     model = _model(nodes)
     lens: LensModel = model or "pinhole"
     left, right = (_camera(nodes, side, size, lens) for side in (0, 1))
@@ -82,12 +96,30 @@ def read_opencv_calibration(
         rotation = _matrix(outer_nodes, _ROTATION, (3, 3))
         translation_m = _matrix(outer_nodes, _TRANSLATION, (3,)) * metres_per_unit
         calibration = StereoCalibration(left, right, make_transform(rotation, translation_m))
-        if calibration.baseline_m > _LONGEST_BASELINE_M:
-            what = "baseline is implausibly long"
-            got, expected = f"{calibration.baseline_m:g} m", f"at most {_LONGEST_BASELINE_M:g} m"
-            hint = "if the file is in millimetres, pass 0.001 metres per unit"
-            raise CalibrationError(what, got=got, expected=expected, hint=hint)
+        _check_unit(calibration.baseline_m)
     return calibration
+
+
+def _rectified(
+    nodes: Nodes, size: tuple[int, int], metres_per_unit: float, unsized: StrPath | None
+) -> RectifiedCamera:
+    """Return the camera of ``P1`` and ``P2``, of images that are rectified."""
+    found = {name: _matrix(nodes, (name,), (3, 4)).copy() for name in sorted(_PROJECTIONS)}
+    for matrix in found.values():
+        matrix[:, 3] *= metres_per_unit
+    if unsized is not None:
+        check_unsized((found["P1"][0, 2], found["P1"][1, 2]), *size, unsized)
+    camera = projected_rig(found, *size)
+    _check_unit(camera.baseline_m)
+    return camera
+
+
+def _check_unit(baseline_m: float) -> None:
+    if baseline_m > _LONGEST_BASELINE_M:
+        what = "baseline is implausibly long"
+        got, expected = f"{baseline_m:g} m", f"at most {_LONGEST_BASELINE_M:g} m"
+        hint = "if the file is in millimetres, pass 0.001 metres per unit"
+        raise CalibrationError(what, got=got, expected=expected, hint=hint)
 
 
 def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:

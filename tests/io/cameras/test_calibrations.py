@@ -311,6 +311,21 @@ def test_opencv_files_in_millimetres_and_with_extrinsics_beside_them_are_read(tm
         read_calibration(beside, 640, 480)
 
 
+@pytest.mark.parametrize("suffix", ["yml", "json"])
+def test_a_file_of_projection_matrices_alone_is_of_rectified_images(tmp_path, suffix):
+    P1 = np.array([[570.0, 0, 330, 0], [0, 570, 240, 0], [0, 0, 1, 0]])
+    P2 = P1 + np.array([[0, 0, 9, -570 * 4.4], [0, 0, 0, 0], [0, 0, 0, 0]])
+    path = write_nodes(tmp_path / f"endoscope.{suffix}", P1=P1, P2=P2, Q=np.eye(4))
+    read = read_calibration(path, 640, 480, metres_per_unit=0.001)
+    assert read == RectifiedCamera(570.0, 330.0, 240.0, 339.0, read.baseline_m, 640, 480)
+    assert read.baseline_m == pytest.approx(0.0044, rel=1e-12)
+    with pytest.raises(CalibrationError, match="the calibration is of another size"):
+        read_calibration(path, 2560, 1920, metres_per_unit=0.001)
+    write_nodes(path, P1=P1, P2=np.diag([1.0, 2.0, 1.0]) @ P2)
+    with pytest.raises(CalibrationError, match="P1 and P2 have different focal lengths or rows"):
+        read_calibration(path, 640, 480)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
