@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,9 +34,13 @@ from recon.core.values.arrays import Float64, UInt8
 from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.images.image import write_image
 from recon.io.trajectory import read_kitti_poses, write_kitti_poses
-from recon.map.drive.sequence import map_sequence
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
+from recon.odometry.registry import make_odometry
+from recon.odometry.rig.refine import RefinedRig, refine_rig
+from recon.run.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
+from recon.stereo.frame import FrameReconstructor
 
 NOISE_DN = 4.0
 EXPOSURE_SHARE = 0.15
@@ -269,13 +273,35 @@ def nodding(plain: Altered) -> Altered:
 
 def figures(altered: Altered, options: argparse.Namespace) -> dict[str, float]:
     """Errors of the path of an altered drive."""
-    config = load_config(None, [f"odometry.method={options.odometry}", *options.set])
-    return {"frames": len(altered), **errors_of(map_sequence(altered, config).trajectory, altered)}
+    config, name = load_config(None, options.set), options.odometry
+    rig = refine_rig(altered, config, config.rig)
+    found = run(altered, {name: make_odometry(name, config.odometry)}, rig)
+    return {"frames": len(altered), **found[name]}
 
 
-def errors_of(path: Trajectory, altered: Altered) -> dict[str, float]:
+def run(
+    altered: Altered, odometries: Mapping[str, Odometry], rig: RefinedRig | None = None
+) -> dict[str, dict[str, Any]]:
+    """Errors of each odometry on the same frames, with the rig as it is or as refined."""
+    config, given = load_config(None, []), altered.calibration
+    rig = RefinedRig(given, given, given) if rig is None else rig
+    reconstructor = FrameReconstructor(rig.calibration, config, threads=1)
+    results: dict[str, list[OdometryResult]] = {name: [] for name in odometries}
+    with serial_algebra():
+        for pair in altered.frames():
+            frame = OdometryFrame(*reconstructor.match(pair))
+            for name, odometry in odometries.items():
+                results[name].append(odometry.register(frame))
+    truth, found = rig.poses(true_path(altered), config.rectification), {}
+    for name, poses in results.items():
+        path = Trajectory(np.stack([each.T_world_camera for each in poses]), altered.stamps_s)
+        untrusted = sum(not each.health.ok for each in poses)
+        found[name] = {**errors_of(path, truth), "untrusted": untrusted}
+    return found
+
+
+def errors_of(path: Trajectory, truth: Trajectory) -> dict[str, float]:
     """Errors of a path, and its length relative to the true one."""
-    truth = true_path(altered)
     found = evaluate_trajectory(path, truth)
     return {
         "t_rel_percent": round(found.t_rel_percent, 3),
@@ -291,8 +317,9 @@ def peer_figures(peer: Path, name: str, altered: Altered) -> dict[str, float]:
         found = json.loads(peer.read_text()).get(name, {})
     else:
         poses = peer / f"{file_name(name)}.txt"
-        times = true_path(altered).timestamps_s
-        found = errors_of(read_kitti_poses(poses, times), altered) if poses.is_file() else {}
+        true = true_path(altered)
+        path = read_kitti_poses(poses, true.timestamps_s) if poses.is_file() else None
+        found = {} if path is None else errors_of(path, true)
     return {f"peer_{key}": value for key, value in found.items()}
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -19,20 +19,15 @@ from typing import Any, Final
 import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
-from altered_drives import Altered, Change, alterations, errors_of, thinned
+from altered_drives import Altered, Change, alterations, run, thinned
 
-from recon.commands.config import load_config
 from recon.core.geometry import se3
-from recon.core.values import SequenceTruth, StereoPair, Trajectory
+from recon.core.values import SequenceTruth, StereoPair
 from recon.core.values.arrays import Float64, UInt8
-from recon.core.values.camera import Rig
-from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
-from recon.run.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.source import DerivedSource
 from recon.sources.synthetic import SyntheticSource
-from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import StreetScene, StreetSettings
 from recon.street.street import StreetWorld, build_street
 
@@ -139,29 +134,6 @@ class Kept(DerivedSource):
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """The pairs from number ``start`` on."""
         return iter(self.pairs[start:])
-
-
-def run(
-    altered: Altered, odometries: Mapping[str, Odometry], rig: Rig | None = None
-) -> dict[str, dict[str, Any]]:
-    """Errors of each odometry on the same frames, with the rig as it is or another one."""
-    given = altered.calibration if rig is None else rig
-    reconstructor = FrameReconstructor(given, load_config(None, []), threads=1)
-    results: dict[str, list[OdometryResult]] = {name: [] for name in odometries}
-    with serial_algebra():
-        for pair in altered.frames():
-            frame = OdometryFrame(*reconstructor.match(pair))
-            for name, odometry in odometries.items():
-                results[name].append(odometry.register(frame))
-    found = {}
-    for name, poses in results.items():
-        path = Trajectory(np.stack([each.T_world_camera for each in poses]), altered.stamps_s)
-        health = [each.health for each in poses]
-        found[name] = {
-            **errors_of(path, altered),
-            "untrusted": sum(not record.ok for record in health),
-        }
-    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401 - what is measured
-from altered_drives import alterations
-from degraded_drives import run
+from altered_drives import alterations, run
 
 from recon.commands.config import load_config
 from recon.odometry.registry import make_odometry
@@ -39,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     drive, config = alterations(open_source(options.drive))["as it is"], load_config(None, [])
     rig = refine_rig(drive, config, config.rig)
-    found = run(drive, odometries, rig.calibration)
+    found = run(drive, odometries, rig)
     result = {"spread": spread(list(found.values())), "ranges_m": found}
     print(json.dumps(result, indent=2) if options.json else table(result))
 

@@ -6,6 +6,7 @@ heading; headings without a cell stay empty.
 
 from __future__ import annotations
 
+from math import hypot
 from statistics import median
 from typing import Any
 
@@ -67,11 +68,43 @@ def lenses(found: Found) -> Rows:
 
 
 def altered(found: Found) -> Rows:
+    """Both rigs side by side; the peer, which refines none, once."""
     rows: Rows = {}
-    for drive, cases in found.items():
+    for label, cases in found.items():
+        drive, _, how = label.partition(", ")
         for case, one in cases.items():
-            row = rows.setdefault(case, {})
-            row[f"{drive} t_rel"], row[f"{drive} length"] = one["t_rel_percent"], one["scale"]
+            row = rows.setdefault(f"{drive}, {case}", {})
+            row["refined" if how.startswith("refined") else "as calibrated"] = one["t_rel_percent"]
+            row["length"] = one["scale"]
+            if "peer_scale" in one:
+                row["ORB-SLAM3"], row["its length"] = one["peer_t_rel_percent"], one["peer_scale"]
+    return rows
+
+
+def disparities(found: Found) -> Rows:
+    """Medians by depth, and what parts of the image are off."""
+    return {
+        name: {f"{depths} m": error for depths, error in one["by_depth_m"].items()}
+        | {"parts, rms": one["parts_rms"], "largest": one["largest_of_parts"]}
+        | {"LiDAR moved": hypot(*one["moved_mm"]), "turned": hypot(*one["turned_deg"])}
+        for name, one in found[""].items()
+    }
+
+
+def planted(found: Found) -> Rows:
+    rows: Rows = {}
+    for drive, faults in found.items():
+        without = faults["none"].get("t_rel_percent")
+        for name, one in faults.items():
+            if name == "none":
+                continue
+            row = rows[f"{drive}, {name}"] = {
+                "planted": one["planted_px"],
+                "left": one["left_px"],
+                "recovered": one["recovered_percent"],
+            }
+            if without is not None:
+                row |= {"t_rel": one["t_rel_percent"], "without it": without}
     return rows
 
 

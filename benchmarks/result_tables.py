@@ -126,15 +126,36 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "kitti-altered": Table(
         {
-            name: f"python benchmarks/altered_drives.py {drive} --json"
+            f"{name}, {how}": f"python benchmarks/altered_drives.py {drive} --json "
+            f"--peer benchmarks/peers/orbslam3/{Path(drive).name}.json {' '.join(options)}"
             for name, drive in DRIVES.items()
+            for how, options in REFINED.items()
         },
-        {
-            f"{name} {what}": form
-            for name in DRIVES
-            for what, form in (("t_rel", PERCENT), ("length", SHARE))
-        },
+        {"as calibrated": PERCENT, "refined": PERCENT, "length": "{:.4f}"}
+        | {"ORB-SLAM3": PERCENT, "its length": "{:.4f}"},
         rows_of.altered,
+    ),
+    "kitti-disparity": Table(
+        {"": f"python benchmarks/lidar_disparity.py {D13} {D13}/lidar_map.ply --json"},
+        {f"{depths} m": "{:+.2f} px" for depths in ("4 to 8", "8 to 12", "12 to 16", "16 to 22")}
+        | {f"{depths} m": "{:+.2f} px" for depths in ("22 to 30", "30 to 45")}
+        | {"parts, rms": "{:.2f} px", "largest": "{:.2f} px"}
+        | {"LiDAR moved": "{:.0f} mm", "turned": "{:.2f}°"},
+        rows_of.disparities,
+    ),
+    "planted": Table(
+        {
+            Path(folder).name: f"python benchmarks/planted_faults.py $RECON_DATA/{folder} --json"
+            for folder in (
+                "driven/kitti_raw_0013",
+                "driven/kitti_06_51",
+                "driven/kitti_05_100",
+                "walked/backyard",
+            )
+        },
+        {"planted": "{:.2f} px", "left": "{:.2f} px", "recovered": "{:.0f} %"}
+        | {"t_rel": PERCENT, "without it": PERCENT},
+        rows_of.planted,
     ),
     "kitti-localize": Table(
         {"drive": f"python benchmarks/localize.py {D13} --elsewhere {D06} --json"},
