@@ -134,7 +134,8 @@ def run_map(
         made = make(Order(map_, mapped.placed, run, config.mesh), options.products)
         with run.stage("compare"):
             given = options.known_poses is not None
-            errors = compare_with_truth(source, mapped, made.grid, poses_given=given)
+            true = found.true_path(source, config.rectification)
+            errors = compare_with_truth(source, mapped, made.grid, true, poses_given=given)
         drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_share)
         said = [*rig.warnings(findings), *_next_drive(source, config, rig)]
         doubts = [*said, *_warnings(source, mapped, drift)]

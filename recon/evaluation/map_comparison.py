@@ -254,11 +254,17 @@ class DriveErrors:
 
 
 def compare_with_truth(
-    source: StereoSource, mapped: MappedSequence, grid: OccupancyGrid, *, poses_given: bool
+    source: StereoSource,
+    mapped: MappedSequence,
+    grid: OccupancyGrid,
+    true_path: Trajectory | None,
+    *,
+    poses_given: bool,
 ) -> DriveErrors:
     """Compare a mapped drive and its grid with the truth that its source knows.
 
-    Poses that were given are no estimate, and 0 % drift would mislead: the paths are not compared.
+    ``true_path`` is that of the camera of the map. Poses that were given are no estimate, and 0 %
+    drift would mislead: the paths are not compared.
     """
     warnings: list[str] = []
 
@@ -269,7 +275,7 @@ def compare_with_truth(
             warnings.append(f"not compared with the true {what}: {error}")
 
     truth = source.truth or SequenceTruth()
-    path = None if poses_given else truth.trajectory
+    path = None if poses_given else true_path
     own, near_m = mapped.trajectory.select(mapped.joined), mapped.config.scale * _NEAR_M
     cells = source.occupancy_truth(**occupancy_view(mapped.config, mapped.T_map_world))
     return DriveErrors(
@@ -282,7 +288,7 @@ def compare_with_truth(
             lambda true: evaluate_occupancy(drop_undecided(mapped.voxels), grid, true),
         ),
         tuple(warnings),
-        truth.trajectory,
+        true_path,
     )
 
 

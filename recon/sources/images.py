@@ -37,6 +37,7 @@ class ImageSource(Recording):
 
     images: Sequence[ImageFrame]
     imu: Callable[[], ImuRecord] | None = None  # reads what the inertial unit measured
+    truth_of_raw: bool = False
 
     @cached_property
     def files(self) -> Sequence[Path]:

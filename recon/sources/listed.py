@@ -60,6 +60,7 @@ def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
         images=frames,
         listing=listing,
         truth=truth,
+        truth_of_raw=True,
         texts=(*texts, *paths),
     )
 
@@ -118,6 +119,7 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
         images=frames,
         listing=listing,
         truth=truth,
+        truth_of_raw=True,
         texts=(*texts, *(view / "data.csv" for view in views), *_imu_files(root)),
         imu=partial(_read_imu, root, views[0]) if _imu_files(root) else None,
     )

@@ -46,6 +46,8 @@ class StereoSource(ABC):
     """Whether pairs arrive in their own time: poses come first, and what is late is left out."""
     lead: int = 0
     """Pairs at the start that only lead the odometry, and are not put into the map."""
+    truth_of_raw: bool = False
+    """Whether the true path is that of the left camera as mounted, not of its rectified view."""
 
     @cached_property
     def name(self) -> str:

@@ -118,11 +118,22 @@ class RefinedRig:
         rig = seen.applied(self.calibration) if use else self.calibration
         return replace(self, calibration=rig, baseline=seen)
 
-    def poses(self, given: Trajectory, settings: RectificationSettings) -> Trajectory:
-        """Return poses of the rectified left camera as given for the refined one."""
-        before, now = turns_of(self.given, settings), turns_of(self.calibration, settings)
-        turned = make_transform(before.R_left @ now.R_left.T, np.zeros(3))
+    def poses(
+        self, given: Trajectory, settings: RectificationSettings, *, of_raw: bool = False
+    ) -> Trajectory:
+        """Return poses of the rectified left camera as given, or the raw one, for the refined."""
+        before = np.eye(3) if of_raw else turns_of(self.given, settings).R_left
+        now = turns_of(self.calibration, settings).R_left
+        turned = make_transform(before @ now.T, np.zeros(3))
         return replace(given, T_world_camera=given.T_world_camera @ turned)
+
+    def true_path(
+        self, source: StereoSource, settings: RectificationSettings
+    ) -> Trajectory | None:
+        """Return the true path of the rectified left camera of the refined rig, if it is known."""
+        if source.truth is None or source.truth.trajectory is None:
+            return None
+        return self.poses(source.truth.trajectory, settings, of_raw=source.truth_of_raw)
 
     def depth_percent(self, change: RigChange) -> tuple[float, float]:
         """Return by how much depth was off on average, and the standard deviation, in per cent.

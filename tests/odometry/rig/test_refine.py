@@ -10,7 +10,7 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.core.geometry.se3 import exp_so3, make_transform
-from recon.core.values import RectifiedCamera, Rig, StereoPair, Trajectory
+from recon.core.values import RectifiedCamera, Rig, SequenceTruth, StereoPair, Trajectory
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.rig.refine import (
     MIN_WINDOWS,
@@ -219,6 +219,13 @@ def test_known_poses_are_those_of_the_refined_rig(street):
     # The raw left camera is where it was.
     np.testing.assert_allclose(found[:, :3, :3] @ R, given.T_world_camera[:, :3, :3], atol=1e-12)
     np.testing.assert_array_equal(found[:, :3, 3], given.T_world_camera[:, :3, 3])
+    # The true path of a source is that of one or the other.
+    source = Plain()
+    assert rig.true_path(source, CONFIG.rectification) is None
+    for before, of_raw in ((refined, True), (camera, False)):
+        vars(source).update(truth=SequenceTruth(given), truth_of_raw=of_raw)
+        true = replace(rig, given=before).true_path(source, CONFIG.rectification)
+        np.testing.assert_array_equal(true.T_world_camera, found)
 
 
 class Plain(StereoSource):
