@@ -127,9 +127,7 @@ class RefinedRig:
         turned = make_transform(before @ now.T, np.zeros(3))
         return replace(given, T_world_camera=given.T_world_camera @ turned)
 
-    def true_path(
-        self, source: StereoSource, settings: RectificationSettings
-    ) -> Trajectory | None:
+    def true_path(self, source: StereoSource, settings: RectificationSettings) -> Trajectory | None:
         """Return the true path of the rectified left camera of the refined rig, if it is known."""
         if source.truth is None or source.truth.trajectory is None:
             return None
