@@ -64,6 +64,10 @@ SHARE: Final = "{:.3f}"
 CM: Final = "{:.1f} cm"
 MB: Final = "{:.0f} MB"
 MIDDLEBURY: Final = "recon evaluate middlebury $RECON_DATA/middlebury/MiddEval3/trainingQ --json"
+HALF_SIZE: Final = (
+    "recon evaluate middlebury $RECON_DATA/middlebury/MiddEval3/trainingH --json "
+    "--truth $RECON_DATA/middlebury/MiddEval3/trainingQ"
+)
 RIGS: Final = {
     "kitti_raw_0013": (D13, "13"),
     "sequence 06": (D06, "06"),
@@ -188,18 +192,25 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "middlebury": Table(
         {
-            "": f"{MIDDLEBURY} --matcher sad,sgm,opencv-bm,opencv-sgbm --out $OUT/plain",
+            "": f"{MIDDLEBURY} --matcher sad,sgm,fine,opencv-bm,opencv-sgbm --out $OUT/plain",
             ", padded": f"{MIDDLEBURY} --matcher opencv-bm,opencv-sgbm "
             "--set matching.opencv.pad=true --out $OUT/padded",
+            ", half size": f"{HALF_SIZE} --matcher sgm,fine --out $OUT/half",
+            ", half size, padded": f"{HALF_SIZE} --matcher opencv-sgbm "
+            "--set matching.opencv.pad=true --out $OUT/half-padded",
         },
         {"bad 1": "{:.1f} %", "bad 2": "{:.1f} %", "bad 4": "{:.1f} %", "mean error": "{:.1f} px"},
         rows_of.middlebury,
     ),
     "confidence": Table(
         {
-            folder: f"recon evaluate middlebury $RECON_DATA/middlebury/{folder} --matcher sad,sgm "
-            f"--json --out $OUT/{Path(folder).name}"
-            for folder in ("MiddEval3/trainingQ", "2003", "2005", "2006")
+            folder: f"recon evaluate middlebury $RECON_DATA/middlebury/{folder} "
+            f"--matcher {matchers} --json --out $OUT/{Path(folder).name}"
+            for folder, matchers in {
+                "MiddEval3/trainingQ": "sad,sgm,fine",
+                # `fine` was trained on scenes of the others.
+                **dict.fromkeys(("2003", "2005", "2006"), "sad,sgm"),
+            }.items()
         },
         {"calibration error": SHARE, "AUSE": SHARE}
         | {"within one sigma": "{:.0f} %", "within two": "{:.0f} %"},

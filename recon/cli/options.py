@@ -61,7 +61,7 @@ Set = Annotated[
 Matcher = Annotated[
     str | None,
     setting(
-        "matching.matcher", "sad, sgm, opencv-bm, opencv-sgbm, onnx or plug-in.", default="sad"
+        "matching.matcher", "sad, sgm, fine, opencv-bm, opencv-sgbm, onnx, plug-in.", default="sad"
     ),
 ]
 Json = Annotated[bool, option("Print the summary as JSON and nothing else.", "--json")]

@@ -101,11 +101,13 @@ REASON_COLOURS: Final[Mapping[Reason, Rgb]] = {
     Reason.BORDER: (70, 76, 84),
     Reason.SPECKLE: (240, 100, 180),
     Reason.EDGE: (0, 158, 115),
+    Reason.FILLED: (180, 190, 160),
 }
 REASON_LABELS: Final[Mapping[Reason, str]] = {
     **{reason: reason.name.lower().replace("_", " ") for reason in Reason},
     Reason.LEFT_RIGHT: "left-right check",
     Reason.EDGE: "flying edge",
+    Reason.FILLED: "filled by planes",
 }
 _GRID_IMAGE_PX: Final = 1500
 GRID_FREE: Final[Rgb] = (247, 249, 250)

@@ -3,7 +3,8 @@
 `frame.py` takes one pair through all of it, stage by stage, and makes points of disparities:
 
 - `rectify/rectifier.py`: both images are warped so that matching pixels share a row;
-- `match/registry.py`: the matchers by name; ours are `match/sad.py` and `match/sgm.py`.
+- `match/registry.py`: the matchers by name; ours are `match/sad.py`, `match/sgm.py` and
+  `match/fine.py`.
 
 The loops are in `kernels/`. `rectify/` also has what calibration and audit need of cameras: lenses,
 epipolar lines, matched features.

@@ -121,7 +121,7 @@ ASSUMED_SIGMA_PX: Final = 0.25  # standard deviation of matches whose matcher gi
 
 
 class Reason(IntEnum):
-    """Why a pixel has no disparity, or VALID if it has one."""
+    """Why a pixel has no disparity, or how it got one: VALID, or FILLED from planes around it."""
 
     VALID = 0
     LOW_TEXTURE = 1
@@ -132,6 +132,7 @@ class Reason(IntEnum):
     BORDER = 6
     SPECKLE = 7
     EDGE = 8
+    FILLED = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +143,8 @@ class Disparity:
         values: float32 (H, W), ``x_left - x_right`` in pixels; NaN = no match.
         confidence: float32 (H, W) in [0, 1]; 0 where ``values`` is NaN.
         sigma_px: float32 (H, W), standard deviation of ``values``; NaN where ``values`` is NaN.
-        reason: uint8 (H, W), a `Reason` for each pixel; VALID exactly where ``values`` is finite.
+        reason: uint8 (H, W), a `Reason` for each pixel; VALID or FILLED exactly where ``values`` is
+            finite.
     """
 
     values: Float32
@@ -155,7 +157,8 @@ class Disparity:
         for name, dtype in (("confidence", "f4"), ("sigma_px", "f4"), ("reason", "u1")):
             freeze(self, name, dtype, self.values.shape)
         # Compared with the enum member itself, numpy would use 64 bits and take ten times as long.
-        if not np.array_equal(self.valid, self.reason == np.uint8(Reason.VALID)):
+        has = self.reason == np.uint8(Reason.VALID)
+        if not np.array_equal(self.valid, has | (self.reason == np.uint8(Reason.FILLED))):
             raise ShapeError("Disparity.reason is VALID where values is NaN, or the reverse")
 
     @classmethod

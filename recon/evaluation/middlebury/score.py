@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.alignment import nearest_sorted
 from recon.core.values import (
     Disparity,
     DisparityMetrics,
@@ -22,8 +21,9 @@ from recon.core.values import (
     RectifiedCamera,
     StereoPair,
 )
-from recon.core.values.arrays import Float32, Float64, frozen_array
+from recon.core.values.arrays import Float32, Float64
 from recon.evaluation import disparity as errors
+from recon.stereo.match.holes import fill_holes
 
 # Pixels that are scored: those seen by both cameras, or occluded ones as well.
 MASKS: Final = {"nonocc": False, "all": True}
@@ -133,30 +133,6 @@ def dense_map(values: Float32) -> Float32:
     """
     filled = fill_holes(values)
     return np.where(np.isfinite(filled), filled, np.float32(0))
-
-
-def fill_holes(values: Float32) -> Float32:
-    """Give each pixel without a disparity that of the background beside it: float32 (H, W).
-
-    That is the smaller of the nearest values to the left and to the right, or the only one. A row
-    without any is copied from the nearest row with some, the upper one of two.
-
-    Ref: the background interpolation of A. Geiger et al., KITTI stereo development kit.
-    """
-    values = frozen_array("values", values, np.float32, (None, None))
-    known = np.isfinite(values)
-    background = np.fmin(_from_left(values), _from_left(values[:, ::-1])[:, ::-1])
-    filled = np.where(known, values, background)
-    rows = np.flatnonzero(known.any(axis=1))
-    return filled[rows[nearest_sorted(np.arange(len(filled)), rows)]] if rows.size else filled
-
-
-def _from_left(values: Float32) -> Float32:
-    """Return float32 (H, W): the nearest known value at or left of each; NaN = none."""
-    columns = np.where(np.isfinite(values), np.arange(values.shape[1], dtype=np.int32), -1)
-    last = np.maximum.accumulate(columns, axis=1)
-    there = np.take_along_axis(values, np.maximum(last, 0).astype(np.intp), axis=1)
-    return np.where(last >= 0, there, np.float32(np.nan))
 
 
 def evaluate_middlebury(

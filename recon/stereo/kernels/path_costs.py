@@ -11,7 +11,8 @@ correspondence", ECCV 1994.
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,6 +136,21 @@ def empty_cost_rows(columns: int, window: Window) -> CostRows:
         aligned((2 * window.rows_radius + 1, BLOCK, columns)),
         aligned((BLOCK, columns), np.uint16),
     )
+
+
+WriteCosts: TypeAlias = Callable[[tuple[int, int], int, int, UInt8], None]
+"""Writes the costs of columns ``(start, end)`` of rows ``top`` to ``bottom - 1`` to a ring, uint8
+(N, P, C), as `write_costs` does."""
+
+
+def window_costs(views: Views, window: Window, columns: int) -> WriteCosts:
+    """Return what writes the costs of a window, for at most so many columns at a time."""
+    rows = empty_cost_rows(columns, window)
+
+    def write(band: tuple[int, int], top: int, bottom: int, costs: UInt8) -> None:
+        write_costs(views, window, band, top, bottom, rows, costs)
+
+    return write
 
 
 @kernel

@@ -22,15 +22,7 @@ import numpy as np
 
 from recon.core.kernels.compiled import UInt8, kernel
 from recon.stereo.kernels.minima import Minima
-from recon.stereo.kernels.path_costs import (
-    CostRows,
-    Views,
-    Window,
-    aligned,
-    empty_cost_rows,
-    padded,
-    write_costs,
-)
+from recon.stereo.kernels.path_costs import WriteCosts, aligned, padded
 from recon.stereo.kernels.paths import (
     DOWN,
     UP,
@@ -110,31 +102,37 @@ def _band_scratch(scratch: Scratch, columns: int, paths: Paths) -> BandScratch:
 
 
 def semi_global_minima(
-    views: Views, window: Window, paths: Paths, strip: range, scratch: Scratch, minima: Minima
+    grey: UInt8,
+    write: WriteCosts,
+    radius: int,
+    paths: Paths,
+    strip: range,
+    scratch: Scratch,
+    minima: Minima,
 ) -> None:
     """Find the best candidate of each pixel of a strip of rows, in the left and the right view.
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the mean of the costs
     of the paths that end there. A path starts at the border of the image or, if that is nearer,
     ``overlap`` rows above the strip (from above), ``overlap`` rows below each block (from below) or
-    ``side_overlap`` columns beside each band (from the sides).
+    ``side_overlap`` columns beside each band (from the sides). ``radius`` is the half width of
+    what ``write`` reads around a pixel.
     """
-    width = views.grey.shape[1]
-    rows = empty_cost_rows(scratch.columns, window)
+    width = grey.shape[1]
     best = empty_best(scratch.columns, width, len(strip))
     minima.right_winner[strip.start : strip.stop] = paths.ndisp
     buffers = None
-    for band in bands_of(width, scratch.columns, window, paths):
+    for band in bands_of(width, scratch.columns, radius, paths):
         if buffers is None or padded(band.end - band.start) != buffers.costs.shape[2]:
             buffers = _band_scratch(scratch, padded(band.end - band.start), paths)
-        _search_band(views, window, paths, strip, band, buffers, rows, best, minima)
+        _search_band(grey, write, paths, strip, band, buffers, best, minima)
 
 
-def bands_of(width: int, columns: int, window: Window, paths: Paths) -> list[Band]:
+def bands_of(width: int, columns: int, radius: int, paths: Paths) -> list[Band]:
     """Divide an image into bands that overlap, each of at most so many columns."""
     if columns < width:
         # Together with the sides of its windows, a band fills whole vectors.
-        columns -= 2 * window.radius
+        columns -= 2 * radius
     overlap = paths.side_overlap
     bands, first = [], 0
     while first < width:
@@ -147,13 +145,12 @@ def bands_of(width: int, columns: int, window: Window, paths: Paths) -> list[Ban
 
 
 def _search_band(
-    views: Views,
-    window: Window,
+    grey: UInt8,
+    write: WriteCosts,
     paths: Paths,
     strip: range,
     band: Band,
     buffers: BandScratch,
-    rows: CostRows,
     best: Best,
     minima: Minima,
 ) -> None:
@@ -161,15 +158,15 @@ def _search_band(
     begin(paths, buffers.above)
     for first in range(top, strip.stop, ROWS):
         end = min(first + ROWS, strip.stop)
-        bottom = min(end + paths.overlap, len(views.grey))
-        write_costs(views, window, band[:2], known, bottom, rows, buffers.costs)
+        bottom = min(end + paths.overlap, len(grey))
+        write(band[:2], known, bottom, buffers.costs)
         known = bottom
-        _sweep_down(views.grey, paths, band, first, end, buffers)
+        _sweep_down(grey, paths, band, first, end, buffers)
         wanted = max(first, strip.start)
         if wanted < end:
             begin(paths, buffers.under)
             place = wanted - strip.start
-            _sweep_up(views.grey, paths, band, bottom, wanted, end, place, buffers, best, minima)
+            _sweep_up(grey, paths, band, bottom, wanted, end, place, buffers, best, minima)
 
 
 @kernel

@@ -3,5 +3,6 @@
 `protocol.py` has what every matcher gives, `search.py` what matchers over a range share. `sad.py`
 also finds a range where none is known, and rough disparities at half size; its costs are in
 `kernels/half_windows.py`, those of `sgm.py` in `kernels/path_costs.py`. Of both,
-`kernels/refine.py` checks what was found, and says why a pixel has no disparity.
+`kernels/refine.py` checks what was found, and says why a pixel has no disparity. `fine.py` adds
+costs that a network knows (`features.py`) and a search among planes (`kernels/planes.py`).
 """

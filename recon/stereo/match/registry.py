@@ -11,6 +11,7 @@ from recon.core.errors import SettingsError
 from recon.core.settings import Settings
 from recon.core.values import RectifiedPair
 from recon.stereo.match import protocol
+from recon.stereo.match.fine import FineMatcher, FineSettings
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher, name_of
@@ -21,6 +22,7 @@ from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
     "sad": SadMatcher,
     "sgm": SgmMatcher,
+    "fine": FineMatcher,
     "opencv-bm": lambda settings, _: OpencvMatcher(settings, semi_global=False),
     "opencv-sgbm": lambda settings, _: OpencvMatcher(settings, semi_global=True),
     "onnx": OnnxMatcher,
@@ -31,10 +33,11 @@ class MatchingSettings(Settings):
     """Which matcher, and the settings of each."""
 
     matcher: str | InstanceOf[Matcher] = "sad"
-    """Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one that an installed package
-    registers; in Python also a matcher of your own."""
+    """Name of the matcher: sad, sgm, fine, opencv-bm, opencv-sgbm, onnx, or one that an installed
+    package registers; in Python also a matcher of your own."""
     sad: SadSettings = SadSettings()
     sgm: SgmSettings = SgmSettings()
+    fine: FineSettings = FineSettings()
     opencv: OpencvSettings = OpencvSettings()
     onnx: OnnxSettings = OnnxSettings()
 

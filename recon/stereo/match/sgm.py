@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, Final
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, RectifiedPair
 from recon.stereo.kernels.minima import empty_minima
 from recon.stereo.kernels.path_costs import (
     CENSUS_RADIUS,
     Views,
     Window,
+    WriteCosts,
     empty_planes,
     scaled_window,
+    window_costs,
     write_views,
 )
 from recon.stereo.kernels.paths import Paths
 from recon.stereo.kernels.plane_minima import PARTS
-from recon.stereo.kernels.refine import REFINED_BYTES, refine_minima, refined_in
+from recon.stereo.kernels.refine import REFINED_BYTES, Rules, refine_minima, refined_in
 from recon.stereo.kernels.semi_global import (
     band_columns,
     empty_scratch,
@@ -31,16 +34,16 @@ from recon.stereo.kernels.semi_global import (
 )
 from recon.stereo.match import search as common
 
-_LEVELS: Final = 250  # largest path cost before rounding, which needs the rest of a byte
-_ODDS: Final = 2.4  # `Rules.odds`, fitted on MiddEval3; 2003, 2005 and 2006 were held out
+LEVELS: Final = 250  # largest path cost before rounding, which needs the rest of a byte
+ODDS: Final = 2.4  # `Rules.odds`, fitted on MiddEval3; 2003, 2005 and 2006 were held out
 _STRIP_ROWS: Final = 192
 _SIDE_OVERLAP: Final = 16  # columns shared by bands: horizontal and diagonal paths start there
-_COST_CAP: Final = 14  # largest difference of gradients that counts at one pixel
+COST_CAP: Final = 14  # largest difference of gradients that counts at one pixel
 # Of one pixel: of its gradient and of all bits of the census.
-_LARGEST_COST: Final = _COST_CAP + (2 * CENSUS_RADIUS + 1) ** 2 - 1
+LARGEST_COST: Final = COST_CAP + (2 * CENSUS_RADIUS + 1) ** 2 - 1
 # Where the image changes by more along a path, large steps are cheaper: surfaces end there.
-_EDGE_GREY_LEVELS: Final = 12
-_EDGE_P2_SHARE: Final = 0.25  # share of P2 that is left there
+EDGE_GREY_LEVELS: Final = 12
+EDGE_P2_SHARE: Final = 0.25  # share of P2 that is left there
 _OVERLAP_ROWS: Final = 4  # rows that strips share, for vertical paths to start in
 _MEMORY_BYTES: Final = 1536 << 20  # what strips that are worked on at once need together, at most
 
@@ -82,47 +85,77 @@ class SgmMatcher:
     def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
-        self._scratch = common.ScratchPool(empty_scratch, self._threads)
         self._planes = common.ScratchPool(empty_planes, 1)
-        self._minima = common.ScratchPool(empty_minima, 1)
-        self._results = common.ResultPool(2)
+        self._search = PathSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair."""
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
         window, size = _window(s), pair.left.shape
-        paths = _paths(s, ndisp, window.levels)
+        paths = paths_of(ndisp, s.min_disparity_px, s.p1, s.p2, window.levels)
         # A cost is about so many times the mean cost of a pixel.
-        rules = common.rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=_ODDS)
-        results = self._results.lend(REFINED_BYTES * pair.left.size)
-        refined = refined_in(results, *size)
+        rules = common.rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=ODDS)
+        with self._planes.borrow(*size, window.radius, ndisp) as planes:
+            views = Views(pair.left, *planes)
+            prepare_views(pair, views, window.radius, s.min_disparity_px, self._threads)
+            costs = partial(window_costs, views, window)
+            return self._search.run(pair, costs, window.radius, paths, rules)
 
-        def prepare(strip: range) -> None:
-            write_views(pair.right, window.radius, s.min_disparity_px, strip, views)
+
+def prepare_views(
+    pair: RectifiedPair, views: Views, radius: int, minimum: int, threads: int
+) -> None:
+    """Write the planes of both images, in strips of rows."""
+    with ThreadPoolExecutor(threads) as pool:
+        common.in_strips(
+            pool,
+            threads,
+            lambda rows: write_views(pair.right, radius, minimum, rows, views),
+            len(pair.left),
+        )
+
+
+class PathSearch:
+    """Finds the best candidates along paths, whatever writes the costs of the pixels."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._scratch = common.ScratchPool(empty_scratch, threads)
+        self._minima = common.ScratchPool(empty_minima, 1)
+        self._results = common.ResultPool(2)
+
+    def run(
+        self,
+        pair: RectifiedPair,
+        costs: Callable[[int], WriteCosts],
+        radius: int,
+        paths: Paths,
+        rules: Rules,
+    ) -> Disparity:
+        """Return the disparity, checked and refined.
+
+        ``costs`` makes, for bands of so many columns, what writes costs of a reach of ``radius``.
+        """
+        size = pair.left.shape
+        refined = refined_in(self._results.lend(REFINED_BYTES * pair.left.size), *size)
 
         def search(strip: range) -> None:
-            with self._scratch.borrow(pair.camera.width_px, paths) as scratch:
-                semi_global_minima(views, window, paths, strip, scratch, minima)
-            enough = common.no_texture(pair.camera.width_px, pair.valid, strip)
+            with self._scratch.borrow(size[1], paths) as scratch:
+                write = costs(scratch.columns)
+                semi_global_minima(pair.left, write, radius, paths, strip, scratch, minima)
+            enough = common.no_texture(size[1], pair.valid, strip)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
-        strips, at_once = self._strips(pair.camera, paths)
-        with (
-            self._planes.borrow(*size, window.radius, ndisp) as planes,
-            self._minima.borrow(*size) as minima,
-            ThreadPoolExecutor(at_once) as pool,
-        ):
-            views = Views(pair.left, *planes)
-            list(pool.map(prepare, strips))
+        strips, at_once = self._strips(size[0], size[1], paths)
+        with self._minima.borrow(*size) as minima, ThreadPoolExecutor(at_once) as pool:
             list(pool.map(search, strips))
             return common.finish(refined, pool, at_once)
 
-    def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
-        height = camera.height_px
+    def _strips(self, height: int, width: int, paths: Paths) -> tuple[list[range], int]:
         # An even number of strips keeps two cores busy to the end.
         rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))
-        bytes_each = scratch_bytes(band_columns(camera.width_px, paths), paths)
+        bytes_each = scratch_bytes(band_columns(width, paths), paths)
         at_once = min(self._threads, _MEMORY_BYTES // bytes_each)
         strips = [range(y, min(y + rows, height)) for y in range(0, height, rows)]
         return strips, max(1, at_once)
@@ -133,23 +166,23 @@ def _window(settings: SgmSettings) -> Window:
     return scaled_window(
         radius=s.window_px // 2,
         rows_radius=s.window_px // 2,
-        gradient_cap=_COST_CAP,
-        largest=_LARGEST_COST,
-        levels=_LEVELS / (_LARGEST_COST + s.p1 + s.p2),
+        gradient_cap=COST_CAP,
+        largest=LARGEST_COST,
+        levels=LEVELS / (LARGEST_COST + s.p1 + s.p2),
     )
 
 
-def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
-    s = settings
-    p2 = round(s.p2 * levels)
-    p1 = max(1, round(s.p1 * levels))
+def paths_of(ndisp: int, minimum: int, p1: float, p2: float, levels: float) -> Paths:
+    """Return candidates and penalties, ``levels`` steps of a path cost for one of a pixel's."""
+    large = round(p2 * levels)
+    small = max(1, round(p1 * levels))
     return Paths(
         ndisp=ndisp,
-        minimum=s.min_disparity_px,
-        p1=p1,
-        p2=p2,
-        p2_at_edge=max(p1, round(p2 * _EDGE_P2_SHARE)),
-        edge=_EDGE_GREY_LEVELS,
+        minimum=minimum,
+        p1=small,
+        p2=large,
+        p2_at_edge=max(small, round(large * EDGE_P2_SHARE)),
+        edge=EDGE_GREY_LEVELS,
         overlap=_OVERLAP_ROWS,
         side_overlap=_SIDE_OVERLAP,
     )

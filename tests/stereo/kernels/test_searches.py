@@ -21,6 +21,7 @@ from recon.stereo.kernels.path_costs import (
     Window,
     empty_planes,
     scaled_window,
+    window_costs,
     write_planes,
     write_views,
 )
@@ -346,7 +347,10 @@ def sweep(views, window, paths, strips=1, columns=None):
         if columns:
             memory = np.zeros(semi_global.scratch_bytes(columns, paths), np.uint8)
             scratch = semi_global.Scratch(memory, columns)
-        semi_global.semi_global_minima(views, window, paths, range(first, end), scratch, minima)
+        write = window_costs(views, window, scratch.columns)
+        semi_global.semi_global_minima(
+            views.grey, write, window.radius, paths, range(first, end), scratch, minima
+        )
     return minima
 
 
@@ -393,7 +397,7 @@ def test_bands_equal_the_reference_that_begins_at_sides(minimum, side_overlap):
     window = scaled_window(2, 2, 16, 40, 3.0)
     views = make_views((left, right), window, paths)
     for strips, columns in ((1, 64), (2, 128)):
-        bands = semi_global.bands_of(300, columns, window, paths)
+        bands = semi_global.bands_of(300, columns, window.radius, paths)
         expected = semi_global_minima_reference(views, window, paths, bands)
         assert len(bands) > 1
         assert_equal(sweep(views, window, paths, strips, columns), expected)

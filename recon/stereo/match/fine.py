@@ -1,0 +1,239 @@
+"""The fine matcher: learned features, paths, then a search among planes; for pairs that deserve it.
+
+A network of some 100,000 weights describes each pixel by what is around it, in the image and at
+half and a quarter of its size. How unlike two descriptions are is added to the costs of `sgm`, and
+paths are followed as there. What they find is where a search among planes starts
+(`kernels/planes.py`): where windows see nothing, planes go on from where they do.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from recon.core.values import Disparity, Reason, RectifiedPair
+from recon.core.values.arrays import Float32, UInt8
+from recon.stereo.kernels import planes as kernels
+from recon.stereo.kernels.path_costs import (
+    Views,
+    Window,
+    WriteCosts,
+    empty_planes,
+    padded,
+    scaled_window,
+    window_costs,
+)
+from recon.stereo.kernels.plane_minima import PARTS
+from recon.stereo.kernels.refine import SIGMA_LARGEST_PX
+from recon.stereo.kernels.similarity import Blend, add_unlikeness
+from recon.stereo.match import search as common
+from recon.stereo.match import sgm
+from recon.stereo.match.features import Describer, fine_grey, load_network, rows_at_once
+from recon.stereo.match.plane_search import FAR_FIT_PX, SAME_SURFACE_PX, search_planes
+
+# Costs of one pixel, in units of those of `sgm`.
+_LEARNED: Final = 14.0  # of features that are orthogonal; added to the costs of `sgm`
+_LARGEST_LEARNED: Final = 17.0
+_LARGEST: Final = _LARGEST_LEARNED + sgm.LARGEST_COST
+_P1, _P2 = 16.0, 58.0  # penalties of paths from disparity to disparity
+_PER_PX, _MOST = 50.0, 140.0  # and from plane to plane
+_EDGE_SHARE: Final = 0.15  # of the latter that is left where the image has an edge
+_RADIUS: Final = 1  # of windows; planes do what larger ones do
+_LEVELS: Final = sgm.LEVELS / (_LARGEST + _P2)  # steps of a cost in a byte
+# Fitted on MiddEval3 at quarter and half size: of what planes and paths agree on, at least and by
+# the square of the confidence of the paths, and of what only planes explain.
+_AGREED_CONFIDENCE: Final = (0.53, 0.46)
+_FILLED_CONFIDENCE: Final = np.float32(0.43)
+_VOLUME_BYTES: Final = 448 << 20  # at most; larger images are matched in strips of rows
+_OVERLAP_ROWS: Final = 64  # of strips
+
+
+class FineSettings(common.MeasuredSettings):
+    """Settings of the fine matcher."""
+
+
+class FineMatcher:
+    """Matches for quality, in seconds per megapixel; a `Matcher`.
+
+    Pixels that only planes around them explain are FILLED. ``threads`` (None = all cores) has no
+    effect on the result.
+    """
+
+    def __init__(self, settings: FineSettings, threads: int | None = None) -> None:
+        self._settings = settings
+        self._threads = max(1, threads or os.cpu_count() or 1)
+        self._paths = sgm.PathSearch(self._threads)
+        self._network: Any = None
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Match one rectified pair."""
+        height, width = pair.left.shape
+        ndisp = self._settings.ndisp_within(pair.camera)
+        rows = max(_VOLUME_BYTES // (padded(width) * ndisp), 4 * _OVERLAP_ROWS)
+        if height <= rows:
+            return self._match(pair, ndisp)
+        parts = []
+        for first, last, start, end in _strips(height, rows):
+            part = self._match(_rows(pair, start, end), ndisp)
+            kept = slice(first - start, last - start)
+            parts.append(
+                (part.values[kept], part.confidence[kept], part.sigma_px[kept], part.reason[kept])
+            )
+        return Disparity(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def _match(self, pair: RectifiedPair, ndisp: int) -> Disparity:
+        s = self._settings
+        paths = sgm.paths_of(ndisp, s.min_disparity_px, _P1, _P2, _LEVELS)
+        rules = common.rules_of(s, ndisp, max(1, round(PARTS * _LEVELS)), odds=sgm.ODDS)
+        volume = self._volume(pair, ndisp)
+        seen = self._paths.run(pair, partial(_copy_costs, volume), 0, paths, rules)
+        if not seen.valid.any():
+            return seen
+        values = search_planes(pair, seen, volume, _changes(s.min_disparity_px), self._threads)
+        return _judged(pair, seen, values)
+
+    def _volume(self, pair: RectifiedPair, ndisp: int) -> UInt8:
+        """Return the costs of all pixels, uint8 (H, P, at least W)."""
+        minimum, (height, width) = self._settings.min_disparity_px, pair.left.shape
+        window = _window()
+        views = Views(pair.left, *empty_planes(height, width, window.radius, ndisp))
+        sgm.prepare_views(pair, views, window.radius, minimum, self._threads)
+        volume = np.empty((height, ndisp, padded(width)), np.uint8)
+        blend = Blend(
+            float(_LEARNED * _LEVELS),
+            float(_LARGEST_LEARNED * _LEVELS),
+            float(int(_LARGEST * _LEVELS)),
+        )
+        if self._network is None:
+            self._network = load_network()
+        left, right = fine_grey(pair.left, pair.left_rgb), fine_grey(pair.right, pair.right_rgb)
+        level = float(left.mean())
+        views_of = [Describer(self._network, image, level) for image in (left, right)]
+        with ThreadPoolExecutor(self._threads) as pool:
+
+            def compare(rows: range) -> None:
+                write = window_costs(views, window, volume.shape[2])
+                write((0, width), rows.start, rows.stop, volume)
+
+            common.in_strips(pool, self._threads, compare, height)
+            for first in range(0, height, at_once := rows_at_once(width)):
+                end = min(first + at_once, height)
+                ours, others = (view.describe(first, end) for view in views_of)
+                costs = volume[first:end]
+
+                def add(
+                    rows: range,
+                    ours: Float32 = ours,
+                    others: Float32 = others,
+                    costs: UInt8 = costs,
+                ) -> None:
+                    add_unlikeness(ours, others, minimum, blend, rows.start, rows.stop, costs)
+
+                common.in_strips(pool, self._threads, add, end - first)
+        return volume
+
+
+def _changes(minimum: int) -> kernels.Changes:
+    return kernels.Changes(
+        per_px=_PER_PX * _LEVELS,
+        most=_MOST * _LEVELS,
+        most_at_edge=_EDGE_SHARE * _MOST * _LEVELS,
+        edge=sgm.EDGE_GREY_LEVELS,
+        outside=float(sgm.LEVELS),
+        minimum=minimum,
+    )
+
+
+def _window() -> Window:
+    return scaled_window(
+        radius=_RADIUS,
+        rows_radius=_RADIUS,
+        gradient_cap=sgm.COST_CAP,
+        largest=sgm.LARGEST_COST,
+        levels=_LEVELS,
+    )
+
+
+def _copy_costs(volume: UInt8, _columns: int) -> WriteCosts:
+    """Return what copies the costs of a volume (H, P, at least W)."""
+
+    def write(band: tuple[int, int], top: int, bottom: int, costs: UInt8) -> None:
+        start, end = band
+        for y in range(top, bottom):
+            costs[y % len(costs), :, : end - start] = volume[y, :, start:end]
+
+    return write
+
+
+def _strips(height: int, rows: int) -> list[tuple[int, int, int, int]]:
+    """Divide an image into strips: rows that are kept, ``first`` to ``last``, of those matched."""
+    strips, first = [], 0
+    while first < height:
+        start = max(0, first - _OVERLAP_ROWS)
+        end = min(start + rows, height)
+        last = end if end == height else end - _OVERLAP_ROWS
+        strips.append((first, last, start, end))
+        first = last
+    return strips
+
+
+def _rows(pair: RectifiedPair, start: int, end: int) -> RectifiedPair:
+    names = ("left", "right", "left_rgb", "right_rgb", "valid")
+    images = {name: getattr(pair, name) for name in names}
+    rows: dict[str, Any] = {
+        name: None if image is None else image[start:end] for name, image in images.items()
+    }
+    return replace(pair, camera=replace(pair.camera, height_px=end - start), **rows)
+
+
+def _judged(pair: RectifiedPair, seen: Disparity, values: Float32) -> Disparity:
+    """Return the disparity with reasons, confidence and uncertainty.
+
+    That a plane and what was seen agree makes both more probable than either. A disparity that
+    only planes explain may as well be that of any surface around it.
+    """
+    height, width = values.shape
+    hidden = np.empty(values.shape, np.bool_)
+    kernels.mark_hidden(values, SAME_SURFACE_PX, 0, height, hidden)
+    there = np.arange(width, dtype=np.float32) - values
+    border = (there < -0.5) | (there > width - 0.5)
+    if pair.valid is not None:
+        border |= ~pair.valid
+    with np.errstate(invalid="ignore"):
+        agree = seen.valid & (np.abs(values - seen.values) <= SAME_SURFACE_PX)
+    # What both views agree on is not hidden, though a plane beside it may reach too far.
+    hidden = (hidden | (seen.reason == np.uint8(Reason.OCCLUDED))) & ~agree
+    reason = np.where(agree, np.uint8(Reason.VALID), np.uint8(Reason.FILLED))
+    reason[hidden], reason[border] = np.uint8(Reason.OCCLUDED), np.uint8(Reason.BORDER)
+    least, more = _AGREED_CONFIDENCE
+    sure = np.float32(least) + np.float32(more) * seen.confidence**2
+    none, nan = hidden | border, np.float32(np.nan)
+    spread = _spread(np.where(agree & ~none, values, nan))
+    return Disparity(
+        values=np.where(none, nan, values),
+        confidence=np.where(none, np.float32(0), np.where(agree, sure, _FILLED_CONFIDENCE)),
+        sigma_px=np.where(none, nan, np.where(agree, seen.sigma_px, spread)),
+        reason=reason,
+    )
+
+
+def _spread(values: Float32) -> Float32:
+    """Return the standard deviation of a disparity that is anywhere among those around it.
+
+    float32 (H, W); of a uniform distribution from the least to the largest value around a pixel,
+    and at least that of a flat minimum. Where none is around, of the whole map.
+    """
+    known = np.isfinite(values)
+    side = np.ones((2 * FAR_FIT_PX + 1,) * 2, np.uint8)
+    high = cv2.dilate(np.where(known, values, np.float32(-np.inf)), side)
+    low = cv2.erode(np.where(known, values, np.float32(np.inf)), side)
+    everywhere = float(np.ptp(values[known])) if known.any() else 0.0
+    wide = np.where(high >= low, high - low, np.float32(everywhere))
+    sigma = np.maximum(wide / np.sqrt(12), SIGMA_LARGEST_PX)
+    return np.asarray(sigma, dtype=np.float32)

@@ -1,0 +1,189 @@
+"""What the fine matcher promises: slants, plain areas, edges, reasons, pieces, memory."""
+
+import subprocess
+import sys
+from dataclasses import fields, replace
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.commands.evaluate_middlebury import run_middlebury
+from recon.core.errors import MatchingError
+from recon.core.values import Disparity, Reason, RectifiedPair
+from recon.io.middlebury import stand_in_camera
+from recon.stereo.match import fine, sgm
+from recon.stereo.match.features import Describer, fine_grey, load_network
+from recon.stereo.match.fine import FineMatcher, FineSettings
+
+HEIGHT, WIDTH = 120, 240
+SETTINGS = FineSettings(ndisp=48)
+
+
+def rendered(truth: np.ndarray, texture: np.ndarray, noise: float = 1.0) -> RectifiedPair:
+    """A surface whose disparity is given on the grid of the right view, with its texture."""
+    y, x = np.mgrid[: truth.shape[0], : truth.shape[1]].astype(np.float32)
+    left = texture[:, : truth.shape[1]]
+    right = cv2.remap(texture, x + truth.astype(np.float32), y, cv2.INTER_CUBIC)
+    rng = np.random.default_rng(3)
+    views = [
+        np.clip(np.rint(view + rng.normal(0, noise, view.shape)), 0, 255).astype(np.uint8)
+        for view in (left, right)
+    ]
+    return RectifiedPair(*views, stand_in_camera(*truth.shape[::-1]))
+
+
+def cloth(seed: int = 0, contrast: float = 25.0) -> np.ndarray:
+    grey = np.random.default_rng(seed).normal(size=(HEIGHT, WIDTH + 64))
+    grey = cv2.GaussianBlur(grey, (0, 0), 1.2)
+    return (120 + contrast * grey / grey.std()).astype(np.float32)
+
+
+def ground() -> np.ndarray:
+    """Disparity of a plane that comes nearer with each row, the same in both views."""
+    return np.broadcast_to(4 + np.arange(HEIGHT)[:, None] / 3, (HEIGHT, WIDTH))
+
+
+def match(pair: RectifiedPair, threads: int | None = None, **settings: int) -> Disparity:
+    return FineMatcher(FineSettings(**{"ndisp": 48, **settings}), threads).match(pair)
+
+
+def test_slanted_ground_is_complete_and_right_to_a_fraction():
+    truth = ground()
+    found = match(rendered(truth, cloth(contrast=8)))
+    error = np.abs(found.values - truth)[6:-6, 60:-6]
+    assert np.isfinite(error).mean() > 0.97
+    assert np.nanmedian(error) < 0.15
+    assert (error > 1).mean() < 0.02
+
+
+def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
+    truth, texture = ground(), cloth()
+    texture[40:80, 120:180] = 120
+    pair = rendered(truth, texture, noise=1.5)
+    found = match(pair)
+    plain = np.s_[45:75, 125:140]  # seen without texture in both views
+    error = np.abs(found.values - truth)
+    assert (error[plain] < 1).mean() > 0.85
+    filled = found.reason == Reason.FILLED
+    assert filled[45:75, 125:140].mean() > filled[85:, 60:].mean()
+    only = sgm.SgmMatcher(sgm.SgmSettings(ndisp=48)).match(pair)
+    assert (np.abs(only.values - truth)[plain] < 1).mean() < (error[plain] < 1).mean()
+    # Of what only planes explain less is promised.
+    seen = found.reason == Reason.VALID
+    assert np.median(found.sigma_px[filled]) > 2 * np.median(found.sigma_px[seen])
+    assert np.median(found.confidence[filled]) < np.median(found.confidence[seen])
+
+
+def square_before_wall() -> tuple[RectifiedPair, np.ndarray]:
+    """A square (disparity 20) before a wall (4), and the mask of its half shadow."""
+    wall, square = cloth(1)[:, : WIDTH + 8], cloth(2)[:60, :70]
+    left, right = wall[:, :WIDTH].copy(), wall[:, 4 : WIDTH + 4].copy()
+    left[30:90, 110:180] = square
+    right[30:90, 90:160] = square
+    hidden = np.zeros(left.shape, bool)
+    hidden[30:90, 94:110] = True
+    views = [np.rint(view).astype(np.uint8) for view in (left, right)]
+    return RectifiedPair(*views, stand_in_camera(WIDTH, HEIGHT)), hidden
+
+
+def test_edges_are_where_the_image_has_them_and_the_half_shadow_is_occluded():
+    pair, hidden = square_before_wall()
+    found = match(pair)
+    assert (found.reason[35:85, 96:108] == Reason.OCCLUDED).mean() > 0.7
+    inside = found.values[33:87, 113:177]
+    assert (np.abs(inside - 20) < 0.5).mean() > 0.99
+    outside = np.ones(hidden.shape, bool)
+    outside[27:93, 91:183] = outside[:, :40] = False
+    assert (np.abs(found.values[outside] - 4) < 0.5).mean() > 0.99
+
+
+def test_pixels_without_an_image_or_beyond_the_right_one_are_border():
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[:, 150:160] = False
+    found = match(replace(rendered(np.full((HEIGHT, WIDTH), 20.0), cloth()), valid=valid))
+    assert (found.reason[:, 150:160] == Reason.BORDER).all()
+    assert (found.reason[:, :15] == Reason.BORDER).mean() > 0.9
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (2, 3), (40, 60)])
+@pytest.mark.parametrize("level", [0, 255])
+def test_where_nothing_is_seen_nothing_is_filled(shape, level):
+    grey = np.full(shape, level, np.uint8)
+    found = match(RectifiedPair(grey, grey, stand_in_camera(*shape[::-1])))
+    assert found.values.shape == shape
+    assert np.isnan(found.values).all()
+
+
+def test_ranges_of_either_sign_are_searched_and_one_outside_is_refused():
+    pair = rendered(np.full((HEIGHT, WIDTH), 9.0), cloth())
+    swapped = replace(pair, left=pair.right, right=pair.left)
+    found = match(swapped, min_disparity_px=-20, ndisp=40)
+    assert (np.abs(found.values + 9)[10:-10, 30:-30] < 0.5).mean() > 0.98
+    with pytest.raises(MatchingError, match="no disparity of the range"):
+        match(pair, min_disparity_px=WIDTH)
+
+
+def test_colour_and_threads_and_strips():
+    pair = rendered(ground(), cloth())
+    one, two = match(pair, threads=1), match(pair, threads=2)
+    for field in fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
+    left, right = (np.repeat(view[..., None], 3, 2) for view in (pair.left, pair.right))
+    coloured = match(replace(pair, left_rgb=left, right_rgb=right))
+    assert np.nanmedian(np.abs(coloured.values - one.values)) < 0.02
+    tall = RectifiedPair(
+        *(np.tile(view, (4, 1)) for view in (pair.left, pair.right)),
+        stand_in_camera(WIDTH, 4 * HEIGHT),
+    )
+    whole = match(tall)
+    with patch.object(fine, "_VOLUME_BYTES", 1):
+        strips = match(tall)
+    assert strips.values.shape == whole.values.shape
+    assert np.nanmedian(np.abs(strips.values - whole.values)) < 0.02
+    assert (strips.valid == whole.valid).mean() > 0.97
+
+
+def test_descriptions_are_of_unit_length_and_the_same_in_pieces():
+    image = fine_grey(rendered(ground(), cloth()).left, None)
+    described = Describer(load_network(), image, float(image.mean()))
+    whole = described.describe(0, 97)
+    assert whole.shape == (97, 48, WIDTH)
+    np.testing.assert_allclose(np.linalg.norm(whole, axis=1), 1, atol=1e-5)
+    parts = np.concatenate(
+        [described.describe(first, min(first + 32, 97)) for first in range(0, 97, 32)]
+    )
+    np.testing.assert_allclose(parts, whole, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_memory_of_a_large_pair_is_bounded():
+    code = """
+import resource
+import numpy as np
+from recon.io.middlebury import stand_in_camera
+from recon.stereo.match.fine import FineMatcher, FineSettings
+from recon.core.values import RectifiedPair
+grey = np.random.default_rng(0).integers(0, 256, (2000, 3000), dtype=np.uint8)
+pair = RectifiedPair(grey, np.roll(grey, -40, 1), stand_in_camera(3000, 2000))
+FineMatcher(FineSettings(ndisp=300), threads=2).match(pair)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 100e3 < int(done.stdout) < 2.5e6  # kilobytes
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_half_size_scenes_are_better_than_those_of_sgm(recon_data, tmp_path):
+    scenes = recon_data / "middlebury" / "MiddEval3"
+    figures = run_middlebury(
+        scenes / "trainingH",
+        matchers=["sgm", "fine"],
+        truth=scenes / "trainingQ",
+        out=tmp_path,
+    )
+    for limit, ratio in (("1", 0.9), ("2", 0.85)):
+        each = [figures["weighted"][n]["nonocc"]["dense"]["bad"][limit] for n in ("sgm", "fine")]
+        assert 0.3 * each[0] < each[1] < ratio * each[0]
