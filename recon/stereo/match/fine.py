@@ -233,7 +233,7 @@ def _spread(values: Float32) -> Float32:
     side = np.ones((2 * FAR_FIT_PX + 1,) * 2, np.uint8)
     high = cv2.dilate(np.where(known, values, np.float32(-np.inf)), side)
     low = cv2.erode(np.where(known, values, np.float32(np.inf)), side)
-    everywhere = float(np.ptp(values[known])) if known.any() else 0.0
-    wide = np.where(high >= low, high - low, np.float32(everywhere))
+    wide = np.full_like(high, np.ptp(values[known]) if known.any() else 0)
+    np.subtract(high, low, out=wide, where=high >= low)
     sigma = np.maximum(wide / np.sqrt(12), SIGMA_LARGEST_PX)
     return np.asarray(sigma, dtype=np.float32)
