@@ -50,6 +50,7 @@ _LEVELS: Final = sgm.LEVELS / (_LARGEST + _P2)  # steps of a cost in a byte
 # the square of the confidence of the paths, and of what only planes explain.
 _AGREED_CONFIDENCE: Final = (0.53, 0.46)
 _FILLED_CONFIDENCE: Final = np.float32(0.43)
+_SHADOW_PX: Final = 5  # what is hidden fills the larger part of such a square
 _VOLUME_BYTES: Final = 448 << 20  # at most; larger images are matched in strips of rows
 _OVERLAP_ROWS: Final = 64  # of strips
 
@@ -208,7 +209,9 @@ def _judged(pair: RectifiedPair, seen: Disparity, values: Float32) -> Disparity:
     with np.errstate(invalid="ignore"):
         agree = seen.valid & (np.abs(values - seen.values) <= SAME_SURFACE_PX)
     # What both views agree on is not hidden, though a plane beside it may reach too far.
-    hidden = (hidden | (seen.reason == np.uint8(Reason.OCCLUDED))) & ~agree
+    shadow = (seen.reason == np.uint8(Reason.OCCLUDED)).astype(np.uint8)
+    # Single pixels are noise, of what is plain.
+    hidden = (hidden | (cv2.medianBlur(shadow, _SHADOW_PX) > 0)) & ~agree
     reason = np.where(agree, np.uint8(Reason.VALID), np.uint8(Reason.FILLED))
     reason[hidden], reason[border] = np.uint8(Reason.OCCLUDED), np.uint8(Reason.BORDER)
     least, more = _AGREED_CONFIDENCE
