@@ -159,7 +159,9 @@ class Disparity:
         # Compared with the enum member itself, numpy would use 64 bits and take ten times as long.
         has = self.reason == np.uint8(Reason.VALID)
         if not np.array_equal(self.valid, has | (self.reason == np.uint8(Reason.FILLED))):
-            raise ShapeError("Disparity.reason is VALID where values is NaN, or the reverse")
+            raise ShapeError(
+                "Disparity.reason is FILLED or VALID where values is NaN, or the reverse"
+            )
 
     @classmethod
     def from_values(

@@ -133,12 +133,16 @@ def bands_of(width: int, columns: int, radius: int, paths: Paths) -> list[Band]:
     if columns < width:
         # Together with the sides of its windows, a band fills whole vectors.
         columns -= 2 * radius
-    overlap = paths.side_overlap
+    return divided(width, columns, paths.side_overlap)
+
+
+def divided(length: int, most: int, overlap: int) -> list[Band]:
+    """Divide columns (or rows) into bands of at most so many, which share twice the overlap."""
     bands, first = [], 0
-    while first < width:
+    while first < length:
         start = max(first - overlap, 0)
-        end = min(start + columns, width)
-        last = end if end == width else end - overlap
+        end = min(start + most, length)
+        last = end if end == length else end - overlap
         bands.append(Band(start, end, first, last))
         first = last
     return bands

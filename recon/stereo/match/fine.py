@@ -22,15 +22,16 @@ from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.kernels import planes as kernels
 from recon.stereo.kernels.path_costs import (
     Views,
-    Window,
     WriteCosts,
     empty_planes,
     padded,
     scaled_window,
     window_costs,
+    write_views,
 )
 from recon.stereo.kernels.plane_minima import PARTS
 from recon.stereo.kernels.refine import SIGMA_LARGEST_PX
+from recon.stereo.kernels.semi_global import divided
 from recon.stereo.kernels.similarity import Blend, add_unlikeness
 from recon.stereo.match import search as common
 from recon.stereo.match import sgm
@@ -46,6 +47,18 @@ _PER_PX, _MOST = 50.0, 140.0  # and from plane to plane
 _EDGE_SHARE: Final = 0.15  # of the latter that is left where the image has an edge
 _RADIUS: Final = 1  # of windows; planes do what larger ones do
 _LEVELS: Final = sgm.LEVELS / (_LARGEST + _P2)  # steps of a cost in a byte
+_WINDOW: Final = scaled_window(
+    radius=_RADIUS,
+    rows_radius=_RADIUS,
+    gradient_cap=sgm.COST_CAP,
+    largest=sgm.LARGEST_COST,
+    levels=_LEVELS,
+)
+_BLEND: Final = Blend(
+    learned=_LEARNED * _LEVELS,
+    largest=_LARGEST_LEARNED * _LEVELS,
+    top=float(int(_LARGEST * _LEVELS)),
+)
 # Fitted on MiddEval3 at quarter and half size: of what planes and paths agree on, at least and by
 # the square of the confidence of the paths, and of what only planes explain.
 _AGREED_CONFIDENCE: Final = (0.53, 0.46)
@@ -80,9 +93,9 @@ class FineMatcher:
         if height <= rows:
             return self._match(pair, ndisp)
         parts = []
-        for first, last, start, end in _strips(height, rows):
-            part = self._match(_rows(pair, start, end), ndisp)
-            kept = slice(first - start, last - start)
+        for strip in divided(height, rows, _OVERLAP_ROWS):
+            part = self._match(_rows(pair, strip.start, strip.end), ndisp)
+            kept = slice(strip.first - strip.start, strip.last - strip.start)
             parts.append(
                 (part.values[kept], part.confidence[kept], part.sigma_px[kept], part.reason[kept])
             )
@@ -102,42 +115,35 @@ class FineMatcher:
     def _volume(self, pair: RectifiedPair, ndisp: int) -> UInt8:
         """Return the costs of all pixels, uint8 (H, P, at least W)."""
         minimum, (height, width) = self._settings.min_disparity_px, pair.left.shape
-        window = _window()
-        views = Views(pair.left, *empty_planes(height, width, window.radius, ndisp))
-        sgm.prepare_views(pair, views, window.radius, minimum, self._threads)
+        views = Views(pair.left, *empty_planes(height, width, _RADIUS, ndisp))
         volume = np.empty((height, ndisp, padded(width)), np.uint8)
-        blend = Blend(
-            float(_LEARNED * _LEVELS),
-            float(_LARGEST_LEARNED * _LEVELS),
-            float(int(_LARGEST * _LEVELS)),
-        )
         if self._network is None:
             self._network = load_network()
         left, right = fine_grey(pair.left, pair.left_rgb), fine_grey(pair.right, pair.right_rgb)
         level = float(left.mean())
-        views_of = [Describer(self._network, image, level) for image in (left, right)]
+        one, other = (Describer(self._network, image, level) for image in (left, right))
+        at_once = rows_at_once(width)
+
+        def prepare(rows: range) -> None:
+            write_views(pair.right, _RADIUS, minimum, rows, views)
+
+        def compare(rows: range) -> None:
+            write = window_costs(views, _WINDOW, volume.shape[2])
+            write((0, width), rows.start, rows.stop, volume)
+
         with ThreadPoolExecutor(self._threads) as pool:
-
-            def compare(rows: range) -> None:
-                write = window_costs(views, window, volume.shape[2])
-                write((0, width), rows.start, rows.stop, volume)
-
-            common.in_strips(pool, self._threads, compare, height)
-            for first in range(0, height, at_once := rows_at_once(width)):
+            for work in (prepare, compare):
+                common.in_strips(pool, self._threads, work, height)
+            for first in range(0, height, at_once):
                 end = min(first + at_once, height)
-                ours, others = (view.describe(first, end) for view in views_of)
-                costs = volume[first:end]
-
-                def add(
-                    rows: range,
-                    ours: Float32 = ours,
-                    others: Float32 = others,
-                    costs: UInt8 = costs,
-                ) -> None:
-                    add_unlikeness(ours, others, minimum, blend, rows.start, rows.stop, costs)
-
+                ours, others = one.describe(first, end), other.describe(first, end)
+                add = partial(_add_learned, ours, others, minimum, volume[first:end])
                 common.in_strips(pool, self._threads, add, end - first)
         return volume
+
+
+def _add_learned(left: Float32, right: Float32, minimum: int, costs: UInt8, rows: range) -> None:
+    add_unlikeness(left, right, minimum, _BLEND, rows.start, rows.stop, costs)
 
 
 def _changes(minimum: int) -> kernels.Changes:
@@ -151,16 +157,6 @@ def _changes(minimum: int) -> kernels.Changes:
     )
 
 
-def _window() -> Window:
-    return scaled_window(
-        radius=_RADIUS,
-        rows_radius=_RADIUS,
-        gradient_cap=sgm.COST_CAP,
-        largest=sgm.LARGEST_COST,
-        levels=_LEVELS,
-    )
-
-
 def _copy_costs(volume: UInt8, _columns: int) -> WriteCosts:
     """Return what copies the costs of a volume (H, P, at least W)."""
 
@@ -170,18 +166,6 @@ def _copy_costs(volume: UInt8, _columns: int) -> WriteCosts:
             costs[y % len(costs), :, : end - start] = volume[y, :, start:end]
 
     return write
-
-
-def _strips(height: int, rows: int) -> list[tuple[int, int, int, int]]:
-    """Divide an image into strips: rows that are kept, ``first`` to ``last``, of those matched."""
-    strips, first = [], 0
-    while first < height:
-        start = max(0, first - _OVERLAP_ROWS)
-        end = min(start + rows, height)
-        last = end if end == height else end - _OVERLAP_ROWS
-        strips.append((first, last, start, end))
-        first = last
-    return strips
 
 
 def _rows(pair: RectifiedPair, start: int, end: int) -> RectifiedPair:

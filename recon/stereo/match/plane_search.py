@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
 from typing import Final
 
 import cv2
@@ -58,13 +59,7 @@ def search_planes(
             for done in sweeps:
                 done.result()
             chosen = np.empty((3, *size), np.float32)
-
-            def choose(
-                rows: range, sums: Float32 = sums, table: Int32 = table, to: Float32 = chosen
-            ) -> None:
-                first, end = rows.start, rows.stop
-                kernels.choose_planes(sums[0], sums[1], sources, table, first, end, to)
-
+            choose = partial(_choose, sums, sources, table, chosen)
             common.in_strips(pool, threads, choose, size[0])
             sources[NOW] = sources[FITTED] = chosen
             last = number + 1 == len(_ROUNDS)
@@ -74,6 +69,10 @@ def search_planes(
     chosen, fitted = sources[NOW, 0], sources[FITTED, 0]
     near_by = np.abs(fitted - chosen) < SAME_SURFACE_PX / 2
     return np.asarray(np.where(near_by, fitted, chosen), dtype=np.float32)
+
+
+def _choose(sums: Float32, sources: Float32, table: Int32, to: Float32, rows: range) -> None:
+    kernels.choose_planes(sums[0], sums[1], sources, table, rows.start, rows.stop, to)
 
 
 class _Fits:

@@ -98,22 +98,12 @@ class SgmMatcher:
         rules = common.rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=ODDS)
         with self._planes.borrow(*size, window.radius, ndisp) as planes:
             views = Views(pair.left, *planes)
-            prepare_views(pair, views, window.radius, s.min_disparity_px, self._threads)
+
+            def prepare(strip: range) -> None:
+                write_views(pair.right, window.radius, s.min_disparity_px, strip, views)
+
             costs = partial(window_costs, views, window)
-            return self._search.run(pair, costs, window.radius, paths, rules)
-
-
-def prepare_views(
-    pair: RectifiedPair, views: Views, radius: int, minimum: int, threads: int
-) -> None:
-    """Write the planes of both images, in strips of rows."""
-    with ThreadPoolExecutor(threads) as pool:
-        common.in_strips(
-            pool,
-            threads,
-            lambda rows: write_views(pair.right, radius, minimum, rows, views),
-            len(pair.left),
-        )
+            return self._search.run(pair, costs, window.radius, paths, rules, prepare)
 
 
 class PathSearch:
@@ -132,10 +122,12 @@ class PathSearch:
         radius: int,
         paths: Paths,
         rules: Rules,
+        prepare: Callable[[range], None] | None = None,
     ) -> Disparity:
         """Return the disparity, checked and refined.
 
-        ``costs`` makes, for bands of so many columns, what writes costs of a reach of ``radius``.
+        ``costs`` makes, for bands of so many columns, what writes costs of a reach of ``radius``;
+        ``prepare`` is done before for each strip of rows.
         """
         size = pair.left.shape
         refined = refined_in(self._results.lend(REFINED_BYTES * pair.left.size), *size)
@@ -149,6 +141,8 @@ class PathSearch:
 
         strips, at_once = self._strips(size[0], size[1], paths)
         with self._minima.borrow(*size) as minima, ThreadPoolExecutor(at_once) as pool:
+            if prepare is not None:
+                list(pool.map(prepare, strips))
             list(pool.map(search, strips))
             return common.finish(refined, pool, at_once)
 

@@ -271,16 +271,18 @@ def test_windows_and_penalties_that_do_not_fit_are_refused(settings, wrong, word
 
 
 @pytest.mark.slow
-def test_memory_of_a_large_pair_is_bounded():
-    code = """
+@pytest.mark.parametrize("name", ["sgm", "fine"])
+def test_memory_of_a_large_pair_is_bounded(name):
+    code = f"""
 import resource
 import numpy as np
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.match.sgm import SgmMatcher, SgmSettings
+from recon.stereo.match.registry import MatchingSettings, make_matcher
 from recon.core.values import RectifiedPair
 grey = np.random.default_rng(0).integers(0, 256, (2000, 3000), dtype=np.uint8)
 pair = RectifiedPair(grey, np.roll(grey, -40, 1), stand_in_camera(3000, 2000))
-SgmMatcher(SgmSettings(ndisp=300), threads=8).match(pair)
+settings = MatchingSettings.parse({{"{name}": {{"ndisp": 300}}}})
+make_matcher("{name}", settings, threads=8).match(pair)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
