@@ -1,16 +1,20 @@
-"""The fused cloud of a map as a PLY file, and an even sample of it for images and reports."""
+"""The fused cloud of a map as files, and an even sample of it for images and reports."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
 from recon.export.product import Made, Order
+from recon.io.models.npz import write_npz
+from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import write_ply_tiles
 from recon.map.tiles import Tiles
 
@@ -23,6 +27,39 @@ def cloud_product(order: Order) -> Made:
     """Write ``map/cloud.ply``, and ``map/removed.ply`` with what moved."""
     files = [order.run.path(f"map/{name}.ply") for name in ("cloud", "removed")]
     return export_cloud(order.placed.tiles, *files)
+
+
+def pcd_product(order: Order) -> Made:
+    """Write ``map/cloud.pcd``, the fused cloud for PCL."""
+    clouds = (tile.cloud for tile in order.placed.tiles)
+    return Made({"points": write_pcd(order.run.path("map/cloud.pcd"), filter(len, clouds))})
+
+
+def arrays_product(order: Order) -> Made:
+    """Write ``map/map.npz``: the fields of the fused cloud, and the paths of the drives.
+
+    ``xyz`` and the other fields of `PointCloud` that the map has; and for each frame ``times_s``,
+    ``T_map_camera`` (F, 4, 4), ``placed`` (whether it has a place in the map) and ``session``.
+    """
+    drives = order.map.linked
+    paths = [drive.T_map_world @ drive.trajectory.T_world_camera for drive in drives]
+    whole: dict[str, list[NDArray[Any]]] = {
+        "times_s": [drive.trajectory.timestamps_s for drive in drives],
+        "T_map_camera": paths,
+        "placed": [order.map.placed[drive.number] for drive in drives],
+        "session": [np.full(len(drive), drive.number) for drive in drives],
+    }
+    points = write_npz(
+        order.run.path("map/map.npz"),
+        (_fields(tile.cloud) for tile in order.placed.tiles if len(tile.cloud)),
+        {name: np.concatenate(each) for name, each in whole.items()},
+    )
+    return Made({"points": points})
+
+
+def _fields(cloud: PointCloud) -> dict[str, NDArray[Any]]:
+    values = {field.name: getattr(cloud, field.name) for field in fields(cloud)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:

@@ -8,7 +8,7 @@ from typing import Any, Final, cast
 
 from recon.core.errors import MeshingError, SettingsError
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
-from recon.export.cloud import cloud_product
+from recon.export.cloud import arrays_product, cloud_product, pcd_product
 from recon.export.colmap import colmap_product
 from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
@@ -32,6 +32,9 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     },
     "las": Product(survey_product("las"), surveyed=True),
     "laz": Product(survey_product("laz"), surveyed=True),
+    "e57": Product(survey_product("e57"), surveyed=True),
+    "pcd": Product(pcd_product),
+    "npz": Product(arrays_product),
     "mcap": Product(mcap_product, needs_occupancy=True, surveyed=True),
     "colmap": Product(colmap_product, needs_images=True),
     "nerfstudio": Product(nerfstudio_product, needs_images=True),

@@ -13,14 +13,15 @@ import numpy as np
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert
-from recon.core.values import PointCloud
+from recon.core.values import UNKNOWN, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
-from recon.export.occupancy import grounds
+from recon.export.occupancy import export_grid, grounds
 from recon.export.product import Made, Order
 from recon.export.survey import placed_in_survey
 from recon.io.models.geotiff import RasterFile, RasterPlace, write_geotiff
 from recon.map.ground.surface import GroundSurface
 
+_ROWS: Final = 256  # of a raster at a time
 _CORNERS: Final = np.array([*product((0.0, 1.0), repeat=2)])
 Fill = Callable[[Order, RasterFile, Float64], None]
 
@@ -123,6 +124,22 @@ def _ground_slopes(order: Order, file: RasterFile, T_file_map: Float64) -> None:
     _write_ground(order, file, T_file_map, slopes)
 
 
+def _occupancy(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+    """Write what the flat grid has at the middle of each cell: 0 = free, 100 = occupied."""
+    grid, T_map_file, place = export_grid(order.placed, None)[0], invert(T_file_map), file.place
+    for row in range(0, place.rows, _ROWS):
+        shape = min(_ROWS, place.rows - row), place.columns
+        middles = place.centres(row, 0, shape).reshape(-1, 2)
+        level = np.full((len(middles), 1), T_file_map[2, 3])
+        xy_m = apply(T_map_file, np.hstack([middles, level]))[:, :2]
+        i, j = np.floor((xy_m - grid.origin_m) / grid.resolution_m).astype(int)[:, ::-1].T
+        inside = (i >= 0) & (j >= 0) & (i < grid.cells.shape[0]) & (j < grid.cells.shape[1])
+        values = np.full(len(xy_m), np.nan, np.float32)
+        cells = grid.cells[i[inside], j[inside]]
+        values[inside] = np.where(cells == UNKNOWN, np.nan, cells)
+        file.write(row, 0, values.reshape(1, *shape))
+
+
 def _write_ground(
     order: Order,
     file: RasterFile,
@@ -152,5 +169,6 @@ RASTERS: Final[dict[str, tuple[Fill, bool]]] = {
     "dtm": (_ground_heights, False),
     "slope": (_ground_slopes, False),
     "orthophoto": (_surface_colours, True),
+    "occupancy": (_occupancy, False),
 }
 """What fills a raster, and whether it is one of colours."""

@@ -12,6 +12,7 @@ import numpy as np
 from recon.core.geometry.alignment import fit_points
 from recon.core.values.arrays import Float64
 from recon.export.product import Made, Order
+from recon.io.models.e57 import write_e57
 from recon.io.models.las import check_inside, write_las
 from recon.map.map import Map
 from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, span_m
@@ -65,16 +66,19 @@ class Georeference:
 
 
 def survey_product(suffix: str) -> Callable[[Order], Made]:
-    """Return what writes ``map/cloud.las`` or ``.laz``, perhaps in survey coordinates."""
+    """Return what writes ``map/cloud.las``, ``.laz`` or ``.e57``, perhaps where a survey says."""
 
     def write(order: Order) -> Made:
         T_file_map, figures, warnings = placed_in_survey(order)
         clouds = (tile.cloud for tile in order.placed.tiles)
         path = order.run.path(f"map/cloud.{suffix}")
         crs = None if order.survey is None else order.survey.crs
-        # A hundredth of a voxel, as a decimal: a millimetre on a road.
-        step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
-        points = write_las(path, clouds, T_file_map, crs, step_m)
+        if suffix == "e57":
+            points = write_e57(path, clouds, T_file_map, crs)
+        else:
+            # A hundredth of a voxel, as a decimal: a millimetre on a road.
+            step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
+            points = write_las(path, clouds, T_file_map, crs, step_m)
         return Made({**figures, "points": points}, warnings)
 
     return write

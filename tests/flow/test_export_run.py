@@ -74,7 +74,7 @@ def test_products_whose_tiles_workers_make_are_the_same_files(small_demo, tmp_pa
     assert files == sorted([*maps, "grid.wld", "config.yaml", "run.json", "summary.json"])
 
 
-def test_the_cloud_comes_as_laz_in_survey_coordinates(small_demo, tmp_path):
+def test_the_cloud_comes_as_laz_and_e57_in_survey_coordinates_and_as_arrays(small_demo, tmp_path):
     laspy = pytest.importorskip("laspy")
     path, origin = read_tum(small_demo / "trajectory_map_base_tum.txt"), np.array([4e5, 5e6, 100])
     there = np.column_stack([path.timestamps_s, path.positions_m + origin])
@@ -82,12 +82,26 @@ def test_the_cloud_comes_as_laz_in_survey_coordinates(small_demo, tmp_path):
     height_m = summary_of(small_demo)["camera_height_m"]
     words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}"]
     out = tmp_path / "out"
-    done = run("export", small_demo, "--to", "laz", *words, "--crs", "EPSG:25832", "--out", out)
+    words += ["--crs", "EPSG:25832", "--out", out]
+    done = run("export", small_demo, "--to", "laz,e57,npz", *words)
     assert done.code == 0, done.err
     found, cloud = laspy.read(out / "map/cloud.laz"), read_ply(small_demo / "map/cloud.ply")
-    assert np.abs(found.xyz - (cloud.xyz.astype(np.float64) + origin)).max() < 0.002
+    expected = cloud.xyz.astype(np.float64) + origin
+    assert np.abs(found.xyz - expected).max() < 0.002
     assert found.header.parse_crs().to_epsg() == 25832
     assert summary_of(out)["misfit_rms_m"] < 0.001
+    with pytest.importorskip("pye57").E57(str(out / "map/cloud.e57")) as file:
+        scans = [file.read_scan(n, colors=True) for n in range(file.scan_count)]
+        heights = np.concatenate([scan["cartesianZ"] for scan in scans])
+    assert np.abs(heights - expected[:, 2]).max() < 0.002
+    with np.load(out / "map/map.npz") as arrays:
+        np.testing.assert_array_equal(arrays["xyz"], cloud.xyz)
+        np.testing.assert_array_equal(arrays["sigma_m"], cloud.sigma_m)
+        np.testing.assert_allclose(arrays["times_s"], path.timestamps_s)
+        T_map_world = np.array(summary_of(small_demo)["T_map_world"])
+        camera = read_tum(small_demo / "trajectory_tum.txt").T_world_camera
+        np.testing.assert_allclose(arrays["T_map_camera"], T_map_world @ camera, atol=1e-6)
+        assert arrays["placed"].all()
 
 
 def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_path):
@@ -100,7 +114,7 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}"]
     out = tmp_path / "out"
     words += ["--crs", "EPSG:25832", "--out", out]
-    done = run("export", small_demo, "--to", "dsm,dtm,slope,orthophoto", *words)
+    done = run("export", small_demo, "--to", "dsm,dtm,slope,orthophoto,occupancy", *words)
     assert done.code == 0, done.err
     cloud = read_ply(small_demo / "map/cloud.ply")
     xyz = np.einsum("ij,nj->ni", R, cloud.xyz.astype(np.float64)) + origin
@@ -122,6 +136,16 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     driven = there[-2:, 1:] + 8.0 * ahead / np.linalg.norm(ahead)
     assert np.abs(at_points("dtm", places=driven) - driven[:, 2]).max() < 0.1
     assert np.nanmedian(at_points("slope")) < 3
+    assert (at_points("occupancy", places=driven) == 0).all()
+    grid = read_nav2(small_demo / "map/grid.yaml")
+    i, j = np.argwhere(grid.cells == OCCUPIED).T
+    xy_m = grid.origin_m + grid.resolution_m * (np.column_stack([j, i]) + 0.5)
+    placed = np.column_stack([xy_m, np.zeros(len(i))]) @ R.T + origin
+    inside = (placed[:, :2] > xyz[:, :2].min(0)) & (placed[:, :2] < xyz[:, :2].max(0))
+    found = at_points("occupancy", places=placed[inside.all(axis=1)])
+    # A turned cell has the middle of another one: some at the edge of what stands are free.
+    assert found.size > 100
+    assert np.mean(found == OCCUPIED) > 0.7
 
 
 @pytest.mark.parametrize(("options", "said"), [

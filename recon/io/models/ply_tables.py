@@ -5,7 +5,7 @@ Ref: G. Turk, "The PLY polygon file format", 1994.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import SEEK_END
 from pathlib import Path
@@ -98,18 +98,31 @@ def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[
 def write_table_stream(
     path: StrPath, name: str, tables: Iterable[Table], comments: Sequence[str], empty: Table
 ) -> int:
-    """Write one element whose rows arrive in parts, ``empty`` if there are none, atomically.
+    """Write one element whose rows arrive in parts, ``empty`` if there are none, atomically."""
 
-    All tables get the dtype of the first. The number of rows is filled into the header at the end.
+    def header(rows: int, filler: str, dtype: np.dtype[Any]) -> bytes:
+        return _header([(name, rows, dtype)], [*comments, filler])
+
+    return write_row_stream(path, tables, empty, header)
+
+
+def write_row_stream(
+    path: StrPath,
+    tables: Iterable[Table],
+    empty: Table,
+    header: Callable[[int, str, np.dtype[Any]], bytes],
+) -> int:
+    """Write rows that arrive in parts, behind a header that says how many, atomically.
+
+    All tables get the dtype of the first. The number of rows is filled in at the end: ``header``
+    has a comment with a filler of dots, so that it is as long for every number.
     """
     dtype: np.dtype[Any] | None = None
     rows = 0
 
     def head() -> bytes:
-        # Padded with a comment to the same length for every number of rows.
-        number = str(rows)
-        padded = [*comments, "." * (_LONGEST_NUMBER - len(number))]
-        return _header([(name, number, empty.dtype if dtype is None else dtype)], padded)
+        filler = "." * (_LONGEST_NUMBER - len(str(rows)))
+        return header(rows, filler, empty.dtype if dtype is None else dtype)
 
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         for table in tables:

@@ -1,10 +1,13 @@
-"""Clouds (PLY, LAS), OctoMaps and Nav2 grids: round trips, other programs, and damaged files."""
+"""Clouds, OctoMaps and Nav2 grids as files: round trips, other programs, and damage."""
 
+import shutil
+import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import open3d
 import pymeshlab
 import pyoctomap
 import pytest
@@ -21,10 +24,21 @@ from recon.core.errors import (
     SettingsError,
 )
 from recon.core.geometry.se3 import make_transform
-from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels, PointCloud
+from recon.core.values import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    OccupancyVoxels,
+    PointCloud,
+    join_clouds,
+)
+from recon.io.models.e57 import write_e57
 from recon.io.models.las import check_crs, check_inside, write_las
 from recon.io.models.nav2 import read_nav2, write_nav2
+from recon.io.models.npz import write_npz
 from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
+from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import read_ply, write_ply
 from tests.scenery.octomaps import write_octomap
 
@@ -225,10 +239,61 @@ def test_positions_lie_in_the_area_of_their_system(name, east, north, inside):
         check_inside(name, place, "gnss.txt")
 
 
-def test_without_laspy_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "laspy", None)
+@pytest.mark.parametrize(("write", "library"), [(write_las, "laspy"), (write_e57, "pye57")])
+def test_without_its_library_the_extra_is_named(tmp_path, monkeypatch, write, library):
+    monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(MissingDependencyError, match=r"recon\[survey\]"):
-        write_las(tmp_path / "cloud.laz", [], np.eye(4))
+        write(tmp_path / "cloud", [], np.eye(4))
+
+
+def test_an_e57_has_a_scan_for_each_part_at_its_place(tmp_path):
+    pye57 = pytest.importorskip("pye57")
+    parts, path = [example_cloud(1000), example_cloud(0), example_cloud(10)], tmp_path / "cloud.e57"
+    assert write_e57(path, parts, T_SURVEY_MAP, "EPSG:25832") == 1010
+    with pye57.E57(str(path)) as file:
+        assert file.scan_count == 2
+        assert "UTM zone 32N" in file.root["coordinateMetadata"].value()
+        for number, cloud in enumerate((parts[0], parts[2])):
+            found = file.read_scan(number, colors=True, ignore_missing_fields=True)
+            x, y, z = cloud.xyz.astype(np.float64).T
+            expected = 456789.25 - y, 5433210.5 + x, 118.75 + z
+            for axis, values in zip("XYZ", expected, strict=True):
+                assert np.abs(found[f"cartesian{axis}"] - values).max() < 1e-6
+            rgb = np.stack([found[f"color{name}"] for name in ("Red", "Green", "Blue")], axis=1)
+            np.testing.assert_array_equal(rgb, cloud.rgb)
+    with pytest.raises(SettingsError, match="unknown coordinate system"):
+        write_e57(path, parts, T_SURVEY_MAP, "EPSG:99")
+    assert [file.name for file in tmp_path.iterdir()] == ["cloud.e57"]
+
+
+def test_pcl_reads_the_points_of_a_pcd(tmp_path):
+    parts, path = [example_cloud(1000), example_cloud(10)], tmp_path / "cloud.pcd"
+    assert write_pcd(path, parts) == 1010
+    found, cloud = open3d.t.io.read_point_cloud(str(path)).point, join_clouds(parts)
+    np.testing.assert_array_equal(found["positions"].numpy(), cloud.xyz)
+    np.testing.assert_array_equal(found["colors"].numpy(), cloud.rgb)
+    np.testing.assert_array_equal(found["normals"].numpy(), cloud.normals)
+    np.testing.assert_array_equal(found["sigma"].numpy()[:, 0], cloud.sigma_m)
+    if (convert := shutil.which("pcl_pcd2ply")) is not None:
+        subprocess.run([convert, path, tmp_path / "pcl.ply"], check=True, capture_output=True)
+        np.testing.assert_array_equal(read_ply(tmp_path / "pcl.ply").rgb, cloud.rgb)
+    assert write_pcd(path, []) == 0
+    assert b"POINTS 0" in path.read_bytes()
+
+
+def test_arrays_that_come_in_parts_are_one_in_an_archive(tmp_path):
+    parts = [{"a": np.arange(6.0).reshape(n, 6 // n), "b": np.ones(n, np.uint8)} for n in (3, 3)]
+    path = tmp_path / "map.npz"
+    assert write_npz(path, iter(parts), {"whole": np.eye(4)}) == 6
+    with np.load(path, allow_pickle=False) as found:
+        np.testing.assert_array_equal(found["a"], np.concatenate([part["a"] for part in parts]))
+        assert found["b"].dtype == np.uint8
+        np.testing.assert_array_equal(found["whole"], np.eye(4))
+    assert write_npz(path, [], {"whole": np.eye(4)}) == 0
+    with pytest.raises(KeyError):
+        write_npz(path, [parts[0], {"a": parts[0]["a"]}], {})
+    assert np.load(path).files == ["whole"]  # as before
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
 
 
 # Row 0 has the smallest y. An obstacle at the right of the lowest row, unknown at the top left.
