@@ -3,10 +3,11 @@
 
     pip install torch onnx
     scripts/train_features.py PHOTOGRAPHS MIDDLEBURY --minutes 60 --into features.onnx
+    scripts/train_features.py PHOTOGRAPHS MIDDLEBURY --start features.onnx --into better.onnx
 
 Half of the samples are rendered: planes that hide each other, each with a photograph or with noise
 on it. PHOTOGRAPHS is a folder of pictures of any kind (the network that comes with the program saw
-81 pictures of Debian's packages gnome-backgrounds, lomiri-wallpapers, mate-backgrounds,
+the pictures of Debian's packages gnome-backgrounds, lomiri-wallpapers, mate-backgrounds,
 plasma-workspace-wallpapers and ukui-wallpapers). The others are of MIDDLEBURY's 2003, 2005 and 2006
 at a third of their size (it saw Cones, Books, Dolls, Aloe, Baby1 and Cloth1; Art is left out, as
 MiddEval3 has it too). Gain, gamma, contrast, light, blur, noise and height of the two views differ.
@@ -28,8 +29,10 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
+from onnx.numpy_helper import to_array
 from torch import nn
 from torch.nn import functional
 
@@ -37,6 +40,8 @@ from recon.evaluation.middlebury.bench import find_scenes, read_scored_scene
 
 HEIGHT, WIDTH, BORDER = 96, 256, (12, 16)  # of a sample, and what of it has no full view around it
 CHANNELS, LAYERS, FEATURES = 32, 5, 48
+BATCH, RATE = 4, 1.2e-3
+TEMPERATURE = 3.2  # of a trained network; its file has none
 LEFT_OUT = {"Art"}
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 Float = NDArray[np.float32]
@@ -273,13 +278,14 @@ def loss_of(network: Network, sample: Sample) -> Any:
     """Return the cross entropy of one sample; None where too little of its truth is known."""
     left, right = (torch.from_numpy(view)[None, None] / 32 for view in (sample[0], sample[1]))
     level = left.mean()
-    one, other = (
-        functional.normalize(
-            network((view - level).contiguous(memory_format=torch.channels_last)), dim=1
-        )[0]
-        for view in (left, right)
-    )
-    products = torch.einsum("chx,chz->hxz", one, other)
+
+    def described(view: Any) -> Any:
+        with torch.autocast("cpu", torch.bfloat16):
+            features = network((view - level).contiguous(memory_format=torch.channels_last))
+        return functional.normalize(features.float(), dim=1)[0]
+
+    one, other = described(left), described(right)
+    products = torch.bmm(one.permute(1, 2, 0).bfloat16(), other.permute(1, 0, 2).bfloat16()).float()
     places = torch.arange(WIDTH)[:, None] + sample.offset - torch.arange(sample.ndisp)[None]
     inside = places.clamp(min=0)[None].expand(HEIGHT, -1, -1)
     scores = torch.gather(products, 2, inside) * torch.exp(network.t)
@@ -298,11 +304,22 @@ def loss_of(network: Network, sample: Sample) -> Any:
     return -((1 - part) * low + part * high).mean()
 
 
-def train(photographs: list[Float], scenes: list[Any], minutes: float) -> Network:
+def started(start: Path | None) -> Network:
+    """Return a network of random weights, or of those of an ONNX file."""
     torch.manual_seed(0)
+    network = Network()
+    if start is not None:
+        weights = {one.name: to_array(one) for one in onnx.load(str(start)).graph.initializer}
+        found = {name: torch.from_numpy(array.copy()) for name, array in weights.items()}
+        network.load_state_dict({**network.state_dict(), **found})
+        network.t.data.fill_(TEMPERATURE)
+    return network.to(memory_format=torch.channels_last)
+
+
+def train(network: Network, data: tuple[list[Float], list[Any]], minutes: float) -> Network:
+    photographs, scenes = data
     cv2.setNumThreads(1)
-    network = Network().to(memory_format=torch.channels_last)
-    optimiser = torch.optim.Adam(network.parameters(), 2e-3)
+    optimiser = torch.optim.Adam(network.parameters(), RATE)
     samples: Queue[Sample] = Queue(64)
 
     def fill(seed: int) -> None:
@@ -316,12 +333,12 @@ def train(photographs: list[Float], scenes: list[Any], minutes: float) -> Networ
     start, losses = time.monotonic(), []
     while (done := (time.monotonic() - start) / (60 * minutes)) < 1:
         for group in optimiser.param_groups:
-            group["lr"] = 1e-3 * (1 + np.cos(np.pi * done)) + 1e-5
-        each = [loss_of(network, samples.get()) for _ in range(2)]
+            group["lr"] = RATE * (1 + np.cos(np.pi * done)) / 2 + 1e-5
+        each = [loss_of(network, samples.get()) for _ in range(BATCH)]
         found = [loss for loss in each if loss is not None]
         if not found:
             continue
-        loss = torch.stack(found).sum() / 2
+        loss = torch.stack(found).sum() / BATCH
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -336,12 +353,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
     parser.add_argument("photographs", type=Path)
     parser.add_argument("middlebury", type=Path)
+    parser.add_argument("--start", type=Path, help="go on from this network")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--into", type=Path, default=Path("features.onnx"))
     given = parser.parse_args()
-    network = train(
-        read_photographs(given.photographs), read_scenes(given.middlebury), given.minutes
-    )
+    data = read_photographs(given.photographs), read_scenes(given.middlebury)
+    network = train(started(given.start), data, given.minutes)
     sizes = {2: "height", 3: "width"}
     torch.onnx.export(
         network.eval(),
