@@ -92,7 +92,7 @@ Threads = Annotated[
     int | None,
     option("Number of threads. Does not change the results.", default="all cores", min=1),
 ]
-POSITIONS = " Rows of time, easting, northing and height (s, m), on the clock of the images."
+POSITIONS = " NMEA, RTKLIB, an OXTS folder, or rows of time, easting, northing, height (s, m)."
 SOURCES_HELP = (
     "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "
     "ROS bag, MCAP file, or Middlebury scene."

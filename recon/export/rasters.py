@@ -33,7 +33,7 @@ def raster_product(name: str) -> Callable[[Order], Made]:
     def write(order: Order) -> Made:
         T_file_map, figures, warnings = placed_in_survey(order)
         place = _place(order, T_file_map)
-        crs = None if order.survey is None else order.survey.crs
+        crs = None if order.survey is None else order.survey.system
         path = order.run.path(f"map/{name}.tif")
         with write_geotiff(path, place, colours=colours, crs=crs) as file:
             fill(order, file, T_file_map)

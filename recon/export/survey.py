@@ -72,7 +72,7 @@ def survey_product(suffix: str) -> Callable[[Order], Made]:
         T_file_map, figures, warnings = placed_in_survey(order)
         clouds = (tile.cloud for tile in order.placed.tiles)
         path = order.run.path(f"map/cloud.{suffix}")
-        crs = None if order.survey is None else order.survey.crs
+        crs = None if order.survey is None else order.survey.system
         if suffix == "e57":
             points = write_e57(path, clouds, T_file_map, crs)
         else:
@@ -99,8 +99,8 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
     positions that contradict most others are left out.
     """
     measured = measure_along(map_.first, survey)
-    if survey.crs is not None:
-        check_inside(survey.crs, np.median(measured.position_m, axis=0), survey.positions)
+    if survey.system is not None:
+        check_inside(survey.system, np.median(measured.position_m, axis=0), survey.positions)
     agree = measured.agree
     ours_m, position_m = measured.ours_m[agree], measured.position_m[agree]
     return Georeference(
@@ -109,5 +109,5 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
         span_m(position_m),
         fit_points(ours_m, position_m, scaled=True).scale,
         len(agree) - len(ours_m),
-        tuple(measured.warnings()),
+        (*survey.notes(), *measured.warnings()),
     )

@@ -26,14 +26,17 @@ class Fixes:
     # float64 (N, 3), where it was then, from the camera of that frame, in its axes
     offset_m: Float64
     position_m: Float64  # (N, 3), where it was measured, in the coordinates of a survey
-    sigma_m: float  # standard deviation of a measured coordinate
+    sigma_m: Float64  # (N,), standard deviations of a measured coordinate
 
     def __post_init__(self) -> None:
         count = len(self.frames)
         frozen_array("frames", self.frames, np.int32, (count,))
         frozen_array("offset_m", self.offset_m, np.float64, (count, 3))
         frozen_array("position_m", self.position_m, np.float64, (count, 3))
-        if not (np.isfinite(self.position_m).all() and self.sigma_m > 0.0):
+        # Maps of before have one for all.
+        each_m = np.broadcast_to(np.asarray(self.sigma_m, np.float64), (count,))
+        object.__setattr__(self, "sigma_m", each_m)
+        if not (np.isfinite(self.position_m).all() and (self.sigma_m > 0.0).all()):
             raise ShapeError("measured positions are finite, and have a standard deviation")
 
     def __len__(self) -> int:
@@ -52,7 +55,7 @@ class Fixes:
         return frames, _placed(T_node_world, self.by_path(trajectory))
 
 
-NO_FIXES: Final = Fixes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
+NO_FIXES: Final = Fixes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 """Of a drive along which nothing was measured."""
 
 
@@ -69,18 +72,20 @@ class Held:
         """An edge from the survey to each node near which something was measured.
 
         It says where the node is, and not how it is turned. What is near one node counts as one
-        measurement: neighbours are off by the same. The last of the poses ``T_world_node`` is the
-        survey's; an antenna beside the camera moves as it turns.
+        measurement, as good as its best: neighbours are off by the same. The last of the poses
+        ``T_world_node`` is the survey's; an antenna beside the camera moves as it turns.
         """
         survey, begin, edges = len(T_world_node) - 1, 0, list[PoseEdge]()
         R_survey_world = T_world_node[survey, :3, :3].T
         for path, own, fixes in zip(drives, nodes, self.fixes, strict=True):
             near, offset_m = fixes.at_nodes(path, own)
-            information = np.diag(3 * [fixes.sigma_m**-2] + 3 * [_NO_TURN])
             for k in np.unique(near).tolist():
                 R = R_survey_world @ T_world_node[begin + k, :3, :3]
                 here = near == k
-                place_m = (fixes.position_m[here] - offset_m[here] @ R.T).mean(axis=0)
+                weights = fixes.sigma_m[here] ** -2
+                places_m = fixes.position_m[here] - offset_m[here] @ R.T
+                place_m = np.average(places_m, axis=0, weights=weights)
+                information = np.diag(3 * [weights.max()] + 3 * [_NO_TURN])
                 edges.append(PoseEdge(survey, begin + k, make_transform(R, place_m), information))
             begin += len(own)
         return edges

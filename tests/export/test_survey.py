@@ -16,6 +16,7 @@ from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.store.session import SessionInfo
 from recon.odometry.protocol import OdometryHealth
+from tests.scenery import receivers
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 T_SURVEY_MAP = make_transform(
@@ -150,7 +151,7 @@ def test_positions_of_another_day_or_at_one_place_or_none_are_refused(place, tmp
     rows[:, 1:] = rows[0, 1:]
     with pytest.raises(EvaluationError, match="do not say how the map is turned"):
         place(rows)
-    (tmp_path / "gnss.txt").write_text("$GPGGA,123519,4807.038,N\n")
+    (tmp_path / "gnss.txt").write_text("12:35:19 4807.038 N E\n")
     with pytest.raises(FormatError, match=r"gnss\.txt:1"):
         georeference(mapped(), Survey(tmp_path / "gnss.txt"))
 
@@ -204,3 +205,51 @@ def test_positions_outside_the_coordinate_system_are_refused(place, change):
     pytest.importorskip("pyproj")
     with pytest.raises(EvaluationError, match=r"outside the area|not degrees"):
         place(OUTSIDE[change](each_second()), crs="EPSG:25832")
+
+
+# A drive whose speed and curvature change: only such a one shows a clock.
+def winding(times_s: Float64) -> Float64:
+    s = times_s - FROM_S
+    return np.column_stack([times_s, 60 * np.sin(0.3 * s), 4 * s + 8 * np.sin(0.7 * s), 0.1 * s])
+
+
+@pytest.fixture
+def winding_map():
+    map_, times_s = Map.temporary(), FROM_S + 0.1 * np.arange(200)
+    session = map_.begin(SessionInfo())
+    session.set_axes(T_MAP_WORLD, RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12))
+    for T, time_s in zip(winding(times_s)[:, 1:] @ AXES_MAP_WORLD, times_s.tolist(), strict=True):
+        session.add_frame(make_transform(np.eye(3), T), time_s, OdometryHealth())
+    return map_
+
+
+@pytest.mark.parametrize("off_s", [0.0, 0.5, -1.3, 1.3e9])
+@pytest.mark.parametrize("jumps", [False, True])
+def test_a_clock_that_is_off_is_found_said_and_taken_as_that(winding_map, place, off_s, jumps):
+    rng, rows = np.random.default_rng(3), winding(FROM_S + np.arange(0.5, 19.5, 0.2))
+    rows[:, 1:] += rng.normal(0, 0.02, (len(rows), 3)) + np.array([4e5, 5e6, 100])
+    rows[:, 0] += off_s
+    if jumps:
+        rows[rng.choice(len(rows), len(rows) // 10, replace=False), 1:3] += [3.0, 4.0]
+    placed = place(rows, winding_map, antenna=(0.0, 0.0, 0.0))
+    assert placed.rms_m < 0.06
+    assert placed.left_out == (len(rows) // 10 if jumps else 0)
+    said = [line for line in placed.warnings() if "clock" in line]
+    assert len(said) == (off_s != 0)
+    if off_s:
+        late = "late" if off_s > 0 else "early"
+        (found_s,) = [float(line.split(" is ")[1].split(" s ")[0]) for line in said]
+        assert f" s {late}" in said[0]
+        assert found_s == pytest.approx(abs(off_s), abs=0.02)
+
+
+def test_swapped_latitude_and_longitude_are_refused(winding_map, tmp_path):
+    pytest.importorskip("pyproj")
+    rows = winding(FROM_S + np.arange(0.5, 19.5, 0.2)) + np.array([0, 4e5, 5e6, 100])
+    degrees = receivers.degrees_of(rows[:, 1:], "EPSG:32632")
+    survey = Survey(receivers.write_degrees(tmp_path / "gnss.csv", rows[:, 0], degrees))
+    assert georeference(winding_map, survey).rms_m < 0.01
+    swapped = degrees[:, [1, 0, 2]]
+    survey = Survey(receivers.write_degrees(tmp_path / "swapped.csv", rows[:, 0], swapped))
+    with pytest.raises(EvaluationError, match="latitude and longitude are swapped"):
+        georeference(winding_map, survey)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from recon.core.errors import EvaluationError, FormatError, SettingsError
+from recon.core.errors import EvaluationError, ReconError, SettingsError
 from recon.core.geometry.alignment import (
     find_agreeing,
     fit_upright,
@@ -21,8 +21,8 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.io.files import read_table, reader
-from recon.io.trajectory import check_positions
+from recon.io.positions import Positions, read_positions
+from recon.map.sessions.clock import clock_error
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
@@ -50,12 +50,14 @@ class Survey:
     """Positions along a drive in the coordinates of a survey.
 
     Attributes:
-        positions: File with rows of time in seconds, easting, northing and height in metres (or a
-            TUM file), on the clock of the images. One or three more columns are standard
-            deviations in metres, of each coordinate or all.
+        positions: What a receiver or a total station wrote (`recon.io.positions`), or rows of time
+            in seconds, easting, northing and height in metres (or a TUM file), on the clock of the
+            images. One or three more columns are standard deviations in metres, of all coordinates
+            or each.
         antenna_m: Where what they are the positions of (antenna, prism) is, from the left camera:
             metres forward, left and up.
-        crs: Name of the coordinate system, such as ``EPSG:25832``; None = not stated.
+        crs: Name of the coordinate system, such as ``EPSG:25832``; None = not stated: that of UTM
+            where positions are latitude and longitude.
     """
 
     positions: Path
@@ -73,9 +75,39 @@ class Survey:
             )
 
     @cached_property
+    def found(self) -> Positions:
+        """What the file has, in the order of time."""
+        return read_positions(self.positions)
+
+    @cached_property
+    def system(self) -> str | None:
+        """The coordinate system of products; None = not known."""
+        return self._projected[1]
+
+    @cached_property
     def rows(self) -> Float64:
-        """float64 (N, 5), time, easting, northing, height, sigma (or NaN), in the order of time."""
-        return _read_positions(self.positions)
+        """float64 (N, 7), time, easting, northing, height, and sigma (or NaN) of these, metres."""
+        return np.column_stack([self.found.times_s, self._projected[0], self.found.sigma_m])
+
+    @cached_property
+    def swapped_m(self) -> Float64:
+        """float64 (N, 3), where positions would be with their first two columns swapped."""
+        swapped = replace(self.found, places=self.found.places[:, [1, 0, 2]])
+        try:
+            return swapped.projected(None, self.positions)[0]
+        except ReconError:  # there is no such place
+            return self.rows[:, 1:4]
+
+    def notes(self) -> list[str]:
+        """Return lines of what was chosen, and of what heights are above."""
+        chosen = [] if self.crs == self.system else [f"coordinates are those of {self.system}"]
+        if self.found.heights:
+            chosen += [f"heights are above {self.found.heights}, as the receiver has them"]
+        return chosen
+
+    @cached_property
+    def _projected(self) -> tuple[Float64, str | None]:
+        return self.found.projected(self.crs, self.positions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +118,12 @@ class Measured:
     position_m: Float64  # (N, 3), in the coordinates of the survey
     ours_m: Float64  # (N, 3), by the path, in map axes
     agree: Bool  # (N,), False for positions that contradict most others
-    # Standard deviation of a coordinate by the file; None = it does not say
-    stated_m: float | None = None
+    # float64 (N,), standard deviation of a coordinate by the file; None = it does not say
+    stated_m: Float64 | None = None
+    swapped_m: Float64 | None = None  # (N, 3), with easting and northing swapped
+    late_s: float = 0.0  # by how much their clock was late; times are those of the images
+    late_sigma_s: float = 0.0
+    degrees: bool = False  # whether the file has latitude and longitude
 
     @cached_property
     def T_survey_map(self) -> Float64:
@@ -100,13 +136,17 @@ class Measured:
         return np.asarray(apply(self.T_survey_map, self.ours_m) - self.position_m)
 
     @property
-    def sigma_m(self) -> float:
-        """Standard deviation of a coordinate, as the path is bent by it.
+    def sigma_m(self) -> Float64:
+        """float64 (N,), standard deviation of a coordinate, as the path is bent by it.
 
         What many in a row are off by, or by more and more, cannot be told from drift of the path:
-        that is for the file to say.
+        that is for the file to say. Where it says, its own differences count.
         """
-        return max(_LEAST_SIGMA_M, self.uneven_m, self.stated_m or 0.0)
+        stated_m = np.zeros(len(self.times_s)) if self.stated_m is None else self.stated_m
+        typical_m = float(np.median(stated_m[self.agree])) if self.agree.any() else 0.0
+        worse = max(1.0, self.uneven_m / typical_m) if typical_m > 0.0 else 1.0
+        least_m = self.uneven_m if typical_m == 0.0 else 0.0
+        return np.maximum(max(_LEAST_SIGMA_M, least_m), worse * stated_m)
 
     @property
     def uneven_m(self) -> float:
@@ -118,8 +158,13 @@ class Measured:
     def check(self, drift_m: float, where: Path) -> None:
         """Refuse positions that neither the drift of the path nor their noise explains."""
         swapped = "; ".join(self._swapped())
+        if swapped and self.degrees:
+            what, hint = "latitude and longitude are swapped", "the file has latitude first"
+            raise EvaluationError(what, where=where, got=swapped, hint=hint)
         hint = swapped or "have they its clock, metres, and the offset of the antenna?"
-        sigma_m = RECEIVER_M if self.stated_m is None else self.stated_m
+        sigma_m = RECEIVER_M
+        if self.stated_m is not None:
+            sigma_m = float(np.sqrt(np.mean(self.stated_m[self.agree] ** 2)))
         ours_m, position_m = self.ours_m[self.agree], self.position_m[self.agree]
         fit_to_path(ours_m, position_m, drift_m, sigma_m).check(where, hint)
         if self.uneven_m > SIGMAS * sigma_m:
@@ -133,20 +178,28 @@ class Measured:
 
     def warnings(self) -> list[str]:
         """Return lines of positions that are left out, and of columns that seem swapped."""
-        return [*self._left_out(), *self._swapped()]
+        late = []
+        if self.late_s:
+            by = f"{abs(self.late_s):.2f} s {'late' if self.late_s > 0 else 'early'}"
+            kept = f"(± {self.late_sigma_s:.2g} s), and taken as that"
+            late = [f"the clock of the positions is {by} beside that of the images {kept}"]
+        return [*late, *self._left_out(), *self._swapped()]
 
     def _swapped(self) -> list[str]:
         """Return a line if the path, which may bend left or right, is that of a mirror image."""
         ours_m, position_m = self.ours_m[self.agree], self.position_m[self.agree]
         if len(ours_m) < _FEWEST_TO_BEND:
             return []
+        mirrored_m = self.position_m[:, [1, 0, 2]] if self.swapped_m is None else self.swapped_m
         as_given, swapped = (
             float(np.sqrt(3.0 * np.mean(_off_m(ours_m, there_m) ** 2)))
-            for there_m in (position_m, position_m[:, [1, 0, 2]])
+            for there_m in (position_m, mirrored_m[self.agree])
         )
         if swapped > 0.5 * as_given or as_given < _LEAST_BEND_M:
             return []
         better = f"{swapped:.2f} m instead of {as_given:.2f} m (RMS)"
+        if self.degrees:
+            return [better]
         ask = "columns are time, easting, northing, height"
         return [f"with easting and northing swapped the positions fit better, {better}: {ask}"]
 
@@ -172,7 +225,16 @@ def measure_along(session: Session, survey: Survey) -> Measured:
     Between frames that are trusted, the path is interpolated at their times.
     """
     rows, path = survey.rows, _trusted_path(session)
-    here = rows[_during(path, rows[:, 0])]
+    T_map_world = session.T_map_world
+    antenna_m = _in_camera(survey, T_map_world)
+
+    def ours_at(times_s: Float64) -> Float64:
+        return _placed(T_map_world @ interpolate_poses(path, times_s), antenna_m)
+
+    late_s, late_sigma_s = clock_error(path, rows, ours_at)
+    rows = rows - np.array([late_s, *[0.0] * 6])
+    during = _during(path, rows[:, 0])
+    here = rows[during]
     if not len(here):
         raise EvaluationError(
             "no position was measured during the drive",
@@ -181,7 +243,7 @@ def measure_along(session: Session, survey: Survey) -> Measured:
             expected=f"times within {path.timestamps_s[0]:.3f} to {path.timestamps_s[-1]:.3f} s",
             hint="both need one clock",
         )
-    position_m, sigma_m = here[:, 1:4], here[:, 4]
+    position_m, sigma_m = here[:, 1:4], np.sqrt(np.mean(here[:, 4:] ** 2, axis=1))
     if span_m(position_m[:, :2]) < _LEAST_SPAN_M:
         raise EvaluationError(
             "the positions do not say how the map is turned",
@@ -190,12 +252,13 @@ def measure_along(session: Session, survey: Survey) -> Measured:
             expected=f"{_LEAST_SPAN_M:g} m or more",
             hint="eastings and northings are in metres, not degrees",
         )
-    T_map_world = session.T_map_world
-    antenna_m = _in_camera(survey, T_map_world)
-    ours_m = _placed(T_map_world @ interpolate_poses(path, here[:, 0]), antenna_m)
+    ours_m = ours_at(here[:, 0])
     agree = find_agreeing(ours_m, position_m, LARGEST_MISFIT * span_m(ours_m))
-    stated_m = None if np.isnan(sigma_m).any() else float(np.sqrt(np.mean(sigma_m[agree] ** 2)))
-    measured = Measured(here[:, 0], position_m, ours_m, agree, stated_m)
+    stated_m = None if np.isnan(sigma_m).any() else sigma_m
+    measured = Measured(
+        *(here[:, 0], position_m, ours_m, agree, stated_m, survey.swapped_m[during]),
+        *(late_s, late_sigma_s, survey.found.degrees),
+    )
     path = session.odometry
     stated = expected_drift(path, session.health, session.camera)
     drift_m = drift_at_end(path, session.trusted, None if stated is None else stated.percent)
@@ -214,7 +277,7 @@ def hold(map_: MapFile, survey: Survey) -> list[str]:
         measured = measure_along(session, survey)
         session.set_fixes(_fixes(session, measured, survey))
         lines += measured.warnings()
-    return lines
+    return [*survey.notes(), *lines]
 
 
 def misfit_rms_m(map_: MapFile) -> float | None:
@@ -249,7 +312,7 @@ def _fixes(session: Session, measured: Measured, survey: Survey) -> Fixes:
         frames,
         _placed(T_frame_camera, _in_camera(survey, session.T_map_world)),
         measured.position_m[measured.agree],
-        measured.sigma_m,
+        measured.sigma_m[measured.agree],
     )
 
 
@@ -274,20 +337,6 @@ def _trusted_path(session: Session) -> Trajectory:
 def span_m(positions: Float64) -> float:
     """Return the diagonal of the box around positions (N, 3)."""
     return float(np.linalg.norm(np.ptp(positions, axis=0)))
-
-
-@reader
-def _read_positions(file: Path) -> Float64:
-    """Return time, east, north, up and sigma (N, 5), in the order of time."""
-    table, lines = read_table(file, (4, 5, 7, 8))
-    check_positions(table[:, 1:4], lines, file)
-    sigma_m = np.full(len(table), np.nan)
-    if table.shape[1] in (5, 7):
-        sigma_m = np.sqrt(np.mean(table[:, 4:] ** 2, axis=1))
-        if not (table[:, 4:] > 0.0).all():
-            raise FormatError("a standard deviation is not above 0", where=file)
-    rows = np.column_stack([table[:, :4], sigma_m])
-    return np.asarray(rows[np.argsort(rows[:, 0], kind="stable")])
 
 
 def _during(path: Trajectory, times_s: Float64) -> Bool:

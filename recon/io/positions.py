@@ -1,0 +1,313 @@
+"""Positions that receivers and total stations write: NMEA, RTKLIB, KITTI's OXTS, and tables."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from functools import reduce
+from operator import xor
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import EvaluationError, FormatError, require
+from recon.core.text import counted, parse_numbers
+from recon.core.values.arrays import Float64
+from recon.io.files import StrPath, read_table, read_text, reader
+from recon.io.models.las import check_crs
+from recon.io.trajectory import check_positions
+
+_NAMES: Final = {
+    "time": ("time", "t", "timestamp", "time_s", "timestamp_s", "seconds"),
+    "lat": ("lat", "latitude", "lat_deg", "latitude_deg"),
+    "lon": ("lon", "lng", "long", "longitude", "lon_deg", "longitude_deg"),
+    "height": ("alt", "altitude", "height", "ele", "elevation", "h", "alt_m", "height_m"),
+    "sigma": ("sigma", "sigma_m", "accuracy"),
+}
+# Standard deviations of a horizontal coordinate in metres at a dilution of precision of 1, by the
+# quality that NMEA 0183 states in GGA: autonomous, differential, RTK fixed, RTK floating.
+_NMEA_SIGMA_M: Final = {1: 5.0, 2: 1.0, 4: 0.02, 5: 0.3}
+_USUAL_SIGMA_M: Final = 10.0  # of other qualities: estimated, simulated
+_UP: Final = 1.5  # how many times less a receiver knows its height
+# GPS time does not have the leap seconds of UTC. Ref: IERS Bulletin C.
+_LEAPS: Final = ((2017, 1, 18), (2015, 7, 17), (2012, 7, 16), (2009, 1, 15), (2006, 1, 14))
+_GPS_EPOCH: Final = datetime(1980, 1, 6, tzinfo=timezone.utc)
+_NMEA: Final = re.compile(r"\$?..(GGA|RMC|ZDA|GST),")
+_FARTHEST_DEG: Final = (90.0, 360.0)
+_NO_PLACE_DEG: Final = 1e-6  # latitude and longitude of a receiver without a position
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """Positions in the order of time.
+
+    ``places`` (N, 3) are degrees of latitude and longitude, or eastings and northings in metres,
+    and heights in metres; ``sigma_m`` (N, 3) standard deviations east, north and up, NaN = unknown.
+    """
+
+    times_s: Float64
+    places: Float64
+    sigma_m: Float64
+    degrees: bool = False
+    heights: str = ""  # what they are above, if the format says
+
+    def projected(self, crs: str | None, where: StrPath) -> tuple[Float64, str | None]:
+        """Return metres east, north and up (N, 3), and their system: UTM's where none is given.
+
+        Heights stay as they are: between the ellipsoid and the geoid lies a grid of tens of metres
+        that must not be guessed.
+        """
+        if not self.degrees:
+            return self.places, crs
+        lat, lon = np.median(self.places[:, :2], axis=0)
+        zone = int((lon + 180.0) // 6.0) % 60 + 1
+        system = crs or f"EPSG:{(32600 if lat >= 0 else 32700) + zone}"
+        pyproj = require("pyproj", extra="survey")
+        flat = check_crs(system)
+        flat = flat.sub_crs_list[0] if flat.sub_crs_list else flat
+        convert = pyproj.Transformer.from_crs("EPSG:4326", flat, always_xy=True)
+        east, north = convert.transform(self.places[:, 1], self.places[:, 0])
+        if not (np.isfinite(east).all() and np.isfinite(north).all()):
+            what, expected = "positions cannot be converted", "latitude and longitude in its area"
+            got = f"latitude {lat:g}, longitude {lon:g} in {system}"
+            raise EvaluationError(what, where=where, got=got, expected=expected)
+        return np.column_stack([east, north, self.places[:, 2]]), system
+
+
+@reader
+def read_positions(path: StrPath) -> Positions:
+    """Read positions in the format that the file, or a folder of OXTS, shows itself to be in.
+
+    Times are seconds on the clock of the file, since 1970 (UTC) where it has dates. Rows without a
+    position are left out; sentences with a wrong checksum, too.
+
+    Raises:
+        FormatError: There is no position, or a row is not what its format says.
+
+    Ref: NMEA 0183 (GGA, RMC, ZDA, GST); T. Takasu, "RTKLIB manual 2.4.2", appendix B; A. Geiger et
+    al., "Vision meets robotics: the KITTI dataset", IJRR 32, 2013 (OXTS).
+    """
+    place = Path(path)
+    if place.is_dir():
+        return _in_order(_read_oxts(place), place)
+    first = next((line.strip() for line in read_text(place).splitlines() if line.strip()), "")
+    if _NMEA.match(first) or first.startswith("$"):
+        return _in_order(_read_nmea(place), place)
+    if first.startswith("%"):
+        return _in_order(_read_rtklib(place), place)
+    columns = _columns_of(first)
+    return _in_order(_read_table(place) if columns is None else _read_named(place, columns), place)
+
+
+def _in_order(found: Positions, path: Path) -> Positions:
+    """Return positions in the order of time, without those that say that there is none."""
+    good = np.isfinite(found.places).all(axis=1) & np.isfinite(found.times_s)
+    if found.degrees:
+        good &= np.abs(found.places[:, :2]).max(axis=1, initial=0.0) > _NO_PLACE_DEG
+        beyond = good & (np.abs(found.places[:, :2]) > _FARTHEST_DEG).any(axis=1)
+        if beyond.any():
+            lat, lon = found.places[beyond][0, :2]
+            what, expected = "no such place", "latitude within 90 degrees, then longitude"
+            got, hint = f"latitude {lat:g}, longitude {lon:g}", "are the two swapped?"
+            raise FormatError(what, where=path, got=got, expected=expected, hint=hint)
+    if not good.any():
+        raise FormatError("the file has no position", where=path)
+    sigma_m = np.where(found.sigma_m > 0, found.sigma_m, np.nan)
+    order = np.flatnonzero(good)[np.argsort(found.times_s[good], kind="stable")]
+    arrays = found.times_s[order], found.places[order], sigma_m[order]
+    return Positions(*arrays, degrees=found.degrees, heights=found.heights)
+
+
+def _read_table(path: Path) -> Positions:
+    """Read rows of time, easting, northing, height, and perhaps one or three deviations."""
+    table, lines = read_table(path, (4, 5, 7, 8))
+    check_positions(table[:, 1:4], lines, path)
+    sigma_m = np.full((len(table), 3), np.nan)
+    if table.shape[1] in (5, 7):
+        sigma_m[:] = table[:, 4:]
+        if not (sigma_m > 0.0).all():
+            raise FormatError("a standard deviation is not above 0", where=path)
+    return Positions(table[:, 0], table[:, 1:4], sigma_m)
+
+
+def _columns_of(line: str) -> dict[str, int] | None:
+    """Return which columns a line of names has; None if it does not name latitude and longitude."""
+    words = [word.strip("\"'").lower() for word in line.lstrip("# ").replace(",", " ").split()]
+    found = {
+        name: next((n for n, word in enumerate(words) if word in known), -1)
+        for name, known in _NAMES.items()
+    }
+    return found if min(found["lat"], found["lon"]) >= 0 else None
+
+
+def _read_named(path: Path, columns: dict[str, int]) -> Positions:
+    missing = [name for name in ("time", "height") if columns[name] < 0]
+    if missing:
+        what, expected = "the header lacks a column", "time, lat, lon, height (and sigma)"
+        raise FormatError(what, where=path, got=f"no {missing[0]}", expected=expected)
+    rows = [
+        line.replace(",", " ").split()
+        for line in read_text(path).splitlines()[1:]
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    used = [columns[name] for name in ("time", "lat", "lon", "height", "sigma")]
+    table = np.array([_numbers(row, [*filter(_is_there, used)], path) for row in rows])
+    if not len(table):
+        raise FormatError("the file has no position", where=path)
+    sigma_m = np.full((len(table), 3), np.nan)
+    if table.shape[1] == 5:
+        sigma_m[:] = table[:, 4:]
+    return Positions(table[:, 0], table[:, 1:4], sigma_m, degrees=True)
+
+
+def _is_there(column: int) -> bool:
+    return column >= 0
+
+
+def _numbers(words: Sequence[str], columns: Sequence[int], path: Path) -> list[float]:
+    try:
+        return [float(number) for number in parse_numbers([words[n] for n in columns])]
+    except (IndexError, ValueError) as error:
+        got = " ".join(words)[:60]
+        raise FormatError("not a row of numbers", where=path, got=got) from error
+
+
+def _read_oxts(folder: Path) -> Positions:
+    """Read a folder ``oxts`` of KITTI's raw data, or one that has it."""
+    folder = folder / "oxts" if (folder / "oxts").is_dir() else folder
+    files = sorted((folder / "data").glob("*.txt"))
+    if not files:
+        expected = "data/*.txt and timestamps.txt"
+        raise FormatError("the folder is not one of OXTS", where=folder, expected=expected)
+    lines = [line for line in read_text(folder / "timestamps.txt").splitlines() if line.strip()]
+    if len(lines) != len(files):
+        got, expected = counted(len(lines), "time"), counted(len(files), "time")
+        raise FormatError("wrong number of times", where=folder, got=got, expected=expected)
+    times_s = [_seconds(line, folder / "timestamps.txt") for line in lines]
+    # Latitude, longitude, altitude; accuracy of the position (1 sigma) is number 23.
+    rows = np.array([_numbers(read_text(one).split(), (0, 1, 2, 23), one) for one in files])
+    sigma_m = np.repeat(rows[:, 3:], 3, axis=1)
+    places, above = rows[:, :3], "the ellipsoid"
+    return Positions(np.array(times_s), places, sigma_m, degrees=True, heights=above)
+
+
+def _seconds(text: str, path: Path) -> float:
+    """Return seconds since 1970 of a date and time in UTC, with more digits than Python reads."""
+    whole, _, part = text.strip().replace("T", " ").replace("/", "-").partition(".")
+    try:
+        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+        return moment.timestamp() + float(f"0.{part or 0}")
+    except ValueError as error:
+        what, expected = "not a time", "2011-09-26 13:02:25.964"
+        raise FormatError(what, where=path, got=text[:40], expected=expected) from error
+
+
+def _read_rtklib(path: Path) -> Positions:
+    """Read a solution of RTKLIB: its last line of ``%`` names the columns."""
+    lines = read_text(path).splitlines()
+    heads = [line.lstrip("% ") for line in lines if line.startswith("%")]
+    names = heads[-1].split() if heads else []
+    lat = next((n for n, name in enumerate(names) if name.startswith("latitude")), -1)
+    if lat < 0 or "sdn(m)" not in names:
+        what, expected = "not a solution with latitude and longitude", "RTKLIB's out-solformat=llh"
+        raise FormatError(what, where=path, got=" ".join(names)[:60], expected=expected)
+    gps = names[0].upper() == "GPST"
+    # A time is two words, and has one name.
+    shift = 1
+    used = [lat + shift + n for n in range(3)]
+    used += [names.index(name) + shift for name in ("sde(m)", "sdn(m)", "sdu(m)")]
+    rows, times_s = [], []
+    for line in lines:
+        words = line.split()
+        if not words or words[0].startswith("%"):
+            continue
+        times_s.append(_rtklib_time(words[:2], path, gps=gps))
+        rows.append(_numbers(words, used, path))
+    if not rows:
+        raise FormatError("the file has no position", where=path)
+    table = np.array(rows)
+    above = next((what for what in ("ellipsoidal", "geodetic") if what in " ".join(heads)), "")
+    heights = {"ellipsoidal": "the ellipsoid", "geodetic": "the geoid"}.get(above, "")
+    return Positions(np.array(times_s), table[:, :3], table[:, 3:], degrees=True, heights=heights)
+
+
+def _rtklib_time(words: Sequence[str], path: Path, *, gps: bool) -> float:
+    if "/" in words[0]:
+        seconds = _seconds(" ".join(words), path)
+    else:  # week and seconds
+        week, of_week = _numbers(words, (0, 1), path)
+        seconds = (_GPS_EPOCH + timedelta(weeks=week, seconds=of_week)).timestamp()
+    return seconds - _leap_seconds(seconds) if gps else seconds
+
+
+def _leap_seconds(time_s: float) -> int:
+    moment = datetime.fromtimestamp(time_s, timezone.utc)
+    return next((n for year, month, n in _LEAPS if (moment.year, moment.month) >= (year, month)), 0)
+
+
+def _read_nmea(path: Path) -> Positions:
+    """Read sentences of a receiver: GGA for positions, RMC or ZDA for the date, GST for sigma."""
+    rows: list[list[float]] = []
+    day_s, before_s = 0.0, 0.0
+    deviations: dict[str, list[float]] = {}
+    for kind, words in _sentences(path):
+        if kind == "RMC" and len(words) > 8 and len(words[8]) == 6:
+            day_s = _day(words[8][4:], words[8][2:4], words[8][:2], path)
+        elif kind == "ZDA" and len(words) > 3 and words[3]:
+            day_s = _day(words[3], words[2], words[1], path)
+        elif kind == "GST" and len(words) > 7 and all(words[5:8]):
+            north, east, up = _numbers(words, (5, 6, 7), path)
+            deviations[words[0]] = [east, north, up]
+        elif kind == "GGA" and len(words) > 8 and words[5] not in ("", "0"):
+            time_s = _time_of_day(words[0], path)
+            # Midnight may come before the new date.
+            time_s += day_s + (86400.0 if day_s + time_s < before_s - 43200.0 else 0.0)
+            before_s = time_s
+            lat = _degrees(words[1], words[2], path)
+            lon = _degrees(words[3], words[4], path)
+            quality, dilution, height = _numbers([w or "1" for w in words], (5, 7, 8), path)
+            each = _NMEA_SIGMA_M.get(int(quality), _USUAL_SIGMA_M) * dilution
+            sigma_m = deviations.get(words[0], [each, each, _UP * each])
+            rows.append([time_s, lat, lon, height, *sigma_m])
+    if not rows:
+        what, hint = "no sentence has a position", "GGA with a quality above 0, and a checksum"
+        raise FormatError(what, where=path, hint=hint)
+    table = np.array(rows)
+    if day_s:
+        dated = table[:, 0] >= 86400.0
+        table[~dated, 0] += 86400.0 * np.floor(table[dated, 0].min(initial=day_s) / 86400.0)
+    above = "the geoid of the receiver"
+    return Positions(table[:, 0], table[:, 1:4], table[:, 4:], degrees=True, heights=above)
+
+
+def _sentences(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield kind and fields of the sentences whose checksum is right."""
+    for line in read_text(path).splitlines():
+        content, star, checksum = line.strip().lstrip("$").partition("*")
+        if not star or not _matches(content, checksum):
+            continue
+        kind, *words = content.split(",")
+        yield kind[2:], words
+
+
+def _matches(content: str, checksum: str) -> bool:
+    return f"{reduce(xor, content.encode(), 0):02X}" == checksum.strip().upper()
+
+
+def _day(year: str, month: str, day: str, path: Path) -> float:
+    century = 0 if len(year) == 4 else 1900 if int(year) >= 70 else 2000
+    return _seconds(f"{century + int(year)}-{month}-{day} 00:00:00", path)
+
+
+def _time_of_day(text: str, path: Path) -> float:
+    hours, minutes, seconds = _numbers([text[:2], text[2:4], text[4:]], (0, 1, 2), path)
+    return 3600.0 * hours + 60.0 * minutes + seconds
+
+
+def _degrees(text: str, side: str, path: Path) -> float:
+    point = text.find(".") if "." in text else len(text)
+    degrees, minutes = _numbers([text[: point - 2] or "0", text[point - 2 :]], (0, 1), path)
+    return (degrees + minutes / 60.0) * (-1.0 if side in ("S", "W") else 1.0)
