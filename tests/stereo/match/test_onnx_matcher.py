@@ -42,6 +42,8 @@ def pair_of(left: int, right: int, shape: tuple[int, int] = (40, 60)) -> Rectifi
 
 
 def match(model: Path, pair: RectifiedPair, **settings: object) -> Disparity:
+    """Match as a network that need not be a matcher, from the left view alone."""
+    settings = {"self_test": False, "left_right": False, **settings}
     return OnnxMatcher(OnnxSettings(model=model, **settings), threads=1).match(pair)
 
 
