@@ -32,9 +32,7 @@ PRESETS: Final = {
     # Ref: Tankovich et al., "HITNet: Hierarchical iterative tile refinement network for real-time
     # stereo matching", CVPR 2021. Grey levels in [0, 1], both images in one input.
     "hitnet": Preset(
-        get="hitnet_eth3d_480x640.onnx or another size, from the releases (v0.1-hitnet) of "
-        "github.com/nburrus/stereodemo; converted in PINTO_model_zoo/142_HITNET from eth3d.pb of "
-        "github.com/google-research/google-research/tree/master/hitnet",
+        get="hitnet_eth3d_480x640.onnx of github.com/nburrus/stereodemo, release v0.1-hitnet",
         licence="Apache-2.0 (that of the sources in google-research; none is stated for weights)",
         trained_on="ETH3D, by its name; its authors do not state what else",
         layout="1 input of 2 channels",
@@ -42,8 +40,8 @@ PRESETS: Final = {
     # Ref: Jing et al., "Lite Any Stereo: Efficient zero-shot stereo matching", CVPR 2026. Levels in
     # [0, 255], which it normalises itself.
     "lite-any-stereo": Preset(
-        get="LiteAnyStereo.pth, linked in the README of github.com/TomTomTommi/LiteAnyStereo, made "
-        "an .onnx file of your image size by its export_onnx.py --version las1",
+        get="LiteAnyStereo.pth of github.com/TomTomTommi/LiteAnyStereo, exported with its "
+        "export_onnx.py --version las1",
         licence="MIT (LICENSE of github.com/TomTomTommi/LiteAnyStereo)",
         trained_on="synthetic sets and pairs without truth, named in arXiv:2511.16555; not those "
         "of Middlebury, ETH3D and KITTI, by its authors",

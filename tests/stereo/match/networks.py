@@ -54,7 +54,7 @@ def write_matcher(path, ndisp=24, *, channels=1, stacked=False, size=(None, None
         left = graph.cut("both", 1, 0, channels)
         right = graph.cut("both", 1, channels, 2 * channels)
     else:
-        inputs = {side: (1, channels, *size) for side in ("left", "right")}
+        inputs = dict.fromkeys(("left", "right"), (1, channels, *size))
         left, right = inputs
     pads = graph.constant([0, 0, 0, ndisp, 0, 0, 0, 0], np.int64)
     wide = graph.add("Pad", right, pads, graph.constant(9.0))
