@@ -59,9 +59,9 @@ class OnnxSettings(Settings):
     left_right: bool = True
     """Match the right view too, in twice the time: what both views agree on is kept, and how well
     they agree makes confidence and sigma_px. Else all matches have the same."""
-    tile_megapixels: float = Field(2.0, ge=0.1, le=1000)
-    """Larger images are matched in tiles of this size, which overlap; memory grows with it. Not
-    where the network or width_px gives the size."""
+    tile_megapixels: float = Field(1.0, ge=0.1, le=1000)
+    """Larger images are matched in tiles of this size, which overlap; memory grows with it, by 1 to
+    2 GB per megapixel of a small network. Not where the network or width_px gives the size."""
     self_test: bool = True
     """Let the network match a rendered plane first, and refuse it if it does not find the
     disparity."""
