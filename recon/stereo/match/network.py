@@ -21,7 +21,14 @@ _MISTAKEN: Final = {
 
 
 class OnnxNetwork:
-    """A loaded network, run on the CPU; ``threads`` per operator, None = onnxruntime's default."""
+    """A loaded network, run on the CPU; ``threads`` per operator, None = onnxruntime's default.
+
+    Attributes:
+        stacked: Whether one input takes both images, one behind the other: (1, 2·C, H, W).
+        channels: Those of one image; 3 where the network leaves them free.
+        size: Width and height of the images that it takes; None = any.
+        layout: The number of inputs and their channels, in words.
+    """
 
     def __init__(self, path: Path, threads: int | None = None) -> None:
         runtime = require("onnxruntime", extra="onnx")
@@ -41,42 +48,19 @@ class OnnxNetwork:
             raise FormatError(
                 "onnxruntime cannot load the network", where=path, got=_first_line(error)
             ) from error
+        self._read_inputs()
 
-    @property
-    def input_shapes(self) -> tuple[tuple[int | None, ...], ...]:
-        """The shape of each input as the network declares it; None = a size that is free."""
-        return tuple(
-            tuple(length if isinstance(length, int) else None for length in one.shape)
-            for one in self._session.get_inputs()
-        )
-
-    @property
-    def stacked(self) -> bool:
-        """Whether one input takes both images, one behind the other: (1, 2·C, H, W)."""
-        return len(self._session.get_inputs()) == 1
-
-    @property
-    def channels(self) -> int:
-        """The channels of one image; 3 where the network leaves them free."""
-        first = self.input_shapes[0]
-        channels = first[1] if len(first) == 4 else None
-        if channels is None:
-            return 3
-        return max(1, channels // 2) if self.stacked else channels
-
-    @property
-    def size(self) -> tuple[int, int] | None:
-        """Width and height of the images that it takes; None = any."""
-        first = self.input_shapes[0]
-        height, width = first[2:] if len(first) == 4 else (None, None)
-        return None if width is None or height is None else (width, height)
-
-    @property
-    def layout(self) -> str:
-        """What it takes, in words."""
-        count = len(self._session.get_inputs())
-        channels = self.channels * (2 if self.stacked else 1)
-        return f"{count} input{'s'[: count != 1]} of {channels} channel{'s'[: channels != 1]}"
+    def _read_inputs(self) -> None:
+        inputs = self._session.get_inputs()
+        if not inputs:
+            raise FormatError("the network has no input", where=self._path, expected="two images")
+        shape = [length if isinstance(length, int) else None for length in inputs[0].shape]
+        channels, height, width = shape[1:] if len(shape) == 4 else (None, None, None)
+        self.stacked = len(inputs) == 1
+        self.channels: int = max(1, channels // (1 + self.stacked)) if channels else 3
+        self.size = None if width is None or height is None else (width, height)
+        of, s = (self.channels * (1 + self.stacked), "" if self.stacked else "s")
+        self.layout = f"{len(inputs)} input{s} of {of} channel{'s' if of > 1 else ''}"
 
     def run(self, inputs: Sequence[Float32]) -> list[Float32]:
         """Run the network once, from float32 arrays in the order of its inputs."""

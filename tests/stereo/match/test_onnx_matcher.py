@@ -93,6 +93,10 @@ def test_no_map_and_other_inputs_of_a_network_are_refused(difference, tmp_path):
     sides, letters = ["left", "right"], ["a", "b", "c"]
     shape = (1, 3, None, None)
     colours = write_network(tmp_path / "colours.onnx", sides, [(sides, "d", "Sub")], shape)
+    none = Graph()
+    none.write(tmp_path / "none.onnx", {}, none.add("Add", none.constant(1.0), none.constant(2.0)))
+    with pytest.raises(FormatError, match="no input"):
+        match(tmp_path / "none.onnx", pair_of(1, 2))
     three = write_network(tmp_path / "three.onnx", letters, [(letters, "d", "Sum")])
     for path, settings, words in (
         (colours, {}, "not a disparity map"),
