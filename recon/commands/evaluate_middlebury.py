@@ -27,6 +27,7 @@ from recon.io.images.disparity import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
 from recon.run.run import Run
 from recon.run.work import SILENT, Progress
+from recon.stereo.match.onnx import describe_network
 from recon.stereo.match.protocol import Matcher
 
 
@@ -108,6 +109,8 @@ def run_middlebury(
             progress.on_finish()
         summary = summarise_scenes(found, names, others, Path(folder))
         summary |= {"threads": run.threads, "parallel": parallel}
+        if "onnx" in chosen:
+            summary["network"] = describe_network(config.matching.onnx)
         with run.report(summary):
             write_middlebury_page(summary, run)
         files = [file for path in paths.values() for file in sorted(path.iterdir())]

@@ -32,8 +32,9 @@ from recon.run.run import Run, plain
 from recon.run.work import SILENT, Progress
 from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
+from recon.stereo.match.onnx import describe_network
 from recon.stereo.match.protocol import Matcher, name_of
-from recon.stereo.match.registry import MATCHERS, check_matcher, field_of
+from recon.stereo.match.registry import MATCHERS, MatchingSettings, check_matcher, field_of
 
 
 def run_pair(
@@ -139,6 +140,7 @@ def _compared(
         "pair": name,
         **_disparity_figures(disparity),
         **({} if metrics is None else {"disparity": plain(metrics)}),
+        **_network_figures(config.matching),
         **figures,
         "warnings": list(warnings),
     }
@@ -239,6 +241,10 @@ def _disparity_figures(disparity: Disparity) -> dict[str, Any]:
         "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
         "disparity_median_px": float(np.median(found)) if len(found) else None,
     }
+
+
+def _network_figures(settings: MatchingSettings) -> dict[str, Any]:
+    return {"network": describe_network(settings.onnx)} if settings.matcher == "onnx" else {}
 
 
 def _cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:

@@ -75,6 +75,12 @@ def image(side: str, path: Path) -> None:
     write_image(path, getattr(next(iter(street())), side))
 
 
+def network(path: Path) -> None:
+    from tests.stereo.match.networks import write_matcher
+
+    write_matcher(path)
+
+
 def camchain(path: Path) -> None:
     camera = street().calibration
     values = {"f": camera.focal_px, "cx": camera.cx_px, "cy": camera.cy_px}
@@ -242,6 +248,7 @@ STAND_INS = (
     StandIn("MiddEval3/trainingQ", scenes),
     StandIn("results/mine", results),
     StandIn("results/baseline", results),
+    StandIn("network.onnx", network),
     StandIn("pip install ./block-matcher", plugin, "site"),
     StandIn("rides/today", recording),
     StandIn("rides/long", drive),

@@ -1,6 +1,7 @@
 """`recon evaluate middlebury` and `recon evaluate disparity` from files to figures."""
 
 import csv
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -118,6 +119,28 @@ def test_figures_ignore_what_runs_beside(quarter, matched, tmp_path):
     beside = summary_of(matched)["matchers"]["sad"]["scenes"]
     assert alone == beside["MiddEval3/trainingQ/Vintage"]["nonocc"]
     assert done.err == ""
+
+
+def test_results_of_a_network_name_it_with_licence_and_training_sets(quarter, tmp_path):
+    pytest.importorskip("onnx")
+    from tests.stereo.match.networks import write_matcher
+
+    model = write_matcher(tmp_path / "n.onnx", channels=3)
+    words = ["--set", f"matching.onnx.model={model}"]
+    words += ["--set", "matching.onnx.preset=lite-any-stereo"]
+    words += ["--set", "matching.onnx.std=[1]", "--out"]
+    scored = printed(middlebury(quarter, "--matcher", "onnx", "--json", *words, tmp_path / "many"))
+    images = [quarter / "Teddy" / f"im{n}.png" for n in (0, 1)]
+    calib = ["--calib", quarter / "Teddy" / "calib.txt"]
+    assert run("pair", *images, *calib, "--matcher", "onnx", *words, tmp_path / "one").code == 0
+    network = summary_of(tmp_path / "one")["network"]
+    assert network == scored["network"] == summary_of(tmp_path / "many")["network"]
+    assert network["sha256"] == hashlib.sha256(model.read_bytes()).hexdigest()
+    assert scored["matchers"]["onnx"]["weighted"]["confidence"]["ece"] < 0.3
+    for folder in ("one", "many"):
+        page = (tmp_path / folder / "report.html").read_text()
+        assert network["sha256"] in page
+        assert network["trained_on"] in page
 
 
 @pytest.mark.parametrize(("words", "said"), [

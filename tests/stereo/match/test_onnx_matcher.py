@@ -9,10 +9,15 @@ from recon.core import errors
 from recon.core.errors import FormatError, MatchingError, MissingDependencyError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
+from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings, describe_network
+from recon.stereo.match.presets import PRESETS
+from recon.stereo.match.self_test import rendered_pair
+from recon.stereo.match.tiles import match_in_tiles
 
 onnx = pytest.importorskip("onnx", reason="the package onnx builds the network: pip install onnx")
 pytest.importorskip("onnxruntime", reason="extra onnx: pip install 'recon[onnx]'")
+
+from tests.stereo.match.networks import Graph, write_matcher  # noqa: E402 (it needs onnx)
 
 
 def write_network(path, inputs, nodes, shape=(1, 1, None, None)):
@@ -42,6 +47,8 @@ def pair_of(left: int, right: int, shape: tuple[int, int] = (40, 60)) -> Rectifi
 
 
 def match(model: Path, pair: RectifiedPair, **settings: object) -> Disparity:
+    """Match as a network that need not be a matcher, from the left view alone."""
+    settings = {"self_test": False, "left_right": False, **settings}
     return OnnxMatcher(OnnxSettings(model=model, **settings), threads=1).match(pair)
 
 
@@ -86,6 +93,10 @@ def test_no_map_and_other_inputs_of_a_network_are_refused(difference, tmp_path):
     sides, letters = ["left", "right"], ["a", "b", "c"]
     shape = (1, 3, None, None)
     colours = write_network(tmp_path / "colours.onnx", sides, [(sides, "d", "Sub")], shape)
+    none = Graph()
+    none.write(tmp_path / "none.onnx", {}, none.add("Add", none.constant(1.0), none.constant(2.0)))
+    with pytest.raises(FormatError, match="no input"):
+        match(tmp_path / "none.onnx", pair_of(1, 2))
     three = write_network(tmp_path / "three.onnx", letters, [(letters, "d", "Sum")])
     for path, settings, words in (
         (colours, {}, "not a disparity map"),
@@ -117,3 +128,162 @@ def test_without_the_extra_pip_is_named(difference, monkeypatch):
     monkeypatch.setattr(errors, "import_module", absent)
     with pytest.raises(MissingDependencyError, match=r"recon\[onnx\]"):
         match(difference, pair_of(1, 2))
+
+
+@pytest.fixture(scope="module")
+def matcher_file(tmp_path_factory):
+    """A network that matches, of two inputs of one channel."""
+    return write_matcher(tmp_path_factory.mktemp("network") / "sad.onnx")
+
+
+def plane_pair(*, hide: bool = False) -> tuple[RectifiedPair, np.ndarray]:
+    """A textured plane with its disparity; with a square before it, 8 px nearer, if ``hide``."""
+    left, right, truth = (np.array(one) for one in rendered_pair((320, 160)))
+    if hide:
+        left, truth = left.copy(), truth.copy()
+        square = np.random.default_rng(1).integers(40, 215, (60, 60), dtype=np.uint8)
+        left[50:110, 150:210], right[50:110, 130:190], truth[50:110, 150:210] = square, square, 20
+    return RectifiedPair(left, right, stand_in_camera(320, 160)), truth
+
+
+def run(model: Path, pair: RectifiedPair, **settings: object) -> Disparity:
+    return OnnxMatcher(OnnxSettings(model=model, **settings), threads=1).match(pair)
+
+
+def test_agreement_of_both_views_finds_what_one_hides_and_rates_the_rest(matcher_file):
+    pair, truth = plane_pair(hide=True)
+    found = run(matcher_file, pair)
+    error = np.abs(found.values - truth)[found.valid]
+    assert np.median(error) < 0.3
+    # The plane is 14 px behind the square at most, and as much of it is seen by the left view only.
+    shadow = found.reason[60:100, 144:149]
+    assert np.isin(shadow, (Reason.OCCLUDED, Reason.LEFT_RIGHT)).mean() > 0.9
+    sure, sigma = found.confidence[found.valid], found.sigma_px[found.valid]
+    least, most = np.quantile(sure, (0.1, 0.9))
+    assert (error[sure < least] > 1).mean() > (error[sure >= most] > 1).mean()
+    assert np.abs(sure.mean() - (error <= 1).mean()) < 0.1
+    assert 0.25 <= sigma.min() < sigma.max() < 3
+    assert 0.6 < (error <= sigma).mean() <= 1
+    alone = run(matcher_file, pair, left_right=False)
+    assert alone.valid.sum() > found.valid.sum()
+    assert len(np.unique(alone.confidence[alone.valid])) == 1
+
+
+def scaled(factor):
+    return lambda graph, name: graph.add("Mul", name, graph.constant(factor))
+
+
+def invalid(graph, name):
+    return graph.add("Div", graph.add("Sub", name, name), graph.constant(0.0))
+
+
+def everywhere(graph, name):
+    return graph.add("Add", graph.add("Sub", name, name), graph.constant(7.0))
+
+
+@pytest.mark.parametrize(
+    ("last", "settings", "words"),
+    [
+        (scaled(-1.0), {}, r"-1\.?\d* times the disparity.*output_scale=-1"),
+        (scaled(0.5), {}, r"0\.5\d* times the disparity.*output_scale=(1\.9|2)"),
+        (scaled(1.0), {"output_scale": -2.0}, r"-2.*output_scale=(0\.99|1)"),
+        (invalid, {}, "no finite number"),
+        (everywhere, {}, "7 everywhere"),
+        (scaled(1.0), {"std": (100.0,)}, "median error|everywhere"),
+    ],
+)
+def test_a_network_that_does_not_find_a_rendered_plane_is_refused(tmp_path, last, settings, words):
+    path = write_matcher(tmp_path / "n.onnx", last=last)
+    with pytest.raises(MatchingError, match=words):
+        run(path, plane_pair()[0], **settings)
+
+
+@pytest.mark.parametrize(
+    ("preset", "made"),
+    [
+        # As converted from TensorFlow: channels at the end of the output.
+        ("hitnet", {"stacked": True, "size": (128, 320), "last": "transpose"}),
+        ("lite-any-stereo", {"channels": 3, "size": (160, 320), "last": "levels"}),
+    ],
+)
+def test_a_network_laid_out_like_that_of_a_preset_is_fed_as_it_is_meant(tmp_path, preset, made):
+    def transpose(graph, name):
+        return graph.add("Transpose", name, perm=[0, 2, 3, 1])
+
+    last = transpose if made["last"] == "transpose" else None
+    path = write_matcher(tmp_path / "n.onnx", **{**made, "last": last})
+    pair, truth = plane_pair()
+    found = run(path, pair, preset=preset)
+    assert np.nanmedian(np.abs(found.values - truth)) < 0.5
+    about = describe_network(OnnxSettings(model=path, preset=preset))
+    assert about["trained_on"] == PRESETS[preset].trained_on
+    assert len(about["sha256"]) == 64
+    other = {"hitnet": "lite-any-stereo", "lite-any-stereo": "hitnet"}[preset]
+    with pytest.raises(SettingsError, match=r"not the network of the preset.*get "):
+        run(path, pair, preset=other)
+
+
+def test_a_preset_without_a_file_says_which_to_get_and_what_is_set_wins():
+    with pytest.raises(SettingsError, match="stereodemo"):
+        OnnxMatcher(OnnxSettings(preset="hitnet")).match(pair_of(1, 2))
+    own = OnnxSettings(preset="lite-any-stereo", std=(0.5,), output_scale=2.0).read()
+    assert (own.std, own.output_scale, own.mean) == ((0.5,), 2.0, (0.0,))
+    assert OnnxSettings(preset="lite-any-stereo").read().std == (1 / 255,)
+
+
+def test_colours_reach_a_network_of_three_channels(tmp_path):
+    def write_green(path):
+        graph = Graph()
+        return graph.write(
+            path,
+            dict.fromkeys(("left", "right"), (1, 3, None, None)),
+            graph.cut("left", 1, 1, 2),
+        )
+
+    pair, colour = pair_of(0, 0), np.zeros((40, 60, 3), np.uint8)
+    colour[..., 1] = 12
+    seen = RectifiedPair(pair.left, pair.right, pair.camera, left_rgb=colour, right_rgb=colour)
+    values = match(write_green(tmp_path / "g.onnx"), seen, std=(1 / 255,)).values
+    assert np.nanmedian(values) == pytest.approx(12)
+
+
+@pytest.mark.parametrize("shape", [(448, 320), (128, 1024), (384, 512)])
+def test_tiles_give_what_the_whole_image_gives(matcher_file, shape):
+    random = np.random.default_rng(3)
+    right = random.integers(0, 255, shape, dtype=np.uint8)
+    pair = RectifiedPair(np.roll(right, 9, 1), right, stand_in_camera(*shape[::-1], ndisp=24))
+    whole = run(matcher_file, pair, self_test=False, left_right=False)
+    tiled = run(matcher_file, pair, self_test=False, left_right=False, tile_megapixels=0.1)
+    np.testing.assert_allclose(tiled.values, whole.values, atol=1e-4)
+    assert np.nanmedian(tiled.values) == pytest.approx(9, abs=0.1)
+
+
+def test_no_tile_of_a_huge_image_is_larger_than_allowed():
+    sizes = []
+
+    def look(left, right):
+        sizes.append(left.size)
+        return left.astype(np.float32)
+
+    image = np.tile(np.arange(250, dtype=np.uint8), (2016, 40))[:, :9984]
+    found = match_in_tiles(look, (image, image), 500, 1_000_000, 32)
+    np.testing.assert_array_equal(found, image)
+    assert 500_000 < max(sizes) <= 1_000_000
+    assert len(sizes) < 80
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"<!DOCTYPE html><html>", "a web page"),
+        (b"\n\n  <html>", "a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "git-lfs"),
+        (b"PK\x03\x04archive/data.pkl", "PyTorch"),
+        (b"\x1f\x8b\x08", "gzip"),
+        (b"", "onnxruntime cannot load"),
+    ],
+)
+def test_what_is_saved_instead_of_a_network_is_named(tmp_path, content, words):
+    (tmp_path / "n.onnx").write_bytes(content)
+    with pytest.raises(FormatError, match=words):
+        match(tmp_path / "n.onnx", pair_of(1, 2))

@@ -1,0 +1,106 @@
+"""A network in an ONNX file, run by onnxruntime: what it takes, and that it is one at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.errors import FormatError, MatchingError, require
+from recon.core.values.arrays import Float32
+
+#: What files begin with that people save instead of a network.
+_MISTAKEN: Final = {
+    b"version https://git-lfs": ("a pointer of git-lfs", "fetch the file itself: git lfs pull"),
+    b"<": ("a web page", "the address is that of a page, not of the file: download it there"),
+    b"PK\x03\x04": ("a zip archive or PyTorch weights", "unpack or export it first"),
+    b"\x1f\x8b": ("an archive (gzip)", "unpack it first"),
+}
+
+
+class OnnxNetwork:
+    """A loaded network, run on the CPU; ``threads`` per operator, None = onnxruntime's default.
+
+    Attributes:
+        stacked: Whether one input takes both images, one behind the other: (1, 2·C, H, W).
+        channels: Those of one image; 3 where the network leaves them free.
+        size: Width and height of the images that it takes; None = any.
+        layout: The number of inputs and their channels, in words.
+    """
+
+    def __init__(self, path: Path, threads: int | None = None) -> None:
+        runtime = require("onnxruntime", extra="onnx")
+        if not path.is_file():
+            raise FormatError("file does not exist", where=path, expected="an ONNX network")
+        _refuse_mistaken(path)
+        self._path = path
+        self._errors = _errors_of(runtime)
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = threads or 0
+        options.log_severity_level = 4  # fatal only: lesser errors arrive as exceptions
+        try:
+            self._session = runtime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+        except self._errors as error:
+            raise FormatError(
+                "onnxruntime cannot load the network", where=path, got=_first_line(error)
+            ) from error
+        self._read_inputs()
+
+    def _read_inputs(self) -> None:
+        inputs = self._session.get_inputs()
+        if not inputs:
+            raise FormatError("the network has no input", where=self._path, expected="two images")
+        shape = [length if isinstance(length, int) else None for length in inputs[0].shape]
+        channels, height, width = shape[1:] if len(shape) == 4 else (None, None, None)
+        self.stacked = len(inputs) == 1
+        self.channels: int = max(1, channels // (1 + self.stacked)) if channels else 3
+        self.size = None if width is None or height is None else (width, height)
+        of, s = (self.channels * (1 + self.stacked), "" if self.stacked else "s")
+        self.layout = f"{len(inputs)} input{s} of {of} channel{'s' if of > 1 else ''}"
+
+    def run(self, inputs: Sequence[Float32]) -> list[Float32]:
+        """Run the network once, from float32 arrays in the order of its inputs."""
+        wanted = self._session.get_inputs()
+        if len(wanted) != len(inputs):
+            raise MatchingError(
+                "the network has a different number of inputs",
+                where=self._path,
+                got=f"{len(wanted)}: {', '.join(one.name for one in wanted)}",
+                expected=str(len(inputs)),
+            )
+        feed = {one.name: np.ascontiguousarray(x) for one, x in zip(wanted, inputs, strict=True)}
+        try:
+            outputs = self._session.run(None, feed)
+        except self._errors as error:
+            raise MatchingError(
+                "the network cannot process these images",
+                where=self._path,
+                got=_first_line(error),
+                hint="check the size that it expects: matching.onnx.width_px and height_px",
+            ) from error
+        return [np.asarray(output, dtype=np.float32) for output in outputs]
+
+
+def _refuse_mistaken(path: Path) -> None:
+    with path.open("rb") as file:
+        start = file.read(64).lstrip(b"\xef\xbb\xbf \r\n\t")
+    for beginning, (what, hint) in _MISTAKEN.items():
+        if start.startswith(beginning):
+            raise FormatError(
+                "not a network", where=path, got=what, expected="an ONNX network", hint=hint
+            )
+
+
+def _errors_of(runtime: Any) -> tuple[type[Exception], ...]:
+    """Return exceptions that onnxruntime raises: its own have no common base class."""
+    state = vars(runtime.capi.onnxruntime_pybind11_state).values()
+    own = [kind for kind in state if isinstance(kind, type) and issubclass(kind, Exception)]
+    return (*own, RuntimeError, ValueError, TypeError)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
