@@ -47,17 +47,18 @@ def measure(mesh: TriangleMesh, camera: RectifiedCamera, truth_px: Float64) -> d
         "mean": float(off.mean()),
         "95 %": float(np.quantile(off, 0.95)),
         "faces": len(mesh.faces),
-        "not manifold": _not_manifold(mesh),
+        "not manifold": sum(not_manifold(mesh)),
     }
 
 
-def _not_manifold(mesh: TriangleMesh) -> int:
+def not_manifold(mesh: TriangleMesh) -> tuple[int, int]:
+    """How many edges of a mesh more than two triangles share, and vertices that join several."""
     surface = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)),
         o3d.utility.Vector3iVector(np.array(mesh.faces)),
     )
     edges = surface.get_non_manifold_edges(allow_boundary_edges=True)
-    return len(edges) + len(surface.get_non_manifold_vertices())
+    return len(edges), len(surface.get_non_manifold_vertices())
 
 
 def compare(scene: Path) -> dict[str, dict[str, Any]]:

@@ -149,6 +149,14 @@ def pair_meshes(found: Found) -> Rows:
     }
 
 
+def drive_meshes(found: Found) -> Rows:
+    return {
+        f"{drive}, `{way}`": {**figures, "edges not manifold": figures["not manifold"]}
+        for drive, ways in found.items()
+        for way, figures in ways.items()
+    }
+
+
 def occupancy(found: Found) -> Rows:
     return {f"street {seed}": one for seed, one in found["streets"]["streets"].items()}
 

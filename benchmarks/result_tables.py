@@ -229,6 +229,17 @@ TABLES: Final[dict[str, Table]] = {
         rows_of.pair_meshes,
         timed=True,
     ),
+    "drive-meshes": Table(
+        {
+            drive: f"python benchmarks/drive_meshes.py $RECON_DATA/driven/{drive} "
+            f"$RECON_DATA/driven/{drive}/lidar_map.ply $RECON_DATA/driven/{drive}/poses.txt --json"
+            for drive in ("kitti_raw_0013",)
+        },
+        {"mesh / mapping": "{:.2f}", "precision": SHARE, "recall": SHARE, "F": SHARE}
+        | {"faces": "{:,}", "border": "{:,.0f} m", "edges not manifold": "{}", "seconds": "{:.1f}"},
+        rows_of.drive_meshes,
+        timed=True,
+    ),
     "movers": Table(
         {
             "seed 4": "python benchmarks/movers.py --seed 4",

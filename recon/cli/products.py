@@ -99,9 +99,10 @@ def mesh(
 ) -> None:
     """Reconstruct a surface mesh from a PLY point cloud, or from a run of map or pair.
 
-    Screened Poisson reconstruction, trimmed where there are no points. The map
-    of a run is meshed in tiles, and surfaces in space that the cameras saw to
-    be free are removed. The cloud of a pair is meshed as recon pair does.
+    A cloud gets MeshLab's screened Poisson reconstruction, trimmed where there
+    are no points. The map of a run is meshed in tiles, through the points of its
+    voxels, without surfaces in space that the cameras saw to be free. The cloud
+    of a pair is meshed as recon pair does.
 
     Examples:
       recon mesh cloud.ply --format obj --format glb

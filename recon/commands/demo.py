@@ -69,7 +69,7 @@ def compile_kernels() -> dict[str, Any]:
         folder = Path(name)
         config = load_config(None, _SMALL)
         source = demo_source(config)
-        options = MapOptions("demo", folder / "drive", mesh=False, audit=False)
+        options = MapOptions("demo", folder / "drive", audit=False)
         run_map(source, config, options)
         run_occupancy(folder / "drive", out=folder / "occupancy")
         read_octomap(folder / "drive" / OCTOMAP)  # as an evaluation does

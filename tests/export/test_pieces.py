@@ -1,5 +1,7 @@
 """Cut meshes meet without a gap, and the surface of a drive is built of such tiles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,6 +13,7 @@ from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
 from recon.export.mesh import cut
 from recon.export.mesh.pieces import export_mesh
 from recon.export.mesh.poisson import MeshSettings
+from recon.export.mesh.voxels import reconstruct_map_surface
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
 from recon.map.tiles import Tiles
@@ -177,8 +180,10 @@ def written(store, folder, settings=SETTINGS, threads=None):
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)
 
 
-def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(store, tmp_path):
-    whole, tiles, warnings = written(store, tmp_path / "alone", threads=1)
+@pytest.mark.parametrize("way", ["voxels", "poisson"])
+def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(store, tmp_path, way):
+    settings = SETTINGS.model_copy(update={"map_surface": way})
+    whole, tiles, warnings = written(store, tmp_path / "alone", settings, threads=1)
     assert (warnings, len(tiles)) == ([], 2)
     assert sum(len(tile.faces) for tile in tiles) == len(whole.faces)
     np.testing.assert_array_equal(whole.vertices, np.concatenate([t.vertices for t in tiles]))
@@ -192,9 +197,27 @@ def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(store, tmp_path
     assert len(distance_m) > 2 * 60 * 7
     assert distance_m.max() < 0.1
     assert np.percentile(distance_m, 95) < 1e-4
-    together = written(store, tmp_path / "at once", threads=3)[0]
+    together = written(store, tmp_path / "at once", settings, threads=3)[0]
     np.testing.assert_array_equal(together.vertices, whole.vertices)
     np.testing.assert_array_equal(together.faces, whole.faces)
+
+
+def test_cells_are_doubled_where_points_are_sparse():
+    cloud, settings = street(), MeshSettings(min_component_faces=1)
+    fine, coarse = (reconstruct_map_surface(cloud, settings, voxel_m) for voxel_m in (0.1, 0.025))
+    assert len(coarse.faces) == pytest.approx(len(fine.faces), rel=0.05)
+
+
+def test_a_map_far_from_its_origin_has_the_same_surface():
+    cloud, settings = street(), MeshSettings()
+    here = reconstruct_map_surface(cloud, settings, 0.1)
+    there = reconstruct_map_surface(
+        replace(cloud, xyz=cloud.xyz + np.float32(2**13)), settings, 0.1
+    )
+    # float32 resolves a millimetre at eight kilometres.
+    assert len(there.faces) == pytest.approx(len(here.faces), rel=0.01)
+    mean_m = there.vertices.astype(np.float64).mean(axis=0) - 2**13
+    np.testing.assert_allclose(mean_m, here.vertices.mean(axis=0), atol=0.05)
 
 
 def test_a_target_is_that_of_all_tiles(store, tmp_path):

@@ -1,5 +1,5 @@
 """Surface meshes from point clouds, whole or in pieces with closed seams.
 
 - `poisson.py`: the surface of a cloud; `grid.py`: that of a single pair, of its pixels;
-- `pieces.py`: that of a map, piece by piece, cut, joined and trimmed (`cut.py`).
+- `voxels.py`: that of a map; `pieces.py`: piece by piece, cut, joined and trimmed (`cut.py`).
 """

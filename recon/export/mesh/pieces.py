@@ -20,6 +20,7 @@ from recon.core.values.cloud import Frame
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import Plane, close_seam, cut_mesh, open_edges
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
+from recon.export.mesh.voxels import reconstruct_map_surface
 from recon.export.product import Made, Order
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
@@ -174,7 +175,11 @@ class _Mesher:
             target = max(4, round(target * len(cloud) / self.points.total()))
             settings = settings.model_copy(update={"target_faces": target})
         try:
-            mesh = reconstruct_mesh(cloud, settings, wrong=wrong)
+            if settings.map_surface == "voxels":
+                voxel_m = self.tiles.config.fusion.voxel_m
+                mesh = reconstruct_map_surface(cloud, settings, voxel_m, wrong)
+            else:
+                mesh = reconstruct_mesh(cloud, settings, wrong=wrong)
         except MeshingError as error:
             return error
         for axis, far in _SIDES:

@@ -38,7 +38,10 @@ class MeshSettings(Settings):
 
     pair_surface: Literal["grid", "poisson"] = "grid"
     """How the surface of a pair is made: from the grid of its pixels, in a second; or by MeshLab's
-    Poisson reconstruction, as those of drives and clouds."""
+    Poisson reconstruction, as those of clouds."""
+    map_surface: Literal["voxels", "poisson"] = "voxels"
+    """How the surface of a map is made: through the points of its voxels, in seconds; or by
+    MeshLab's Poisson reconstruction, which closes wider holes and is smoother."""
     depth: int | None = Field(None, ge=4, le=12)
     """Octree depth; none = chosen by cell_spacings, up to max_depth. Each step halves the cells."""
     cell_spacings: float = Field(1.5, ge=0.1, le=20)
@@ -94,7 +97,7 @@ def reconstruct_mesh(
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
-    cloud = _oriented(usable(cloud), viewpoint_m)
+    cloud = oriented(cloud, viewpoint_m)
     depth = settings.depth or _fitting_depth(cloud.xyz, settings)
     normals = np.asarray(cloud.normals)
     vertices, faces, density = screened_poisson(
@@ -103,9 +106,22 @@ def reconstruct_mesh(
     supported = density >= np.quantile(density, settings.trim_density_quantile)
     if settings.max_distance_spacings is not None:
         supported &= _near_data(vertices, cloud.xyz, settings.max_distance_spacings)
+    return trimmed(keep_vertices(vertices, faces, supported), cloud, settings, wrong)
+
+
+def trimmed(
+    surface: tuple[Float32, Int32],
+    cloud: PointCloud,
+    settings: MeshSettings,
+    wrong: Callable[[Float32], Bool] | None,
+) -> TriangleMesh:
+    """Return vertices (V, 3) and faces (F, 3) without those that cannot be, and without crumbs.
+
+    Vertices take the colours of the nearest points of the cloud.
+    """
+    vertices, faces = surface
     if wrong is not None:
-        supported &= ~wrong(vertices)
-    vertices, faces = keep_vertices(vertices, faces, supported)
+        vertices, faces = keep_vertices(vertices, faces, ~wrong(vertices))
     vertices, faces = drop_small_components(vertices, faces, settings.min_component_faces)
     rgb = None if cloud.rgb is None else cloud.rgb[_nearest(vertices, cloud.xyz)]
     mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
@@ -156,8 +172,9 @@ def _refuse_outliers(xyz: Float32) -> None:
         raise MeshingError("a point lies far from all others", got=got, hint=hint)
 
 
-def _oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
-    """Return the points that have a normal, or all points with estimated normals."""
+def oriented(cloud: PointCloud, viewpoint_m: Point | None = None) -> PointCloud:
+    """Return the usable points that have a normal, or all of them with estimated normals."""
+    cloud = usable(cloud)
     if cloud.normals is not None:
         # NaN fails the comparison, so it counts as no normal.
         known = np.asarray(np.linalg.norm(cloud.normals, axis=1) > 0.5)
@@ -174,16 +191,21 @@ def _oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
 
 def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
     """Return the smallest octree depth whose cells are no wider than the settings allow."""
-    step = max(1, len(xyz) // _SPACING_SAMPLES)
-    cell_m = settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
+    cell_m = settings.cell_spacings * typical_spacing_m(xyz)
     extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
     if cell_m * 2**settings.max_depth <= extent_m:
         return settings.max_depth
     return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
 
 
+def typical_spacing_m(xyz: Float32) -> float:
+    """Return the median distance of the points of a cloud to their seventh neighbour."""
+    step = max(1, len(xyz) // _SPACING_SAMPLES)
+    return float(np.median(_spacing(xyz[::step], xyz)))
+
+
 def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
-    """Return float32 (N,): distance of points of a cloud to their neighbours in it."""
+    """Return float32 (N,): distance of points of a cloud to their seventh neighbour in it."""
     return open3d_clouds.nearest(some_xyz, xyz, _SPACING_NEIGHBOURS)[1][:, -1]
 
 

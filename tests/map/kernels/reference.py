@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import unpack_keys
 from recon.map.kernels.clamped import ClampedBlocks, observed_rows
+from recon.map.kernels.distance import REACH as REACH_ALONG
+from recon.map.kernels.distance import THICKNESS
 from recon.map.kernels.facets import DOUBLINGS, LEAST, REACH
 from recon.map.kernels.raycast import MIN_DEPTH_M, Rays
 
@@ -177,3 +179,88 @@ def cells_of(blocks: ClampedBlocks) -> dict[Cell, Clamped]:
 def log_odds_of(blocks: ClampedBlocks) -> dict[Cell, float]:
     cells = cells_of(blocks).items()
     return {cell: min(max(change, low), high) for cell, (change, low, high) in cells}
+
+
+def distance_reference(xyz, normals, farthest):
+    """Distance at each corner that is known, as `recon.map.kernels.distance.surface_of` says."""
+    around = range(-5, 6)
+    near = {
+        tuple(np.floor(point).astype(int) + step)
+        for point in xyz
+        for step in product(around, around, around)
+    }
+    found = {}
+    for corner in near:
+        away = np.array(corner) - xyz
+        along = (away * normals).sum(axis=1)
+        across = away - along[:, None] * normals
+        used = (np.abs(along) <= THICKNESS) & ((across**2).sum(axis=1) <= REACH_ALONG**2)
+        weight = np.exp(-0.5 * ((across**2).sum(axis=1) + 4 * along**2)) * used
+        middle = np.linalg.norm((weight[:, None] * across).sum(axis=0))
+        if used.any() and middle <= farthest * weight.sum():
+            found[corner] = float((weight * along).sum() / weight.sum())
+    return found
+
+
+def surface_reference(distance):
+    """The quads (Q, 4, 3), by their corners, of the surface where the distance is 0, facing up.
+
+    What is on an edge of the grid belongs to the sheet that a walk over the faces of the cell
+    reaches from there: over a face, one goes around the corner that is above.
+    """
+    quads = []
+    for corner, axis in product(distance, range(3)):
+        end = _stepped(corner, axis, 1)
+        if end not in distance or (distance[corner] >= 0) == (distance[end] >= 0):
+            continue
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        cells = [
+            _stepped(_stepped(corner, first, -a), second, -b)
+            for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
+        ]
+        if all(_eight(cell) <= distance.keys() for cell in cells):
+            quad = [_sheet(cell, (corner, end), distance) for cell in cells]
+            quads.append(quad if distance[corner] < 0 else quad[::-1])
+    return quads
+
+
+def _stepped(corner, axis, by):
+    return tuple(c + by * (a == axis) for a, c in enumerate(corner))
+
+
+def _eight(cell):
+    return {tuple(np.add(cell, step).tolist()) for step in product((0, 1), repeat=3)}
+
+
+def _sheet(cell, edge, distance):
+    """The mean of where the sheet that crosses an edge of a cell crosses all of its edges."""
+    reached, to_visit = set(), [edge]
+    while to_visit:
+        one = to_visit.pop()
+        if one in reached:
+            continue
+        reached.add(one)
+        along = int(np.flatnonzero(np.subtract(one[1], one[0]))[0])
+        for axis in {0, 1, 2} - {along}:
+            side = one[0][axis] - cell[axis]  # of the face across this axis that has the edge
+            face = {corner for corner in _eight(cell) if corner[axis] - cell[axis] == side}
+            to_visit += _next_on_face(one, face, distance)
+    return np.mean([_crossing(one, distance) for one in reached], axis=0)
+
+
+def _next_on_face(edge, face, distance):
+    """The edges of a face that the curve through a crossed edge leaves it by."""
+    edges = [
+        (a, b)
+        for a, b in product(sorted(face), repeat=2)
+        if sum(np.subtract(b, a)) == 1 and (distance[a] >= 0) != (distance[b] >= 0)
+    ]
+    if len(edges) == 4:
+        above = max(edge, key=lambda corner: distance[corner])
+        edges = [one for one in edges if above in one]
+    return edges
+
+
+def _crossing(edge, distance):
+    begin, end = (distance[corner] for corner in edge)
+    return np.add(edge[0], begin / (begin - end) * np.subtract(edge[1], edge[0]))
