@@ -240,6 +240,15 @@ TABLES: Final[dict[str, Table]] = {
         rows_of.drive_meshes,
         timed=True,
     ),
+    "textures": Table(
+        {
+            "rendered street": "python benchmarks/textures.py --street --json",
+            "kitti_05_100": "python benchmarks/textures.py $RECON_DATA/driven/kitti_05_100 --json",
+        },
+        {"covered": SHARE, "PSNR, vertices": "{:.1f} dB", "PSNR, texture": "{:.1f} dB"}
+        | {"SSIM, vertices": SHARE, "SSIM, texture": SHARE},
+        lambda found: found,
+    ),
     "movers": Table(
         {
             "seed 4": "python benchmarks/movers.py --seed 4",

@@ -24,7 +24,7 @@ def export(
         opt.option(
             "cloud, grid, octomap, mesh; for surveying programs las, laz, e57, and dsm, dtm, "
             "slope, orthophoto, occupancy (GeoTIFF); pcd (PCL), npz (NumPy), mcap (ROS 2), "
-            "colmap, nerfstudio; several with commas.",
+            "colmap, nerfstudio, texture; several with commas.",
             default="the first four",
         ),
     ] = None,

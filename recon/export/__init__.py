@@ -6,5 +6,5 @@
   from tiles; `colmap.py`, `nerfstudio.py`, `mcap.py`: for other tools, with the images of the
   drives (`images.py`);
 - `trajectories.py`: the paths of drives; `pair.py`: what is made of a single pair, or of a cloud;
-- `mesh/poisson.py`: the surface of a cloud.
+- `mesh/`: surfaces, of clouds, pairs and maps, and their textures.
 """

@@ -12,6 +12,7 @@ from recon.export.cloud import arrays_product, cloud_product, pcd_product
 from recon.export.colmap import colmap_product
 from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
+from recon.export.mesh.texture import texture_product
 from recon.export.nerfstudio import nerfstudio_product
 from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import Made, Order, Product
@@ -26,6 +27,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "octomap": Product(octomap_product, needs_occupancy=True),
     "grid": Product(grid_product, needs_occupancy=True),
     "mesh": Product(mesh_product),
+    "texture": Product(texture_product, needs_images=True),
     # Their cells, and the ground far from the path, are those of the voxels.
     **{
         name: Product(raster_product(name), needs_occupancy=True, surveyed=True) for name in RASTERS

@@ -101,10 +101,10 @@ def _write_surface(
     frame: Frame | None = None if camera is None else "camera"
     for suffix in dict.fromkeys(("ply", *formats)):
         write_mesh(run.path(f"mesh/mesh.{suffix}"), mesh, frame)
-    photo = None
+    photos = []
     if camera is not None and mesh.texture is not None:
-        photo = Photo(run.path(f"mesh/{mesh.texture.name}"), camera)
-    write_mlp(run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": cloud}, frame, photo)
+        photos = [Photo(run.path(f"mesh/{mesh.texture.name}"), camera)]
+    write_mlp(run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": cloud}, frame, photos)
 
 
 def mesh_cloud(

@@ -1,23 +1,27 @@
 """Products for other tools are opened by the libraries of those tools, and are right there."""
 
 import json
+import re
 import shutil
 import sys
 from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
+import open3d as o3d
 import pytest
+from scipy.spatial import cKDTree
 
 from recon.commands.config import load_config, run_settings
 from recon.commands.demo import demo_source
 from recon.commands.export import run_export
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.geometry.se3 import apply, invert
+from recon.core.geometry.se3 import T_YUP_FRAME, apply, invert
 from recon.core.values.camera import unproject
 from recon.export import nerfstudio
 from recon.io.images.image import read_image, read_levels
+from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_tum
 from recon.map.map import Map
@@ -265,3 +269,27 @@ def test_a_map_that_says_nothing_or_nonsense_of_its_images_is_refused(
         map_.commit()
     done = run("export", tmp_path / "run", "--to", "nerfstudio", "--out", tmp_path / "out")
     assert_refused(done, said, "" if "recon" in said else "--images")
+
+
+def test_a_textured_drive_shows_its_images_in_other_programs(small_demo, tmp_path):
+    out = tmp_path / "out"
+    formats = ("obj", "glb")
+    figures = run_export(small_demo, products=["texture"], formats=formats, out=out)
+    assert 0.5 < figures["textured"] <= 1
+    mesh = read_mesh(out / "mesh" / "mesh.ply")
+    # A GLB is turned upright.
+    for suffix, R_file_map in zip(formats, (np.eye(3), T_YUP_FRAME["map"][:3, :3]), strict=True):
+        shown = o3d.io.read_triangle_mesh(out / "texture" / f"mesh.{suffix}", True)
+        picture, uv = np.asarray(shown.textures[0]), np.asarray(shown.triangle_uvs)
+        assert max(picture.shape) == figures["texture_px"]
+        assert 0 <= uv.min() <= uv.max() <= 1
+        # At the vertices it shows what the fused points have, and what is finer than they are.
+        corners = np.asarray(shown.vertices)[np.asarray(shown.triangles).ravel()] @ R_file_map
+        nearest = cKDTree(mesh.vertices).query(corners)[1]
+        column, row = (uv * picture.shape[1::-1]).astype(int).T
+        grey = picture[row, column].mean(axis=1), mesh.rgb[nearest].mean(axis=1)
+        assert np.corrcoef(*grey)[0, 1] > 0.6
+    project = (out / "texture" / "mesh.mlp").read_text()
+    images = re.findall(r'fileName="(images/.*?)"', project)
+    assert len(images) >= 2
+    assert all((out / "texture" / name).is_file() for name in images)

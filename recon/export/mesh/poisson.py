@@ -63,6 +63,9 @@ class MeshSettings(Settings):
     """
     tile_m: float = Length(50.0, ge=1e-06, le=100_000.0)
     """Edge of the tiles in which the map of a drive is meshed. Smaller ones take less memory."""
+    texture_px: int = Field(8192, ge=64, le=16384)
+    """Largest width and height of the picture of a textured map: what graphics cards take. Its
+    texels are as wide as the pixels that saw the surface, wider where that is more."""
     free_space: bool = True
     """Remove surfaces in space that the cameras of a drive saw to be free. Off keeps what moved
     through."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
@@ -25,22 +25,24 @@ _SENSOR_MM: Final = 36.0  # width of the sensor of MeshLab's cameras; only ratio
 
 @dataclass(frozen=True)
 class Photo:
-    """The image of a camera at the origin of the layers, looking along their z axis."""
+    """The image of a camera."""
 
     file: Path
     camera: RectifiedCamera
+    # float64 (4, 4), its pose in the frame of the layers; else it is at their origin
+    T_frame_camera: Float64 = field(default_factory=lambda: np.eye(4))
 
 
 def write_mlp(
     path: StrPath,
     layers: Mapping[str, StrPath],
     frame: Frame | None = None,
-    photo: Photo | None = None,
+    photos: Sequence[Photo] = (),
 ) -> None:
     """Write a MeshLab project of layers (label and file, which must exist), atomically.
 
     Paths are relative to it. MeshLab opens it with y up and looks along -z, so layers are turned if
-    their frame is known. The camera of a photo is at the origin of the frame ``camera``.
+    their frame is known.
     """
     T = _IDENTITY if frame is None else T_YUP_FRAME[frame]
     project = ET.Element("MeshLabProject")
@@ -49,22 +51,24 @@ def write_mlp(
         layer = {"label": label, "filename": _relative(file, Path(path)), "visible": "1"}
         ET.SubElement(ET.SubElement(group, "MLMesh", layer), "MLMatrix44").text = _rows(T)
     rasters = ET.SubElement(project, "RasterGroup")
-    if photo is not None:
-        _add_photo(rasters, photo, Path(path))
+    for photo in photos:
+        _add_photo(rasters, photo, T, Path(path))
     ET.indent(project, " ")
     body = ET.tostring(project, encoding="unicode")
     write_text(path, f"<!DOCTYPE MeshLabDocument>\n{body}\n")
 
 
-def _add_photo(group: ET.Element, photo: Photo, project: Path) -> None:
+def _add_photo(group: ET.Element, photo: Photo, T: Float64, project: Path) -> None:
     """Add a raster layer: an image, and where MeshLab's camera has to stand to see it."""
     camera = photo.camera
     pixel_mm = _SENSOR_MM / camera.width_px
     raster = ET.SubElement(group, "MLRaster", {"label": photo.file.stem})
-    # MeshLab counts from the lower left corner of the image, and cameras look along -z.
+    # MeshLab counts from the lower left corner of the image, and cameras look along -z. It takes
+    # the position of the camera with the other sign.
+    T_world_camera = T @ photo.T_frame_camera @ T_YUP_FRAME["camera"].T
     lens = {
-        "TranslationVector": "0 0 0 1",
-        "RotationMatrix": " ".join(_rows(_IDENTITY).split()),
+        "TranslationVector": " ".join(f"{x:.10g}" for x in (*-T_world_camera[:3, 3], 1)),
+        "RotationMatrix": " ".join(_rows(_turn_of(T_world_camera).T).split()),
         "FocalMm": f"{camera.focal_px * pixel_mm:.10g}",
         "PixelSizeMm": f"{pixel_mm:.10g} {pixel_mm:.10g}",
         "ViewportPx": f"{camera.width_px} {camera.height_px}",
@@ -75,8 +79,15 @@ def _add_photo(group: ET.Element, photo: Photo, project: Path) -> None:
     ET.SubElement(raster, "Plane", {"semantic": "1", "fileName": _relative(photo.file, project)})
 
 
+def _turn_of(T: Float64) -> Float64:
+    """Return the rotation of a motion, float64 (4, 4)."""
+    turn: Float64 = T.copy()
+    turn[:3, 3] = 0
+    return turn
+
+
 def _rows(T: Float64) -> str:
-    return "\n" + "".join(" ".join(f"{x:g}" for x in row) + " \n" for row in T)
+    return "\n" + "".join(" ".join(f"{x:.10g}" for x in row) + " \n" for row in T)
 
 
 def _relative(file: StrPath, project: Path) -> str:

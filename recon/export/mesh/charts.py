@@ -1,0 +1,146 @@
+"""A mesh cut into charts, each a piece of surface as it is seen along an axis, side by side."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from recon.core.open3d_raycasting import RayScene
+from recon.core.values import TriangleMesh
+from recon.core.values.arrays import Float32, Float64, Int32, Int64
+
+_RIGHT: Final = np.array([[0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, -1, 0], [1, 0, 0], [1, 0, 0]])
+_DOWN: Final = np.array([[0, 0, -1], [0, 0, -1], [0, -1, 0], [0, 0, -1], [0, 0, -1], [0, 1, 0]])
+"""(6, 3), how what faces +x, +y, +z, -x, -y and -z lies in the picture: as seen from outside."""
+_FACING: Final = np.concatenate([np.eye(3), -np.eye(3)])
+_SLANTED: Final = 0.3  # least cosine to the axis of a chart: texels are stretched three times there
+_SMOOTHINGS: Final = 3  # rounds in which faces join the charts of their neighbours
+_BLOCK_PX: Final = 256  # charts are cut into blocks as wide, to fit closely side by side
+MARGIN_PX: Final = 2  # around a chart, painted with what is next to it
+_ROWS: Final = 256  # of texels that are located at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """The charts of a mesh in one picture."""
+
+    mesh: TriangleMesh  # with a vertex for each chart that one is in
+    vertex_of: Int64  # (V,), the vertex of the mesh without charts
+    places: Float64  # (V, 2), column and row of each vertex, texels from the upper left corner
+    width_px: int
+    height_px: int
+    texel_m: float  # edge of a texel
+
+
+def make_atlas(mesh: TriangleMesh, texel_m: float, most_px: int) -> Atlas:
+    """Lay out the charts of a mesh; texels grow until the picture is at most ``most_px`` wide."""
+    facing, pairs = _directions(mesh)
+    while True:
+        atlas = _laid_out(mesh, facing, pairs, texel_m)
+        most = max(atlas.width_px, atlas.height_px)
+        if most <= most_px:
+            return atlas
+        texel_m *= 1.02 * most / most_px
+
+
+def texels_of(atlas: Atlas) -> tuple[Int32, Int32]:
+    """Return number (N,), row by row, of the texels that a face covers; and its number (N,)."""
+    corners = np.zeros((*atlas.mesh.faces.shape, 3), np.float32)
+    corners[..., :2] = atlas.places[atlas.mesh.faces]
+    scene, down = RayScene(corners), np.array([0.0, 0.0, -1.0])
+    numbers, faces = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)]
+    for first in range(0, atlas.height_px, _ROWS):
+        rows, columns = np.mgrid[first : min(first + _ROWS, atlas.height_px), : atlas.width_px]
+        above = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5, np.ones(rows.size)], axis=1)
+        found = scene.first_hit(above, np.broadcast_to(down, above.shape))
+        hit = np.flatnonzero(found >= 0)
+        numbers.append((first * atlas.width_px + hit).astype(np.int32))
+        faces.append(found[hit])
+    return np.concatenate(numbers), np.concatenate(faces)
+
+
+def shares_of(atlas: Atlas, numbers: Int32, faces: Int32) -> Float32:
+    """Return float32 (N, 3), how much each corner of its face counts at the centre of a texel."""
+    at = np.stack([numbers % atlas.width_px, numbers // atlas.width_px], axis=1) + 0.5
+    a, b, c = atlas.places[atlas.mesh.faces[faces]].transpose(1, 0, 2)
+    (ux, uy), (vx, vy), (wx, wy) = (b - a).T, (c - a).T, (at - a).T
+    area = ux * vy - uy * vx
+    area = np.where(np.abs(area) < 1e-12, 1.0, area)  # a face on edge, as a ray may just hit one
+    second, third = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
+    shares = np.stack([1 - second - third, second, third], axis=1)
+    return np.asarray(np.clip(shares, 0, 1), np.float32)
+
+
+def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
+    """Return int64 (F,), by which axis each face is seen; and pairs (P, 2) that share an edge."""
+    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    cosines = normals @ _FACING.T
+    facing, pairs, rows = cosines.argmax(axis=1), _neighbours(mesh.faces), np.arange(len(a))
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    for _ in range(_SMOOTHINGS):
+        votes = np.bincount(6 * ends[:, 0] + facing[ends[:, 1]], minlength=6 * len(a))
+        votes = votes.reshape(-1, 6).astype(np.float64)
+        votes[rows, facing] += 0.5  # of two that are equal, its own
+        facing = np.where(cosines >= _SLANTED, votes, -1).argmax(axis=1)
+    return facing, pairs
+
+
+def _neighbours(faces: Int32) -> Int64:
+    """Return int64 (P, 2), the faces on both sides of each inner edge."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
+    packed = (edges[:, 0] << 32) | edges[:, 1]
+    order = np.argsort(packed, kind="stable")
+    same = np.flatnonzero(packed[order][1:] == packed[order][:-1])
+    return np.stack([order[same], order[same + 1]], axis=1) // 3
+
+
+def _laid_out(mesh: TriangleMesh, facing: Int64, pairs: Int64, texel_m: float) -> Atlas:
+    """Return the atlas with texels of a size."""
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    block = np.floor(middles / (_BLOCK_PX * texel_m)).astype(np.int64)
+    one, other = pairs.T
+    joined = (facing[one] == facing[other]) & (block[one] == block[other]).all(axis=1)
+    links = coo_matrix((np.ones(joined.sum()), pairs[joined].T), shape=(len(facing),) * 2)
+    charts, chart_of_face = connected_components(links, directed=False)
+    packed = (chart_of_face.astype(np.int64)[:, None] << 32) | mesh.faces
+    keys, faces = np.unique(packed, return_inverse=True)
+    chart, vertex = keys >> 32, keys & 0xFFFFFFFF
+    side = np.zeros(charts, np.int64)
+    side[chart_of_face] = facing
+    xyz = mesh.vertices[vertex].astype(np.float64)
+    flat = [np.einsum("ij,ij->i", xyz, way[side[chart]]) / texel_m for way in (_RIGHT, _DOWN)]
+    places = np.stack(flat, axis=1)
+    low, high = np.full((charts, 2), np.inf), np.full((charts, 2), -np.inf)
+    np.minimum.at(low, chart, places)
+    np.maximum.at(high, chart, places)
+    sizes = np.ceil(high - low).astype(np.int64) + 1 + 2 * MARGIN_PX
+    corners, (width_px, height_px) = _packed(sizes)
+    places += (corners - low + MARGIN_PX + 0.5)[chart]
+    split = replace(
+        mesh,
+        vertices=mesh.vertices[vertex],
+        faces=faces.reshape(-1, 3).astype(np.int32),
+        normals=None if mesh.normals is None else mesh.normals[vertex],
+        rgb=None if mesh.rgb is None else mesh.rgb[vertex],
+    )
+    return Atlas(split, vertex, places, width_px, height_px, texel_m)
+
+
+def _packed(sizes: Int64) -> tuple[Int64, tuple[int, int]]:
+    """Return the upper left corners (C, 2) of boxes of sizes (C, 2) on shelves; and the size."""
+    # A tenth for what is left over at the ends of shelves.
+    width = max(int(sizes[:, 0].max()), math.ceil(math.sqrt(1.1 * float(sizes.prod(axis=1).sum()))))
+    corners, x, y, shelf = np.zeros_like(sizes), 0, 0, 0
+    for chart in np.argsort(-sizes[:, 1], kind="stable"):
+        wide, high = sizes[chart].tolist()
+        if x + wide > width:
+            x, y, shelf = 0, y + shelf, 0
+        corners[chart], x, shelf = (x, y), x + wide, max(shelf, high)
+    return corners, (width, y + shelf)

@@ -1,0 +1,111 @@
+"""The surface of a map with the images of its drives as its texture: decision 0037."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import MeshingError
+from recon.core.values import Texture, TriangleMesh
+from recon.export.images import DriveImages, open_images
+from recon.export.mesh.charts import make_atlas
+from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product
+from recon.export.mesh.views import BestViews, PosedImage, paint
+from recon.export.product import Made, Order
+from recon.io.images.image import write_image
+from recon.io.models.mesh import read_mesh, write_mesh
+from recon.io.models.mlp import Photo, write_mlp
+from recon.map.fusion import fusion_range_m
+from recon.map.sessions.placed import settings_of
+
+_FOLDER: Final = "texture"
+_WITH_TEXTURE: Final = ("glb", "obj", "ply")
+Views = Callable[[], Iterable[PosedImage]]
+"""Gives the same images again each time it is called, one in memory at a time."""
+
+
+def texture_product(order: Order) -> Made:
+    """Write ``texture/``: the surface and its picture, and a MeshLab project with the keyframes.
+
+    The formats are those of the mesh that hold a texture, GLB if there is none.
+    """
+    drives, run = open_images(order.map, order.images), order.run
+    if not run.path(WHOLE).is_file():
+        mesh_product(order)
+    mesh = read_mesh(run.path(WHOLE))
+    if len(mesh.faces) > SAMPLE_FACES:
+        what, hint = "the mesh is too large for one texture", "--set mesh.target_faces=1000000"
+        raise MeshingError(what, got=f"{len(mesh.faces):,} faces", hint=hint)
+    edge_m, settings = order.placed.tiles.config.fusion.voxel_m, order.mesh
+    range_m = max(fusion_range_m(d.session.camera, settings_of(d.session).fusion) for d in drives)
+    textured, figures = textured_mesh(
+        mesh, lambda: posed_images(drives), edge_m, range_m, settings.texture_px
+    )
+    chosen = [name for name in order.formats if name in _WITH_TEXTURE]
+    named = [name for name in chosen if chosen != ["ply"]] or ["glb"]
+    for suffix in dict.fromkeys(named):
+        write_mesh(run.path(f"{_FOLDER}/mesh.{suffix}"), textured, "map")
+    photos = [*_photos(order, drives)]
+    write_mlp(run.path(f"{_FOLDER}/mesh.mlp"), {"mesh": run.path(WHOLE)}, "map", photos)
+    return Made(figures)
+
+
+def textured_mesh(
+    mesh: TriangleMesh, views: Views, edge_m: float, range_m: float, most_px: int
+) -> tuple[TriangleMesh, dict[str, float]]:
+    """Return a mesh in charts whose picture is painted by images; and figures of it.
+
+    Args:
+        mesh: The surface, with normals; its colours are for what no image sees.
+        views: Gives the images; they are gone through twice.
+        edge_m: Usual edge of its triangles.
+        range_m: Distance up to which images are looked at.
+        most_px: Largest width and height of the picture.
+
+    Raises:
+        MeshingError: No image sees any of the surface.
+    """
+    best, count = BestViews(mesh, edge_m), 0
+    for view in views():
+        best.add(view, range_m)
+        count = view.number + 1
+    seen = np.isfinite(best.footprint_m)
+    if not seen.any():
+        raise MeshingError("no image of the drive sees the surface", got=f"{count} images")
+    atlas = make_atlas(mesh, float(np.median(best.footprint_m[seen])), most_px)
+    picture = paint(atlas, best, best.gains(count), views())
+    uv = (atlas.places / [atlas.width_px, atlas.height_px]).astype(np.float32)
+    # Colours of vertices would darken the picture in some viewers.
+    textured = replace(atlas.mesh, rgb=None, texture=Texture(picture, uv))
+    figures = {
+        "texture_px": max(atlas.width_px, atlas.height_px),
+        "texel_m": atlas.texel_m,
+        "textured": float(seen.mean()),
+    }
+    return textured, figures
+
+
+def posed_images(drives: Sequence[DriveImages]) -> Iterator[PosedImage]:
+    """Yield the left images of all frames that have a place, numbered over all drives."""
+    first = 0
+    for drive in drives:
+        for frame, pair in drive.pairs():
+            left = drive.rectifier.warp(pair)[0]
+            colours = left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2)
+            camera, T_map_camera = drive.session.camera, drive.T_map_camera[frame]
+            yield PosedImage(first + frame, colours, camera, T_map_camera)
+        first += len(drive.placed)
+
+
+def _photos(order: Order, drives: Sequence[DriveImages]) -> Iterator[Photo]:
+    """Write the left images of the keyframes, and yield them."""
+    for drive in drives:
+        keyframes = {*np.asarray(drive.session.keyframes.frames).tolist()}
+        for frame, pair in drive.pairs():
+            if frame in keyframes:
+                path = order.run.path(f"{_FOLDER}/images/{drive.file('left', frame)}")
+                write_image(path, drive.rectifier.warp(pair)[0])
+                yield Photo(path, drive.session.camera, drive.T_map_camera[frame])
