@@ -91,10 +91,10 @@ def test_an_error_inside_is_reported_and_kept_as_the_cause(blind):
             raise KeyError("frames")
 
     odometry = make_odometry(Broken())
-    with pytest.raises(RegistrationError, match="'Broken'.*fails.*ZeroDivisionError: by") as told:
+    with pytest.raises(RegistrationError, match=r"'Broken'.*fails.*ZeroDivisionError: by") as told:
         odometry.register(blind())
     assert isinstance(told.value.__cause__, ZeroDivisionError)
-    with pytest.raises(RegistrationError, match="'Broken'.*fails.*KeyError"):
+    with pytest.raises(RegistrationError, match=r"'Broken'.*fails.*KeyError"):
         odometry.restore({"odometry": {"own": {}, "begun": True}, "last": None})
 
 
@@ -204,7 +204,7 @@ def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["odometry"] == "ahead"
     assert "method: ahead" in (tmp_path / "run" / "config.yaml").read_text()
     bad = recon.MapOptions(audit=False, out=tmp_path / "bad", mesh=False)
-    with pytest.raises(RegistrationError, match="odometry 'worse', frame 0: .*no rigid pose.*nan"):
+    with pytest.raises(RegistrationError, match=r"odometry 'worse', frame 0: .*no rigid pose.*nan"):
         recon.run_map(source, recon.load_config(overrides=["odometry.method=worse"]), bad)
     assert not (tmp_path / "bad").exists()
 
@@ -212,10 +212,8 @@ def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
 def test_the_command_line_lists_the_choices(tmp_path):
     from tests.scenery.kitti import write_kitti
 
-    write_kitti(
-        recon.SyntheticSource(recon.load_config(overrides=["street.frames=2"]).street),
-        tmp_path / "d",
-    )
+    config = recon.load_config(overrides=["street.frames=2"])
+    write_kitti(recon.SyntheticSource(config.street), tmp_path / "d")
     done = CliRunner().invoke(app, ["map", str(tmp_path / "d"), "--odometry", "orb", "--quiet"])
     assert done.exit_code == 1
     assert done.stderr.startswith("error: unknown odometry (got 'orb', expected one of: kiss, sfm,")

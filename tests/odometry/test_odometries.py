@@ -42,7 +42,7 @@ def test_a_saved_odometry_goes_on_to_the_bit(name, street, tmp_path):
 
 
 def test_the_settings_offer_what_there_is_and_runs_of_older_versions_were_visual_too():
-    with pytest.raises(SettingsError, match="unknown odometry.*one of: kiss, sfm, visual"):
+    with pytest.raises(SettingsError, match=r"unknown odometry.*one of: kiss, sfm, visual"):
         make_odometry("lidar")
     assert OdometrySettings().method == "visual"
     assert OdometrySettings.parse({"method": "fused"}).method == "visual"

@@ -16,7 +16,7 @@ from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
 
 
 def install_plugin(site, package, modules, points, group="matchers"):
-    """Write modules and metadata of a package that registers matchers, or others, into a folder of packages."""
+    """Write modules and metadata of a package with entry points into a folder of packages."""
     for name, source in modules.items():
         (site / name).write_text(source)
     info = site / f"{package.replace('-', '_')}-1.0.dist-info"
