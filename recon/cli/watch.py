@@ -18,8 +18,6 @@ from recon.run.batch.job_file import read_plan
 from recon.run.batch.results import JobResult, wrong_first
 from recon.run.batch.watch import watch_jobs
 
-Rounds = Iterator[list[JobResult]]
-
 
 def show_batch(folder: Path) -> None:
     """Show how the jobs of a batch stand until it ends."""
@@ -30,24 +28,20 @@ def show_batch(folder: Path) -> None:
         typer.echo(f"warning: nobody runs this batch; {hint}", err=True)
 
 
-def _refresh(rounds: Rounds) -> None:
+def _refresh(rounds: Iterator[list[JobResult]]) -> None:
     with Live(console=Console(), auto_refresh=False) as live:
         for results in rounds:
-            live.update(batch_table([*map(_row, wrong_first(results))]), refresh=True)
+            rows = [{**one.facts, "figures": one.figures} for one in wrong_first(results)]
+            live.update(batch_table(rows), refresh=True)
 
 
-def _list_changes(rounds: Rounds) -> None:
+def _list_changes(rounds: Iterator[list[JobResult]]) -> None:
     """Write a line when the state or the try of a job changes."""
     shown: dict[str, tuple[Any, ...]] = {}
     for results in rounds:
         for one in results:
-            facts = one.facts
-            now = facts["state"], facts["tries"]
+            now = one.facts["state"], one.last.tries
             if shown.get(one.job.name, ("not run", 0)) != now:
                 why = f": {one.last.error}" if one.failed else ""
                 typer.echo(f"{one.job.name}: {now[0]}, try {now[1]}, {one.seconds:.1f} s{why}")
             shown[one.job.name] = now
-
-
-def _row(one: JobResult) -> dict[str, Any]:
-    return {**one.facts, "figures": one.figures}

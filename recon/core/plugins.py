@@ -6,11 +6,9 @@ import inspect
 from collections.abc import Collection
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final
+from typing import Any
 
 from recon.core.errors import SettingsError
-
-_PREFIX: Final = "recon."
 
 
 @dataclass(frozen=True)
@@ -18,38 +16,29 @@ class Plugins:
     """What others write of one kind."""
 
     kind: str  # what one is called in errors
-    group: str  # the entry point group in which packages register it, after "recon."
+    group: str  # the entry point group in which packages register it
     methods: tuple[str, ...]  # what it must have, as it is called: ``match(pair)``
-
-    def names(self) -> set[str]:
-        """Return names that installed packages register."""
-        return set(entry_points(group=_PREFIX + self.group).names)
 
     def check(self, given: object, ours: Collection[str] = ()) -> None:
         """Refuse an unknown name, and an object that is none, without making anything."""
         if isinstance(given, str):
-            if given not in ours and given not in (others := self.names()):
+            if given not in ours and given not in (others := entry_points(group=self.group).names):
                 choices = ", ".join(sorted({*ours, *others}))
                 what = f"unknown {self.kind}"
                 raise SettingsError(what, got=repr(given), expected=f"one of: {choices}")
         elif inspect.isclass(given):
             name = given.__name__
-            raise SettingsError(
-                f"{self.kind} is a class", got=name, expected=f"an object: {name}()"
-            )
+            what, expected = f"{self.kind} is a class", f"an object: {name}()"
+            raise SettingsError(what, got=name, expected=expected)
         elif not self._fits(given):
-            article = "an" if self.kind[0] in "aeiou" else "a"
-            raise SettingsError(
-                f"not {article} {self.kind}",
-                got=type(given).__name__,
-                expected=f"a name, or {self._expected}",
-            )
+            what, expected = f"not usable as {self.kind}", f"a name, or {self._expected}"
+            raise SettingsError(what, got=type(given).__name__, expected=expected)
 
     def load(self, given: str | object) -> Any:
         """Return an object as it is, and make that of a name which a package registers."""
         if not isinstance(given, str):
             return given
-        found = entry_points(group=_PREFIX + self.group, name=given)
+        found = entry_points(group=self.group, name=given)
         point, *others = sorted(found, key=_origin)
         origin = f"{self.kind} {given!r} ({_origin(point)})"
         if others:

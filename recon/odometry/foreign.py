@@ -14,7 +14,9 @@ from recon.core.plugins import Plugins, described, kind_of
 from recon.core.values.arrays import Float64
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 
-PLUGINS: Final = Plugins("odometry", "odometries", ("register(frame)", "state()", "restore(state)"))
+PLUGINS: Final = Plugins(
+    "odometry", "recon.odometries", ("register(frame)", "state()", "restore(state)")
+)
 _HEALTH: Final = TypeAdapter(OdometryHealth)
 _FIRST_M: Final = 1e-6  # rounding apart, the first pose is the identity
 _PLAIN: Final = (str, int, float, type(None))

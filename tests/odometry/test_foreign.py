@@ -119,7 +119,8 @@ def test_it_goes_on_from_its_state(blind):
 
 
 @pytest.mark.parametrize(
-    ("given", "words"), [(Ahead, r"is a class.*Ahead\(\)"), (7, "not an odometry.*int.*register")]
+    ("given", "words"),
+    [(Ahead, r"is a class.*Ahead\(\)"), (7, "not usable as odometry.*int.*register")],
 )
 def test_what_is_no_odometry_is_refused(given, words):
     with pytest.raises(SettingsError, match=words):

@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 from recon.core.errors import FormatError
 from recon.io.atomic import is_locked
@@ -15,11 +14,9 @@ from recon.run.batch.job_file import PLAN
 from recon.run.batch.results import JobResult, compare, result_of
 from recon.run.directory import lock_file
 
-_EVERY_S: Final = 1.0
-
 
 def watch_jobs(
-    folder: Path, jobs: Sequence[Job], every_s: float = _EVERY_S
+    folder: Path, jobs: Sequence[Job], every_s: float = 1.0
 ) -> Iterator[list[JobResult]]:
     """Yield how all jobs stand, every second until nobody runs the batch any more.
 

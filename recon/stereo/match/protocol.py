@@ -43,7 +43,7 @@ def unrated_disparity(values: Float32, reason: UInt8, pair: RectifiedPair) -> Di
     )
 
 
-PLUGINS: Final = Plugins("matcher", "matchers", ("match(pair)",))
+PLUGINS: Final = Plugins("matcher", "recon.matchers", ("match(pair)",))
 
 
 class CheckedMatcher:

@@ -118,7 +118,7 @@ def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named():
     ("given", "settings", "word"),
     [
         (Flat, {}, r"class.*Flat\(\)"),
-        (7, {}, "not a matcher.*int"),
+        (7, {}, "not usable as matcher.*int"),
         (Flat(), {"ndisp": 16}, r"only recon's own matchers take settings.*ndisp"),
     ],
 )
