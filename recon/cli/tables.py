@@ -104,7 +104,7 @@ def batch_table(all_jobs: Sequence[Mapping[str, Any]]) -> Table:
 
     table, jobs = Table(show_edge=False, pad_edge=False), all_jobs[:_MOST_JOBS]
     judged = accuracies(job["figures"] for job in jobs)
-    for title in ("job", "state", "tries", "seconds", "MB", *judged):
+    for title in ("job", "state", "tries", "s", "MB", *judged):
         table.add_column(re.sub(r"(?<=[a-z])[._]", " ", title), overflow="fold")
     for job in jobs:
         times = (str(job["tries"]), f"{job['seconds']:.1f}", f"{job['bytes'] / 1e6:.1f}")

@@ -47,12 +47,9 @@ class ForeignOdometry:
     def state(self) -> dict[str, Any]:
         own = self._call(self._odometry.state, where=self._where)
         if not isinstance(own, Mapping) or not _storable(own):
-            raise RegistrationError(
-                "the state of the odometry cannot be stored",
-                where=self._where,
-                got=kind_of(own),
-                expected="a dict of arrays, texts and numbers of Python, also in dicts and lists",
-            )
+            what, got = "the state of the odometry cannot be stored", kind_of(own)
+            expected = "a dict of arrays, texts and numbers of Python, also in dicts and lists"
+            raise RegistrationError(what, where=self._where, got=got, expected=expected)
         return {"own": dict(own), "begun": self._begun}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -56,12 +56,8 @@ def _table(command: str, results: Sequence[JobResult]) -> Table:
     for one in jobs:
         facts, figures = one.facts, (one.figures.get(name, NOT_KNOWN) for name in columns)
         cells = (f"{x:.4g}" if isinstance(x, float) else str(x) for x in figures)
-        shown = (
-            facts["state"],
-            str(facts["tries"]),
-            f"{one.seconds:.1f}",
-            f"{one.bytes / 1e6:.1f}",
-        )
+        spent = (f"{one.seconds:.1f}", f"{one.bytes / 1e6:.1f}")
+        shown = (facts["state"], str(facts["tries"]), *spent)
         rows.append((one.job.name, one.last.error or one.remark, *shown, *cells))
     return Table(command, ("job", "remark", "state", "tries", "seconds", "MB", *columns), rows)
 
