@@ -52,6 +52,10 @@ from recon.map.drive.sequence import MappedSequence as MappedSequence
 from recon.map.drive.sequence import map_sequence as map_sequence
 from recon.map.map import Map as Map
 from recon.map.sessions.measured import Survey as Survey
+from recon.odometry.protocol import Odometry as Odometry
+from recon.odometry.protocol import OdometryFrame as OdometryFrame
+from recon.odometry.protocol import OdometryHealth as OdometryHealth
+from recon.odometry.protocol import OdometryResult as OdometryResult
 from recon.rig.audit.audit import Audit as Audit
 from recon.sources.one_pair import PairInput as PairInput
 from recon.sources.registry import open_source as open_source

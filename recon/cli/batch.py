@@ -21,6 +21,10 @@ def batch(
     resume: Annotated[
         Path | None, opt.option("Do what is missing of the batch in this folder.")
     ] = None,
+    watch: Annotated[
+        Path | None,
+        opt.option("Show how the batch in this folder stands, until it ends; from any terminal."),
+    ] = None,
     scheduler: opt.Scheduler = None,
     workers: Annotated[
         int | None, opt.option("Workers on this machine.", default="one per core", min=1)
@@ -54,7 +58,7 @@ def batch(
 
     Each job is a process of its own with a folder of its own below --out. One
     that fails leaves the others alone; one whose worker dies goes on elsewhere.
-    The folder gets summary.json, a table and a report with outliers first. The
+    The folder gets summary.json, tables and a report, what is wrong first. The
     exit code is 1 if any job failed. It needs: pip install 'recon\[cluster]'
 
     Examples:
@@ -62,10 +66,16 @@ def batch(
       recon batch map drives/* --out outputs/week --option=--no-mesh
       recon batch jobs.toml --scheduler tcp://head:8786 --timeout 7200
       recon batch --resume outputs/week
+      recon batch --watch outputs/week
     """
-    if (resume is None) == (not what):
-        raise typer.BadParameter("give JOBS, or COMMAND and SOURCES, or --resume FOLDER")
+    if [bool(what), resume is not None, watch is not None].count(True) != 1:
+        raise typer.BadParameter("give JOBS, COMMAND and SOURCES, --resume or --watch FOLDER")
     with one_line_errors(quiet=quiet):
+        if watch is not None:
+            from recon.cli.watch import show_batch
+
+            show_batch(watch)
+            return
         from recon.cli.program import plan_jobs
         from recon.cli.progress import choose_viewer
         from recon.commands.batch import run_batch

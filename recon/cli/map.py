@@ -6,7 +6,7 @@ import os
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -37,11 +37,11 @@ def map_(
     out: opt.Out = None,
     start: Start = None,
     odometry: Annotated[
-        Literal["visual", "kiss", "sfm", "fused"] | None,
+        str | None,
         opt.setting(
             "odometry.method",
             "visual (also named fused): features; kiss: kiss-icp on points, to compare with; sfm: "
-            "structure from motion, for pairs in any order (extra sfm).",
+            "structure from motion, for pairs in any order (extra sfm); or a plug-in.",
             default="visual",
         ),
     ] = None,

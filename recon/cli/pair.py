@@ -27,7 +27,7 @@ def _disparities(ndisp: int) -> dict[str, int]:
 def _settings(shared: opt.Shared, ndisp: int | None) -> ReconConfig:
     """Return the configuration of one pair, whose matcher has a number of disparities if given."""
     from recon.commands.config import PAIR_DEFAULTS
-    from recon.stereo.match.protocol import name_of
+    from recon.core.plugins import name_of
     from recon.stereo.match.registry import settings_of
 
     settings = shared.settings(PAIR_DEFAULTS)

@@ -83,27 +83,35 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
 
 
 def print_batch(summary: Mapping[str, Any]) -> None:
-    """Print one line per job, what is unusual, why jobs failed, and the folder of the batch."""
-    from recon.run.batch.results import accuracies
+    """Print a line per job, what is wrong first; then why jobs failed, and what is unusual."""
+    from recon.run.batch.results import urgency
 
-    table, jobs = Table(show_edge=False, pad_edge=False), summary["jobs"][:_MOST_JOBS]
-    judged = accuracies(job["figures"] for job in jobs)
-    for title in ("job", "state", "tries", "seconds", *judged):
-        table.add_column(re.sub(r"(?<=[a-z])[._]", " ", title), overflow="fold")
-    for job in jobs:
-        cells = (job["name"], job["state"], str(job["tries"]), f"{job['seconds']:.1f}")
-        figures = (job["figures"].get(name) for name in judged)
-        found = ("" if value is None else f"{value:.4g}" for value in figures)
-        table.add_row(*map(Text, (*cells, *found)))
-    Console().print(table)
-    if more := len(summary["jobs"]) - len(jobs):
+    jobs = sorted(summary["jobs"], key=lambda job: urgency(job, job["figures"]))
+    Console().print(batch_table(jobs))
+    if (more := len(jobs) - _MOST_JOBS) > 0:
         typer.echo(f"and {more} more, in table.csv")
-    for job in summary["jobs"]:
+    for job in jobs:
         if "remark" in job:
             typer.echo(f"unusual: {job['name']}: {job['remark']}")
         if job["state"] == "failed":
             typer.echo(f"error: {job['name']}: {job['error']}", err=True)
     typer.echo(f"results: {summary['out']}")
+
+
+def batch_table(all_jobs: Sequence[Mapping[str, Any]]) -> Table:
+    """Return one line per job, with its size and the accuracy of its command."""
+    from recon.run.batch.results import accuracies
+
+    table, jobs = Table(show_edge=False, pad_edge=False), all_jobs[:_MOST_JOBS]
+    judged = accuracies(job["figures"] for job in jobs)
+    for title in ("job", "state", "tries", "s", "MB", *judged):
+        table.add_column(re.sub(r"(?<=[a-z])[._]", " ", title), overflow="fold")
+    for job in jobs:
+        times = (str(job["tries"]), f"{job['seconds']:.1f}", f"{job['bytes'] / 1e6:.1f}")
+        figures = (job["figures"].get(name) for name in judged)
+        found = ("" if value is None else f"{value:.4g}" for value in figures)
+        table.add_row(*map(Text, (job["name"], job["state"], *times, *found)))
+    return table
 
 
 def print_datasets(found: Mapping[str, Any]) -> None:

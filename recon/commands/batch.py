@@ -62,6 +62,7 @@ def _summary(results: Sequence[JobResult], run_now: int, seconds: float) -> dict
         "succeeded": sum(one.ok for one in results),
         "failed": sum(one.failed for one in results),
         "not_run": sum(not one.ok and not one.failed for one in results),
+        "bytes": sum(one.bytes for one in results),
         "jobs_per_hour": 3600.0 * run_now / seconds if run_now else None,
         "warnings": [f"{one.job.name}: {text}" for one in results for text in one.warnings],
     }

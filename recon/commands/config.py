@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
 from recon.core.errors import FormatError, SettingsError
+from recon.core.plugins import name_of
 from recon.core.settings import (
     Settings,
     alternatives,
@@ -32,7 +33,6 @@ from recon.run.finished import is_pair_run
 from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings
 from recon.stereo.frame import ANY_SCALE
-from recon.stereo.match.protocol import name_of
 from recon.stereo.match.registry import MATCHERS, field_of
 from recon.street.settings import StreetSettings
 

@@ -19,6 +19,7 @@ from recon.core.errors import (
     ReconError,
     SettingsError,
 )
+from recon.core.plugins import name_of
 from recon.core.text import counted
 from recon.core.values import (
     OccupancyGrid,
@@ -41,6 +42,7 @@ from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
 from recon.odometry.prior import MotionPrior
+from recon.odometry.registry import check_odometry
 from recon.odometry.rig.length import check_length, see_baseline
 from recon.odometry.rig.refine import DEPTHS_M, KnownRig, RefinedRig, refine_rig, rig_shown
 from recon.odometry.sfm.find import check_sfm
@@ -112,6 +114,7 @@ def run_map(
     """
     config, options = config or load_config(), options or MapOptions()
     check_source(source)
+    check_odometry(config.odometry.method)
     if config.odometry.method == "sfm" and options.known_poses is None:
         refuse_with_sfm(source, options)
     findings = quick_warnings(source, config) if options.audit else ()
@@ -269,7 +272,7 @@ def _summary(
     frames, prior = len(mapped.trajectory), mapped.prior
     known = {"trajectory": errors.path, "map": errors.surface, "occupancy": errors.occupancy}
     return {
-        "odometry": "known poses" if given else mapped.config.odometry.method,
+        "odometry": "known poses" if given else name_of(mapped.config.odometry.method),
         "source": source.name,
         "frames": frames,
         "fps": frames / mapped.seconds if mapped.seconds > 0 else None,

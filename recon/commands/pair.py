@@ -10,6 +10,7 @@ import numpy as np
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
+from recon.core.plugins import name_of
 from recon.core.values import (
     Disparity,
     Reason,
@@ -33,7 +34,7 @@ from recon.run.work import SILENT, Progress
 from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 from recon.stereo.match.onnx import describe_network
-from recon.stereo.match.protocol import Matcher, name_of
+from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, check_matcher, field_of
 
 

@@ -4,6 +4,7 @@
 - `errors.py`: one tree, one line each; `settings.py`: the base of all settings;
 - `kernels/compiled.py`: how loops are compiled; `kernels/cache.py`: where machine code is kept;
 - `kernels/voxels.py`: hashes and sets of packed cells;
+- `plugins.py`: parts that others write, registered by packages or given as objects;
 - `text.py`: numbers read from text and written with words and units;
 - `least_squares.py`: the loop of every non-linear fit.
 """

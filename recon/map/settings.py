@@ -15,6 +15,8 @@ from recon.map.ground.grid import GridSettings
 from recon.map.ground.surface import GroundSettings
 from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.map.submaps import SubmapSettings
+from recon.odometry.protocol import Odometry
+from recon.odometry.registry import check_odometry
 from recon.odometry.settings import OdometrySettings, RigSettings
 from recon.run.work import MemorySettings
 from recon.stereo.frame import FilterSettings, StereoSettings
@@ -74,6 +76,15 @@ class DriveSettings(StereoSettings):
     def scale(self) -> float:
         """Size of the scene against a road."""
         return self.scene.scale or 1.0
+
+    def with_odometry(self, odometry: str | Odometry) -> Self:
+        """Return the settings with another odometry, by name or as an object.
+
+        ``config.yaml`` has the name of an object only, so such a run is repeated from Python.
+        """
+        check_odometry(odometry)
+        chosen = self.odometry.model_copy(update={"method": odometry})
+        return self.model_copy(update={"odometry": chosen})
 
     def at_scale(self, scale: float) -> Self:
         """Return the settings with lengths that follow from a scale, unless another one is set."""

@@ -2,6 +2,7 @@
 
 - `protocol.py`: what every odometry takes and gives; `registry.py`: the odometries by name, and
   known poses as one of them;
+- `foreign.py`: odometries that are not ours, whose poses are checked;
 - `visual.py`: features, found again from other positions (`features.py`), give a pose, adjusted in
   a short window of frames (`pose.py`);
 - `sfm/`: structure from motion, for pairs in any order, by COLMAP;

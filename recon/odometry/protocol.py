@@ -58,7 +58,7 @@ class OdometryResult:
     """Where the left camera was when the frame was taken."""
 
     T_world_camera: Float64  # (4, 4); the first frame is the identity
-    health: OdometryHealth  # how far it can be trusted
+    health: OdometryHealth = OdometryHealth()  # how far it can be trusted
 
 
 @runtime_checkable

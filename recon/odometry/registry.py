@@ -9,9 +9,11 @@ import numpy as np
 
 from recon.core.errors import RegistrationError, SettingsError
 from recon.core.geometry.se3 import invert
+from recon.core.plugins import name_of
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.odometry.checked import CheckedOdometry
+from recon.odometry.foreign import PLUGINS, ForeignOdometry
 from recon.odometry.guide import Guide
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.prior import MotionPrior
@@ -26,27 +28,38 @@ ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, Guide | None], Odometry]
 
 
 def make_odometry(
-    name: str,
+    odometry: str | Odometry,
     settings: OdometrySettings | None = None,
     prior: Trajectory | None = None,
     scale: float = 1.0,
     guide: Guide | None = None,
 ) -> Odometry:
-    """Make the odometry of a name in `ODOMETRIES`; its poses are checked (`CheckedOdometry`).
+    """Make the odometry of a name, ours or one that an installed package registers.
+
+    An object with the methods of `Odometry` is taken too. Poses are checked (`CheckedOdometry`).
 
     Each odometry uses its own part of the settings; ``prior`` is the path of the rig by other
     sensors, on the clock of the frames, ``scale`` the size of the scene against a road;
-    without a prior ``guide`` says how the rig moves.
+    without a prior ``guide`` says how the rig moves: neither is of use to one that is not ours.
     """
-    if name == "sfm":
+    if odometry == "sfm":
         what, expected = "structure from motion is no odometry frame by frame", "visual or kiss"
-        raise SettingsError(what, where="odometry.method", got=name, expected=expected)
-    if name not in ODOMETRIES:
-        choices = ", ".join(sorted(ODOMETRIES))
-        raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
+        raise SettingsError(what, where="odometry.method", got=odometry, expected=expected)
+    check_odometry(odometry)
+    if not isinstance(odometry, str) or odometry not in ODOMETRIES:
+        if prior is not None:
+            where, hint = f"odometry {name_of(odometry)!r}", "leave out --prior"
+            raise SettingsError("only odometries of recon take a prior", where=where, hint=hint)
+        made = ForeignOdometry(PLUGINS.load(odometry), name_of(odometry))
+        return CheckedOdometry(made, scale)
     settings = settings or OdometrySettings()
     guide = guide if prior is None else MotionPrior(prior, settings.prior)
-    return CheckedOdometry(ODOMETRIES[name](settings, guide), scale)
+    return CheckedOdometry(ODOMETRIES[odometry](settings, guide), scale)
+
+
+def check_odometry(odometry: str | Odometry) -> None:
+    """Check that an odometry exists, without making it."""
+    PLUGINS.check(odometry, (*ODOMETRIES, "sfm"))
 
 
 class KnownPoses:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, InstanceOf, field_serializer
 
+from recon.core.plugins import name_of
 from recon.core.settings import Length, Settings
+from recon.odometry.protocol import Odometry
 
 
 class PriorSettings(Settings):
@@ -27,9 +29,6 @@ class PriorSettings(Settings):
     """Standard deviation of its rotation from frame to frame."""
 
 
-OdometryName = Literal["visual", "kiss", "sfm"]
-
-
 def _name_today(name: object) -> object:
     """Return what an odometry is called today: in runs of older versions it may be "fused"."""
     return "visual" if name == "fused" else name
@@ -47,10 +46,11 @@ class RigSettings(Settings):
 class OdometrySettings(Settings):
     """Where the camera is in each frame."""
 
-    method: Annotated[OdometryName, BeforeValidator(_name_today)] = "visual"
+    method: Annotated[str | InstanceOf[Odometry], BeforeValidator(_name_today)] = "visual"
     """visual = features followed from frame to frame; kiss = kiss-icp, which from there registers
     the points that stereo measures well over time, to compare with; sfm = structure from motion by
-    COLMAP over all pairs, in any order (extra sfm)."""
+    COLMAP over all pairs, in any order (extra sfm); or one that an installed package registers;
+    in Python also an odometry of your own."""
     imu: bool = True
     """Use the inertial unit of a source that has one, without `--prior`: its gyro says how the
     camera turns, also where it sees nothing, its accelerometer what is up. Its bias, delay and axes
@@ -59,3 +59,7 @@ class OdometrySettings(Settings):
     """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
     it with a wide baseline in open country."""
     prior: PriorSettings = PriorSettings()
+
+    @field_serializer("method")
+    def _written(self, method: str | Odometry) -> str:
+        return name_of(method)

@@ -14,7 +14,7 @@ from recon.report import style
 from recon.report.page import write_page
 from recon.report.table import NOT_KNOWN, Table, csv_text, join
 from recon.run.batch.job import LOGS
-from recon.run.batch.results import JobResult, accuracies, outliers_first
+from recon.run.batch.results import JobResult, accuracies, wrong_first
 from recon.run.directory import RunDirectory
 
 #: Columns of the tables for people, where any job has them; the CSV has every figure.
@@ -29,13 +29,15 @@ _PANEL_IN: Final = 3.2
 def write_batch_page(
     results: Sequence[JobResult], summary: Mapping[str, Any], run: RunDirectory
 ) -> None:
-    """Write the table as CSV and Markdown, and ``report.html`` with the outliers first."""
+    """Write the table as CSV, Markdown and LaTeX, and ``report.html``, what is wrong first."""
     write_text(run.path("table.csv"), batch_csv(results))
-    write_text(run.path("table.md"), join(table.markdown() for table in batch_tables(results)))
+    tables = batch_tables(results)
+    write_text(run.path("table.md"), join(table.markdown() for table in tables))
+    write_text(run.path("table.tex"), join(table.latex() for table in tables))
     sweep = sweep_figure(results)
     if sweep:
         write_bytes(run.path("sweep.png"), sweep)
-    first = outliers_first(results)
+    first = wrong_first(results)
     pages = {one.job.name: _page(one, run.folder) for one in first}
     failed = [f"{one.job.name}: {one.last.error}" for one in first if one.failed]
     shown = {"tables": batch_tables(first), "pages": pages, "sweep": sweep}
@@ -54,16 +56,17 @@ def _table(command: str, results: Sequence[JobResult]) -> Table:
     for one in jobs:
         facts, figures = one.facts, (one.figures.get(name, NOT_KNOWN) for name in columns)
         cells = (f"{x:.4g}" if isinstance(x, float) else str(x) for x in figures)
-        shown = (facts["state"], str(facts["tries"]), f"{one.seconds:.1f}")
+        spent = (f"{one.seconds:.1f}", f"{one.bytes / 1e6:.1f}")
+        shown = (facts["state"], str(facts["tries"]), *spent)
         rows.append((one.job.name, one.last.error or one.remark, *shown, *cells))
-    return Table(command, ("job", "remark", "state", "tries", "seconds", *columns), rows)
+    return Table(command, ("job", "remark", "state", "tries", "seconds", "MB", *columns), rows)
 
 
 def batch_csv(results: Sequence[JobResult]) -> str:
     """Return the table for programs: every swept setting and every figure of every job."""
     swept = list(dict.fromkeys(key for one in results for key in one.job.swept))
     names = list(dict.fromkeys(key for one in results for key in one.figures))
-    facts = ("name", "command", "source", "state", "tries", "seconds", "error")
+    facts = ("name", "command", "source", "state", "tries", "seconds", "bytes", "error")
     rows = [
         [found.get(key, "") for found, keys in parts for key in keys]
         for parts in (

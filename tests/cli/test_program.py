@@ -163,7 +163,15 @@ def test_jobs_that_are_none_are_one_line(changes, words):
 
 
 def job(name: str, state: str = "succeeded", **more: Any) -> dict[str, Any]:
-    return {"name": name, "state": state, "tries": 1, "seconds": 12.34, "figures": {}, **more}
+    return {
+        "name": name,
+        "state": state,
+        "tries": 1,
+        "seconds": 12.34,
+        "bytes": 5_000_000,
+        "figures": {},
+        **more,
+    }
 
 
 def test_the_table_has_the_accuracy_of_each_command_and_not_all_of_very_many_jobs(

@@ -152,6 +152,14 @@ def plugin(site: Path) -> None:
     install_plugin(site, "block-matcher", {"block_matcher.py": source}, points)
 
 
+def odometry_plugin(module: Path) -> None:
+    """That of the examples, as pip would install it."""
+    module.parent.mkdir(exist_ok=True)
+    source = (ROOT / "examples" / "03_own_odometry.py").read_text()
+    points = {"icp": "own_odometry:IcpOdometry"}
+    install_plugin(module.parent, "own-odometry", {module.name: source}, points, "odometries")
+
+
 def scenes(folder: Path) -> None:
     """Those of the paper, in Middlebury's layout."""
     for number, name in enumerate(SCENES):
@@ -250,6 +258,7 @@ STAND_INS = (
     StandIn("results/baseline", results),
     StandIn("network.onnx", network),
     StandIn("pip install ./block-matcher", plugin, "site"),
+    StandIn("pip install ./own-odometry", odometry_plugin, "site/own_odometry.py"),
     StandIn("rides/today", recording),
     StandIn("rides/long", drive),
     StandIn("drives/*", drive, "drives/monday"),

@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import nbformat
 import numpy as np
 import pytest
+from nbclient import NotebookClient
 
 from tests.flow.runs import RECON, ROOT, summary_of
 from tests.scenery.kitti import street_drive
@@ -71,6 +73,7 @@ EXAMPLES = {
         "position error",
         ["trajectory_kitti.txt", "map/cloud.ply", "map/grid.yaml", "map/octomap.bt"],
     ),
+    "03_own_odometry.py": ("icp: ", ["icp/map/cloud.ply", "visual/map/cloud.ply"]),
 }
 
 
@@ -78,7 +81,7 @@ EXAMPLES = {
 def test_an_example_prints_and_writes_what_it_says(name, tmp_path, monkeypatch, capsys):
     said, files = EXAMPLES[name]
     words = [str(tmp_path / "out")]
-    if "drive" in name:
+    if name != "01_one_pair.py":
         words.insert(0, str(street_drive(tmp_path / "drive", 6)))
     monkeypatch.setattr(sys, "argv", [name, *words])
     runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
@@ -88,3 +91,17 @@ def test_an_example_prints_and_writes_what_it_says(name, tmp_path, monkeypatch, 
 
 def test_every_example_is_tested():
     assert {path.name for path in (ROOT / "examples").glob("*.py")} == EXAMPLES.keys()
+
+
+@pytest.mark.slow
+def test_the_notebook_shows_its_values_and_is_kept_without_outputs(tmp_path, monkeypatch):
+    path = ROOT / "examples" / "04_notebook.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(not cell.outputs and cell.execution_count is None for cell in cells)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    NotebookClient(notebook, timeout=500, resources={"metadata": {"path": tmp_path}}).execute()
+    shown = [out.get("data", {}) for cell in cells for out in cell.outputs]
+    assert sum("data:image/png" in data.get("text/html", "") for data in shown) == 5
+    assert sum("image/png" in data for data in shown) == 1

@@ -126,7 +126,7 @@ def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("batch") / "out"
     summary = {
         "jobs": [{}] * 12, "succeeded": 10, "failed": 1, "seconds": 60.0, "workers": 2,
-        "jobs_per_hour": 600.0, "warnings": ["drive0_w=9: the lens is dirty"],
+        "bytes": 7e8, "jobs_per_hour": 600.0, "warnings": ["drive0_w=9: the lens is dirty"],
     }  # fmt: skip
     (out / "drive3_w=9").mkdir(parents=True)
     (out / "drive3_w=9" / "report.html").touch()

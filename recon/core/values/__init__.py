@@ -1,4 +1,7 @@
-"""Immutable data types: validated on construction, numpy only; no file access, no drawing."""
+"""Immutable data types: validated on construction, numpy only; no file access, no drawing.
+
+What a notebook shows of them is made by `recon.report.notebook`, on demand (`shown.py`).
+"""
 
 from recon.core.values.camera import LARGEST_CENTRE_OFFSET as LARGEST_CENTRE_OFFSET
 from recon.core.values.camera import CameraIntrinsics as CameraIntrinsics

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from recon.core.text import counted
 from recon.core.values.arrays import Float32, Int32, UInt8, extent_text, freeze
+from recon.core.values.shown import Shape
 
 Frame = Literal["camera", "world", "map"]
 
 
 @dataclass(frozen=True, eq=False)
-class PointCloud:
+class PointCloud(Shape):
     """Points in one frame. Every field but ``xyz`` and ``frame`` may be None (unknown).
 
     Attributes:
@@ -100,7 +101,7 @@ class Texture:
 
 
 @dataclass(frozen=True, eq=False)
-class TriangleMesh:
+class TriangleMesh(Shape):
     """A surface: vertices float32 (V, 3), metres; faces int32 (F, 3), counter-clockwise outside.
 
     ``normals``, float32 (V, 3) unit vectors, ``rgb``, uint8 (V, 3), and ``texture`` may be None.

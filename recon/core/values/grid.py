@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.core.text import counted
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze, size_text
+from recon.core.values.shown import Shown
 
 FREE: Final = 0
 OCCUPIED: Final = 100
@@ -66,7 +67,7 @@ def join_voxels(parts: Iterable[OccupancyVoxels], resolution_m: float) -> Occupa
 
 
 @dataclass(frozen=True, eq=False)
-class OccupancyGrid:
+class OccupancyGrid(Shown):
     """A 2-D occupancy grid in map axes, with the conventions of ROS.
 
     ``cells`` is int8 (rows, columns) of FREE, OCCUPIED or UNKNOWN, from the smallest y and x on;

@@ -23,6 +23,7 @@ from recon.core.values.arrays import (
     size_text,
 )
 from recon.core.values.camera import RectifiedCamera
+from recon.core.values.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ class Reason(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Disparity:
+class Disparity(Shown):
     """Disparity map of the left view, with confidence and uncertainty.
 
     Attributes:

@@ -12,10 +12,11 @@ from typing_extensions import Self
 from recon.core.errors import ShapeError
 from recon.core.text import counted
 from recon.core.values.arrays import Float64, freeze
+from recon.core.values.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Shown):
     """Poses of the left camera, float64 (N, 4, 4), metres, and not decreasing times, float64 (N,).
 
     ``xyz_world = apply(T_world_camera, xyz_camera)``.

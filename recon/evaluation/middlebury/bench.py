@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import FormatError, SettingsError, SourceError
+from recon.core.plugins import name_of
 from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float32
@@ -39,7 +40,7 @@ from recon.io.middlebury import (
 )
 from recon.run.run import plain
 from recon.stereo.frame import StereoSettings
-from recon.stereo.match.protocol import Matcher, name_of
+from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import check_matcher, make_matcher, searched_ndisp
 from recon.stereo.rectify.rectifier import Rectifier
 

@@ -18,17 +18,28 @@ from recon.io.files import StrPath
 
 def write_mesh(path: StrPath, mesh: TriangleMesh) -> None:
     """Write OBJ or STL, chosen by the suffix."""
-    surface = _surface(mesh.vertices, mesh.faces)
-    if mesh.normals is not None:
-        normals = np.array(mesh.normals, dtype=np.float64)
-        surface.vertex_normals = o3d.utility.Vector3dVector(normals)
-    if mesh.rgb is not None:
-        surface.vertex_colors = o3d.utility.Vector3dVector(mesh.rgb.astype(np.float64) / 255)
+    surface = to_open3d(mesh)
     with _quiet():
         surface.compute_triangle_normals()
         written = o3d.io.write_triangle_mesh(Path(path), surface)
     if not written:
         raise OutputError("Open3D could not write the mesh", where=path)
+
+
+def to_open3d(shape: Any) -> Any:
+    """Return a mesh or a cloud as Open3D's, with its normals and colours."""
+    is_mesh, geometry = isinstance(shape, TriangleMesh), o3d.geometry
+    made = (
+        _surface(shape.vertices, shape.faces)
+        if is_mesh
+        else geometry.PointCloud(_vectors(shape.xyz))
+    )
+    of = "vertex_" if is_mesh else ""
+    if shape.normals is not None:
+        setattr(made, f"{of}normals", _vectors(shape.normals))
+    if shape.rgb is not None:
+        setattr(made, f"{of}colors", _vectors(shape.rgb / 255))
+    return made
 
 
 def read_mesh(path: StrPath) -> TriangleMesh:
@@ -72,9 +83,13 @@ def decimate(
 def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
     """Return an Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
     return o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(np.array(vertices, dtype=np.float64)),
+        _vectors(vertices),
         o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),
     )
+
+
+def _vectors(values: NDArray[Any]) -> Any:
+    return o3d.utility.Vector3dVector(np.array(values, dtype=np.float64))
 
 
 def _quiet() -> Any:

@@ -29,8 +29,9 @@ from recon.io.files import reading
 from recon.run.directory import RECORD, STARTED, lock_file, refuse_links, state_folder
 from recon.run.run import SUMMARY, Run
 
-State = Literal["not run", "succeeded", "failed", "broken"]
-"""``failed``: by its input, so that another try would fail too. ``broken``: by anything else."""
+State = Literal["not run", "running", "succeeded", "failed", "broken"]
+"""``running``: seen from outside, in no log. ``failed``: by its input, so that another try would
+fail too. ``broken``: by anything else."""
 LOGS: Final = "logs"
 _TAIL_BYTES: Final = 1 << 16  # at the end of a log, in which the last try is found
 _PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")

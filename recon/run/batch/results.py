@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +28,8 @@ _LEAST_SPREAD: Final = {
 }  # fmt: skip
 """What is compared, drift and trust, by the last part of its name: what it differs by at least
 from drive to drive; negative where less is worse."""
+_DRIFT: Final = ("trajectory.t_rel_percent", "t_rel_percent", "expected_drift_percent")
+"""What the drift of a job is: the first of these that it has."""
 _SUMMARY_BYTES: Final = 1 << 26
 _LEAST_JOBS: Final = 4  # fewer of one kind have no usual value
 #: The spread of a normal distribution from its median absolute deviation.
@@ -48,6 +52,7 @@ class JobResult:
     figures: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     remark: str = ""
+    bytes: int = 0  # of all files in its folder, also where it did not succeed
 
     @property
     def ok(self) -> bool:
@@ -86,6 +91,7 @@ class JobResult:
             "tries": last.tries,
             "seconds": last.seconds,
             "worker": last.worker,
+            "bytes": self.bytes,
             **({"error": last.error} if self.failed else {}),
             **({"swept": dict(job.swept)} if job.swept else {}),
             **({"remark": self.remark} if self.remark else {}),
@@ -111,15 +117,16 @@ def work_off(
 
 def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
     """Return the result of a job, with the figures of its summary."""
+    size = folder_bytes(folder / job.name)
     if outcome.state != "succeeded":
-        return JobResult(job, outcome)
+        return JobResult(job, outcome, bytes=size)
     path = folder / job.name / SUMMARY
     with reading(path):
         summary = json.loads(read_text(path, _SUMMARY_BYTES))
         if not outcome.seconds:  # its worker died before it could say so
             outcome = replace(outcome, seconds=float(summary.get("seconds", 0.0)))
         warnings = tuple(map(str, summary.get("warnings", ())))
-        return JobResult(job, outcome, dict(_flat(summary)), warnings)
+        return JobResult(job, outcome, dict(_flat(summary)), warnings, bytes=size)
 
 
 def compare(results: Sequence[JobResult]) -> list[JobResult]:
@@ -135,9 +142,26 @@ def compare(results: Sequence[JobResult]) -> list[JobResult]:
     return [replace(one, remark=remarks.get(one.job.name, "")) for one in results]
 
 
-def outliers_first(results: Iterable[JobResult]) -> list[JobResult]:
-    """Return failed jobs first, then unusual ones."""
-    return sorted(results, key=lambda one: (not one.failed, not one.remark, one.job.name))
+def wrong_first(results: Iterable[JobResult]) -> list[JobResult]:
+    """Return failed jobs first, then those with the least trust, the most drift, a remark."""
+    return sorted(results, key=lambda one: urgency(one.facts, one.figures))
+
+
+def urgency(facts: Mapping[str, Any], figures: Mapping[str, float]) -> tuple[Any, ...]:
+    """Return what `wrong_first` sorts by; jobs that are alike in it keep their order."""
+    untrusted = figures.get("frames_not_trusted", 0.0) / max(1.0, figures.get("frames", 1.0))
+    drift = next((figures[name] for name in _DRIFT if name in figures), 0.0)
+    return facts["state"] != "failed", -untrusted, -drift, "remark" not in facts
+
+
+def folder_bytes(folder: Path) -> int:
+    """Return the size of all files in a folder, which others may be writing or removing."""
+    size = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with suppress(OSError):
+                size += Path(place, name).lstat().st_size
+    return size
 
 
 def accuracies(figures: Iterable[Mapping[str, float]]) -> list[str]:

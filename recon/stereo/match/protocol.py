@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from recon.core.errors import MatchingError, ReconError, SettingsError
+from recon.core.errors import MatchingError, ReconError
+from recon.core.plugins import Plugins, described, kind_of
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.core.values.image import ASSUMED_CONFIDENCE, ASSUMED_SIGMA_PX
@@ -44,7 +43,7 @@ def unrated_disparity(values: Float32, reason: UInt8, pair: RectifiedPair) -> Di
     )
 
 
-GROUP: Final = "recon.matchers"  # the entry point group in which a package registers its matchers
+PLUGINS: Final = Plugins("matcher", "recon.matchers", ("match(pair)",))
 
 
 class CheckedMatcher:
@@ -62,70 +61,10 @@ class CheckedMatcher:
             raise
         except Exception as error:
             raise MatchingError(
-                "the matcher fails", where=f"matcher {self._name!r}", got=_described(error)
+                "the matcher fails", where=f"matcher {self._name!r}", got=described(error)
             ) from error
         disparity = _checked(found, pair, self._name)
         return disparity if pair.valid is None else disparity.reject(~pair.valid, Reason.BORDER)
-
-
-def check_object(matcher: object) -> Matcher:
-    """Check that an object can be used as a matcher."""
-    if inspect.isclass(matcher):
-        name = matcher.__name__
-        raise SettingsError("matcher is a class", got=name, expected=f"an object: {name}()")
-    if not isinstance(matcher, Matcher) or not callable(matcher.match):
-        raise SettingsError(
-            "not a matcher",
-            got=type(matcher).__name__,
-            expected="a name, or an object with a method match(pair)",
-        )
-    return matcher
-
-
-def name_of(matcher: str | Matcher) -> str:
-    """Return the name that results have: an object's attribute ``name``, else that of its class."""
-    if isinstance(matcher, str):
-        return matcher
-    name = getattr(matcher, "name", None)
-    return name if isinstance(name, str) and name else type(matcher).__name__
-
-
-def registered_names() -> set[str]:
-    """Return names of the matchers that installed packages register."""
-    return set(entry_points(group=GROUP).names)
-
-
-def load_registered(name: str) -> Matcher:
-    """Make a matcher that a package registers."""
-    point, *others = sorted(entry_points(group=GROUP, name=name), key=_origin)
-    origin = f"matcher {name!r} ({_origin(point)})"
-    if others:
-        raise SettingsError(
-            "two plug-ins have the same name",
-            where=f"matcher {name!r}",
-            got=" and ".join(map(_origin, (point, *others))),
-            hint="uninstall one of them",
-        )
-    try:
-        made = point.load()()
-    except Exception as error:
-        raise SettingsError(
-            "the plug-in does not load", where=origin, got=_described(error)
-        ) from error
-    if inspect.isclass(made) or not isinstance(made, Matcher):
-        raise SettingsError(
-            "the plug-in makes no matcher",
-            where=origin,
-            got=type(made).__name__,
-            expected="a class or function that takes no argument and gives an object with a "
-            "method match(pair)",
-        )
-    return made
-
-
-def _origin(point: EntryPoint) -> str:
-    package = "" if point.dist is None else f" of package {point.dist.name}"
-    return f"{point.value}{package}"
 
 
 def _checked(found: Any, pair: RectifiedPair, name: str) -> Disparity:
@@ -133,7 +72,7 @@ def _checked(found: Any, pair: RectifiedPair, name: str) -> Disparity:
         raise MatchingError(
             "the matcher returns no Disparity",
             where=f"matcher {name!r}",
-            got=_kind(found),
+            got=kind_of(found),
             hint="return recon.Disparity.from_values(array)",
         )
     problem = _problem(found, pair)
@@ -160,12 +99,3 @@ def _problem(found: Disparity, pair: RectifiedPair) -> tuple[str, str, str] | No
 
 def _worst(numbers: Any) -> str:
     return "NaN" if np.isnan(numbers).any() else f"{numbers.min():g} to {numbers.max():g}"
-
-
-def _kind(found: Any) -> str:
-    shape = f" {found.dtype} {found.shape}" if isinstance(found, np.ndarray) else ""
-    return f"{type(found).__name__}{shape}"
-
-
-def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

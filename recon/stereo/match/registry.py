@@ -7,14 +7,14 @@ from typing import Any, Final
 
 from pydantic import InstanceOf, field_serializer
 
-from recon.core.errors import SettingsError
+from recon.core.plugins import name_of
 from recon.core.settings import Settings
 from recon.core.values import RectifiedPair
 from recon.stereo.match import protocol
 from recon.stereo.match.fine import FineMatcher, FineSettings
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
-from recon.stereo.match.protocol import Matcher, name_of
+from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import AutoRangeMatcher, SadMatcher, SadSettings, estimate_ndisp
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.match.sgm import SgmMatcher, SgmSettings
@@ -57,8 +57,8 @@ def make_matcher(
     settings = settings or MatchingSettings()
     if not isinstance(matcher, str) or matcher not in MATCHERS:
         check_matcher(matcher)
-        made = protocol.load_registered(matcher) if isinstance(matcher, str) else matcher
-        return AutoRangeMatcher(protocol.CheckedMatcher(made, name_of(matcher)))
+        given = protocol.PLUGINS.load(matcher)
+        return AutoRangeMatcher(protocol.CheckedMatcher(given, name_of(matcher)))
     own = getattr(settings, field_of(matcher))
     made = MATCHERS[matcher](own, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.
@@ -69,11 +69,7 @@ def make_matcher(
 
 def check_matcher(matcher: str | Matcher) -> None:
     """Check that a matcher exists, without making it."""
-    if not isinstance(matcher, str):
-        protocol.check_object(matcher)
-    elif matcher not in MATCHERS and matcher not in (others := protocol.registered_names()):
-        choices = ", ".join(sorted({*MATCHERS, *others}))
-        raise SettingsError("unknown matcher", got=repr(matcher), expected=f"one of: {choices}")
+    protocol.PLUGINS.check(matcher, MATCHERS)
 
 
 def settings_of(matcher: str | Matcher, settings: MatchingSettings) -> Settings | None:

@@ -6,7 +6,7 @@ import pytest
 
 from recon.core.errors import FormatError
 from recon.run.batch.job import Outcome
-from recon.run.batch.results import JobResult, accuracies, compare, outliers_first, result_of
+from recon.run.batch.results import JobResult, accuracies, compare, result_of, wrong_first
 from tests.run.batch.jobs import job
 
 DONE = Outcome("succeeded", seconds=1.0, worker="w", tries=1)
@@ -35,7 +35,7 @@ def test_the_job_with_the_unusual_figure_comes_after_the_failed_ones():
     drift = [0.50, 0.55, 0.45, 0.52, 5.0, 0.48]
     results = [result(f"j{n}", t_rel_percent=value, frames=n) for n, value in enumerate(drift)]
     failed = JobResult(job("bad"), Outcome("failed", "no images"))
-    ranked = outliers_first(compare([*results, failed, JobResult(job("later"))]))
+    ranked = wrong_first(compare([*results, failed, JobResult(job("later"))]))
     assert [one.job.name for one in ranked[:2]] == ["bad", "j4"]
     assert ranked[1].remark == "t_rel_percent 5 (usually 0.51)"
     assert [one.remark for one in ranked[2:]] == [""] * 6

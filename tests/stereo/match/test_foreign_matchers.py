@@ -15,15 +15,15 @@ from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
 
 
-def install_plugin(site, package, modules, matchers):
-    """Write modules and metadata of a package that registers matchers into a folder of packages."""
+def install_plugin(site, package, modules, points, group="matchers"):
+    """Write modules and metadata of a package with entry points into a folder of packages."""
     for name, source in modules.items():
         (site / name).write_text(source)
     info = site / f"{package.replace('-', '_')}-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-    points = "".join(f"{name} = {value}\n" for name, value in matchers.items())
-    (info / "entry_points.txt").write_text(f"[recon.matchers]\n{points}")
+    lines = "".join(f"{name} = {value}\n" for name, value in points.items())
+    (info / "entry_points.txt").write_text(f"[recon.{group}]\n{lines}")
 
 
 if sys.version_info >= (3, 11):
@@ -118,7 +118,7 @@ def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named():
     ("given", "settings", "word"),
     [
         (Flat, {}, r"class.*Flat\(\)"),
-        (7, {}, "not a matcher.*int"),
+        (7, {}, "not usable as matcher.*int"),
         (Flat(), {"ndisp": 16}, r"only recon's own matchers take settings.*ndisp"),
     ],
 )

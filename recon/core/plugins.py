@@ -1,0 +1,95 @@
+"""Parts of recon that others write: registered by an installed package, or given as an object."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Collection
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from recon.core.errors import SettingsError
+
+
+@dataclass(frozen=True)
+class Plugins:
+    """What others write of one kind."""
+
+    kind: str  # what one is called in errors
+    group: str  # the entry point group in which packages register it
+    methods: tuple[str, ...]  # what it must have, as it is called: ``match(pair)``
+
+    def check(self, given: object, ours: Collection[str] = ()) -> None:
+        """Refuse an unknown name, and an object that is none, without making anything."""
+        if isinstance(given, str):
+            if given not in ours and given not in (others := entry_points(group=self.group).names):
+                choices = ", ".join(sorted({*ours, *others}))
+                what = f"unknown {self.kind}"
+                raise SettingsError(what, got=repr(given), expected=f"one of: {choices}")
+        elif inspect.isclass(given):
+            name = given.__name__
+            what, expected = f"{self.kind} is a class", f"an object: {name}()"
+            raise SettingsError(what, got=name, expected=expected)
+        elif not self._fits(given):
+            what, expected = f"not usable as {self.kind}", f"a name, or {self._expected}"
+            raise SettingsError(what, got=type(given).__name__, expected=expected)
+
+    def load(self, given: str | object) -> Any:
+        """Return an object as it is, and make that of a name which a package registers."""
+        if not isinstance(given, str):
+            return given
+        found = entry_points(group=self.group, name=given)
+        point, *others = sorted(found, key=_origin)
+        origin = f"{self.kind} {given!r} ({_origin(point)})"
+        if others:
+            raise SettingsError(
+                "two plug-ins have the same name",
+                where=f"{self.kind} {given!r}",
+                got=" and ".join(map(_origin, (point, *others))),
+                hint="uninstall one of them",
+            )
+        try:
+            made = point.load()()
+        except Exception as error:
+            what, got = "the plug-in does not load", described(error)
+            raise SettingsError(what, where=origin, got=got) from error
+        if inspect.isclass(made) or not self._fits(made):
+            raise SettingsError(
+                f"the plug-in makes no {self.kind}",
+                where=origin,
+                got=type(made).__name__,
+                expected=f"a class or function that takes no argument and gives {self._expected}",
+            )
+        return made
+
+    @property
+    def _expected(self) -> str:
+        return f"an object with {', '.join(self.methods)}"
+
+    def _fits(self, given: object) -> bool:
+        names = (method.partition("(")[0] for method in self.methods)
+        return all(callable(getattr(given, name, None)) for name in names)
+
+
+def name_of(given: str | object) -> str:
+    """Return the name that results have: an object's attribute ``name``, else that of its class."""
+    if isinstance(given, str):
+        return given
+    name = getattr(given, "name", None)
+    return name if isinstance(name, str) and name else type(given).__name__
+
+
+def described(error: Exception) -> str:
+    """Return an error of code that is not ours, for a line of ours."""
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def kind_of(found: Any) -> str:
+    """Return what a value is that should have been another one."""
+    shape = f" {found.dtype} {found.shape}" if hasattr(found, "dtype") else ""
+    return f"{type(found).__name__}{shape}"
+
+
+def _origin(point: EntryPoint) -> str:
+    package = "" if point.dist is None else f" of package {point.dist.name}"
+    return f"{point.value}{package}"
