@@ -283,8 +283,7 @@ def live(
         pose, _ = read_start(start)
         settings = shared.settings()
         how: Any = {"begun": view_beside} if view else {}
-        how |= {"mesh": mesh, "source": source, "kind": reading.kind}
-        options = shared.options("live", out, **how)
+        options = shared.options("live", out, mesh=mesh, source=source, kind=reading.kind, **how)
         drive: StereoSource
         if right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]

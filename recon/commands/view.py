@@ -9,19 +9,16 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from recon.core.errors import FormatError
 from recon.core.text import with_unit
 from recon.io.files import read_text, reading
 from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
-from recon.map.store.database import check_format, connect
-from recon.run.directory import RECORD_BYTES, STARTED, state_folder
-from recon.run.finished import CLOUD, GRID, figure_of
+from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
+from recon.run.finished import CLOUD, GRID, command_of_map, figure_of
 from recon.run.run import SUMMARY
 from recon.view.scene import Scene, cut
 from recon.view.server import Viewer
 
-_MAP: Final = "map/map.recon"
 _VOXEL_M: Final = 0.1  # where the summary has none, as of merged runs
 _TURN_S: Final = 0.2  # between two looks at whether there is anything new
 _TURNS: Final = 25  # that are waited for a browser
@@ -39,7 +36,8 @@ def run_view(
         ReconError: A run has no map or a damaged one, viser is missing, or the port is taken.
     """
     for run in runs:
-        _check(run)
+        if not (state_folder(run) / STARTED).is_file():
+            command_of_map(run)  # refuses what made no map
     with closing(Viewer(port)) as viewer:
         announce(viewer.url)
         coming = [(run, _scenes(run, viewer)) for run in runs]
@@ -63,7 +61,7 @@ def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:
 
     if growing:
         yield from grow(run, path)
-    if (run / _MAP).is_file():  # else it was given up
+    if not growing or (run / RECORD).is_file():  # else it was given up
         yield from finish(run, read_products(run))
 
 
@@ -79,13 +77,3 @@ def read_products(run: Path) -> Scene:
     points = cut(read_ply(cloud), spacing_m) if cloud.is_file() else ()
     grids = ((read_nav2(grid), ground_m),) if grid.is_file() else ()
     return Scene([str(run), *lines], points, spacing_m, grids)
-
-
-def _check(run: Path) -> None:
-    """Refuse what cannot be shown, before anything heavy is loaded."""
-    path = state_folder(run) / STARTED
-    path = path if path.is_file() else run / _MAP
-    if not path.is_file():
-        raise FormatError("folder has no map", where=run, expected=f"a {_MAP}")
-    with reading(path), closing(connect(path, read_only=True)) as database:
-        check_format(database, path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -32,9 +32,7 @@ from recon.view.scene import Points, Scene
 _MOST_FACES: Final = 400_000
 # Not to be trusted, trusted but without a place in the map, in the map.
 _TRUST: Final = np.array([(229, 57, 53), (255, 167, 38), (67, 200, 90)], np.uint8)
-_BEHIND_PX: Final = 1.0
-"""With so much less disparity than was matched there, a place is hidden: matches are right to a
-fraction of it, the rest is the slope to the next disparity that a keyframe keeps."""
+_BEHIND_PX: Final = 1.0  # less disparity than was matched there: a place is hidden
 
 
 def finish(run: Path, scene: Scene) -> Iterator[Scene]:
@@ -42,11 +40,9 @@ def finish(run: Path, scene: Scene) -> Iterator[Scene]:
     map_ = Map.open(run)  # as long as its keyframes are looked at
     scene = replace(scene, paths=_paths(map_), keyframes=KeyframeViews(map_))
     yield scene
-    mesh = run / "mesh" / "mesh.ply"
-    if mesh.is_file():
-        scene = replace(scene, mesh=thin_mesh(read_mesh(mesh), _MOST_FACES))
-        yield scene
-    yield replace(scene, points=_dated(scene.points, scene.paths))
+    file = run / "mesh" / "mesh.ply"
+    mesh = thin_mesh(read_mesh(file), _MOST_FACES) if file.is_file() else None
+    yield replace(scene, mesh=mesh, points=_dated(scene.points, scene.paths))
 
 
 def _paths(map_: Map) -> tuple[Points, ...]:
@@ -56,9 +52,8 @@ def _paths(map_: Map) -> tuple[Points, ...]:
         path, number = drive.trajectory, drive.number
         xyz = apply(drive.T_map_world, path.positions_m).astype(np.float32)
         rgb = _TRUST[drive.trusted.astype(np.int64) + placed[number]]
-        seen = np.stack([path.timestamps_s - path.timestamps_s[0], np.full(len(xyz), number)], 1)
-        cloud = PointCloud(xyz, rgb=rgb, frame="map")
-        paths.append(Points(f"{number}", cloud, seen.astype(np.float32)))
+        seen = np.stack([np.full(len(xyz), number), path.timestamps_s - path.timestamps_s[0]], 1)
+        paths.append(Points(f"{number}", PointCloud(xyz, rgb), seen.astype(np.float32)))
     return tuple(paths)
 
 
@@ -85,12 +80,11 @@ def grow(run: Path, path: Path) -> Iterator[Scene | None]:
         yield None
 
 
-def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene | None:
+def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene:
     """Add new submaps, and return the scene of the last commit."""
     with Map.open(path) as map_:
         drive = map_.first
-        new = range(len(taken), len(drive.submaps))
-        taken += [_submap(map_, number) for number in new]
+        taken += [_submap(map_, number) for number in range(len(taken), len(drive.submaps))]
         lines = [str(run), f"frame {len(drive)} of {drive.info.frames}, it is being mapped"]
         points = tuple(part for one in taken for part in one.points)
         grids = tuple(grid for one in taken for grid in one.grids)
@@ -134,10 +128,11 @@ class KeyframeViews:
         step = -(-view.camera.height_px // len(coarse))
         return bool(disparity > coarse[int(v) // step, int(u) // step] - _BEHIND_PX)
 
-    def look(self, number: int) -> tuple[list[str], Mapping[str, UInt8]]:
-        """Match a keyframe again: what it says, and images uint8 (H, W, 3) by their names.
+    def look(self, number: int) -> tuple[list[str], UInt8 | None]:
+        """Match a keyframe again: what it says; its left image, disparities and reasons.
 
-        Where the images of the drive are not at hand there are none, and a line says why.
+        The three stand below each other, uint8 (3 H, W, 3); None where the images of the drive are
+        not at hand, which a line says.
         """
         session, frame = self._views.keys[number]
         drive = self._map.session(session)
@@ -152,9 +147,9 @@ class KeyframeViews:
             source, matcher = self._opened[session]
             pair, disparity = matcher.match(next(source.frames(frame)))
         except ReconError as error:
-            return [*lines, f"no images: {error}"], {}
+            return [*lines, f"no images: {error}"], None
         shares = disparity.reason_shares.items()
         lines.append(", ".join(f"{REASON_LABELS[r]} {100 * share:.0f} %" for r, share in shares))
         left = np.dstack([pair.left] * 3) if pair.left_rgb is None else pair.left_rgb
-        disparities, reasons = colour_disparity(disparity.values), colour_reasons(disparity.reason)
-        return lines, {"left": left, "disparity": disparities, "reasons": reasons}
+        coloured = colour_disparity(disparity.values), colour_reasons(disparity.reason)
+        return lines, np.concatenate([left, *coloured])

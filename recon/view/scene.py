@@ -17,12 +17,10 @@ if TYPE_CHECKING:
 
 MOST_POINTS: Final = 1_500_000  # in the browser: about 25 MB
 _TILE_VOXELS: Final = 256  # edge of what is thinned together
-_SCALES: Final = {"height": "turbo", "sigma": "viridis", "age": "viridis", "session": "tab10"}
-_LEGEND: Final = {
-    "height": "m, blue to red",
-    "sigma": "m, blue to yellow",
-    "age": "s, blue to yellow",
-}
+_SCALES: Final = {
+    "height": ("turbo", "m, blue to red"), "sigma": ("viridis", "m, blue to yellow"),
+    "age": ("viridis", "s, blue to yellow"),
+}  # fmt: skip
 _CLICK_RAD: Final = 0.006  # about five pixels of a screen
 
 
@@ -30,8 +28,7 @@ _CLICK_RAD: Final = 0.006  # about five pixels of a screen
 class Points:
     """Points that are thinned together: a tile of a map, or a submap of one that grows.
 
-    ``seen``, float32 (N, 2): time in its drive, in seconds, and number of the drive that came
-    nearest; None = not looked up.
+    ``seen`` is float32 (N, 2): number of the drive that came nearest, and when in it [s].
     """
 
     name: str
@@ -41,17 +38,14 @@ class Points:
     def values(self, by: str) -> NDArray[Any] | None:
         """Return what a colouring shows: (N,), or colours (N, 3) by ``image``; None = unknown."""
         if by in ("age", "session"):
-            return None if self.seen is None else self.seen[:, int(by == "session")]
+            return None if self.seen is None else self.seen[:, int(by == "age")]
         known = {"image": self.cloud.rgb, "sigma": self.cloud.sigma_m}
         return known.get(by, self.cloud.xyz[:, 2])
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is shown of a run: name and figures, points ``spacing_m`` apart, grids at a height.
-
-    ``paths`` are the positions of drives, coloured by whether they are to be trusted.
-    """
+    """What is shown of a run: figures, points, grids and their heights, paths coloured by trust."""
 
     lines: Sequence[str]
     points: tuple[Points, ...] = ()
@@ -94,10 +88,10 @@ def colours(parts: Sequence[Points], by: str) -> tuple[list[UInt8], str]:
     from recon.report.style import colour_values, value_range  # noqa: PLC0415 - takes a second
 
     if by == "session":
-        return [colour_values(each % 10, _SCALES[by], (0.0, 9.0)) for each in values], ""
-    ends = value_range(np.concatenate(values))
-    legend = f"{ends[0]:.3g} to {ends[1]:.3g} {_LEGEND[by]}"
-    return [colour_values(each, _SCALES[by], ends) for each in values], legend
+        return [colour_values(each % 10, "tab10", (0.0, 9.0)) for each in values], ""
+    ends, (scale, unit) = value_range(np.concatenate(values)), _SCALES[by]
+    legend = f"{ends[0]:.3g} to {ends[1]:.3g} {unit}"
+    return [colour_values(each, scale, ends) for each in values], legend
 
 
 def pick(parts: Sequence[Points], origin_m: Float64, direction: Float64) -> Float64 | None:
@@ -117,5 +111,5 @@ def first_view(scene: Scene) -> tuple[Float64, Float64]:
     """Return eye and look-at point (3,) from which most points are in view, from behind."""
     xyz = np.concatenate([part.cloud.xyz for part in scene.points])[::16]
     low, high = np.quantile(xyz, (0.05, 0.95), axis=0)
-    away_m = max(float(np.linalg.norm(high - low)), 1e-3) * np.array([-0.65, -0.3, 0.5])
+    away_m = max(float(np.linalg.norm(high - low)), 1e-3) * np.array([-0.75, -0.35, 0.55])
     return (low + high) / 2 + away_m, (low + high) / 2

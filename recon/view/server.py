@@ -6,11 +6,12 @@ Callbacks note what is wanted; all work is done in the thread that calls `Viewer
 from __future__ import annotations
 
 import io
+import logging
 import socket
 from contextlib import redirect_stdout
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,16 +20,11 @@ from recon.core.values import UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64
 from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
 
-if TYPE_CHECKING:
-    from recon.view.follow import KeyframeViews
-
 HOST: Final = "127.0.0.1"
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
-_IMAGES: Final = ("left", "disparity", "reasons")
 _FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
 _INK: Final = (255, 213, 79)
-_FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
 
 
@@ -44,18 +40,17 @@ class Viewer:
         try:
             socket.create_server((HOST, port)).close()
         except OSError as error:
-            hint = "if another program has it, give another --port"
-            what, got = "cannot serve the page", f"port {port}: {error.strerror}"
-            raise OutputError(what, where=HOST, got=got, hint=hint) from error
-        with redirect_stdout(io.StringIO()):  # of which viser has its own say
+            what, where, hint = "cannot serve here", f"{HOST}:{port}", "give another --port"
+            raise OutputError(what, where=where, got=error.strerror, hint=hint) from error
+        logging.getLogger("websockets").addHandler(logging.NullHandler())  # a browser may vanish
+        with redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(HOST, port, "recon", verbose=False)
         self.url = f"http://{HOST}:{self._server.get_port()}"
         self.looked_at = False
         self._scenes: dict[Path, Scene] = {}
         self._parts: list[Points] = []
-        self._keyframes: list[tuple[KeyframeViews, int]] = []
+        self._keyframes: list[tuple[Any, int]] = []  # each by its views, and its number there
         self._drawn: dict[str, tuple[Any, ...]] = {}  # what each node was made of
-        self._nodes: dict[str, Any] = {}
         self._eye_m: Float64 = np.zeros(3)
         self._wanted: dict[str, Any] = {}
         self._news = Event()
@@ -104,18 +99,17 @@ class Viewer:
     def _lay_out(self) -> None:
         gui, scene = self._server.gui, self._server.scene
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._text = gui.add_markdown("")
+        self._text = gui.add_markdown("nothing to be seen yet")
         self._by = gui.add_dropdown("Colours", _COLOURINGS[:1])
         self._legend = gui.add_markdown("")
-        self._layers = {name: gui.add_checkbox(f"Show {name}", name != "mesh") for name in _LAYERS}
+        self._layers = [
+            (gui.add_checkbox(f"Show {name}", name != "mesh"), scene.add_frame(f"/{name}", False))
+            for name in _LAYERS
+        ]
         self._slider = gui.add_slider("Keyframe", 0, 1, 1, 0, disabled=True)
         self._said = gui.add_markdown("Move the slider, or click into the scene.")
-        for name in _LAYERS:
-            self._nodes[name] = scene.add_frame(f"/{name}", show_axes=False)
-        for name in _IMAGES:
-            blank = np.zeros((1, 1, 3), np.uint8)
-            self._nodes[name] = gui.add_image(blank, label=name, format="jpeg", visible=False)
-        for control in (self._by, *self._layers.values()):
+        self._image = gui.add_image(np.zeros((1, 1, 3), np.uint8), format="jpeg", visible=False)
+        for control in (self._by, *(box for box, _ in self._layers)):
             control.on_update(lambda _: self._note(drawn=True))
         self._slider.on_update(lambda e: self._note(keyframe=e.client and e.target.value))
         scene.on_click()(lambda e: self._note(ray=np.array([e.ray_origin, e.ray_direction])))
@@ -125,17 +119,22 @@ class Viewer:
 
     def _changed(self, name: str, *made_of: Any) -> bool:
         """Return whether something is to be drawn, as it is made of other values than before."""
+        self._kept.add(name)
         before, self._drawn[name] = self._drawn.get(name), made_of
         return before != made_of
 
     def _draw(self) -> None:
         """Bring the browser up to date; what has not changed is not sent again."""
-        for name, box in self._layers.items():
-            self._nodes[name].visible = box.value
+        for box, frame in self._layers:
+            frame.visible = box.value
+        self._kept: set[str] = set()
         if self._parts:
             self._draw_clouds()
         for number, scene in enumerate(self._scenes.values()):
             self._draw_rest(number, scene)
+        for name in {*self._drawn} - self._kept:
+            self._server.scene.remove_by_name(name)
+            del self._drawn[name]
 
     def _draw_clouds(self) -> None:
         by, parts, scenes = self._by.value, self._parts, enumerate(self._scenes.values())
@@ -147,11 +146,9 @@ class Viewer:
             if self._changed(name, part, by, times):
                 xyz, shown = part.cloud.xyz[:: 1 << times], rgb[:: 1 << times]
                 # Fewer points are larger, so that the surface stays closed.
-                how = {**_FLAT, "point_size": named[name].spacing_m * 2 ** (times / 2)}
-                self._nodes[name] = self._server.scene.add_point_cloud(name, xyz, shown, **how)
-        for name in {name for name in self._nodes if name.startswith("/cloud")} - {*named}:
-            self._nodes.pop(name).remove()
-            del self._drawn[name]
+                size_m = named[name].spacing_m * 2 ** (times / 2)
+                how = {"point_size": size_m, "precision": "float32", "point_shading": "flat"}
+                self._server.scene.add_point_cloud(name, xyz, shown, **how)
 
     def _draw_rest(self, number: int, scene: Scene) -> None:
         api, by, mesh = self._server.scene, self._by.value, scene.mesh
@@ -160,16 +157,17 @@ class Viewer:
             if self._changed(name, grid):
                 # Where they overlap, the later one is above.
                 _add_grid(api, name, grid, height_m + 1e-3 * scene.spacing_m * part)
-        if mesh is not None and self._changed(f"/mesh/{number}", mesh):
-            rgb = None if mesh.rgb is None else 255 * (mesh.rgb / 255) ** 2.2  # glTF's are linear
-            trimesh, how = require("trimesh", extra="view"), {"vertex_colors": rgb}
-            shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, **how)
-            api.add_mesh_trimesh(f"/mesh/{number}", shape)
+        if mesh is not None and self._changed(name := f"/mesh/{number}", mesh):
+            trimesh = require("trimesh", extra="view")
+            rgb = np.full_like(mesh.vertices, 184) if mesh.rgb is None else mesh.rgb
+            linear = (255 * (rgb / 255) ** 2.2).astype(np.uint8)  # as colours of glTF are
+            how: Any = {"vertex_colors": linear, "process": False}
+            api.add_mesh_trimesh(name, trimesh.Trimesh(mesh.vertices, mesh.faces, **how))
         for path in scene.paths:
             name = f"/path/{number}_{path.name}"
             if self._changed(name, path, by):
-                (rgb,), _ = colours([path], by if by in ("age", "session") else "image")
-                pairs = [np.stack([a[:-1], a[1:]], axis=1) for a in (path.cloud.xyz, rgb)]
+                (own,), _ = colours([path], by if by in ("age", "session") else "image")
+                pairs = [np.stack([a[:-1], a[1:]], axis=1) for a in (path.cloud.xyz, own)]
                 api.add_line_segments(name, *pairs, **_LINE)
 
     def _choose(self, keyframe: int | None, place_m: Float64 | None) -> None:
@@ -187,11 +185,9 @@ class Viewer:
             self._slider.value = keyframe
         if keyframe is not None:
             of, number = known[keyframe]
-            lines, images = of.look(number)
-            text = "  \n".join([*lines, text])
-            for name in _IMAGES:
-                self._nodes[name].visible = name in images
-                self._nodes[name].image = images.get(name, self._nodes[name].image)
+            lines, image = of.look(number)
+            text, self._image.visible = "  \n".join([*lines, text]), image is not None
+            self._image.image = self._image.image if image is None else image
         self._said.content = text
 
 
