@@ -65,10 +65,7 @@ def _dated(parts: Sequence[Points], paths: Sequence[Points]) -> tuple[Points, ..
 
 
 def grow(run: Path, path: Path) -> Iterator[Scene | None]:
-    """Yield the scene of an unfinished map after each commit, until it is gone; None = as it was.
-
-    Each submap is read once. What moved is still in it, and loops are open.
-    """
+    """Yield the scene of an unfinished map after each commit until it is gone; None = as it was."""
     taken: list[Scene] = []
     before, now, log = 0, 0, Path(f"{path}-wal")  # SQLite's, of a map that is being written
     while path.is_file():

@@ -65,17 +65,14 @@ def cut(cloud: PointCloud, spacing_m: float) -> tuple[Points, ...]:
 
 
 def halvings(parts: Sequence[Points], eye_m: Float64, limit: int = MOST_POINTS) -> list[int]:
-    """Return how often to halve the points of each part, so that about ``limit`` are left.
-
-    What is twice as far away gets points twice as far apart: a quarter of them.
-    """
+    """Return how often to halve each part so that ``limit`` are left: by distance from the eye."""
     sizes = np.array([len(part.cloud) for part in parts])
-    low, high = (np.array([f(p.cloud.xyz, axis=0) for p in parts]) for f in (np.min, np.max))
-    gaps_m = np.maximum(np.maximum(low - eye_m, eye_m - high), 0.0)
-    distance_m = np.maximum(np.linalg.norm(gaps_m, axis=1), 1e-3)
+    centres = np.array([part.cloud.xyz.mean(axis=0) for part in parts])
+    distance_m = np.maximum(np.linalg.norm(centres - eye_m, axis=1), 1e-3)
     whole_m, times = float(distance_m.max()), np.zeros(len(parts), np.int64)
     while (-(-sizes >> times)).sum() > max(limit, len(parts)):  # rounded up
         whole_m /= np.sqrt(2.0)
+        # Twice as far away, points are twice as far apart: a quarter of them.
         times = np.ceil(2.0 * np.log2(np.maximum(distance_m / whole_m, 1.0))).astype(np.int64)
     return [int(number) for number in times]
 

@@ -1,7 +1,4 @@
-"""The page in the browser, served to this machine alone; the only file that knows viser.
-
-Callbacks note what is wanted; all work is done in the thread that calls `Viewer.serve`.
-"""
+"""The page in the browser, served to this machine alone; the only file that knows viser."""
 
 from __future__ import annotations
 
@@ -25,15 +22,12 @@ _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
 _FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
 _INK: Final = (255, 213, 79)
+_FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
 
 
 class Viewer:
-    """Shows scenes of one or several runs at ``url``, and knows whether it was ``looked_at``.
-
-    Raises:
-        ReconError: viser is not installed, or the port is not to be had.
-    """
+    """Shows scenes of runs at ``url``; `ReconError` without viser, or where the port is taken."""
 
     def __init__(self, port: int) -> None:
         viser: Any = require("viser", extra="view")
@@ -46,7 +40,7 @@ class Viewer:
         with redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(HOST, port, "recon", verbose=False)
         self.url = f"http://{HOST}:{self._server.get_port()}"
-        self.looked_at = False
+        self.looked_at = False  # by a browser
         self._scenes: dict[Path, Scene] = {}
         self._parts: list[Points] = []
         self._keyframes: list[tuple[Any, int]] = []  # each by its views, and its number there
@@ -62,8 +56,7 @@ class Viewer:
             self._eye_m, centre = first_view(scene)
             self._server.initial_camera.position = self._eye_m
             self._server.initial_camera.look_at = centre
-        self._scenes[run] = scene
-        scenes = self._scenes.values()
+        scenes = (self._scenes := {**self._scenes, run: scene}).values()
         self._parts = [part for one in scenes for part in one.points]
         views = [one.keyframes for one in scenes if one.keyframes is not None]
         self._keyframes = [(of, n) for of in views for n in range(len(of.T_map_camera))]
@@ -87,12 +80,11 @@ class Viewer:
             self._draw()
 
     def close(self) -> None:
-        """End the page."""
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
     def _note(self, **wanted: Any) -> None:
-        # What we set ourselves comes from no client: None.
+        # For `serve`, whose thread does all work; what we set comes from no client: None.
         self._wanted.update({name: one for name, one in wanted.items() if one is not None})
         self._news.set()
 
@@ -146,8 +138,7 @@ class Viewer:
             if self._changed(name, part, by, times):
                 xyz, shown = part.cloud.xyz[:: 1 << times], rgb[:: 1 << times]
                 # Fewer points are larger, so that the surface stays closed.
-                size_m = named[name].spacing_m * 2 ** (times / 2)
-                how = {"point_size": size_m, "precision": "float32", "point_shading": "flat"}
+                how = {"point_size": named[name].spacing_m * 2 ** (times / 2), **_FLAT}
                 self._server.scene.add_point_cloud(name, xyz, shown, **how)
 
     def _draw_rest(self, number: int, scene: Scene) -> None:
@@ -155,13 +146,10 @@ class Viewer:
         for part, (grid, height_m) in enumerate(scene.grids):
             name = f"/grid/{number}_{part}"
             if self._changed(name, grid):
-                # Where they overlap, the later one is above.
-                _add_grid(api, name, grid, height_m + 1e-3 * scene.spacing_m * part)
+                _add_grid(api, name, grid, height_m + 0.01 * scene.spacing_m * part)
         if mesh is not None and self._changed(name := f"/mesh/{number}", mesh):
             trimesh = require("trimesh", extra="view")
-            rgb = np.full_like(mesh.vertices, 184) if mesh.rgb is None else mesh.rgb
-            linear = (255 * (rgb / 255) ** 2.2).astype(np.uint8)  # as colours of glTF are
-            how: Any = {"vertex_colors": linear, "process": False}
+            how: Any = {"vertex_colors": mesh.rgb, "process": False}
             api.add_mesh_trimesh(name, trimesh.Trimesh(mesh.vertices, mesh.faces, **how))
         for path in scene.paths:
             name = f"/path/{number}_{path.name}"
@@ -178,8 +166,8 @@ class Viewer:
         seen = [k for k, (of, n) in enumerate(known) if of.sees(n, place_m)]
         ends = np.array([(place_m, eyes_m[k]) for k in seen]).reshape(-1, 2, 3)
         api.add_line_segments("/path/seen", ends, _INK, **_LINE)
-        text = "{:.1f}, {:.1f}, {:.1f} m was seen by keyframes ".format(*place_m)
-        text += ", ".join(map(str, seen)) or "none"
+        names = ", ".join(map(str, seen)) or "none"
+        text = "{:.1f}, {:.1f}, {:.1f} m was seen by keyframes {}".format(*place_m, names)
         if keyframe is None and seen:
             keyframe = min(seen, key=lambda k: float(np.linalg.norm(eyes_m[k] - place_m)))
             self._slider.value = keyframe
