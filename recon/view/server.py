@@ -56,7 +56,8 @@ class Viewer:
             self._eye_m, centre = first_view(scene)
             self._server.initial_camera.position = self._eye_m
             self._server.initial_camera.look_at = centre
-        scenes = (self._scenes := {**self._scenes, run: scene}).values()
+        self._scenes[run] = scene
+        scenes = self._scenes.values()
         self._parts = [part for one in scenes for part in one.points]
         views = [one.keyframes for one in scenes if one.keyframes is not None]
         self._keyframes = [(of, n) for of in views for n in range(len(of.T_map_camera))]
