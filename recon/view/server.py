@@ -21,7 +21,6 @@ HOST: Final = "127.0.0.1"
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
 _FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
-_INK: Final = (255, 213, 79)
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
 
@@ -166,9 +165,9 @@ class Viewer:
         place_m = eyes_m[keyframe] if place_m is None else place_m
         seen = [k for k, (of, n) in enumerate(known) if of.sees(n, place_m)]
         ends = np.array([(place_m, eyes_m[k]) for k in seen]).reshape(-1, 2, 3)
-        api.add_line_segments("/path/seen", ends, _INK, **_LINE)
+        api.add_line_segments("/path/seen", ends, (255, 213, 79), **_LINE)
         names = ", ".join(map(str, seen)) or "none"
-        text = "{:.1f}, {:.1f}, {:.1f} m was seen by keyframes {}".format(*place_m, names)
+        text = f"{np.round(place_m, 1)} m was seen by keyframes {names}"
         if keyframe is None and seen:
             keyframe = min(seen, key=lambda k: float(np.linalg.norm(eyes_m[k] - place_m)))
             self._slider.value = keyframe
