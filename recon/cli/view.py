@@ -23,8 +23,8 @@ Beside = Annotated[int | None, typer.Option(hidden=True)]
 def view(runs: Runs, port: Port = 8080, beside: Beside = None) -> None:
     """Look at maps in the browser: points, grid, mesh, path, keyframes.
 
-    The page is for this machine alone, until Ctrl-C. A click shows which
-    keyframes saw a place, and what they saw. What is being mapped grows.
+    For this machine alone, until Ctrl-C. Runs that are being made grow; a click
+    shows which keyframes saw a place, and what they saw.
 
     Examples:
       recon view outputs/map/latest

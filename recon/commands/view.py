@@ -13,13 +13,13 @@ from recon.core.text import with_unit
 from recon.io.files import read_text, reading
 from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
+from recon.map.store.database import check_format, connect
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
 from recon.run.finished import CLOUD, GRID, command_of_map, figure_of
 from recon.run.run import SUMMARY
 from recon.view.scene import Scene, cut
 from recon.view.server import Viewer
 
-_VOXEL_M: Final = 0.1  # where the summary has none, as of merged runs
 _TURN_S: Final = 0.2  # between two looks at whether there is anything new
 _TURNS: Final = 25  # that are waited for a browser
 _FIGURES: Final = re.compile("frames|path_length|points$|.*drift")
@@ -37,7 +37,9 @@ def run_view(
     """
     for run in runs:
         if not (state_folder(run) / STARTED).is_file():
-            command_of_map(run)  # refuses what made no map
+            path, _ = run / "map/map.recon", command_of_map(run)  # refuses what made no map
+            with reading(path), closing(connect(path, read_only=True)) as database:
+                check_format(database, path)
     with closing(Viewer(port)) as viewer:
         announce(viewer.url)
         coming = [(run, _scenes(run, viewer)) for run in runs]
@@ -73,7 +75,7 @@ def read_products(run: Path) -> Scene:
         ground_m = float(summary["T_map_world"][2][3]) - (height_m or 0.0)
         known = {n: v for n, v in summary.items() if _FIGURES.match(n) and type(v) in (int, float)}
         lines = [f"{name} {with_unit(f'{known[name]:.6g}', name)}" for name in known]
-    cloud, grid, spacing_m = run / CLOUD, run / GRID, voxel_m or _VOXEL_M
+    cloud, grid, spacing_m = run / CLOUD, run / GRID, voxel_m or 0.1  # merged: unsaid
     points = cut(read_ply(cloud), spacing_m) if cloud.is_file() else ()
     grids = ((read_nav2(grid), ground_m),) if grid.is_file() else ()
     return Scene([str(run), *lines], points, spacing_m, grids)

@@ -85,8 +85,7 @@ def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene:
         lines = [str(run), f"frame {len(drive)} of {drive.info.frames}, it is being mapped"]
         points = tuple(part for one in taken for part in one.points)
         grids = tuple(grid for one in taken for grid in one.grids)
-        spacing_m = settings_of(drive).fusion.voxel_m
-        return Scene(lines, points, spacing_m, grids, paths=_paths(map_) if taken else ())
+        return Scene(lines, points, settings_of(drive).fusion.voxel_m, grids, None, _paths(map_))
 
 
 def _submap(map_: Map, number: int) -> Scene:

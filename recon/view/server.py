@@ -116,7 +116,6 @@ class Viewer:
         return before != made_of
 
     def _draw(self) -> None:
-        """Bring the browser up to date; what has not changed is not sent again."""
         for box, frame in self._layers:
             frame.visible = box.value
         self._kept: set[str] = set()
