@@ -61,7 +61,7 @@ def _dated(parts: Sequence[Points], paths: Sequence[Points]) -> tuple[Points, ..
     """Return points with the time and the drive that passed nearest to each."""
     near = cKDTree(np.concatenate([path.cloud.xyz for path in paths]))
     seen = np.concatenate([path.seen for path in paths if path.seen is not None])
-    return tuple(replace(part, seen=seen[near.query(part.cloud.xyz)[1]]) for part in parts)
+    return tuple(replace(p, seen=seen[near.query(p.cloud.xyz, workers=-1)[1]]) for p in parts)
 
 
 def grow(run: Path, path: Path) -> Iterator[Scene | None]:

@@ -58,17 +58,17 @@ class Scene:
 
 def cut(cloud: PointCloud, spacing_m: float) -> tuple[Points, ...]:
     """Cut a cloud into square tiles, seen from above."""
-    cells = np.floor(cloud.xyz[:, :2] / (_TILE_VOXELS * spacing_m)).astype(np.int64)
-    keys, tile = np.unique(cells, axis=0, return_inverse=True)
-    names = [f"{x}_{y}" for x, y in keys.tolist()]
-    return tuple(Points(name, cloud.select(tile.ravel() == n)) for n, name in enumerate(names))
+    keys = (cloud.xyz[:, :2] // (_TILE_VOXELS * spacing_m)).astype(np.int64) @ [1 << 32, 1]
+    order = np.argsort(keys, kind="stable")
+    tiles = np.split(order, np.flatnonzero(np.diff(keys[order])) + 1)
+    return tuple(Points(f"{keys[own[0]]}", cloud.select(own)) for own in tiles if len(own))
 
 
 def halvings(parts: Sequence[Points], eye_m: Float64, limit: int = MOST_POINTS) -> list[int]:
     """Return how often to halve each part so that ``limit`` are left: by distance from the eye."""
     sizes = np.array([len(part.cloud) for part in parts])
-    centres = np.array([part.cloud.xyz.mean(axis=0) for part in parts])
-    distance_m = np.maximum(np.linalg.norm(centres - eye_m, axis=1), 1e-3)
+    places = np.array([part.cloud.xyz[len(part.cloud) // 2] for part in parts])
+    distance_m = np.maximum(np.linalg.norm(places - eye_m, axis=1), 1e-3)
     whole_m, times = float(distance_m.max()), np.zeros(len(parts), np.int64)
     while (-(-sizes >> times)).sum() > max(limit, len(parts)):  # rounded up
         whole_m /= np.sqrt(2.0)
@@ -106,7 +106,7 @@ def pick(parts: Sequence[Points], origin_m: Float64, direction: Float64) -> Floa
 
 def first_view(scene: Scene) -> tuple[Float64, Float64]:
     """Return eye and look-at point (3,) from which most points are in view, from behind."""
-    xyz = np.concatenate([part.cloud.xyz for part in scene.points])[::16]
+    xyz = np.concatenate([part.cloud.xyz[::16] for part in scene.points])
     low, high = np.quantile(xyz, (0.05, 0.95), axis=0)
     away_m = max(float(np.linalg.norm(high - low)), 1e-3) * np.array([-0.75, -0.35, 0.55])
     return (low + high) / 2 + away_m, (low + high) / 2
