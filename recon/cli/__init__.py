@@ -26,6 +26,7 @@ from recon.cli.map import live, localize, map_, merge, piece
 from recon.cli.options import Commands, option
 from recon.cli.pair import disparity, pair
 from recon.cli.products import export, mesh, occupancy
+from recon.cli.view import view
 
 app = Commands(
     name="recon",
@@ -37,7 +38,7 @@ app = Commands(
 _PANELS: Final = {
     "Getting started": (demo, doctor, settings),
     "Reconstruction and mapping": (
-        pair, disparity, map_, localize, live, merge, export, mesh, occupancy, batch,
+        pair, disparity, map_, localize, live, merge, view, export, mesh, occupancy, batch,
     ),
     "Cameras and recordings": (board, calibrate, rectify, capture, audit, datasets),
     "Evaluation": (evaluate, paper),

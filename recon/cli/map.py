@@ -21,6 +21,7 @@ from recon.cli.drive_options import (
 )
 from recon.cli.errors import one_line_errors, until_interrupted
 from recon.cli.tables import print_json, print_run
+from recon.cli.view import View, view_beside
 
 if TYPE_CHECKING:
     from recon.sources.source import StereoSource
@@ -79,6 +80,7 @@ def map_(
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
+    view: View = False,
     *,
     reading: DriveOptions,
     shared: opt.Shared,
@@ -113,16 +115,20 @@ def map_(
         raise typer.BadParameter("give SOURCE, or --resume FOLDER")
     if into is not None and (workers or scheduler) is not None:
         raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
+    if view and (into or workers or scheduler) is not None:
+        raise typer.BadParameter("--view follows one map that grows: no --into, --workers")
     with shared.one_line_errors():
         from recon.cli.progress import warn
         from recon.commands.config import run_settings
         from recon.commands.map import run_map
         from recon.commands.merge import run_map_into, run_remove
 
+        how: Any = {"begun": view_beside} if view else {}
         options = shared.options(
             out=out,
             mesh=mesh,
             warn=partial(warn, quiet=shared.quiet, verbose=shared.verbose),
+            **how,
             workers=open_workers(workers, scheduler, shared),
             source=source,
             kind=reading.kind,
@@ -247,6 +253,7 @@ def live(
     out: opt.Out = None,
     start: StartInMap = None,
     mesh: opt.Mesh = False,
+    view: View = False,
     *,
     reading: DriveOptions,
     shared: opt.Shared,
@@ -265,6 +272,8 @@ def live(
       recon live rides/today --rate 2
       recon live rides/today --map outputs/map/latest
     """
+    if view and map_ is not None:
+        raise typer.BadParameter("--view shows a map that grows, and --map makes none")
     with shared.one_line_errors(), ExitStack() as stack:
         from recon.cli.progress import announce
         from recon.commands.localize import run_live
@@ -273,7 +282,8 @@ def live(
         stopped = stack.enter_context(until_interrupted())
         pose, _ = read_start(start)
         settings = shared.settings()
-        options = shared.options("live", out, mesh=mesh, source=source, kind=reading.kind)
+        how: Any = {"begun": view_beside} if view else {}
+        options = shared.options("live", out, mesh=mesh, source=source, kind=reading.kind, **how)
         drive: StereoSource
         if right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]

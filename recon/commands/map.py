@@ -186,6 +186,7 @@ def _begun(
         fitted = config.at_scale(scene.scale)
         run.settle(fitted)
         with options.begin(run, source, fitted) as map_:
+            options.begun(run.folder)
             yield run, map_, rig, scene, fitted
 
 

@@ -27,6 +27,7 @@ NOT_RUN = {
     r"recon datasets (fetch|verify)": "needs a network; tests/commands/test_datasets.py has one",
     r"dask |for host in |sbatch |kubectl |recon (batch|map) .* --scheduler": "needs a cluster",
     r"recon capture 0 2": "needs two cameras; tests/commands/test_cameras.py records from videos",
+    r"recon view ": "shows until Ctrl-C; tests/flow/test_view.py looks at it",
     r"recon live (0|/dev/)": "needs cameras; tests/flow/test_live.py plays videos as such",
 }
 """Beginnings of shell lines that are checked but not run, and why."""

@@ -1,0 +1,81 @@
+"""`recon view`: maps in the browser, of finished runs and of those that are being made."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+from recon.core.text import with_unit
+from recon.io.files import read_text, reading
+from recon.io.models.nav2 import read_nav2
+from recon.io.models.ply import read_ply
+from recon.map.store.database import check_format, connect
+from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
+from recon.run.finished import CLOUD, GRID, command_of_map, figure_of
+from recon.run.run import SUMMARY
+from recon.view.scene import Scene, cut
+from recon.view.server import Viewer
+
+_TURN_S: Final = 0.2  # between two looks at whether there is anything new
+_TURNS: Final = 25  # that are waited for a browser
+_FIGURES: Final = re.compile("frames|path_length|points$|.*drift")
+
+
+def run_view(
+    runs: Sequence[Path], port: int, announce: Callable[[str], None], stopped: Callable[[], bool]
+) -> None:
+    """Show the maps of runs, each in its own axes, until ``stopped``: what `recon view` does.
+
+    ``port`` is of this machine, for itself alone; ``announce`` gets the address.
+
+    Raises:
+        ReconError: A run has no map or a damaged one, viser is missing, or the port is taken.
+    """
+    for run in runs:
+        if not (state_folder(run) / STARTED).is_file():
+            path, _ = run / "map/map.recon", command_of_map(run)  # refuses what made no map
+            with reading(path), closing(connect(path, read_only=True)) as database:
+                check_format(database, path)
+    with closing(Viewer(port)) as viewer:
+        announce(viewer.url)
+        coming = [(run, _scenes(run, viewer)) for run in runs]
+        while not stopped():
+            for run, scenes in coming:
+                if (new := next(scenes, None)) is not None:
+                    viewer.show(run, new)
+            viewer.serve(_TURN_S)
+
+
+def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:
+    """Yield what is known of a run, step by step; None = nothing new."""
+    path = state_folder(run) / STARTED
+    if not (growing := path.is_file()):
+        yield read_products(run)
+    # What opens maps takes seconds to load, and would slow down the browser that begins.
+    for _ in range(_TURNS):
+        if not viewer.looked_at:
+            yield None
+    from recon.view.follow import finish, grow  # noqa: PLC0415
+
+    if growing:
+        yield from grow(run, path)
+    if not growing or (run / RECORD).is_file():  # else it was given up
+        yield from finish(run, read_products(run))
+
+
+def read_products(run: Path) -> Scene:
+    """Return points, grid and figures of a finished run by its files, which takes a moment."""
+    voxel_m, height_m = (figure_of(run, name) for name in ("voxel_m", "camera_height_m"))
+    with reading(run / SUMMARY):
+        summary = json.loads(read_text(run / SUMMARY, RECORD_BYTES))
+        ground_m = float(summary["T_map_world"][2][3]) - (height_m or 0.0)
+        known = {n: v for n, v in summary.items() if _FIGURES.match(n) and type(v) in (int, float)}
+        lines = [f"{name} {with_unit(f'{known[name]:.6g}', name)}" for name in known]
+    cloud, grid, spacing_m = run / CLOUD, run / GRID, voxel_m or 0.1  # merged: unsaid
+    points = cut(read_ply(cloud), spacing_m) if cloud.is_file() else ()
+    grids = ((read_nav2(grid), ground_m),) if grid.is_file() else ()
+    return Scene([str(run), *lines], points, spacing_m, grids)

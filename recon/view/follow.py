@@ -1,0 +1,151 @@
+"""The scene of a map: of a finished run in full, of one that is being made as far as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from recon.core.errors import ReconError
+from recon.core.geometry.se3 import apply, invert, transform_cloud
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.camera import project
+from recon.export.images import open_images
+from recon.io.models.mesh import read_mesh
+from recon.map.ground.grid import flatten
+from recon.map.ground.surface import estimate_ground_surface
+from recon.map.map import Map
+from recon.map.sessions.placed import settings_of
+from recon.map.store.map_file import MapViews
+from recon.report.scene import thin_mesh
+from recon.report.style import REASON_LABELS, colour_disparity, colour_reasons
+from recon.sources.source import StereoSource
+from recon.stereo.frame import FrameReconstructor
+from recon.view.scene import Points, Scene
+
+_MOST_FACES: Final = 400_000
+# Not to be trusted, trusted but without a place in the map, in the map.
+_TRUST: Final = np.array([(229, 57, 53), (255, 167, 38), (67, 200, 90)], np.uint8)
+_BEHIND_PX: Final = 1.0  # less disparity than was matched there: a place is hidden
+
+
+def finish(run: Path, scene: Scene) -> Iterator[Scene]:
+    """Add to what the files of a finished run show what its map knows, step by step."""
+    map_ = Map.open(run)  # as long as its keyframes are looked at
+    scene = replace(scene, paths=_paths(map_), keyframes=KeyframeViews(map_))
+    yield scene
+    file = run / "mesh" / "mesh.ply"
+    mesh = thin_mesh(read_mesh(file), _MOST_FACES) if file.is_file() else None
+    yield replace(scene, mesh=mesh, points=_dated(scene.points, scene.paths))
+
+
+def _paths(map_: Map) -> tuple[Points, ...]:
+    """Return the path of each drive, its positions coloured by trust."""
+    placed, paths = map_.placed, []
+    for drive in map_.linked:
+        path, number = drive.trajectory, drive.number
+        xyz = apply(drive.T_map_world, path.positions_m).astype(np.float32)
+        rgb = _TRUST[drive.trusted.astype(np.int64) + placed[number]]
+        seen = np.stack([np.full(len(xyz), number), path.timestamps_s - path.timestamps_s[0]], 1)
+        paths.append(Points(f"{number}", PointCloud(xyz, rgb), seen.astype(np.float32)))
+    return tuple(paths)
+
+
+def _dated(parts: Sequence[Points], paths: Sequence[Points]) -> tuple[Points, ...]:
+    """Return points with the time and the drive that passed nearest to each."""
+    near = cKDTree(np.concatenate([path.cloud.xyz for path in paths]))
+    seen = np.concatenate([path.seen for path in paths if path.seen is not None])
+    return tuple(replace(p, seen=seen[near.query(p.cloud.xyz, workers=-1)[1]]) for p in parts)
+
+
+def grow(run: Path, path: Path) -> Iterator[Scene | None]:
+    """Yield the scene of an unfinished map after each commit until it is gone; None = as it was."""
+    taken: list[Scene] = []
+    before, now, log = 0, 0, Path(f"{path}-wal")  # SQLite's, of a map that is being written
+    while path.is_file():
+        before = now
+        with suppress(OSError, ReconError):  # it may be about to be closed
+            now = log.stat().st_mtime_ns
+            if now != before:
+                yield _snapshot(run, path, taken)
+        yield None
+
+
+def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene:
+    """Add new submaps, and return the scene of the last commit."""
+    with Map.open(path) as map_:
+        drive = map_.first
+        taken += [_submap(map_, number) for number in range(len(taken), len(drive.submaps))]
+        lines = [str(run), f"frame {len(drive)} of {drive.info.frames}, it is being mapped"]
+        points = tuple(part for one in taken for part in one.points)
+        grids = tuple(grid for one in taken for grid in one.grids)
+        return Scene(lines, points, settings_of(drive).fusion.voxel_m, grids, None, _paths(map_))
+
+
+def _submap(map_: Map, number: int) -> Scene:
+    """Return what is shown of a submap of the only drive of a map."""
+    drive, settings = map_.first, settings_of(map_.first)
+    submap, T = drive.submaps[number], drive.T_map_world
+    sums = submap.fused.cloud(settings.fusion.voxel_m, settings.fusion.min_count)
+    if not len(sums) or not len(submap.occupancy):
+        return Scene(())
+    cloud = transform_cloud(sums, T, frame="map")
+    voxels = submap.occupancy.voxels(settings.occupancy.resolution_m)
+    path_m = apply(T, drive.odometry.positions_m[submap.first_frame :][: submap.frames])
+    ground = estimate_ground_surface(cloud, path_m, settings.ground)
+    height_m = float(path_m[:, 2].mean() - np.nan_to_num(ground.camera_height_m))
+    points = _dated([Points(f"{number}", cloud)], _paths(map_))
+    return Scene((), points, grids=((flatten(voxels, ground, settings.grid), height_m),))
+
+
+class KeyframeViews:
+    """The keyframes that have a place in a map; disparities and images are read when asked for."""
+
+    def __init__(self, map_: Map) -> None:
+        self._map, self._views = map_, MapViews(map_)
+        self._opened: dict[int, tuple[StereoSource, FrameReconstructor]] = {}
+        T, paths = map_.first.T_map_world, map_.paths
+        self.T_map_camera = [T @ paths[n].T_world_camera[frame] for n, frame in self._views.keys]
+
+    def sees(self, number: int, place_m: Float64) -> bool:
+        """Return whether a keyframe has a place (3,), map axes, in view, with nothing before it."""
+        view = self._views[number]
+        xyz = apply(invert(self.T_map_camera[number]), place_m[None])
+        u, v, disparity = (float(each[0]) for each in project(xyz, view.camera))
+        if not (0 <= u < view.camera.width_px and 0 <= v < view.camera.height_px):
+            return False
+        coarse = view.keyframe.coarse
+        step = -(-view.camera.height_px // len(coarse))
+        return bool(disparity > coarse[int(v) // step, int(u) // step] - _BEHIND_PX)
+
+    def look(self, number: int) -> tuple[list[str], UInt8 | None]:
+        """Match a keyframe again: what it says; its left image, disparities and reasons.
+
+        The three stand below each other, uint8 (3 H, W, 3); None where the images of the drive are
+        not at hand, which a line says.
+        """
+        session, frame = self._views.keys[number]
+        drive = self._map.session(session)
+        health, time_s = drive.health[frame], np.ptp(drive.trajectory.timestamps_s[: frame + 1])
+        lines = [f"frame {frame} of {drive.info.source}, at {time_s:.1f} s", *health.notes]
+        lines += [f"{health.inliers} features agree, {health.reprojection_px:.2f} px off"]
+        try:
+            if session not in self._opened:
+                images = {one.session.number: one for one in open_images(self._map)}[session]
+                matcher = FrameReconstructor(images.rig, settings_of(drive))
+                self._opened[session] = images.source, matcher
+            source, matcher = self._opened[session]
+            pair, disparity = matcher.match(next(source.frames(frame)))
+        except ReconError as error:
+            return [*lines, f"no images: {error}"], None
+        shares = disparity.reason_shares.items()
+        lines.append(", ".join(f"{REASON_LABELS[r]} {100 * share:.0f} %" for r, share in shares))
+        left = np.dstack([pair.left] * 3) if pair.left_rgb is None else pair.left_rgb
+        coloured = colour_disparity(disparity.values), colour_reasons(disparity.reason)
+        return lines, np.concatenate([left, *coloured])

@@ -1,0 +1,219 @@
+"""Maps in the browser: of a finished run, of one that grows, and what is refused."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon.cli.view import view_beside
+from recon.commands import view
+from recon.commands.config import load_config
+from recon.commands.demo import demo_source
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
+from recon.core.values import UNKNOWN
+from recon.io.models.ply import read_ply
+from recon.run.directory import STARTED, state_folder
+from recon.run.work import Silent
+from recon.view.follow import finish, grow
+from recon.view.scene import colours
+from tests.flow.conftest import SMALL_STREET
+from tests.hostile.refusals import assert_refused, run
+from tests.scenery import chromium
+
+VIEW = [sys.executable, "-m", "recon", "view"]
+
+
+@pytest.fixture(scope="module")
+def scenes(small_demo):
+    return list(finish(small_demo, view.read_products(small_demo)))
+
+
+def test_a_finished_run_shows_all_points_of_its_cloud_its_grid_path_and_drift(small_demo, scenes):
+    whole, scene = read_ply(small_demo / "map/cloud.ply"), scenes[-1]
+    shown = np.concatenate([part.cloud.xyz for part in scene.points])
+    assert sorted(map(tuple, shown.tolist())) == sorted(map(tuple, whole.xyz.tolist()))
+    (path,), ((grid, height_m),) = scene.paths, scene.grids
+    assert len(path.cloud) == 12
+    assert -3 < height_m < -1
+    assert (grid.cells != UNKNOWN).any()
+    assert any(line.startswith("expected_drift_percent") for line in scene.lines)
+
+
+def test_points_know_the_drive_and_time_that_passed_nearest(scenes):
+    scene = scenes[-1]
+    (path,) = scene.paths
+    for part in scene.points:
+        assert (part.values("session") == 0).all()
+        near = np.linalg.norm(part.cloud.xyz[:, None] - path.cloud.xyz, axis=2).argmin(axis=1)
+        np.testing.assert_array_equal(part.values("age"), path.values("age")[near])
+
+
+@pytest.mark.parametrize("by", ["image", "height", "sigma", "age", "session"])
+def test_every_colouring_colours_every_point(scenes, by):
+    found, legend = colours(scenes[-1].points, by)
+    assert [len(rgb) for rgb in found] == [len(part.cloud) for part in scenes[-1].points]
+    assert {rgb.dtype for rgb in found} == {np.dtype(np.uint8)}
+    assert (" to " in legend) == (by in ("height", "sigma", "age"))
+
+
+def test_keyframes_see_what_is_before_them_and_not_what_is_behind_them_or_hidden(scenes):
+    views = scenes[-1].keyframes
+    T = views.T_map_camera[0]
+
+    def ahead(metres: float) -> np.ndarray:
+        return (T @ [0.0, 0.0, metres, 1.0])[:3]
+
+    assert views.sees(0, ahead(3.0))
+    assert not views.sees(0, ahead(-3.0))
+    below = (T @ [0.0, 20.0, 30.0, 1.0])[:3]  # through the road
+    assert not views.sees(0, below)
+
+
+def test_a_keyframe_is_matched_again_where_its_images_are_at_hand(scenes, monkeypatch):
+    views = scenes[-1].keyframes
+    lines, image = views.look(0)
+    assert image.shape == (3 * 96, 256, 3)
+    assert any(line.startswith("valid ") for line in lines)
+    views._opened.clear()
+    monkeypatch.setattr("recon.view.follow.open_images", refuse)
+    lines, image = views.look(0)
+    assert image is None
+    assert lines[-1] == "no images: the drive is gone"
+
+
+def refuse(_: object) -> None:
+    from recon.core.errors import SourceError
+
+    raise SourceError("the drive is gone")
+
+
+class Watching(Silent):
+    """A progress that looks at the map after each frame, as a viewer does beside it."""
+
+    def __init__(self) -> None:
+        self.coming, self.seen = None, []
+
+    def begin(self, folder: Path) -> None:
+        self.coming = grow(folder, state_folder(folder) / STARTED)
+
+    def on_step(self, _: object) -> None:
+        self.seen.append(next(self.coming))
+
+
+def map_street(out: Path, **how: Any) -> None:
+    street = [f"street.{key}={value}" for key, value in SMALL_STREET.items()]
+    small = ["checkpoints.every_frames=3", "submaps.length_m=2"]
+    config = load_config(None, [*street, *small])
+    run_map(demo_source(config), config, MapOptions("demo", out, audit=False, mesh=False, **how))
+
+
+def test_a_map_is_seen_to_grow_and_is_the_same_map_as_unseen(tmp_path):
+    watching = Watching()
+    map_street(tmp_path / "seen", progress=watching, begun=watching.begin)
+    grown = [scene for scene in watching.seen if scene is not None and scene.points]
+    counts = [len(scene.points) for scene in grown]
+    assert counts == sorted(counts)
+    assert counts[0] < counts[-1]
+    assert len(grown[0].paths[0].cloud) < len(grown[-1].paths[0].cloud)
+    assert len(grown[-1].grids) == len(grown[-1].points)
+    assert grown[-1].points[0] is grown[0].points[0]  # read once
+    assert set(watching.coming) <= {None}  # it ends, as the map is at its place
+    map_street(tmp_path / "unseen")
+    seen, unseen = ((tmp_path / name / "map/cloud.ply").read_bytes() for name in ("seen", "unseen"))
+    assert seen == unseen
+
+
+def test_what_shows_no_map_is_refused_in_one_line(small_demo, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    monkeypatch.setattr(view, "_TURNS", 0)
+    assert_refused(run("view", tmp_path), "does not contain a finished run")
+    assert_refused(run("view", tmp_path / "missing"), "does not contain a finished run")
+    (tmp_path / "run.json").write_text(json.dumps({"command": "pair"}))
+    assert_refused(run("view", tmp_path), "made no map")
+    damaged = Path(shutil.copytree(small_demo, tmp_path / "damaged"))
+    os.truncate(damaged / "map/map.recon", 50_000)
+    assert_refused(run("view", damaged, "--port", "0"), "damaged")
+    (damaged / "map/map.recon").write_bytes(b"no database")
+    assert_refused(run("view", damaged, "--port", "0"), "map.recon")
+
+
+def test_a_taken_port_and_a_missing_package_are_refused_in_one_line(small_demo, monkeypatch):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert_refused(run("view", small_demo, "--port", f"{port}"), f"{port}", "another --port")
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert_refused(run("view", small_demo), "recon[view]")
+
+
+def test_nothing_that_happens_to_the_viewer_reaches_the_run(monkeypatch, tmp_path):
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(subprocess, "Popen", fail)
+    view_beside(tmp_path)
+
+
+def test_a_viewer_beside_a_run_ends_with_it(small_demo):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    with subprocess.Popen(
+        [*VIEW, small_demo, "--port", "0", "--beside", "1"], stderr=subprocess.PIPE
+    ) as viewer:
+        assert viewer.wait(60) == 0  # whose parent is another process than 1
+
+
+@pytest.fixture
+def page(small_demo):
+    """The process that shows a run, and its address."""
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    words, pipe = [*VIEW, str(small_demo), "--port", "0"], subprocess.PIPE
+    with subprocess.Popen(words, stderr=pipe, text=True) as viewer:
+        try:
+            yield viewer, viewer.stderr.readline().split()[0]
+        finally:
+            viewer.kill()
+
+
+def test_ctrl_c_ends_the_page_with_success_and_no_more_words(page):
+    viewer, url = page
+    assert url.startswith("http://127.0.0.1:")
+    address = url.removeprefix("http://").split(":")
+    with socket.create_connection((address[0], int(address[1]))) as browser:
+        browser.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert browser.recv(15) == b"HTTP/1.1 200 OK"
+    viewer.send_signal(signal.SIGINT)
+    assert viewer.communicate(timeout=60)[1] == ""
+    assert viewer.returncode == 0
+
+
+@pytest.mark.slow
+def test_chromium_shows_it_without_an_error_or_a_request_to_anybody_else(
+    page, small_demo, tmp_path
+):
+    found = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
+    program = next(filter(None, found), None)
+    if program is None:
+        pytest.skip("Chromium is not installed")
+    viewer, url = page
+    cloud_bytes = 15 * len(read_ply(small_demo / "map/cloud.ply"))
+    with chromium.opened(program, tmp_path) as shown:
+        shown.open(url)
+        shown.wait(120.0, cloud_bytes)
+        shown.wait(5.0)
+        assert shown.received >= cloud_bytes
+        assert shown.errors == []
+        outside = [
+            one for one in shown.urls if not one.startswith((url, url.replace("http", "ws")))
+        ]
+        assert [one for one in outside if not one.startswith(("blob:", "data:", "about:"))] == []
+    viewer.send_signal(signal.SIGINT)
+    assert viewer.wait(60) == 0
