@@ -196,7 +196,7 @@ class _Fit:
             side_m = direction[0] * self._x + direction[1] * self._y
             # The cells in between may lie on both sides.
             used = (np.abs(side_m) > 0.6 * self._cell_m).astype(np.float64)
-            beta, covariance = self._solve(used, 0.5 * np.sign(side_m))
+            beta, covariance = self._solve(used, 0.5 * used * np.sign(side_m))
             step_m, sigma_m = np.abs(beta[..., 3]), np.sqrt(covariance[..., 3, 3])
             products = direction[[0, 0, 1]] * direction[[0, 1, 1]] * [1, 2, 1]
             blur_m = np.sqrt(np.einsum("k...,k", self._blur_m2, products))
