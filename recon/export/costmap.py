@@ -63,10 +63,11 @@ class _Costs:
     def __init__(self, placed: PlacedMap, looks: Looks, focal_px: float) -> None:
         self._config, self._looks, self._focal_px = placed.tiles.config, looks, focal_px
 
-    def __call__(
-        self, grid: OccupancyGrid, ground: GroundSurface, passed: Int32
-    ) -> OccupancyGrid:
-        robot, raster = self._config.robot, Raster(grid.origin_m, grid.resolution_m, grid.cells.shape)
+    def __call__(self, grid: OccupancyGrid, ground: GroundSurface, passed: Int32) -> OccupancyGrid:
+        robot, raster = (
+            self._config.robot,
+            Raster(grid.origin_m, grid.resolution_m, grid.cells.shape),
+        )
         low = np.array(grid.origin_m)
         high = low + np.array(grid.cells.shape[::-1]) * grid.resolution_m
         frames = self._looks.near(low, high)
@@ -79,7 +80,7 @@ class _Costs:
 
 def _driven(passed: Int32, raster: Raster) -> Bool:
     """Return the cells (rows, columns) of voxels (N, 3)."""
-    cell, inside = raster.cells_of((passed[:, :2] + 0.5) * raster.cell_m)
+    cell, inside = raster.cells_of((passed[:, :2].astype(np.float64) + 0.5) * raster.cell_m)
     driven = np.zeros(raster.shape, np.bool_)
     driven.ravel()[cell[inside]] = True
     return driven

@@ -61,7 +61,7 @@ def write_nav2_costs(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
     """
     stem = Path(path)
     image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("png", "yaml"))
-    cells = grid.cells[::-1]
+    cells = grid.cells[::-1].astype(np.int16)
     # Two levels for a unit: Nav2 divides by 255, and rounds to units again.
     grey = np.where(cells < 0, np.where(cells == UNKNOWN, _GREY[UNKNOWN], 127), 255 - 2 * cells)
     alpha = np.where(cells < 0, 0, 255)

@@ -24,7 +24,7 @@ from recon.core.values.arrays import Bool, Float64, Int64
 from recon.map.ground.surface import GroundSurface
 
 UNSURE: Final = -2
-"""A cell of a costmap that was seen, but not well enough to tell whether a robot can drive there."""
+"""A cell that was seen, but not well enough to tell whether a robot can drive there."""
 FRICTION: Final = 0.5
 """Of rubber on wet asphalt. With all wheels driven, those on the ground push the one at a step,
 whose normal then leans back by up to twice the angle of friction, atan(μ): it climbs a step of
@@ -36,6 +36,7 @@ _GRADED: Final = 0.25
 side it lies, and by how much."""
 _WINDOW_PX: Final = 5.0  # half of the widest usual window: so far matching moves an edge
 _LEAST_SIGMA_M: Final = 0.003  # roughness of what wheels roll on
+_FRAMES: Final = 2.0  # that must have seen a cell, as many as weigh the same
 _FLATTEST: Final = 0.02  # sine of the flattest view of the ground that is used
 _PRIOR: Final = 1.0
 """Standard deviation of slopes (100 %) and steps (1 m) before anything is seen, so that they are
@@ -140,7 +141,8 @@ def _one_frame(
 
 def _relief(sums: Float64, raster: Raster) -> Relief:
     total, z, zz, variance, squares, *blur = sums.T.reshape(-1, *raster.shape)
-    weight = np.where(total > 0, total, np.nan)
+    # What few frames saw may have moved, or be mismatched.
+    weight = np.where(total**2 >= _FRAMES * squares, np.where(total > 0, total, np.nan), np.nan)
     height_m = z / weight
     # As much as frames and points of a cell differ, if that is more than they say.
     scatter = np.maximum(zz / weight - height_m**2, 0.0) * squares / weight**2
@@ -273,6 +275,7 @@ def widened(grid: OccupancyGrid, robot: RobotSettings, driven: Bool) -> Occupanc
     for value in (UNSURE, UNKNOWN, OCCUPIED):
         others = (cells != value).astype(np.uint8)
         away = cv2.distanceTransform(others, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        near = away * grid.resolution_m < robot.width_m / 2
+        # An obstacle may be anywhere in its cell.
+        near = (away - 0.5) * grid.resolution_m < robot.width_m / 2
         out[near if value == OCCUPIED else near & ~driven & (out >= 0)] = value
     return OccupancyGrid(out, grid.resolution_m, grid.origin_m)

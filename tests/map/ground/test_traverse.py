@@ -176,7 +176,7 @@ def test_the_middle_of_a_robot_stays_half_of_its_width_away(value):
     nowhere = np.zeros((21, 21), np.bool_)
     wide = widened(_one(value), RobotSettings(width_m=1.0), nowhere).cells
     rows, columns = np.indices(wide.shape) - 10
-    near = np.hypot(rows, columns) * 0.1 < 0.5
+    near = (np.hypot(rows, columns) - 0.5) * 0.1 < 0.5
     assert (wide[near] == value).all()
     assert (wide[~near] == FREE).all()
 
