@@ -34,7 +34,7 @@ _LETHAL_P: Final = 0.9
 _GRADED: Final = 0.25
 """Largest deviation, in limits, with which something near a limit has a cost: it is known on which
 side it lies, and by how much."""
-_WINDOW_PX: Final = 5.0  # half of the widest usual window: so far matching moves an edge
+_WINDOW_PX: Final = 6.5  # by which matching moves an edge: half of a window of 11, and a pixel
 _LEAST_SIGMA_M: Final = 0.003  # roughness of what wheels roll on
 _FRAMES: Final = 2.0  # that must have seen a cell, as many as weigh the same
 _FLATTEST: Final = 0.02  # sine of the flattest view of the ground that is used
@@ -178,6 +178,10 @@ class _Fit:
     def __init__(self, relief: Relief, reach: int) -> None:
         self._cell_m, self._reach, self._blur_m2 = relief.raster.cell_m, reach, relief.blur_m2
         self._y, self._x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * self._cell_m
+        # Cells within a blur are off alike, which looks like a step or slope where there is none.
+        xx, xy, yy = relief.blur_m2
+        area = np.sqrt(np.maximum(xx * yy - xy**2, 0.0))
+        self._alike = np.sqrt(1.0 + np.nan_to_num(area) / self._cell_m**2)
         self._weight = np.nan_to_num(relief.sigma_m**-2.0)
         middle_m = np.nanmedian(relief.height_m) if self._weight.any() else 0.0
         self._height_m = np.nan_to_num(relief.height_m - middle_m)
@@ -189,7 +193,7 @@ class _Fit:
         along = beta[..., 1:3] / np.maximum(slope, 1e-12)[..., None]
         along[slope == 0] = [1.0, 0.0]
         variance = np.einsum("...i,...ij,...j", along, covariance[..., 1:3, 1:3], along)
-        return _judged(slope, np.sqrt(variance), slope, np.sqrt(variance), limit)
+        return self._judged(slope, np.sqrt(variance), slope, np.sqrt(variance), limit)
 
     def steps(self, limit_m: float) -> Iterator[Judged]:
         """Yield steps across the cell in each direction; then bumps."""
@@ -205,7 +209,7 @@ class _Fit:
             rise_m = blur_m * np.abs(beta[..., 1:3] @ direction)
             spread = np.einsum("i,...ij,j", direction, covariance[..., 1:3, 1:3], direction)
             most_sigma_m = np.hypot(sigma_m, blur_m * np.sqrt(spread))
-            yield _judged(step_m, sigma_m, step_m + rise_m, most_sigma_m, limit_m)
+            yield self._judged(step_m, sigma_m, step_m + rise_m, most_sigma_m, limit_m)
         inner = max(1, self._reach // 2) + 0.5
         bump = np.maximum(np.abs(self._x), np.abs(self._y)) < inner * self._cell_m
         beta, covariance = self._solve(np.ones_like(self._x), bump)
@@ -213,7 +217,7 @@ class _Fit:
         # What is blurred over more than its own size is lower by as much.
         blur_m2 = self._blur_m2[0] + self._blur_m2[2]
         fades = np.sqrt(1 + blur_m2 / (2 * inner * self._cell_m) ** 2)
-        yield _judged(bump_m, sigma_m, bump_m * fades, sigma_m * fades, limit_m)
+        yield self._judged(bump_m, sigma_m, bump_m * fades, sigma_m * fades, limit_m)
 
     def _solve(self, used: Float64, extra: Float64 | None = None) -> tuple[Float64, Float64]:
         """Return height, slopes and perhaps the extra coefficient (..., 3 or 4); covariances."""
@@ -232,17 +236,16 @@ class _Fit:
         # Where no plane fits, it is known less well.
         return beta, covariance * np.maximum(1.0, left / spare)[..., None, None]
 
+    def _judged(
+        self, value: Float64, sigma: Float64, most: Float64, most_sigma: Float64, limit: float
+    ) -> Judged:
+        sure, possible = (value - limit) / (self._alike * sigma), (most - limit) / most_sigma
+        return Judged(value, ndtr(sure), ndtr(possible), most_sigma / limit)
+
 
 def _sum_around(values: Float64, kernel: Float64) -> Float64:
     summed = cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(summed, np.float64)
-
-
-def _judged(
-    value: Float64, sigma: Float64, most: Float64, most_sigma: Float64, limit: float
-) -> Judged:
-    over, possible = ndtr((value - limit) / sigma), ndtr((most - limit) / most_sigma)
-    return Judged(value, over, possible, most_sigma / limit)
 
 
 def costs(
@@ -254,7 +257,7 @@ def costs(
     height of the robot, in the same cells.
     """
     worst = Judged(*map(np.fmax, steps, slopes))
-    known = (worst.sigma <= _GRADED) & (worst.possible - worst.sure <= 0.5)
+    known = (worst.sigma <= _GRADED) & (worst.possible <= 0.5)
     cells = np.where(known, np.rint(100 * np.nan_to_num(worst.possible)), UNSURE).astype(np.int8)
     cells[worst.possible <= _FREE_P] = FREE
     reach = int(robot.wheel_radius_m / relief.raster.cell_m) + 1
