@@ -88,7 +88,9 @@ class Course(SyntheticSource):
     def world(self) -> StreetWorld:
         """The course, and the path before it."""
         s, random = self.settings, np.random.default_rng([self.settings.seed, 7])
-        end_m, things, parts = (s.frames - 1) * s.speed_m_per_frame, [], []
+        end_m = (s.frames - 1) * s.speed_m_per_frame
+        things: list[str] = []
+        parts: list[TriangleSoup] = []
         for lane, ahead in product(LANES_M, AHEAD_M):
             things = things or list(random.permutation(KINDS))
             at = (end_m + ahead + random.uniform(0, 0.8), lane + random.uniform(-0.2, 0.2))

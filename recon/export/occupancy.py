@@ -95,7 +95,6 @@ class Flattening:
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> WrittenGrid:
-        """Return the grid, as `export_grid` does."""
         if self._tiles.extent[0] == self._tiles.extent[1]:
             raise MappingError("nothing was observed: there is no map to flatten")
         settings, driven = self._along_the_path()

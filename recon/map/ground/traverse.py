@@ -97,14 +97,10 @@ def measure_relief(
     most_m: float,
     focal_px: float,
 ) -> Relief:
-    """Measure the height of each cell.
+    """Measure the height of each cell by rays of frames, camera axes, at their ``T_map_camera``.
 
-    Args:
-        frames: Rays of each frame, camera axes, with ``sigma_m``; and its ``T_map_camera``.
-        ground: Roughly where the ground is: what is more than ``most_m`` above it is left out.
-        raster: The cells, map axes.
-        most_m: See there.
-        focal_px: Focal length of the images, which is how far matching blurs them.
+    What is more than ``most_m`` above the ``ground`` is left out. ``focal_px`` is that of the
+    images, which matching blurs.
     """
     sums = np.zeros((raster.shape[0] * raster.shape[1], 8))
     for cloud, T_map_camera in frames:
@@ -142,7 +138,7 @@ def _one_frame(
 def _relief(sums: Float64, raster: Raster) -> Relief:
     total, z, zz, variance, squares, *blur = sums.T.reshape(-1, *raster.shape)
     # What few frames saw may have moved, or be mismatched.
-    weight = np.where(total**2 >= _FRAMES * squares, np.where(total > 0, total, np.nan), np.nan)
+    weight = np.where((total > 0) & (total**2 >= _FRAMES * squares), total, np.nan)
     height_m = z / weight
     # As much as frames and points of a cell differ, if that is more than they say.
     scatter = np.maximum(zz / weight - height_m**2, 0.0) * squares / weight**2
@@ -190,10 +186,8 @@ class _Fit:
         """Return the slope of the plane."""
         beta, covariance = self._solve(np.ones_like(self._x))
         slope = np.linalg.norm(beta[..., 1:3], axis=-1)
-        along = beta[..., 1:3] / np.maximum(slope, 1e-12)[..., None]
-        along[slope == 0] = [1.0, 0.0]
-        variance = np.einsum("...i,...ij,...j", along, covariance[..., 1:3, 1:3], along)
-        return self._judged(slope, np.sqrt(variance), slope, np.sqrt(variance), limit)
+        sigma = np.sqrt(covariance[..., [1, 2], [1, 2]].max(axis=-1))
+        return self._judged(slope, sigma, slope, sigma, limit)
 
     def steps(self, limit_m: float) -> Iterator[Judged]:
         """Yield steps across the cell in each direction; then bumps."""
@@ -251,10 +245,9 @@ def _sum_around(values: Float64, kernel: Float64) -> Float64:
 def costs(
     relief: Relief, steps: Judged, slopes: Judged, robot: RobotSettings, grid: OccupancyGrid
 ) -> OccupancyGrid:
-    """Return what driving over each cell costs: 0 = free, to 100 = cannot be driven over.
+    """Return the cost of driving over each cell: 0 = free, 100 = not possible; UNKNOWN, `UNSURE`.
 
-    UNKNOWN was not seen, `UNSURE` not well enough. ``grid`` is what stands on the ground, up to the
-    height of the robot, in the same cells.
+    ``grid`` is what stands on the ground, up to the height of the robot, in the same cells.
     """
     worst = Judged(*map(np.fmax, steps, slopes))
     known = (worst.sigma <= _GRADED) & (worst.possible <= 0.5)

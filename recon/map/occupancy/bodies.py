@@ -192,18 +192,14 @@ class Looks:
                 yield self._cast(cloud.select(chosen), T, cells)
 
     def near(self, low: Float64, high: Float64) -> Iterator[tuple[PointCloud, Float64]]:
-        """Yield the rays of frames taken near a rectangle, camera axes, and ``T_map_camera``.
-
-        ``low`` and ``high`` (2,) are its smallest and largest x and y.
-        """
+        """Yield the rays of frames near a rectangle, camera axes, and ``T_map_camera`` of each."""
         for frame in self._near(low, high, self.settings.max_range_m):
             yield self._read(int(frame)).cloud(), self.T_map_camera[frame]
 
     def _near(self, low: Float64, high: Float64, reach_m: float) -> Int64:
         """Return the frames from which something between two corners may be in reach."""
         places = self.T_map_camera[:, : len(low), 3]
-        inside = ((places > low - reach_m) & (places < high + reach_m)).all(axis=1)
-        return np.flatnonzero(inside)
+        return np.flatnonzero(((places > low - reach_m) & (places < high + reach_m)).all(axis=1))
 
     def _cast(self, cloud: PointCloud, T_map_camera: Float64, cells: Int64) -> Int8:
         """Return what the rays of one frame did to cells (N, 3)."""
