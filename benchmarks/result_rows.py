@@ -161,6 +161,24 @@ def occupancy(found: Found) -> Rows:
     return {f"street {seed}": one for seed, one in found["streets"]["streets"].items()}
 
 
+def traversability(found: Found) -> Rows:
+    """Free / obstacle / unknown in percent, by kind and distance."""
+    rows: Rows = {}
+    for vehicle, one in found["courses"].items():
+        rows[vehicle] = {
+            "over, free": one["over the limit, free within 12 m"],
+            "ramps, obstacle": one["ramps up to 15 %, obstacle"],
+        }
+        for kind, bands in one["cells"].items():
+            rows[f"{vehicle}, {kind}"] = {band: thirds(cells) for band, cells in bands.items()}
+    return rows
+
+
+def thirds(cells: dict[str, int]) -> str | None:
+    counted = [cells.get(state, 0) for state in ("free", "obstacle", "unknown")]
+    return " / ".join(f"{100 * n / sum(counted):.0f}" for n in counted) if any(counted) else None
+
+
 def middlebury(found: Found) -> Rows:
     rows: Rows = {}
     for size, columns in found.items():

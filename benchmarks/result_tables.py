@@ -282,6 +282,14 @@ TABLES: Final[dict[str, Table]] = {
         ),
         rows_of.occupancy,
     ),
+    "traversability": Table(
+        {"courses": "python benchmarks/traversability.py --json"},
+        dict.fromkeys(
+            ("0 to 4 m", "4 to 8 m", "8 to 12 m", "12 to 20 m", "over, free", "ramps, obstacle"),
+            "{}",
+        ),
+        rows_of.traversability,
+    ),
     "loops": Table(
         {
             "block 1": "python benchmarks/loops.py --json",

@@ -85,7 +85,7 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
 _FRAME: Final = ("source", "rectification", "matching", "cloud", "filters")
 _DRIVE: Final = (
     *_FRAME, "scene", "map_filters", "rig", "odometry", "loops", "axes", "fusion", "occupancy",
-    "submaps", "memory", "ground", "grid", "mesh", "street",
+    "submaps", "memory", "ground", "grid", "robot", "mesh", "street",
 )  # fmt: skip
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "map": _DRIVE,

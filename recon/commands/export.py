@@ -31,7 +31,7 @@ from recon.run.finished import (
 )
 from recon.run.run import Run
 
-REMADE: Final = ("occupancy", "grid", "ground", "submaps")
+REMADE: Final = ("occupancy", "grid", "ground", "robot", "submaps")
 """Sections of the configuration that may differ from those of the run where rays are cast."""
 
 

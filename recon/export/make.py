@@ -10,6 +10,7 @@ from recon.core.errors import MeshingError, SettingsError
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 from recon.export.cloud import arrays_product, cloud_product, pcd_product
 from recon.export.colmap import colmap_product
+from recon.export.costmap import costmap_product
 from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
@@ -26,6 +27,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "cloud": Product(cloud_product),
     "octomap": Product(octomap_product, needs_occupancy=True),
     "grid": Product(grid_product, needs_occupancy=True),
+    "costmap": Product(costmap_product, needs_occupancy=True),
     "mesh": Product(mesh_product),
     "texture": Product(texture_product, needs_images=True),
     # Their cells, and the ground far from the path, are those of the voxels.

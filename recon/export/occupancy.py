@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 from typing import Final
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
 from recon.export.product import Made, Order
 from recon.io.models.nav2 import write_nav2
@@ -22,7 +22,7 @@ from recon.map.builders import MIN_PROBABILITY
 from recon.map.cut import Rectangle, TileKey
 from recon.map.ground.axes import base_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
-from recon.map.ground.grid import drop_undecided, flatten, ground_depths
+from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
 from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,
@@ -66,9 +66,7 @@ def export_grid(placed: PlacedMap, stem: Path | None) -> WrittenGrid:
         The grid, the height at which something carried the camera above the ground (None = unknown,
         or not at one height), and what a user of the grid should know.
     """
-    if placed.tiles.extent[0] == placed.tiles.extent[1]:
-        raise MappingError("nothing was observed: there is no map to flatten")
-    written = _Flattening(placed).grid()
+    written = Flattening(placed).grid()
     if stem is not None:
         write_nav2(stem, written[0])
     return written
@@ -76,19 +74,29 @@ def export_grid(placed: PlacedMap, stem: Path | None) -> WrittenGrid:
 
 def grounds(placed: PlacedMap) -> Iterator[tuple[Rectangle, GroundSurface]]:
     """Yield the tiles of a map that are near the path, and the ground in each."""
-    return _Flattening(placed).grounds()
+    return Flattening(placed).grounds()
 
 
-class _Flattening:
+Finish = Callable[[OccupancyGrid, GroundSurface, Int32], OccupancyGrid]
+"""Makes another grid of that of a tile and its margin, of the ground there, and of the voxels that
+the vehicle took up."""
+
+
+class Flattening:
     """Makes a grid tile by tile: the ground below the path first, then what stands on it."""
 
-    def __init__(self, placed: PlacedMap) -> None:
+    def __init__(
+        self, placed: PlacedMap, settings: GridSettings | None = None, finish: Finish | None = None
+    ) -> None:
         self._tiles, self._path_m, self._trusted = placed.tiles, placed.path_m, placed.trusted
         self._config, self._resolution_m = placed.tiles.config, placed.tiles.resolution_m
+        self._settings, self._finish = settings or self._config.grid, finish
         self._margin_m = self._config.scale * _MARGIN_M
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> WrittenGrid:
+        if self._tiles.extent[0] == self._tiles.extent[1]:
+            raise MappingError("nothing was observed: there is no map to flatten")
         settings, driven = self._along_the_path()
         low, high = self._extent()
         shape = (high[1] - low[1], high[0] - low[0])
@@ -119,7 +127,7 @@ class _Flattening:
         elif not driven:
             text = "the camera was not carried at one height above the ground: the grid has only "
             yield text + "what was seen, and the base of the trajectory in the map is the camera"
-        settings, cell_m = self._config.grid, self._resolution_m
+        settings, cell_m = self._settings, self._resolution_m
         depths_m = np.concatenate(self._ground_depths)
         if len(depths_m):
             # What is seen as thin as can be still lies up to half a voxel off its centre.
@@ -159,7 +167,13 @@ class _Flattening:
         passed = {} if path is None else self._passed(key, path, ground)
         voxels = self._tiles.wide_voxels(key, passed)
         self._ground_depths.append(ground_depths(voxels, ground))
-        return flatten(voxels, ground, self._config.grid) if len(voxels) else None
+        if not len(voxels):
+            return None
+        grid = flatten(voxels, ground, self._settings)
+        if self._finish is None:
+            return grid
+        cells = [np.zeros((0, 3), np.int32), *(part.cells for part in passed.values())]
+        return self._finish(grid, ground, np.concatenate(cells))
 
     def grounds(self) -> Iterator[tuple[Rectangle, GroundSurface]]:
         """Yield the tiles near the path, and the ground in each."""

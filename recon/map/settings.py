@@ -13,6 +13,7 @@ from recon.map.fusion import FusionSettings
 from recon.map.ground.axes import AxesSettings
 from recon.map.ground.grid import GridSettings
 from recon.map.ground.surface import GroundSettings
+from recon.map.ground.traverse import RobotSettings
 from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.map.submaps import SubmapSettings
 from recon.odometry.protocol import Odometry
@@ -71,6 +72,7 @@ class DriveSettings(StereoSettings):
     memory: MemorySettings = MemorySettings()
     ground: GroundSettings = GroundSettings()
     grid: GridSettings = GridSettings()
+    robot: RobotSettings = RobotSettings()
 
     @property
     def scale(self) -> float:
@@ -102,6 +104,7 @@ class DriveSettings(StereoSettings):
             ("map_filters.voxel_m", 2 * (filters.voxel_m or 0.0)),
             ("map_filters.radius_m", filters.radius_m or 0.0),
             ("grid.min_blob_cells", self.grid.min_blob_cells * resolution_m),
+            ("robot.width_m", self.robot.width_m),
         ):
             if reach_m > tile_m:
                 raise ValueError(

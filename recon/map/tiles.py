@@ -133,9 +133,9 @@ class Tiles:
         return tiles if tiles._take(cut, drives) else None
 
     @property
-    def have_looks(self) -> bool:
-        """Whether it is known what single frames saw, without which nothing is taken out."""
-        return self._looks is not None
+    def looks(self) -> Looks | None:
+        """What single frames saw, without which nothing is taken out; None = it is not known."""
+        return self._looks
 
     def with_looks(self, looks: Looks | None) -> Self:
         """Leave out of clouds what ``looks`` show to have moved; None = nothing."""

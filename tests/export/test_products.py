@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.core.errors import MappingError, OutputError
+from recon.core.errors import MappingError, OutputError, SettingsError
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.export.cloud import CloudSample
+from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
 from recon.export.occupancy import export_grid
 from recon.export.product import Order
@@ -20,7 +21,7 @@ from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.ground.grid import drop_undecided, flatten
 from recon.map.ground.surface import add_floors, estimate_ground_surface, find_floors
-from recon.map.sessions.placed import PlacedMap
+from recon.map.sessions.placed import PlacedMap, place_map
 from recon.run.run import Run
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
@@ -183,3 +184,42 @@ def test_tiles_in_one_file_are_read_as_one_cloud_and_an_error_leaves_none(tmp_pa
     with pytest.raises(OutputError):
         write_ply_tiles(tmp_path / "b.ply", failing(), frame="map")
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, folder):
+    made = make(Order(mapped.map, mapped.placed, folder, load_config().mesh), ("costmap", "grid"))
+    costs, grid = made.made["costmap"].value, made.grid
+    assert (costs.cells.shape, costs.origin_m) == (grid.cells.shape, grid.origin_m)
+    # What is free for a robot of the usual height is free in the grid, too.
+    assert (grid.cells[costs.cells == FREE] == FREE).all()
+    assert (costs.cells[grid.cells == OCCUPIED] == OCCUPIED).all()
+    path_m = mapped.path_m[:, :2]
+    column, row = np.floor((path_m - costs.origin_m) / costs.resolution_m).astype(int).T
+    assert (costs.cells[row, column] == FREE).all()
+    figures = [made.figures[f"costmap_{name}_cells"] for name in ("free", "lethal", "uncertain")]
+    assert min(figures) > 0
+    assert folder.path("map/costmap.png").exists()
+
+
+def test_smaller_tiles_make_the_same_costmap(mapped):
+    whole = load_config(None, [*SETTINGS, "submaps.tile_m=200"])
+    ours, _ = make_costmap(mapped.map, mapped.placed)
+    theirs, _ = make_costmap(mapped.map, place_map(mapped.map, whole))
+    assert (ours.cells != theirs.cells).mean() < 0.001
+
+
+def test_a_costmap_without_rays_or_for_a_robot_flatter_than_ground_is_refused(mapped):
+    low = load_config(None, [*SETTINGS, "robot.clearance_m=0.2"])
+    with pytest.raises(MappingError, match=r"clearance_m=0.2.*grid.min_height_m=0.3"):
+        make_costmap(mapped.map, place_map(mapped.map, low))
+    config = load_config(None, [*SETTINGS, "occupancy.keep_rays=false"])
+    short = SyntheticSource(STREET.model_copy(update={"frames": 3}))
+    without = map_sequence(short, config)
+    with pytest.raises(MappingError, match=r"a costmap is made of rays.*keep_rays=true"):
+        make_costmap(without.map, without.placed)
+
+
+@pytest.mark.parametrize("setting", ["robot.width_m=-1", "robot.width_m=0", "robot.width_m=20"])
+def test_a_robot_that_is_nothing_or_wider_than_a_tile_is_refused(setting):
+    with pytest.raises(SettingsError, match=r"robot\.width_m"):
+        load_config(None, [*SETTINGS, setting])

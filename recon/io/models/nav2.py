@@ -3,6 +3,8 @@
 Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``):
 the occupancy of a pixel is ``(255 - value) / 255``; above ``occupied_thresh`` the cell is
 occupied, below ``free_thresh`` free, else unknown. The first row of the image has the largest y.
+In mode ``scale``, pixels that are not opaque are unknown, and those between the thresholds have
+costs from 0 to 100 in proportion.
 """
 
 from __future__ import annotations
@@ -19,9 +21,10 @@ from recon.core.errors import FormatError
 from recon.core.text import counted
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import UInt8
-from recon.io.atomic import atomic_path, write_text
+from recon.io.atomic import atomic_path, write_bytes, write_text
 from recon.io.fields import read_yaml
 from recon.io.files import StrPath, read_bytes, reader
+from recon.io.images.image import encode_image
 
 _OCCUPIED_THRESH: Final = 0.65
 # With the common 0.25, the grey level of unknown (205, occupancy 0.196…) would be read as free.
@@ -45,22 +48,45 @@ def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
             for cell, value in _GREY.items():
                 grey[cells == cell] = value
             file.write(grey.tobytes())
+    thresholds = {"occupied_thresh": _OCCUPIED_THRESH, "free_thresh": _FREE_THRESH}
+    described = {"image": image.name, "mode": "trinary", **_placed(stem, grid), **thresholds}
+    write_text(description, yaml.safe_dump(described, sort_keys=False))
+    return image, description
+
+
+def write_nav2_costs(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
+    """Write cells from FREE to OCCUPIED as ``path.png``, ``.wld`` and ``.yaml``, each atomically.
+
+    Cells below 0 are unknown: transparent, grey 205 if they are UNKNOWN, else 127.
+    """
+    stem = Path(path)
+    image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("png", "yaml"))
+    cells = grid.cells[::-1].astype(np.int16)
+    # Two levels for a unit: Nav2 divides by 255, and rounds to units again.
+    grey = np.where(cells < 0, np.where(cells == UNKNOWN, _GREY[UNKNOWN], 127), 255 - 2 * cells)
+    alpha = np.where(cells < 0, 0, 255)
+    # Channels are turned round on the way.
+    pixels = np.dstack([alpha, grey, grey, grey]).astype(np.uint8)
+    write_bytes(image, encode_image(pixels, ".png", image))
+    # Just beside 0 and 100, as a cost at a threshold is not beyond it.
+    thresholds = {"occupied_thresh": 2 * OCCUPIED / 255 - 1e-6, "free_thresh": 1e-6}
+    described = {"image": image.name, "mode": "scale", **_placed(stem, grid), **thresholds}
+    write_text(description, yaml.safe_dump(described, sort_keys=False))
+    return image, description
+
+
+def _placed(stem: Path, grid: OccupancyGrid) -> dict[str, Any]:
+    """Write ``stem.wld``, and return where the cells are."""
     # Size and turn of a pixel, and the centre of the first one: gdal.org, raster/wld.html.
     side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
-    world = (side_m, 0, 0, -side_m, x_m + side_m / 2, y_m + (rows - 0.5) * side_m)
+    world = (side_m, 0, 0, -side_m, x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
     text = "".join(f"{_shortest(number)}\n" for number in world)
     write_text(stem.with_name(f"{stem.name}.wld"), text)
-    described = {
-        "image": image.name,
-        "mode": "trinary",
+    return {
         "resolution": float(_shortest(grid.resolution_m)),
         "origin": [*(float(_shortest(place)) for place in grid.origin_m), 0.0],
         "negate": 0,
-        "occupied_thresh": _OCCUPIED_THRESH,
-        "free_thresh": _FREE_THRESH,
     }
-    write_text(description, yaml.safe_dump(described, sort_keys=False))
-    return image, description
 
 
 @reader

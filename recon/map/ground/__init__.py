@@ -2,5 +2,6 @@
 
 - `axes.py`: map axes, from the ground plane in the first frame;
 - `surface.py`: the ground along the drive, and farther away; `driven.py`: under the wheels;
-- `grid.py`: voxels flattened to the grid that robots plan on.
+- `grid.py`: voxels flattened to the grid that robots plan on; `traverse.py`: what a robot can drive
+  over.
 """

@@ -181,10 +181,8 @@ class Looks:
         """
         cells = unpack_keys(keys).astype(np.int64)
         centres = (cells + 0.5) * self.settings.resolution_m
-        origins = self.T_map_camera[:, :3, 3]
         reach_m = self.settings.max_range_m + self.settings.resolution_m
-        low, high = centres.min(axis=0) - reach_m, centres.max(axis=0) + reach_m
-        for frame in np.flatnonzero(((origins > low) & (origins < high)).all(axis=1)):
+        for frame in self._near(centres.min(axis=0), centres.max(axis=0), reach_m):
             T = self.T_map_camera[frame]
             ahead = apply(invert(T), centres)
             seen = (ahead[:, 2] > 0) & (np.linalg.norm(ahead, axis=1) < reach_m)
@@ -192,6 +190,16 @@ class Looks:
                 cloud = self._read(int(frame)).cloud()
                 chosen = _towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
                 yield self._cast(cloud.select(chosen), T, cells)
+
+    def near(self, low: Float64, high: Float64) -> Iterator[tuple[PointCloud, Float64]]:
+        """Yield the rays of frames near a rectangle, camera axes, and ``T_map_camera`` of each."""
+        for frame in self._near(low, high, self.settings.max_range_m):
+            yield self._read(int(frame)).cloud(), self.T_map_camera[frame]
+
+    def _near(self, low: Float64, high: Float64, reach_m: float) -> Int64:
+        """Return the frames from which something between two corners may be in reach."""
+        places = self.T_map_camera[:, : len(low), 3]
+        return np.flatnonzero(((places > low - reach_m) & (places < high + reach_m)).all(axis=1))
 
     def _cast(self, cloud: PointCloud, T_map_camera: Float64, cells: Int64) -> Int8:
         """Return what the rays of one frame did to cells (N, 3)."""

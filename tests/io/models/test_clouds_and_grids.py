@@ -6,6 +6,7 @@ import sys
 import tracemalloc
 from pathlib import Path
 
+import cv2
 import numpy as np
 import open3d
 import pymeshlab
@@ -35,7 +36,7 @@ from recon.core.values import (
 )
 from recon.io.models.e57 import write_e57
 from recon.io.models.las import check_crs, check_inside, write_las
-from recon.io.models.nav2 import read_nav2, write_nav2
+from recon.io.models.nav2 import read_nav2, write_nav2, write_nav2_costs
 from recon.io.models.npz import write_npz
 from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
 from recon.io.models.pcd import write_pcd
@@ -320,6 +321,49 @@ def test_a_grid_is_written_as_nav2_and_a_gis_ask_and_read_back(tmp_path):
     # Of the centre of the upper left pixel, which is the first column of the last row.
     assert (x_m, y_m) == pytest.approx((-3.4 + 0.1, 1.25 + 2.5 * 0.2))
     assert (x_step, y_turn, x_turn, y_step) == (0.2, 0, 0, -0.2)
+
+
+def as_nav2_loads(description: Path, *, ends_apart: bool) -> np.ndarray:
+    """Cells (rows, columns) as map_server makes them in mode ``scale``, row 0 = smallest y.
+
+    Costs between the thresholds are 0 to 100; ``ends_apart``: 1 to 99, as other readers have it.
+    Ref: loadMapFromFile in nav2_map_server/src/map_io.cpp.
+    """
+    fields = yaml.safe_load(description.read_text())
+    assert (fields["mode"], fields["negate"]) == ("scale", 0)
+    pixels = cv2.imread(str(description.parent / fields["image"]), cv2.IMREAD_UNCHANGED)
+    occupancy = 1.0 - pixels[..., :3].mean(axis=2) / 255.0
+    low, high = fields["free_thresh"], fields["occupied_thresh"]
+    share = (occupancy - low) / (high - low)
+    cells = np.rint(1 + 98 * share if ends_apart else 100 * share)
+    cells[occupancy < low] = 0
+    cells[occupancy > high] = 100
+    cells[pixels[..., 3] != 255] = -1
+    return cells[::-1].astype(int)
+
+
+def test_costs_are_what_nav2_reads_and_the_reason_is_in_what_it_does_not_look_at(tmp_path):
+    cells = np.array([[-1, -2, 0, 1], [50, 99, 100, 2]], np.int8)
+    grid = OccupancyGrid(cells, 0.2, (-3.4, 1.25))
+    image, description = write_nav2_costs(tmp_path / "map" / "costmap", grid)
+    np.testing.assert_array_equal(
+        as_nav2_loads(description, ends_apart=False), np.maximum(cells, -1)
+    )
+    other = as_nav2_loads(description, ends_apart=True)
+    ends = (cells <= 0) | (cells == 100)
+    np.testing.assert_array_equal(other[ends], np.maximum(cells, -1)[ends])
+    assert other[~ends].tolist() == [2, 50, 98, 3]
+    grey = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)[::-1, :, 0]
+    assert grey[0, :2].tolist() == [205, 127]
+    fields = yaml.safe_load(description.read_text())
+    assert (fields["resolution"], fields["origin"]) == (0.2, [-3.4, 1.25, 0.0])
+    assert image.with_suffix(".wld").exists()
+
+
+def test_every_cost_comes_back(tmp_path):
+    cells = np.arange(101, dtype=np.int8)[None]
+    _, path = write_nav2_costs(tmp_path / "all", OccupancyGrid(cells, 0.1, (0.0, 0.0)))
+    np.testing.assert_array_equal(as_nav2_loads(path, ends_apart=False), cells)
 
 
 def test_negated_maps_are_read_and_the_origin_is_written_as_it_is_meant(tmp_path):

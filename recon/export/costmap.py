@@ -1,0 +1,59 @@
+"""Where a robot can drive, as a costmap: what its steps, slopes and overhangs are, and how sure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.core.errors import MappingError
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from recon.core.values.arrays import Int32
+from recon.export.occupancy import Flattening
+from recon.export.product import Made, Order
+from recon.io.models.nav2 import write_nav2_costs
+from recon.map.ground.surface import GroundSurface
+from recon.map.ground.traverse import UNSURE, Raster, costs, judge, measure_relief, widened
+from recon.map.map import Map
+from recon.map.sessions.placed import PlacedMap
+
+
+def costmap_product(order: Order) -> Made:
+    """Write ``map/costmap.*``: Nav2's mode ``scale``."""
+    grid, warnings = make_costmap(order.map, order.placed)
+    write_nav2_costs(order.run.path("map/costmap"), grid)
+    named = {"free": FREE, "lethal": OCCUPIED, "unseen": UNKNOWN, "uncertain": UNSURE}
+    figures = {f"costmap_{name}_cells": int((grid.cells == v).sum()) for name, v in named.items()}
+    return Made(figures, warnings, grid)
+
+
+def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str, ...]]:
+    """Return costs of the middle of the robot of the settings, and what a user should know.
+
+    Raises:
+        MappingError: A drive kept no rays, or the robot is lower than what counts as ground.
+    """
+    robot, band, looks = placed.tiles.config.robot, placed.tiles.config.grid, placed.tiles.looks
+    if looks is None:
+        hint = "map the drive with occupancy.keep_rays=true"
+        raise MappingError("a costmap is made of rays, and a drive kept none", hint=hint)
+    if robot.clearance_m <= band.min_height_m:
+        raise MappingError(
+            "the robot is not higher than what may be ground",
+            got=f"robot.clearance_m={robot.clearance_m:g}",
+            expected=f"more than grid.min_height_m={band.min_height_m:g}",
+            hint="set both; a lower band takes smaller cells (occupancy.resolution_m)",
+        )
+    focal_px = min(session.camera.focal_px for session in map_.linked)
+
+    def finish(grid: OccupancyGrid, ground: GroundSurface, passed: Int32) -> OccupancyGrid:
+        raster = Raster(grid.origin_m, grid.resolution_m, grid.cells.shape)
+        low, size = np.array(grid.origin_m), np.array(grid.cells.shape[::-1])
+        frames = looks.near(low, low + size * grid.resolution_m)
+        relief = measure_relief(frames, ground, raster, band.min_height_m, focal_px)
+        cell, inside = raster.cells_of((passed[:, :2].astype(np.float64) + 0.5) * raster.cell_m)
+        driven = np.zeros(raster.shape, np.bool_)
+        driven.ravel()[cell[inside]] = True
+        return widened(costs(relief, *judge(relief, robot), robot, grid), robot, driven)
+
+    settings = band.model_copy(update={"max_height_m": robot.clearance_m})
+    grid, _, warnings = Flattening(placed, settings, finish).grid()
+    return grid, warnings
