@@ -26,11 +26,11 @@ _FIGURES: Final = re.compile("frames|path_length|points$|.*drift")
 
 
 def run_view(
-    runs: Sequence[Path], port: int, announce: Callable[[str], None], stopped: Callable[[], bool]
-) -> None:
+    runs: Sequence[Path], port: int, announce: Callable[[str], object], stopped: Callable[[], bool]
+) -> str:
     """Show the maps of runs, each in its own axes, until ``stopped``: what `recon view` does.
 
-    ``port`` is of this machine, for itself alone; ``announce`` gets the address.
+    ``port`` is of this machine, for itself alone; ``announce`` gets the address, which is returned.
 
     Raises:
         ReconError: A run has no map or a damaged one, viser is missing, or the port is taken.
@@ -41,13 +41,14 @@ def run_view(
             with reading(path), closing(connect(path, read_only=True)) as database:
                 check_format(database, path)
     with closing(Viewer(port)) as viewer:
-        announce(viewer.url)
+        announce(f"{viewer.url} until Ctrl-C")
         coming = [(run, _scenes(run, viewer)) for run in runs]
         while not stopped():
             for run, scenes in coming:
                 if (new := next(scenes, None)) is not None:
                     viewer.show(run, new)
             viewer.serve(_TURN_S)
+    return viewer.url
 
 
 def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:

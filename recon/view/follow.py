@@ -134,7 +134,7 @@ class KeyframeViews:
         drive = self._map.session(session)
         health, time_s = drive.health[frame], np.ptp(drive.trajectory.timestamps_s[: frame + 1])
         lines = [f"frame {frame} of {drive.info.source}, at {time_s:.1f} s", *health.notes]
-        lines += [f"{health.inliers} features agree, {health.reprojection_px:.2f} px off"]
+        lines += [f"features that agree: {health.inliers}, {health.reprojection_px:.2f} px off"]
         try:
             if session not in self._opened:
                 images = {one.session.number: one for one in open_images(self._map)}[session]

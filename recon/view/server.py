@@ -165,8 +165,7 @@ class Viewer:
         seen = [k for k, (of, n) in enumerate(known) if of.sees(n, place_m)]
         ends = np.array([(place_m, eyes_m[k]) for k in seen]).reshape(-1, 2, 3)
         api.add_line_segments("/path/seen", ends, (255, 213, 79), **_LINE)
-        names = ", ".join(map(str, seen)) or "none"
-        text = f"{np.round(place_m, 1)} m was seen by keyframes {names}"
+        text = f"{np.round(place_m, 1)} m was seen by keyframes {seen or 'none'}"
         if keyframe is None and seen:
             keyframe = min(seen, key=lambda k: float(np.linalg.norm(eyes_m[k] - place_m)))
             self._slider.value = keyframe
