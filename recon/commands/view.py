@@ -31,9 +31,7 @@ def run_view(
     """Show the maps of runs, each in its own axes, until ``stopped``: what `recon view` does.
 
     ``port`` is of this machine, for itself alone; ``announce`` gets the address, which is returned.
-
-    Raises:
-        ReconError: A run has no map or a damaged one, viser is missing, or the port is taken.
+    `ReconError`: a run has no map or a damaged one, viser is missing, or the port is taken.
     """
     for run in runs:
         if not (state_folder(run) / STARTED).is_file():
@@ -52,7 +50,6 @@ def run_view(
 
 
 def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:
-    """Yield what is known of a run, step by step; None = nothing new."""
     path = state_folder(run) / STARTED
     if not (growing := path.is_file()):
         yield read_products(run)

@@ -178,7 +178,6 @@ class Viewer:
 
 
 def _add_grid(api: Any, name: str, grid: OccupancyGrid, height_m: float) -> None:
-    """Draw a flat grid; what is unknown is not drawn."""
     from recon.report.style import colour_grid  # noqa: PLC0415 - not for the first points
 
     size_m = np.array(grid.cells.shape[::-1]) * grid.resolution_m
