@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +14,7 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors, until_interrupted
+from recon.cli.tables import print_json
 
 View = Annotated[bool, opt.option("Show the map in the browser while it grows (extra view).")]
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Runs that made or make a map.")]
@@ -20,7 +22,13 @@ Port = Annotated[int, opt.option("Port of this machine; 0 = any that is free.", 
 Beside = Annotated[int | None, typer.Option(hidden=True)]
 
 
-def view(runs: Runs, port: Port = 8080, beside: Beside = None) -> None:
+def view(
+    runs: Runs,
+    port: Port = 8080,
+    beside: Beside = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+) -> None:
     """Look at maps in the browser: points, grid, mesh, path, keyframes.
 
     For this machine alone, until Ctrl-C. Runs that are being made grow; a click
@@ -30,13 +38,13 @@ def view(runs: Runs, port: Port = 8080, beside: Beside = None) -> None:
       recon view outputs/map/latest
       recon view outputs/monday outputs/friday --port 8090
     """
-    with until_interrupted() as stopped, one_line_errors():
+    with until_interrupted() as stopped, one_line_errors(quiet=quiet):
         from recon.commands.view import run_view
 
-        def ended() -> bool:  # beside another command, with that
-            return stopped() or beside not in (None, os.getppid())
-
-        run_view(runs, port, lambda url: typer.echo(f"{url} until Ctrl-C", err=True), ended)
+        say = str if quiet else partial(typer.echo, err=True)
+        url = run_view(runs, port, say, lambda: stopped() or beside not in (None, os.getppid()))
+    if json:
+        print_json({"url": url})
 
 
 def view_beside(run: Path) -> None:

@@ -26,14 +26,12 @@ _FIGURES: Final = re.compile("frames|path_length|points$|.*drift")
 
 
 def run_view(
-    runs: Sequence[Path], port: int, announce: Callable[[str], None], stopped: Callable[[], bool]
-) -> None:
+    runs: Sequence[Path], port: int, announce: Callable[[str], object], stopped: Callable[[], bool]
+) -> str:
     """Show the maps of runs, each in its own axes, until ``stopped``: what `recon view` does.
 
-    ``port`` is of this machine, for itself alone; ``announce`` gets the address.
-
-    Raises:
-        ReconError: A run has no map or a damaged one, viser is missing, or the port is taken.
+    ``port`` is of this machine, for itself alone; ``announce`` gets the address, which is returned.
+    `ReconError`: a run has no map or a damaged one, viser is missing, or the port is taken.
     """
     for run in runs:
         if not (state_folder(run) / STARTED).is_file():
@@ -41,17 +39,17 @@ def run_view(
             with reading(path), closing(connect(path, read_only=True)) as database:
                 check_format(database, path)
     with closing(Viewer(port)) as viewer:
-        announce(viewer.url)
+        announce(f"{viewer.url} until Ctrl-C")
         coming = [(run, _scenes(run, viewer)) for run in runs]
         while not stopped():
             for run, scenes in coming:
                 if (new := next(scenes, None)) is not None:
                     viewer.show(run, new)
             viewer.serve(_TURN_S)
+    return viewer.url
 
 
 def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:
-    """Yield what is known of a run, step by step; None = nothing new."""
     path = state_folder(run) / STARTED
     if not (growing := path.is_file()):
         yield read_products(run)

@@ -46,7 +46,6 @@ def finish(run: Path, scene: Scene) -> Iterator[Scene]:
 
 
 def _paths(map_: Map) -> tuple[Points, ...]:
-    """Return the path of each drive, its positions coloured by trust."""
     placed, paths = map_.placed, []
     for drive in map_.linked:
         path, number = drive.trajectory, drive.number
@@ -78,7 +77,6 @@ def grow(run: Path, path: Path) -> Iterator[Scene | None]:
 
 
 def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene:
-    """Add new submaps, and return the scene of the last commit."""
     with Map.open(path) as map_:
         drive = map_.first
         taken += [_submap(map_, number) for number in range(len(taken), len(drive.submaps))]
@@ -89,7 +87,6 @@ def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene:
 
 
 def _submap(map_: Map, number: int) -> Scene:
-    """Return what is shown of a submap of the only drive of a map."""
     drive, settings = map_.first, settings_of(map_.first)
     submap, T = drive.submaps[number], drive.T_map_world
     sums = submap.fused.cloud(settings.fusion.voxel_m, settings.fusion.min_count)
@@ -134,7 +131,7 @@ class KeyframeViews:
         drive = self._map.session(session)
         health, time_s = drive.health[frame], np.ptp(drive.trajectory.timestamps_s[: frame + 1])
         lines = [f"frame {frame} of {drive.info.source}, at {time_s:.1f} s", *health.notes]
-        lines += [f"{health.inliers} features agree, {health.reprojection_px:.2f} px off"]
+        lines += [f"features that agree: {health.inliers}, {health.reprojection_px:.2f} px off"]
         try:
             if session not in self._opened:
                 images = {one.session.number: one for one in open_images(self._map)}[session]

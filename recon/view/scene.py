@@ -65,14 +65,13 @@ def cut(cloud: PointCloud, spacing_m: float) -> tuple[Points, ...]:
 
 
 def halvings(parts: Sequence[Points], eye_m: Float64, limit: int = MOST_POINTS) -> list[int]:
-    """Return how often to halve each part so that ``limit`` are left: by distance from the eye."""
+    """Return how often to halve each part to keep ``limit``: two more at twice the distance."""
     sizes = np.array([len(part.cloud) for part in parts])
     places = np.array([part.cloud.xyz[len(part.cloud) // 2] for part in parts])
     distance_m = np.maximum(np.linalg.norm(places - eye_m, axis=1), 1e-3)
     whole_m, times = float(distance_m.max()), np.zeros(len(parts), np.int64)
     while (-(-sizes >> times)).sum() > max(limit, len(parts)):  # rounded up
         whole_m /= np.sqrt(2.0)
-        # Twice as far away, points are twice as far apart: a quarter of them.
         times = np.ceil(2.0 * np.log2(np.maximum(distance_m / whole_m, 1.0))).astype(np.int64)
     return [int(number) for number in times]
 

@@ -165,8 +165,7 @@ class Viewer:
         seen = [k for k, (of, n) in enumerate(known) if of.sees(n, place_m)]
         ends = np.array([(place_m, eyes_m[k]) for k in seen]).reshape(-1, 2, 3)
         api.add_line_segments("/path/seen", ends, (255, 213, 79), **_LINE)
-        names = ", ".join(map(str, seen)) or "none"
-        text = f"{np.round(place_m, 1)} m was seen by keyframes {names}"
+        text = f"{np.round(place_m, 1)} m was seen by keyframes {seen or 'none'}"
         if keyframe is None and seen:
             keyframe = min(seen, key=lambda k: float(np.linalg.norm(eyes_m[k] - place_m)))
             self._slider.value = keyframe
@@ -179,7 +178,6 @@ class Viewer:
 
 
 def _add_grid(api: Any, name: str, grid: OccupancyGrid, height_m: float) -> None:
-    """Draw a flat grid; what is unknown is not drawn."""
     from recon.report.style import colour_grid  # noqa: PLC0415 - not for the first points
 
     size_m = np.array(grid.cells.shape[::-1]) * grid.resolution_m
