@@ -74,7 +74,7 @@ def measure(drive: Path, reference: Path, poses: Path, folder: Path) -> dict[str
             **against(mesh, run, true, poses),
             "faces": len(mesh.faces),
             "border": border_m(mesh),
-            "not manifold": not_manifold(mesh)[0],
+            "edges not manifold": not_manifold(mesh)[0],
         }
     return found
 

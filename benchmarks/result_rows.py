@@ -151,7 +151,7 @@ def pair_meshes(found: Found) -> Rows:
 
 def drive_meshes(found: Found) -> Rows:
     return {
-        f"{drive}, `{way}`": {**figures, "edges not manifold": figures["not manifold"]}
+        f"{drive}, `{way}`": figures
         for drive, ways in found.items()
         for way, figures in ways.items()
     }

@@ -3,7 +3,8 @@
 The drive is mapped, and every tenth image left out of the texture. From where those were taken, the
 surface is drawn with its texture, and with the colours of its vertices (of which the fused points
 know all images). Pixels that the surface covers are compared, on grey levels; ``covered`` is their
-share. SSIM: Z. Wang et al., IEEE Transactions on Image Processing 13(4), 2004.
+share. Each drawing is first made as bright as the image. SSIM: Z. Wang et al., IEEE Transactions on
+Image Processing 13(4), 2004.
 
 Examples:
     python benchmarks/textures.py DRIVE --json
@@ -44,7 +45,7 @@ from recon.map.map import Map
 from recon.sources.registry import open_source
 
 LEFT_OUT: Final = 10
-SIDE_PX: Final = 4096
+SIDE_PX: Final = 8192
 
 
 def main() -> None:
@@ -103,9 +104,13 @@ def compare(
     }
     mask, found = hit.reshape(view.image.shape[:2]), {"covered": float(hit.mean())}
     true = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float64)
+    if to is not None:
+        write_image(to / f"{view.number:06d}_image.png", view.image)
     for name, rgb in colours.items():
         picture = view.image.copy()
-        picture[mask] = np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
+        # How the image was exposed, nothing knows.
+        gain = view.image[mask].mean() / rgb.mean()
+        picture[mask] = np.clip(np.rint(gain * rgb), 0, 255).astype(np.uint8)
         drawn = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64)
         found[f"PSNR, {name}"] = 20 * np.log10(255 / np.sqrt(((drawn - true)[mask] ** 2).mean()))
         found[f"SSIM, {name}"] = float(ssim(drawn, true)[mask].mean())

@@ -34,6 +34,7 @@ _BORDER: Final = 0.1  # share of the width of an image over which it counts less
 _LEAST_COSINE: Final = 0.1
 _SHARPNESS: Final = 4  # power of the scores: of images that differ, the best alone
 _DARK, _BRIGHT = 8, 247  # beyond, exposures cannot be compared
+_ANCHOR: Final = 0.1  # how much the colour of a vertex counts beside that of another image
 _NONE: Final = -1
 _NOTHING: Final = 1e-6  # weight that is but a rounding error
 _AT_ONCE: Final = 1 << 19  # texels, which takes some hundred megabytes
@@ -106,23 +107,35 @@ class BestViews:
         return u, v, np.where(cosine > _LEAST_COSINE, fade * pixels, 0).astype(np.float32)
 
     def gains(self, count: int) -> Float64:
-        """Return float64 (count,), factors that make images equally bright where they overlap."""
-        matrix, right = np.zeros((count, count)), np.zeros(count)
+        """Return float64 (count,), factors that make images equally bright where they overlap.
+
+        They are as bright as the colours of the vertices, as far as overlaps leave that open.
+        """
+        matrix, right = np.eye(count) * _ANCHOR, np.zeros(count)
+        own = self._mesh.rgb
+        greys = [self.rgb[:, view].mean(axis=1) for view in range(_VIEWS)]
         for one, other in ((0, 1), (0, 2), (1, 2)):
-            grey = self.rgb[:, [one, other]].mean(axis=2)
-            both = (self.frames[:, [one, other]] != _NONE).all(axis=1)
-            both &= ((grey > _DARK) & (grey < _BRIGHT)).all(axis=1)
-            i, j = self.frames[both][:, [one, other]].T
-            step = np.log(grey[both, 1] / grey[both, 0])
-            np.add.at(matrix, (i, i), 1.0)
-            np.add.at(matrix, (j, j), 1.0)
-            np.add.at(matrix, (i, j), -1.0)
-            np.add.at(matrix, (j, i), -1.0)
+            i, j, step = self._compared(one, greys[one], greys[other], self.frames[:, other])
+            for row, column, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+                np.add.at(matrix, (row, column), sign)
             np.add.at(right, i, step)
             np.add.at(right, j, -step)
-        # The mean is free; what overlaps with nothing keeps its own.
-        matrix[np.diag_indices(count)] += 1.0
+        if own is not None:
+            for view in range(_VIEWS):
+                fused = own.mean(axis=1)
+                i, _, step = self._compared(view, greys[view], fused, self.frames[:, view])
+                np.add.at(matrix, (i, i), _ANCHOR)
+                np.add.at(right, i, _ANCHOR * step)
         return np.asarray(np.exp(np.linalg.solve(matrix, right)))
+
+    def _compared(
+        self, view: int, grey: Float64, other: Float64, others: Int32
+    ) -> tuple[Int32, Int32, Float64]:
+        """Return images, those beside them, and by how much these are brighter (logarithms)."""
+        rows = (self.frames[:, view] != _NONE) & (others != _NONE)
+        for one in (grey, other):
+            rows &= (one > _DARK) & (one < _BRIGHT)
+        return self.frames[rows, view], others[rows], np.log(other[rows] / grey[rows])
 
     def weights(self, gains: Float64) -> Float32:
         """Return float32 (V, 3): how much each image counts, together 1, or 0 where none sees."""
