@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import MeshingError
+from recon.core.text import counted
 from recon.core.values import Texture, TriangleMesh
 from recon.export.images import DriveImages, open_images
 from recon.export.mesh.charts import make_atlas
@@ -38,7 +39,7 @@ def texture_product(order: Order) -> Made:
     mesh = read_mesh(run.path(WHOLE))
     if len(mesh.faces) > SAMPLE_FACES:
         what, hint = "the mesh is too large for one texture", "--set mesh.target_faces=1000000"
-        raise MeshingError(what, got=f"{len(mesh.faces):,} faces", hint=hint)
+        raise MeshingError(what, got=counted(len(mesh.faces), "face"), hint=hint)
     edge_m, settings = order.placed.tiles.config.fusion.voxel_m, order.mesh
     range_m = max(fusion_range_m(d.session.camera, settings_of(d.session).fusion) for d in drives)
     textured, figures = textured_mesh(
@@ -74,7 +75,7 @@ def textured_mesh(
         count = view.number + 1
     seen = np.isfinite(best.footprint_m)
     if not seen.any():
-        raise MeshingError("no image of the drive sees the surface", got=f"{count} images")
+        raise MeshingError("no image of the drive sees the surface", got=counted(count, "image"))
     atlas = make_atlas(mesh, float(np.median(best.footprint_m[seen])), most_px)
     picture = paint(atlas, best, best.gains(count), views())
     uv = (atlas.places / [atlas.width_px, atlas.height_px]).astype(np.float32)

@@ -67,7 +67,7 @@ def _add_photo(group: ET.Element, photo: Photo, T: Float64, project: Path) -> No
     # the position of the camera with the other sign.
     T_world_camera = T @ photo.T_frame_camera @ T_YUP_FRAME["camera"].T
     lens = {
-        "TranslationVector": " ".join(f"{x:.10g}" for x in (*-T_world_camera[:3, 3], 1)),
+        "TranslationVector": " ".join(f"{x:.10g}" for x in (*(0 - T_world_camera[:3, 3]), 1)),
         "RotationMatrix": " ".join(_rows(_turn_of(T_world_camera).T).split()),
         "FocalMm": f"{camera.focal_px * pixel_mm:.10g}",
         "PixelSizeMm": f"{pixel_mm:.10g} {pixel_mm:.10g}",

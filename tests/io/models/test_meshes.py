@@ -217,7 +217,7 @@ def test_meshlab_reads_the_camera_of_a_photo(tmp_path):
     write_image(tmp_path / "left.png", np.zeros((120, 160), np.uint8))
     write_ply(tmp_path / "cloud.ply", PointCloud(MESH.vertices))
     layers = {"cloud": tmp_path / "cloud.ply"}
-    write_mlp(tmp_path / "a.mlp", layers, "camera", Photo(tmp_path / "left.png", camera))
+    write_mlp(tmp_path / "a.mlp", layers, "camera", [Photo(tmp_path / "left.png", camera)])
     meshes = opened(tmp_path / "a.mlp")
     assert meshes.raster_number() == 1
     meshes.save_project(str(tmp_path / "b.mlp"))
