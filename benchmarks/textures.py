@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -60,17 +60,17 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         run_map(source, config, MapOptions(out=run, audit=False))
-        found = measure(run, given.pictures)
+        found = measure(run, given.pictures, [] if given.street else [given.drive])
     print(
         json.dumps(found) if given.json else "\n".join(f"{k:12} {v:.3g}" for k, v in found.items())
     )
 
 
-def measure(run: Path, pictures: Path | None) -> dict[str, float]:
+def measure(run: Path, pictures: Path | None, images: Sequence[Path] = ()) -> dict[str, float]:
     """Texture the map of a run, and compare it with the images that were left out."""
     mesh = read_mesh(run / WHOLE)
     with closing(Map.open(run)) as map_:
-        drives, session = open_images(map_), map_.first
+        drives, session = open_images(map_, images), map_.first
         range_m = fusion_range_m(session.camera, load_config(run / "config.yaml").fusion)
         voxel_m = load_config(run / "config.yaml").fusion.voxel_m
 
