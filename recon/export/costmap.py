@@ -29,12 +29,20 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
     """Return costs of the middle of the robot of the settings, and what a user should know.
 
     Raises:
-        MappingError: A drive kept no rays, or the robot is lower than what counts as ground.
+        MappingError: A drive kept no rays, or the robot is lower than what counts as ground, or
+            wider than a tile.
     """
     robot, band, looks = placed.tiles.config.robot, placed.tiles.config.grid, placed.tiles.looks
     if looks is None:
         hint = "map the drive with occupancy.keep_rays=true"
         raise MappingError("a costmap is made of rays, and a drive kept none", hint=hint)
+    if robot.width_m > (tile_m := placed.tiles.config.submaps.tile_m):
+        raise MappingError(
+            "the robot is wider than a tile of the map",
+            got=f"robot.width_m={robot.width_m:g}",
+            expected=f"at most submaps.tile_m={tile_m:g}",
+            hint="set robot.width_m to that of the robot, or map with larger tiles",
+        )
     if robot.clearance_m <= band.min_height_m:
         raise MappingError(
             "the robot is not higher than what may be ground",

@@ -120,8 +120,9 @@ class Cutter:
         beyond = config.grid.min_blob_cells + 2 * JOINED_CELLS + 1 + BLOCK_EDGE
         beyond = max(beyond, math.ceil(self._filter_margin_m / resolution_m) + 1)
         # What the middle of a robot costs depends on what it is fitted to, half of its width away
-        # from where its sides are.
-        beyond = max(beyond, math.ceil(config.robot.width_m / resolution_m) + 3)
+        # from where its sides are. One wider than a tile, as on a table, has no costmap.
+        if config.robot.width_m <= config.submaps.tile_m:
+            beyond = max(beyond, math.ceil(config.robot.width_m / resolution_m) + 3)
         self.grid_margin_m = math.ceil(beyond / BLOCK_EDGE) * BLOCK_EDGE * resolution_m
         least_m = max(
             config.scale * _LEAST_TILE_M, margin_m, config.grid.min_blob_cells * resolution_m

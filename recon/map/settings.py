@@ -104,7 +104,6 @@ class DriveSettings(StereoSettings):
             ("map_filters.voxel_m", 2 * (filters.voxel_m or 0.0)),
             ("map_filters.radius_m", filters.radius_m or 0.0),
             ("grid.min_blob_cells", self.grid.min_blob_cells * resolution_m),
-            ("robot.width_m", self.robot.width_m),
         ):
             if reach_m > tile_m:
                 raise ValueError(

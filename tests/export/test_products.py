@@ -219,7 +219,14 @@ def test_a_costmap_without_rays_or_for_a_robot_flatter_than_ground_is_refused(ma
         make_costmap(without.map, without.placed)
 
 
-@pytest.mark.parametrize("setting", ["robot.width_m=-1", "robot.width_m=0", "robot.width_m=20"])
-def test_a_robot_that_is_nothing_or_wider_than_a_tile_is_refused(setting):
+def test_a_robot_wider_than_a_tile_has_no_costmap(mapped):
+    # As on a table, whose tiles are smaller than any robot, and which can be mapped all the same.
+    wide = load_config(None, [*SETTINGS, "robot.width_m=20"])
+    with pytest.raises(MappingError, match=r"wider than a tile .*robot\.width_m=20"):
+        make_costmap(mapped.map, place_map(mapped.map, wide))
+
+
+@pytest.mark.parametrize("setting", ["robot.width_m=-1", "robot.width_m=0", "robot.width_m=21"])
+def test_a_robot_that_is_nothing_or_too_wide_for_any_is_refused(setting):
     with pytest.raises(SettingsError, match=r"robot\.width_m"):
         load_config(None, [*SETTINGS, setting])
