@@ -159,6 +159,16 @@ def test_texels_grow_until_the_picture_fits():
     assert figures["texel_m"] > 5 / 128
 
 
+def test_a_picture_too_small_for_the_charts_is_an_error():
+    # Each of 200 patches has a chart of its own, and its margins alone fill the picture.
+    mesh, steps = ground(), np.arange(200)[:, None]
+    apart = np.concatenate([mesh.vertices[mesh.faces[0]] + np.float32([0, 0.01, 0]) * steps[k]
+                            for k in range(200)])  # fmt: skip
+    faces = np.arange(600, dtype=np.int32).reshape(-1, 3)
+    with pytest.raises(MeshingError, match=r"does not fit .*texture_px \(64\)"):
+        make_atlas(TriangleMesh(apart.astype(np.float32), faces), 0.01, 64)
+
+
 def test_a_surface_that_no_image_sees_is_an_error():
     with pytest.raises(MeshingError, match="no image of the drive sees the surface"):
         painted(ground(), [photograph(0, 50.0, 0.0)])

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Float64, Int32, Int64
@@ -38,14 +39,24 @@ class Atlas:
 
 
 def make_atlas(mesh: TriangleMesh, texel_m: float, most_px: int) -> Atlas:
-    """Lay out the charts of a mesh; texels grow until the picture is at most ``most_px`` wide."""
+    """Lay out the charts of a mesh; texels grow until the picture is at most ``most_px`` wide.
+
+    Raises:
+        MeshingError: They would be wider than its triangles: vertices show as much.
+    """
     facing, pairs = _directions(mesh)
+    a, b = mesh.vertices[mesh.faces[:, :2]].transpose(1, 0, 2)
+    widest_m = max(texel_m, float(np.median(np.linalg.norm(b - a, axis=1))))
     while True:
         atlas = _laid_out(mesh, facing, pairs, texel_m)
         most = max(atlas.width_px, atlas.height_px)
         if most <= most_px:
             return atlas
         texel_m *= 1.02 * most / most_px
+        if texel_m > widest_m:
+            what, got = "the surface does not fit into a picture", f"texels of {texel_m:.3g} m"
+            hint = f"raise mesh.texture_px ({most_px}), or mesh.min_component_faces"
+            raise MeshingError(what, got=got, expected=f"{widest_m:.3g} m", hint=hint)
 
 
 def texels_of(atlas: Atlas) -> tuple[Int32, Int32]:

@@ -34,8 +34,7 @@ def texture_product(order: Order) -> Made:
     The formats are those of the mesh that hold a texture, GLB if there is none.
     """
     drives, run = open_images(order.map, order.images), order.run
-    if not run.path(WHOLE).is_file():
-        mesh_product(order)
+    made = None if run.path(WHOLE).is_file() else mesh_product(order)
     mesh = read_mesh(run.path(WHOLE))
     if len(mesh.faces) > SAMPLE_FACES:
         what, hint = "the mesh is too large for one texture", "--set mesh.target_faces=1000000"
@@ -51,7 +50,7 @@ def texture_product(order: Order) -> Made:
         write_mesh(run.path(f"{_FOLDER}/mesh.{suffix}"), textured, "map")
     photos = [*_photos(order, drives)]
     write_mlp(run.path(f"{_FOLDER}/mesh.mlp"), {"mesh": run.path(WHOLE)}, "map", photos)
-    return Made(figures)
+    return Made(figures, () if made is None else made.warnings)
 
 
 def textured_mesh(
@@ -67,7 +66,7 @@ def textured_mesh(
         most_px: Largest width and height of the picture.
 
     Raises:
-        MeshingError: No image sees any of the surface.
+        MeshingError: No image sees any of the surface, or its charts do not fit into the picture.
     """
     best, count = BestViews(mesh, edge_m), 0
     for view in views():

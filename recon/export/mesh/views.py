@@ -112,7 +112,6 @@ class BestViews:
         They are as bright as the colours of the vertices, as far as overlaps leave that open.
         """
         matrix, right = np.eye(count) * _ANCHOR, np.zeros(count)
-        own = self._mesh.rgb
         greys = [self.rgb[:, view].mean(axis=1) for view in range(_VIEWS)]
         for one, other in ((0, 1), (0, 2), (1, 2)):
             i, j, step = self._compared(one, greys[one], greys[other], self.frames[:, other])
@@ -120,9 +119,9 @@ class BestViews:
                 np.add.at(matrix, (row, column), sign)
             np.add.at(right, i, step)
             np.add.at(right, j, -step)
-        if own is not None:
+        if self._mesh.rgb is not None:
+            fused = self._mesh.rgb.mean(axis=1)
             for view in range(_VIEWS):
-                fused = own.mean(axis=1)
                 i, _, step = self._compared(view, greys[view], fused, self.frames[:, view])
                 np.add.at(matrix, (i, i), _ANCHOR)
                 np.add.at(right, i, _ANCHOR * step)

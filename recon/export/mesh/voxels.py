@@ -41,7 +41,7 @@ def reconstruct_map_surface(
     """
     cloud = oriented(cloud)
     apart = _OF_SEVENTH * typical_spacing_m(cloud.xyz) / voxel_m
-    cell_m = voxel_m * 2 ** max(0, round(math.log2(apart)))
+    cell_m = voxel_m * 2 ** round(math.log2(max(apart, 1)))
     # In float32 the kernel would lose what a large coordinate leaves no digits for.
     origin = np.floor(cloud.xyz.min(axis=0) / cell_m).astype(np.float64)
     farthest = settings.max_distance_spacings or math.inf

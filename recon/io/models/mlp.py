@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from recon.core.errors import OutputError
-from recon.core.geometry.se3 import T_YUP_FRAME
+from recon.core.geometry.se3 import T_YUP_FRAME, make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.core.values.cloud import Frame
@@ -66,9 +66,10 @@ def _add_photo(group: ET.Element, photo: Photo, T: Float64, project: Path) -> No
     # MeshLab counts from the lower left corner of the image, and cameras look along -z. It takes
     # the position of the camera with the other sign.
     T_world_camera = T @ photo.T_frame_camera @ T_YUP_FRAME["camera"].T
+    R_camera_world = make_transform(T_world_camera[:3, :3].T, np.zeros(3))
     lens = {
         "TranslationVector": " ".join(f"{x:.10g}" for x in (*(0 - T_world_camera[:3, 3]), 1)),
-        "RotationMatrix": " ".join(_rows(_turn_of(T_world_camera).T).split()),
+        "RotationMatrix": " ".join(_rows(R_camera_world).split()),
         "FocalMm": f"{camera.focal_px * pixel_mm:.10g}",
         "PixelSizeMm": f"{pixel_mm:.10g} {pixel_mm:.10g}",
         "ViewportPx": f"{camera.width_px} {camera.height_px}",
@@ -77,13 +78,6 @@ def _add_photo(group: ET.Element, photo: Photo, T: Float64, project: Path) -> No
     plain = {"LensDistortion": "0 0", "CameraType": "0", "BinaryData": "0"}
     ET.SubElement(raster, "VCGCamera", lens | plain)
     ET.SubElement(raster, "Plane", {"semantic": "1", "fileName": _relative(photo.file, project)})
-
-
-def _turn_of(T: Float64) -> Float64:
-    """Return the rotation of a motion, float64 (4, 4)."""
-    turn: Float64 = T.copy()
-    turn[:3, 3] = 0
-    return turn
 
 
 def _rows(T: Float64) -> str:
