@@ -249,6 +249,12 @@ TABLES: Final[dict[str, Table]] = {
         | {"SSIM, vertices": SHARE, "SSIM, texture": SHARE},
         lambda found: found,
     ),
+    "view": Table(
+        {"kitti_raw_0013": "python benchmarks/view.py $RECON_DATA/driven/kitti_raw_0013 --json"},
+        {"mapping": SHARE, "first picture": "{:.1f} s", "points": "{:,}"},
+        lambda found: found,
+        timed=True,
+    ),
     "movers": Table(
         {
             "seed 4": "python benchmarks/movers.py --seed 4",

@@ -53,10 +53,12 @@ def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:
     path = state_folder(run) / STARTED
     if not (growing := path.is_file()):
         yield read_products(run)
-    # What opens maps takes seconds to load, and would slow down the browser that begins.
-    for _ in range(_TURNS):
-        if not viewer.looked_at:
-            yield None
+    # What opens maps takes seconds to load, and would slow down the browser that begins; beside a
+    # map that grows nothing is done for nobody.
+    turns = 0
+    while not viewer.looked_at and (turns < _TURNS or path.is_file()):
+        turns += 1
+        yield None
     from recon.view.follow import finish, grow  # noqa: PLC0415
 
     if growing:

@@ -20,7 +20,7 @@ from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, ha
 HOST: Final = "127.0.0.1"
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
-_FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
+FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
 
@@ -131,7 +131,7 @@ class Viewer:
         by, parts, scenes = self._by.value, self._parts, enumerate(self._scenes.values())
         if self._changed("colours", by, *parts):
             self._colours, self._legend.content = colours(parts, by)
-        halved = halvings(parts, self._eye_m, MOST_POINTS if self.looked_at else _FIRST_POINTS)
+        halved = halvings(parts, self._eye_m, MOST_POINTS if self.looked_at else FIRST_POINTS)
         named = {f"/cloud/{n}_{part.name}": one for n, one in scenes for part in one.points}
         for name, part, rgb, times in zip(named, parts, self._colours, halved, strict=True):
             if self._changed(name, part, by, times):
