@@ -36,6 +36,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     },
     "las": Product(survey_product("las"), surveyed=True),
     "laz": Product(survey_product("laz"), surveyed=True),
+    "copc": Product(survey_product("copc.laz"), surveyed=True),
     "e57": Product(survey_product("e57"), surveyed=True),
     "pcd": Product(pcd_product),
     "npz": Product(arrays_product),
