@@ -24,7 +24,7 @@ def export(
         opt.option(
             "cloud, grid, octomap, mesh; costmap (Nav2); for surveying programs las, laz, "
             "copc, e57, and dsm, dtm, slope, orthophoto, occupancy (GeoTIFF); pcd (PCL), npz "
-            "(NumPy), mcap (ROS 2), colmap, nerfstudio, texture; several with commas.",
+            "(NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, texture; several with commas.",
             default="the first four",
         ),
     ] = None,

@@ -17,8 +17,9 @@ from recon.core.kernels.voxels import KEY_BITS, pack_keys
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, Int64
 from recon.io.files import StrPath
-from recon.io.models.las import COLOURED, SURVEY, las_header, las_record, packing
+from recon.io.models.las import COLOURED, las_header, las_record, packing
 
+_EXTRA: Final = "survey"
 _CELL_BITS: Final = 7  # a node has 128 cells along each side, with a point for each
 _INFO: Final = struct.Struct("<5d2Q2d88x")  # the first record of the file
 _INFO_AT: Final = 375 + 54  # behind the header of LAS 1.4 and that of the record
@@ -40,7 +41,7 @@ def write_copc(
 
     All points are in memory at once.
     """
-    laspy, lazrs = require("laspy", extra=SURVEY), require("lazrs", extra=SURVEY)
+    laspy, lazrs = require("laspy", extra=_EXTRA), require("lazrs", extra=_EXTRA)
     header = las_header(laspy, T_to_from, crs, step_m)
     records = [las_record(laspy, header, cloud, T_to_from) for cloud in clouds]
     points = laspy.ScaleAwarePointRecord.empty(header=header)

@@ -16,7 +16,7 @@ from recon.core.values.arrays import Float64
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
 
-SURVEY: Final = "survey"
+_EXTRA: Final = "survey"
 COLOURED: Final = 7  # point format with colours, of LAS 1.4
 _STEP_M: Final = 0.001
 _MARGIN_DEG: Final = 6.0  # systems are used as far outside their area as a zone of UTM is wide
@@ -40,7 +40,7 @@ def write_las(
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
-    laspy, points = require("laspy", extra=SURVEY), 0
+    laspy, points = require("laspy", extra=_EXTRA), 0
     header, packed = las_header(laspy, T_to_from, crs, step_m), Path(path).suffix == ".laz"
     with (
         packing(path) as temporary,
@@ -55,7 +55,7 @@ def write_las(
 @contextmanager
 def packing(path: StrPath) -> Iterator[Path]:
     """Give a path as `atomic_path` does; what compresses has an error of its own for full disks."""
-    lazrs = require("lazrs", extra=SURVEY)
+    lazrs = require("lazrs", extra=_EXTRA)
     with atomic_path(path) as temporary:
         try:
             yield temporary
@@ -78,7 +78,7 @@ def las_header(laspy: Any, T_to_from: Float64, crs: str | None, step_m: float) -
 
 def check_crs(crs: str) -> Any:
     """Return the coordinate system of a name such as ``EPSG:25832``."""
-    pyproj = require("pyproj", extra=SURVEY)
+    pyproj = require("pyproj", extra=_EXTRA)
     try:
         found = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
@@ -98,7 +98,7 @@ def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
     """Check that a position (east, north, up) lies where its coordinate system is used."""
     system = check_crs(crs)
     area = system.area_of_use
-    pyproj = require("pyproj", extra=SURVEY)
+    pyproj = require("pyproj", extra=_EXTRA)
     to_degrees = pyproj.Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
     east_m, north_m = (position_m[:2] + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])).T
     lons, lats = to_degrees.transform(east_m, north_m)
