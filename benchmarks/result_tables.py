@@ -249,6 +249,16 @@ TABLES: Final[dict[str, Table]] = {
         | {"SSIM, vertices": SHARE, "SSIM, texture": SHARE},
         lambda found: found,
     ),
+    "survey": Table(
+        {
+            "kitti_raw_0013": "python benchmarks/survey.py $RECON_DATA/driven/kitti_raw_0013 "
+            "$RECON_DATA/driven/kitti_raw_0013/lidar_map.ply "
+            "$RECON_DATA/driven/kitti_raw_0013/poses.txt --json"
+        },
+        {"height": "{:+.3f} m", "absolute": "{:.3f} m", "moved": "{:.1f} m", "misfit": "{:.3f} m"}
+        | {"left out": "{}", "said": "{}"},
+        lambda found: found["kitti_raw_0013"],
+    ),
     "view": Table(
         {"kitti_raw_0013": "python benchmarks/view.py $RECON_DATA/driven/kitti_raw_0013 --json"},
         {"mapping": SHARE, "first picture": "{:.1f} s", "points": "{:,}"},

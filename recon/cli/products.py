@@ -22,9 +22,9 @@ def export(
     to: Annotated[
         list[str] | None,
         opt.option(
-            "cloud, grid, octomap, mesh; costmap (Nav2); for surveying programs las, laz, e57, and "
-            "dsm, dtm, slope, orthophoto, occupancy (GeoTIFF); pcd (PCL), npz (NumPy), mcap (ROS "
-            "2), colmap, nerfstudio, texture; several with commas.",
+            "cloud, grid, octomap, mesh; costmap (Nav2); for surveying programs las, laz, "
+            "copc, e57, and dsm, dtm, slope, orthophoto, occupancy (GeoTIFF); pcd (PCL), npz "
+            "(NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, texture; several with commas.",
             default="the first four",
         ),
     ] = None,

@@ -11,7 +11,14 @@ from recon.export.occupancy import Flattening
 from recon.export.product import Made, Order
 from recon.io.models.nav2 import write_nav2_costs
 from recon.map.ground.surface import GroundSurface
-from recon.map.ground.traverse import UNSURE, Raster, costs, judge, measure_relief, widened
+from recon.map.ground.traverse import (
+    UNSURE,
+    Raster,
+    costs,
+    judge,
+    measure_relief,
+    widened,
+)
 from recon.map.map import Map
 from recon.map.sessions.placed import PlacedMap
 
@@ -50,6 +57,7 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
             expected=f"more than grid.min_height_m={band.min_height_m:g}",
             hint="set both; a lower band takes smaller cells (occupancy.resolution_m)",
         )
+    seen = steep = 0
     focal_px = min(session.camera.focal_px for session in map_.linked)
 
     def finish(grid: OccupancyGrid, ground: GroundSurface, passed: Int32) -> OccupancyGrid:
@@ -57,11 +65,24 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
         low, size = np.array(grid.origin_m), np.array(grid.cells.shape[::-1])
         frames = looks.near(low, low + size * grid.resolution_m)
         relief = measure_relief(frames, ground, raster, band.min_height_m, focal_px)
+        steps, slopes = judge(relief, robot)
+        nonlocal seen, steep
+        # Where noise alone does not reach the limit.
+        known = np.isfinite(relief.height_m) & (slopes.sigma < 0.5)
+        seen += int(known.sum())
+        steep += int((slopes.value[known] > robot.max_slope_percent / 100).sum())
         cell, inside = raster.cells_of((passed[:, :2].astype(np.float64) + 0.5) * raster.cell_m)
         driven = np.zeros(raster.shape, np.bool_)
         driven.ravel()[cell[inside]] = True
-        return widened(costs(relief, *judge(relief, robot), robot, grid), robot, driven)
+        return widened(costs(relief, steps, slopes, robot, grid), robot, driven)
 
     settings = band.model_copy(update={"max_height_m": robot.clearance_m})
     grid, _, warnings = Flattening(placed, settings, finish).grid()
+    if 2 * steep > seen:
+        share, limit = f"{100 * steep / seen:.0f} %", f"{robot.max_slope_percent:g}"
+        level = "is the map level (z up)? An inertial unit levels it"
+        text = (
+            f"{share} of the ground seen is steeper than robot.max_slope_percent={limit}: {level}"
+        )
+        warnings = (*warnings, text)
     return grid, warnings

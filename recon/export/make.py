@@ -11,6 +11,7 @@ from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 from recon.export.cloud import arrays_product, cloud_product, pcd_product
 from recon.export.colmap import colmap_product
 from recon.export.costmap import costmap_product
+from recon.export.gridmap import gridmap_product
 from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
@@ -36,10 +37,12 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     },
     "las": Product(survey_product("las"), surveyed=True),
     "laz": Product(survey_product("laz"), surveyed=True),
+    "copc": Product(survey_product("copc.laz"), surveyed=True),
     "e57": Product(survey_product("e57"), surveyed=True),
     "pcd": Product(pcd_product),
     "npz": Product(arrays_product),
     "mcap": Product(mcap_product, needs_occupancy=True, surveyed=True),
+    "gridmap": Product(gridmap_product, needs_occupancy=True),
     "colmap": Product(colmap_product, needs_images=True),
     "nerfstudio": Product(nerfstudio_product, needs_images=True),
 }

@@ -114,14 +114,15 @@ def _ground_heights(order: Order, file: RasterFile, T_file_map: Float64) -> None
 
 
 def _ground_slopes(order: Order, file: RasterFile, T_file_map: Float64) -> None:
-    """Write by how many degrees the ground is inclined, over a cell of it to either side."""
+    """Write by how many degrees the ground is inclined."""
+    _write_ground(order, file, T_file_map, lambda *where: np.degrees(ground_slopes(*where)))
 
-    def slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
-        sides = ground.cell_m * np.eye(2)
-        rises = [ground.height_at(xy_m + side) - ground.height_at(xy_m - side) for side in sides]
-        return np.asarray(np.degrees(np.arctan(np.hypot(*rises) / (2 * ground.cell_m))))
 
-    _write_ground(order, file, T_file_map, slopes)
+def ground_slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
+    """Return the slope [rad] at places (N, 2), over a cell of the ground to either side."""
+    sides = ground.cell_m * np.eye(2)
+    rises = [ground.height_at(xy_m + side) - ground.height_at(xy_m - side) for side in sides]
+    return np.asarray(np.arctan(np.hypot(*rises) / (2 * ground.cell_m)))
 
 
 def _occupancy(order: Order, file: RasterFile, T_file_map: Float64) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from recon.core.geometry.alignment import fit_points
 from recon.core.values.arrays import Float64
 from recon.export.product import Made, Order
+from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
 from recon.io.models.las import check_inside, write_las
 from recon.map.map import Map
@@ -66,7 +67,8 @@ class Georeference:
 
 
 def survey_product(suffix: str) -> Callable[[Order], Made]:
-    """Return what writes ``map/cloud.las``, ``.laz`` or ``.e57``, perhaps where a survey says."""
+    """Return what writes ``map/cloud.`` and a suffix, perhaps where a survey says."""
+    write_points = write_copc if suffix.startswith("copc") else write_las
 
     def write(order: Order) -> Made:
         T_file_map, figures, warnings = placed_in_survey(order)
@@ -78,7 +80,7 @@ def survey_product(suffix: str) -> Callable[[Order], Made]:
         else:
             # A hundredth of a voxel, as a decimal: a millimetre on a road.
             step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
-            points = write_las(path, clouds, T_file_map, crs, step_m)
+            points = write_points(path, clouds, T_file_map, crs, step_m=step_m)
         return Made({**figures, "points": points}, warnings)
 
     return write

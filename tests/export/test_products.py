@@ -3,14 +3,16 @@
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from recon.commands.config import load_config
 from recon.core.errors import MappingError, OutputError, SettingsError
-from recon.core.geometry.se3 import apply, transform_cloud
+from recon.core.geometry.se3 import apply, exp_so3, make_transform, transform_cloud
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
+from recon.core.values.arrays import Float64
 from recon.export.cloud import CloudSample
 from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
@@ -18,7 +20,9 @@ from recon.export.occupancy import export_grid
 from recon.export.product import Order
 from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply, write_ply_tiles
+from recon.map.drive import mapper
 from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.ground.axes import map_axes
 from recon.map.ground.grid import drop_undecided, flatten
 from recon.map.ground.surface import add_floors, estimate_ground_surface, find_floors
 from recon.map.sessions.placed import PlacedMap, place_map
@@ -217,6 +221,19 @@ def test_a_costmap_without_rays_or_for_a_robot_flatter_than_ground_is_refused(ma
     without = map_sequence(short, config)
     with pytest.raises(MappingError, match=r"a costmap is made of rays.*keep_rays=true"):
         make_costmap(without.map, without.placed)
+
+
+def test_a_map_that_is_not_level_is_said_to_be_steep(mapped, monkeypatch):
+    tilted = make_transform(exp_so3(np.array([0.0, np.radians(20.0), 0.0])), np.zeros(3))
+
+    def lay_badly(*about: Any) -> Float64:
+        return tilted @ map_axes(*about)
+
+    monkeypatch.setattr(mapper, "map_axes", lay_badly)
+    steep = map_sequence(SyntheticSource(STREET), load_config(None, SETTINGS))
+    _, warnings = make_costmap(steep.map, steep.placed)
+    assert any(re.search(r"\d+ % of the ground .*robot\.max_slope_percent=20", w) for w in warnings)
+    assert not any("steeper" in w for w in make_costmap(mapped.map, mapped.placed)[1])
 
 
 def test_a_robot_wider_than_a_tile_has_no_costmap(mapped):

@@ -5,6 +5,7 @@ import re
 import shutil
 import sys
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from recon.core.values.camera import unproject
 from recon.export import nerfstudio
 from recon.io.images.image import read_image, read_levels
 from recon.io.models.mesh import read_mesh
+from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_tum
 from recon.map.map import Map
@@ -46,10 +48,20 @@ def mapped(small_demo):
         return map_.first.camera, map_.first.T_map_world @ map_.first.trajectory.T_world_camera
 
 
-def test_colmap_finds_poses_rig_points_and_images_as_they_are(exported, mapped, small_demo):
+def test_colmap_finds_poses_rig_points_and_images_as_they_are(
+    exported, mapped, small_demo, tmp_path
+):
     pycolmap = pytest.importorskip("pycolmap")
     camera, poses = mapped
-    model = pycolmap.Reconstruction(str(exported / "colmap/sparse/0"))
+    # It reads binary files, and text where there are none.
+    text = Path(shutil.copytree(exported / "colmap/sparse/0", tmp_path / "text"))
+    for path in text.glob("*.bin"):
+        path.unlink()
+    model, same = (pycolmap.Reconstruction(str(p)) for p in (exported / "colmap/sparse/0", text))
+    for name in ("cameras", "rigs", "frames", "images", "points3D"):
+        assert repr(dict(getattr(model, name))) == repr(dict(getattr(same, name)))
+    tracks = [[p.track.elements for p in m.points3D.values()] for m in (model, same)]
+    assert repr(tracks[0]) == repr(tracks[1])
     summary = summary_of(exported)
     assert model.num_images() == summary["colmap_images"] == 2 * len(poses)
     assert model.num_frames() == len(poses)
@@ -135,6 +147,50 @@ def test_what_moved_is_masked_where_it_is_seen(mapped):
     assert seen[30:60, 100:140].all()
     assert seen.sum() == 30 * 40
     assert not nerfstudio.shadow(xyz[:0], camera, 0.1).any()
+
+
+def test_a_grid_map_has_its_layers_where_the_map_has_them(small_demo, tmp_path):
+    pytest.importorskip("rosbags")
+    rasterio = pytest.importorskip("rasterio")
+    from rosbags.highlevel import AnyReader
+
+    assert run("export", small_demo, "--to", "gridmap,grid,dtm", "--out", tmp_path).code == 0
+    with AnyReader([tmp_path / "gridmap"]) as bag:  # by the definitions in the bag itself
+        ((connection, _, raw),) = bag.messages()
+        told = bag.deserialize(raw, connection.msgtype)
+    assert (connection.topic, connection.msgtype) == ("/grid_map", "grid_map_msgs/msg/GridMap")
+    assert told.header.frame_id == "map"
+    assert told.layers == ["elevation", "slope", "occupancy", "traversability"]
+    (columns, rows), info = told.data[0].layout.dim, told.info
+    assert (columns.label, rows.label) == ("column_index", "row_index")
+    assert rows.size == round(info.length_x / info.resolution)
+    assert columns.size == round(info.length_y / info.resolution)
+    assert columns.stride == rows.size * columns.size
+
+    def layer(name):
+        """Values at x and y, by the rule of grid_map: indices grow backwards and to the right."""
+        values = told.data[told.layers.index(name)].data
+        i, j = np.arange(rows.size), np.arange(columns.size)
+        x = info.pose.position.x + info.length_x / 2 - (i + 0.5) * info.resolution
+        y = info.pose.position.y + info.length_y / 2 - (j + 0.5) * info.resolution
+        return x, y, values.reshape(columns.size, rows.size).T
+
+    grid = read_nav2(tmp_path / "map/grid.yaml")
+    x, y, occupancy = layer("occupancy")
+    at = [np.floor((xy - o) / 0.2).astype(int) for xy, o in zip((x, y), grid.origin_m, strict=True)]
+    expected = grid.cells[np.ix_(at[1], at[0])].T
+    np.testing.assert_array_equal(np.nan_to_num(occupancy, nan=-1), expected)
+    _, _, elevation = layer("elevation")
+    with rasterio.open(tmp_path / "map/dtm.tif") as file:
+        wanted, window = file.read(1), file.transform
+    v, u = np.nonzero(np.isfinite(wanted))
+    east, north = window @ (u + 0.5, v + 0.5)
+    i = np.rint((x[0] - east) / info.resolution).astype(int)
+    j = np.rint((y[0] - north) / info.resolution).astype(int)
+    np.testing.assert_allclose(elevation[i, j], wanted[v, u], atol=1e-5)
+    assert np.nanmax(layer("slope")[2]) < np.pi / 2
+    passable = layer("traversability")[2]
+    assert 0 <= np.nanmin(passable) < np.nanmax(passable) <= 1
 
 
 def test_a_bag_says_in_messages_of_ros_what_the_map_is(small_demo, mapped, tmp_path):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
 
 _EXTRA: Final = "survey"
-_COLOURED: Final = 7  # point format with colours, of LAS 1.4
+COLOURED: Final = 7  # point format with colours, of LAS 1.4
 _STEP_M: Final = 0.001
 _MARGIN_DEG: Final = 6.0  # systems are used as far outside their area as a zone of UTM is wide
 _LARGEST_STRETCH: Final = 2.0  # of a metre on the ground: Mercator's at 60 degrees north
@@ -39,24 +40,40 @@ def write_las(
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
-    laspy = require("laspy", extra=_EXTRA)
-    header = laspy.LasHeader(point_format=_COLOURED, version="1.4")
+    laspy, points = require("laspy", extra=_EXTRA), 0
+    header, packed = las_header(laspy, T_to_from, crs, step_m), Path(path).suffix == ".laz"
+    with (
+        packing(path) as temporary,
+        laspy.open(temporary, mode="w", header=header, do_compress=packed) as file,
+    ):
+        for cloud in clouds:
+            file.write_points(las_record(laspy, header, cloud, T_to_from))
+            points += len(cloud)
+    return points
+
+
+@contextmanager
+def packing(path: StrPath) -> Iterator[Path]:
+    """Give a path as `atomic_path` does; what compresses has an error of its own for full disks."""
+    lazrs = require("lazrs", extra=_EXTRA)
+    with atomic_path(path) as temporary:
+        try:
+            yield temporary
+        except lazrs.LazrsError as error:
+            raise OSError(str(error)) from error
+
+
+def las_header(laspy: Any, T_to_from: Float64, crs: str | None, step_m: float) -> Any:
+    """Return the header of a file as `write_las` describes it, without points."""
+    header = laspy.LasHeader(point_format=COLOURED, version="1.4")
     header.generating_software = "recon"
+    header.global_encoding.wkt = True  # as the format of its points needs, even without a system
     header.scales, header.offsets = np.full(3, step_m), np.floor(T_to_from[:3, 3])
     sigma = laspy.ExtraBytesParams("sigma", np.float32, "depth, 1 sigma, metres")
     header.add_extra_dims([sigma])
     if crs is not None:
         header.add_crs(check_crs(crs))
-    points = 0
-    packed = Path(path).suffix == ".laz"
-    with (
-        atomic_path(path) as temporary,
-        laspy.open(temporary, mode="w", header=header, do_compress=packed) as file,
-    ):
-        for cloud in clouds:
-            file.write_points(_record(laspy, header, cloud, T_to_from))
-            points += len(cloud)
-    return points
+    return header
 
 
 def check_crs(crs: str) -> Any:
@@ -118,7 +135,8 @@ def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> 
     raise EvaluationError(what, where=where, got=got, expected=expected)
 
 
-def _record(laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64) -> Any:
+def las_record(laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64) -> Any:
+    """Return the points of a cloud as they are in a file with this header."""
     record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
     record.return_number[:] = record.number_of_returns[:] = 1  # 0 is not permitted
     record.x, record.y, record.z = apply(T_to_from, cloud.xyz.astype(np.float64)).T

@@ -16,6 +16,14 @@ from recon.core.values.arrays import Float64
 
 _EXTRA: Final = "ros"
 _FLOAT32: Final = 7  # number of the type in a PointField
+# Of grid_map_msgs for ROS 2, which rosbags does not bring.
+_GRID_MAP: Final = {
+    "GridMapInfo": "float64 resolution\nfloat64 length_x\nfloat64 length_y\n"
+    "geometry_msgs/Pose pose",
+    "GridMap": "std_msgs/Header header\ngrid_map_msgs/GridMapInfo info\nstring[] layers\n"
+    "string[] basic_layers\nstd_msgs/Float32MultiArray[] data\nuint16 outer_start_index\n"
+    "uint16 inner_start_index",
+}
 Message = tuple[str, Mapping[str, Any]]
 """Type and fields. Messages in it are mappings, too; numbers and texts left out are 0 or empty."""
 
@@ -48,7 +56,7 @@ class RosBag:
             value = values.get(name)
             if isinstance(of, str):
                 value = self._made(of, value or {})
-            elif isinstance(value, list):
+            elif isinstance(value, list) and isinstance(of[0][1], str):
                 value = [self._made(of[0][1], one) for one in value]
             elif value is None:
                 value = "" if of[0] == "string" else 0
@@ -93,6 +101,8 @@ def write_bag(folder: Path) -> Iterator[RosBag]:
     names = ("rosbag2", "interfaces", "typesys")
     rosbag2, interfaces, typesys = (require(f"rosbags.{name}", extra=_EXTRA) for name in names)
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    for name, text in _GRID_MAP.items():
+        store.register(typesys.get_types_from_msg(text, f"grid_map_msgs/msg/{name}"))
     # What is beside the file is of version 9, which ROS 2 reads since Iron.
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         yield RosBag(writer, store, interfaces)

@@ -1,9 +1,11 @@
 """Clouds, OctoMaps and Nav2 grids as files: round trips, other programs, and damage."""
 
+import resource
 import shutil
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,12 +18,14 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial import cKDTree
 
 from recon.core.errors import (
     EvaluationError,
     FormatError,
     MappingError,
     MissingDependencyError,
+    OutputError,
     SettingsError,
 )
 from recon.core.geometry.se3 import make_transform
@@ -34,6 +38,7 @@ from recon.core.values import (
     PointCloud,
     join_clouds,
 )
+from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
 from recon.io.models.las import check_crs, check_inside, write_las
 from recon.io.models.nav2 import read_nav2, write_nav2, write_nav2_costs
@@ -197,6 +202,56 @@ def test_points_of_a_survey_come_back_turned_and_moved(tmp_path, suffix):
     found = laspy.read(path)
     np.testing.assert_allclose(found.xyz, 1.0)
     assert found.header.parse_crs() is None
+    assert found.header.global_encoding.wkt  # as points of this format need
+
+
+@pytest.mark.parametrize("points", [0, 1, 3000])
+def test_a_copc_is_read_as_far_as_a_view_needs(tmp_path, points):
+    laspy = pytest.importorskip("laspy")
+    random, path = np.random.default_rng(3), tmp_path / "cloud.copc.laz"
+    cloud = replace(example_cloud(points), xyz=random.random((points, 3), np.float32) * 100)
+    clouds = [cloud.select(np.arange(points) % 3 == part) for part in range(3)]
+    assert write_copc(path, clouds, T_SURVEY_MAP, "EPSG:25832", step_m=0.01) == points
+    with laspy.CopcReader.open(path) as file:
+        assert file.header.parse_crs().to_epsg() == 25832
+        parts = [file.query(level=depth) for depth in range(6)]
+        found = file.query()
+        assert sum(map(len, parts)) == len(found) == points
+        if points < 2:
+            return
+        low, side = file.copc_info.center - file.copc_info.halfsize, 2 * file.copc_info.halfsize
+        x, y, z = cloud.xyz.astype(np.float64).T
+        expected = np.stack([456789.25 - y, 5433210.5 + x, 118.75 + z], axis=1)
+        places = [np.stack([part.x, part.y, part.z], axis=1) for part in parts]
+        rows = cKDTree(expected).query(np.concatenate(places))[1]
+        assert len({*rows.tolist()}) == points
+        assert np.abs(np.concatenate(places) - expected[rows]).max() < 0.0051
+        sigma = np.concatenate([np.array(part["sigma"]) for part in parts])
+        np.testing.assert_array_equal(sigma, cloud.sigma_m[rows])
+        red = np.concatenate([np.array(part["red"]) for part in parts])
+        np.testing.assert_array_equal(red, cloud.rgb[rows, 0].astype(np.uint16) * 257)
+        # No cell of a depth has two of its points, and a part of the cloud is found by its box.
+        for depth, xyz in enumerate(places[:2]):
+            cells = np.floor((xyz - low) / side * (128 << depth))
+            assert len(np.unique(cells, axis=0)) == len(cells) > 0
+        box = laspy.copc.Bounds(low, low + side / 4)
+        inside = ((expected >= box.mins) & (expected <= box.maxs)).all(axis=1).sum()
+        assert len(file.query(box)) == inside
+    assert len(laspy.read(path).points) == points  # a program that knows LAZ reads it, too
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz", "copc.laz"])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, suffix):
+    pytest.importorskip("laspy")
+    write = write_copc if suffix.startswith("copc") else write_las
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(OutputError, match=f"cloud.{suffix}: cannot write the file"):
+            write(tmp_path / f"cloud.{suffix}", [example_cloud(20_000)], np.eye(4), step_m=0.001)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
