@@ -1,7 +1,8 @@
 """How near to the truth the products of a survey are, by positions as receivers write them.
 
-The drive is mapped once. Its true positions are put into a zone of UTM and written as NMEA and as
-OXTS, as they are and with faults; `recon export --to dsm --georeference` places the map by them.
+The drive is mapped once. Its true positions are put into a zone of UTM and written as NMEA, as OXTS
+and as NavSatFix of a bag, as they are and with faults; `recon export --to dsm --georeference`
+places the map by them. ``held``: the path was bent to run through them first, by `recon merge`.
 Its surface model is compared with the highest point of the reference in each cell: ``height`` is
 the median of the differences, ``absolute`` that of their absolute values, ``moved`` the shift by
 whole cells with which it fits best: by what stands on the ground, as a road fits everywhere.
@@ -26,6 +27,7 @@ from recon.commands.config import load_config
 from recon.commands.export import run_export
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.commands.merge import run_merge
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values.arrays import Float64
@@ -35,13 +37,15 @@ from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.sessions.measured import Survey
 from recon.sources.registry import open_source
 from tests.scenery.receivers import GEOID_M, degrees_of, write_nmea, write_oxts
+from tests.sources.bags import Recording, recorder
 
 CRS: Final = "EPSG:25832"
 PLACE_M: Final = np.array([455_800.0, 5_429_300.0, 115.0])
 TURN_RAD: Final = 0.7
 REACH_CELLS: Final = 5
 STANDS_M: Final = 1.0
-FAULTS: Final = ("none", "jumps", "late", "swapped")
+KINDS: Final = ("NMEA", "OXTS", "NavSatFix")
+FAULTS: Final = ("held", "jumps", "late", "swapped")
 
 
 def main() -> None:
@@ -69,23 +73,22 @@ def measure(drive: Path, reference: Path, poses: Path, folder: Path) -> dict[str
     places = apply(T_survey_true, read_kitti_poses(poses).positions_m)
     true = apply(T_survey_true, read_ply(reference).xyz.astype(np.float64))
     found = {}
-    for kind, fault in [("NMEA", fault) for fault in FAULTS] + [("OXTS", "none")]:
-        file = written(kind, fault, times_s, places, folder / f"{kind}_{fault}")
-        name = kind if fault == "none" else f"{kind}, {fault}"
+    for kind, fault in [*((kind, "") for kind in KINDS), *(("NMEA", fault) for fault in FAULTS)]:
+        file = written(kind, fault, times_s, places, folder / f"{kind}{fault}")
+        name, survey = f"{kind}, {fault}" if fault else kind, Survey(file, crs=CRS)
+        source, out = run, folder / f"out {name}"
+        if fault == "held":
+            source = folder / "held"
+            run_merge([run], options=MapOptions("merge", source, mesh=False), survey=survey)
         try:
-            told = run_export(
-                run,
-                products=("dsm",),
-                out=folder / f"out_{kind}_{fault}",
-                survey=Survey(file, (0.0, 0.0, 0.0), CRS),
-            )
+            told = run_export(source, products=("dsm",), out=out, survey=survey)
         except ReconError as error:
             found[name] = {"said": error.what}
             continue
         figures = {"left out": told["positions_left_out"], "misfit": told["misfit_rms_m"]}
         said = "; ".join(line for line in told["warnings"] if "position" in line)
         found[name] = {
-            **compared(folder / f"out_{kind}_{fault}/map/dsm.tif", true), **figures, "said": said
+            **compared(out / "map/dsm.tif", true), **figures, "said": said
         }  # fmt: skip
     return found
 
@@ -102,8 +105,15 @@ def written(kind: str, fault: str, times_s: Float64, places: Float64, path: Path
     if fault == "swapped":
         degrees = degrees[:, [1, 0, 2]]
     if kind == "OXTS":
-        return write_oxts(path, times_s, degrees)
-    return write_nmea(path, times_s, degrees + np.array([0.0, 0.0, GEOID_M]))
+        write_oxts(path, times_s, degrees)
+    elif kind == "NMEA":
+        write_nmea(path, times_s, degrees + np.array([0.0, 0.0, GEOID_M]))
+    else:
+        with recorder(path, Recording("mcap")) as bag:
+            for time_s, place in zip(times_s, degrees, strict=True):
+                time_ns = round(1e9 * time_s)
+                bag.write("/fix", time_ns, bag.fix(time_ns, place, (0.02, 0.02, 0.03)))
+    return path
 
 
 def compared(dsm: Path, true: Float64) -> dict[str, Any]:

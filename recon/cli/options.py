@@ -92,7 +92,10 @@ Threads = Annotated[
     int | None,
     option("Number of threads. Does not change the results.", default="all cores", min=1),
 ]
-POSITIONS = " NMEA, RTKLIB, an OXTS folder, or rows of time, easting, northing, height (s, m)."
+POSITIONS = (
+    " NMEA, RTKLIB, an OXTS folder, a ROS bag with NavSatFix (BAG or BAG:/TOPIC), or rows of time, "
+    "easting, northing, height (s, m)."
+)
 SOURCES_HELP = (
     "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "
     "ROS bag, MCAP file, or Middlebury scene."

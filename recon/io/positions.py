@@ -35,6 +35,14 @@ _UP: Final = 1.5  # how many times less a receiver knows its height
 # GPS time does not have the leap seconds of UTC. Ref: IERS Bulletin C.
 _LEAPS: Final = ((2017, 1, 18), (2015, 7, 17), (2012, 7, 16), (2009, 1, 15), (2006, 1, 14))
 _GPS_EPOCH: Final = datetime(1980, 1, 6, tzinfo=timezone.utc)
+_ELLIPSOID: Final = "the ellipsoid"
+_ON_EARTH: Final = ("latitude(deg)", "longitude(deg)", "height(m)", "sde(m)", "sdn(m)", "sdu(m)")
+_FROM_CENTRE: Final = (
+    *("x-ecef(m)", "y-ecef(m)", "z-ecef(m)", "sdx(m)", "sdy(m)", "sdz(m)"),
+    *("sdxy(m)", "sdyz(m)", "sdzx(m)"),
+)
+_RTKLIB: Final = (_ON_EARTH, _FROM_CENTRE)
+"""Columns of its solutions that are read."""
 _NMEA: Final = re.compile(r"\$?..(GGA|RMC|ZDA|GST),")
 _FARTHEST_DEG: Final = (90.0, 360.0)
 _NO_PLACE_DEG: Final = 1e-6  # latitude and longitude of a receiver without a position
@@ -92,18 +100,22 @@ def read_positions(path: StrPath) -> Positions:
     """
     place = Path(path)
     if place.is_dir():
-        return _in_order(_read_oxts(place), place)
+        return in_order(_read_oxts(place), place)
     first = next((line.strip() for line in read_text(place).splitlines() if line.strip()), "")
     if _NMEA.match(first) or first.startswith("$"):
-        return _in_order(_read_nmea(place), place)
+        return in_order(_read_nmea(place), place)
     if first.startswith("%"):
-        return _in_order(_read_rtklib(place), place)
+        return in_order(_read_rtklib(place), place)
     columns = _columns_of(first)
-    return _in_order(_read_table(place) if columns is None else _read_named(place, columns), place)
+    return in_order(_read_table(place) if columns is None else _read_named(place, columns), place)
 
 
-def _in_order(found: Positions, path: Path) -> Positions:
-    """Return positions in the order of time, without those that say that there is none."""
+def in_order(found: Positions, path: StrPath) -> Positions:
+    """Return positions in the order of time, without those that say that there is none.
+
+    Raises:
+        FormatError: There is none, or one is no place on earth.
+    """
     good = np.isfinite(found.places).all(axis=1) & np.isfinite(found.times_s)
     if found.degrees:
         good &= np.abs(found.places[:, :2]).max(axis=1, initial=0.0) > _NO_PLACE_DEG
@@ -190,8 +202,7 @@ def _read_oxts(folder: Path) -> Positions:
     # Latitude, longitude, altitude; accuracy of the position (1 sigma) is number 23.
     rows = np.array([_numbers(read_text(one).split(), (0, 1, 2, 23), one) for one in files])
     sigma_m = np.repeat(rows[:, 3:], 3, axis=1)
-    places, above = rows[:, :3], "the ellipsoid"
-    return Positions(np.array(times_s), places, sigma_m, degrees=True, heights=above)
+    return Positions(np.array(times_s), rows[:, :3], sigma_m, degrees=True, heights=_ELLIPSOID)
 
 
 def _seconds(text: str, path: Path) -> float:
@@ -210,15 +221,14 @@ def _read_rtklib(path: Path) -> Positions:
     lines = read_text(path).splitlines()
     heads = [line.lstrip("% ") for line in lines if line.startswith("%")]
     names = heads[-1].split() if heads else []
-    lat = next((n for n, name in enumerate(names) if name.startswith("latitude")), -1)
-    if lat < 0 or "sdn(m)" not in names:
-        what, expected = "not a solution with latitude and longitude", "RTKLIB's out-solformat=llh"
+    kind = next((kind for kind in _RTKLIB if {*kind} <= {*names}), None)
+    if kind is None:
+        what = "not a solution with places on earth"
+        expected = "RTKLIB's out-solformat=llh or xyz"
         raise FormatError(what, where=path, got=" ".join(names)[:60], expected=expected)
     gps = names[0].upper() == "GPST"
     # A time is two words, and has one name.
-    shift = 1
-    used = [lat + shift + n for n in range(3)]
-    used += [names.index(name) + shift for name in ("sde(m)", "sdn(m)", "sdu(m)")]
+    used = [names.index(name) + 1 for name in kind]
     rows, times_s = [], []
     for line in lines:
         words = line.split()
@@ -228,10 +238,31 @@ def _read_rtklib(path: Path) -> Positions:
         rows.append(_numbers(words, used, path))
     if not rows:
         raise FormatError("the file has no position", where=path)
-    table = np.array(rows)
-    above = next((what for what in ("ellipsoidal", "geodetic") if what in " ".join(heads)), "")
-    heights = {"ellipsoidal": "the ellipsoid", "geodetic": "the geoid"}.get(above, "")
+    table, above = np.array(rows), " ".join(heads)
+    if kind == _FROM_CENTRE:
+        return Positions(np.array(times_s), *_on_ellipsoid(table), degrees=True, heights=_ELLIPSOID)
+    heights = _ELLIPSOID if "ellipsoidal" in above else "the geoid" if "geodetic" in above else ""
     return Positions(np.array(times_s), table[:, :3], table[:, 3:], degrees=True, heights=heights)
+
+
+def _on_ellipsoid(table: Float64) -> tuple[Float64, Float64]:
+    """Return latitude, longitude and height, and standard deviations east, north and up (N, 3).
+
+    ``table`` (N, 9) has coordinates from the centre of the earth, their standard deviations, and
+    signed roots of the covariances of x and y, y and z, z and x.
+    """
+    pyproj = require("pyproj", extra="survey")
+    convert = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    lon, lat, height = convert.transform(*table[:, :3].T)
+    xx, yy, zz, xy, yz, zx = (np.sign(table[:, 3:]) * table[:, 3:] ** 2).T
+    covariance = np.array([[xx, xy, zx], [xy, yy, yz], [zx, yz, zz]])
+    (se, ce), (sn, cn), zero = (
+        *((np.sin(angle), np.cos(angle)) for angle in np.radians([lon, lat])),
+        np.zeros(len(lon)),
+    )
+    axes = np.array([[-se, ce, zero], [-sn * ce, -sn * se, cn], [cn * ce, cn * se, sn]])
+    variance = np.einsum("ijn,jkn,ikn->ni", axes, covariance, axes)
+    return np.column_stack([lat, lon, height]), np.sqrt(np.maximum(variance, 0.0))
 
 
 def _rtklib_time(words: Sequence[str], path: Path, *, gps: bool) -> float:

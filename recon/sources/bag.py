@@ -91,7 +91,7 @@ class BagSource(Recording):
 
 def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     """Open a recording, and read all its timestamps to pair the messages."""
-    bag = Bag(_find_files(path))
+    bag = Bag(recording_files(path))
     topics, also = _choose_topics(bag, settings)
     times = bag.scan(topics)
     stamps, clock = _stamps(times, topics, path)
@@ -131,7 +131,8 @@ def find_bags(folder: Path) -> list[Path]:
     return parts or (single if len(single) == 1 else [])
 
 
-def _find_files(path: Path) -> list[Path]:
+def recording_files(path: Path) -> list[Path]:
+    """Return the files of a recording, or a folder of ROS 2; `SourceError` if it is none."""
     if not path.exists():
         raise SourceError("file does not exist", where=path)
     found = [path] if path.is_file() else find_bags(path)

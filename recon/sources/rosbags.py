@@ -25,6 +25,7 @@ from recon.io.images.image import decode_image, pixels_of_ros_image
 IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+FIX: Final = "sensor_msgs/msg/NavSatFix"
 IMU: Final = "sensor_msgs/msg/Imu"
 TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 POSES: Final = (
@@ -150,6 +151,23 @@ class Bag:
             values = [value for one in vectors for value in (one.x, one.y, one.z)]
             rows.append([recorded_ns, self._stamp_ns(content, topic), *values])
         return np.array(rows, np.float64).reshape(-1, 8)
+
+    def fixes(self, topic: str) -> Float64:
+        """Return rows (N, 9) of positions of a receiver.
+
+        Times [ns] of recording and of the header, status (below 0 = no fix), latitude, longitude,
+        height, and standard deviations east, north and up [m]; NaN = unknown.
+        """
+        rows = []
+        for _, recorded_ns, content in self._messages([topic]):
+            message = self._parse(content, topic)
+            known = message.position_covariance_type > 0
+            variance = np.array(message.position_covariance, np.float64)[[0, 4, 8]]
+            sigma = np.sqrt(np.where((variance >= 0) & known, variance, np.nan))
+            place = message.latitude, message.longitude, message.altitude
+            status = message.status.status
+            rows.append([recorded_ns, self._stamp_ns(content, topic), status, *place, *sigma])
+        return np.array(rows, np.float64).reshape(-1, 9)
 
     def _find_topics(self) -> dict[str, BagTopic]:
         found: dict[str, BagTopic] = {}

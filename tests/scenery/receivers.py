@@ -74,6 +74,31 @@ def write_rtklib(path: Path, times_s, degrees, leap_s: int = 15) -> Path:
     return path
 
 
+def write_ecef(path: Path, times_s, degrees) -> Path:
+    """A solution of RTKLIB in coordinates from the centre of the earth, known best to the north."""
+    import pyproj
+
+    convert = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    lat, lon, height = degrees.T
+    names = "x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m) age(s)"
+    lines = ["% (x/y/z-ecef=WGS84,Q=1:fix,2:float,ns=# of satellites)\n", f"%  UTC {names}\n"]
+    for time_s, n, e, xyz in zip(
+        times_s, np.radians(lat), np.radians(lon), np.stack(convert.transform(lon, lat, height), 1),
+        strict=True,
+    ):  # fmt: skip
+        east = np.array([-np.sin(e), np.cos(e), 0.0])
+        north = np.array([-np.sin(n) * np.cos(e), -np.sin(n) * np.sin(e), np.cos(n)])
+        axes = np.stack([east, north, np.cross(east, north)], axis=1)
+        spread = axes @ np.diag(np.square([0.02, 0.01, 0.03])) @ axes.T
+        signed = np.sign(spread) * np.sqrt(np.abs(spread))
+        sigma = [signed[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))]
+        at = f"{moment(time_s):%Y/%m/%d %H:%M:%S.%f}"[:-3]
+        numbers = " ".join(f"{v:.5f}" for v in xyz), " ".join(f"{v:.7f}" for v in sigma)
+        lines.append(f"{at} {numbers[0]} 1 9 {numbers[1]} 0.0\n")
+    path.write_text("".join(lines), encoding="utf-8")
+    return path
+
+
 def write_degrees(path: Path, times_s, degrees, names: str = "time,lat,lon,alt") -> Path:
     rows = [
         f"{time_s:.3f},{','.join(f'{v:.10f}' for v in row)}\n"

@@ -96,6 +96,16 @@ class Recorder:
         parts = (header, none, np.zeros(9), rates, np.zeros(9), forces, np.zeros(9))
         return self.make("sensor_msgs/Imu", *parts)
 
+    def fix(self, stamp_ns: int, place: np.ndarray, sigma_m: Any = None, status: int = 2) -> Any:
+        known = np.zeros(3) if sigma_m is None else np.square(sigma_m)
+        state = self.make("sensor_msgs/NavSatStatus", status=status, service=1)
+        return self.make(
+            "sensor_msgs/NavSatFix", header=self.header(stamp_ns, "gps"), status=state,
+            latitude=place[0], longitude=place[1], altitude=place[2],
+            position_covariance=np.diag(known).ravel(),
+            position_covariance_type=0 if sigma_m is None else 2,
+        )  # fmt: skip
+
     def transform(self, stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
         moved = self.make("geometry_msgs/Transform", *self.place(T, "Vector3"))
         header = self.header(stamp_ns, parent)
