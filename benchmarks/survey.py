@@ -113,6 +113,7 @@ def written(kind: str, fault: str, times_s: Float64, places: Float64, path: Path
             for time_s, place in zip(times_s, degrees, strict=True):
                 time_ns = round(1e9 * time_s)
                 bag.write("/fix", time_ns, bag.fix(time_ns, place, (0.02, 0.02, 0.03)))
+        return Path(Recording("mcap").path(path))
     return path
 
 
