@@ -93,8 +93,8 @@ Threads = Annotated[
     option("Number of threads. Does not change the results.", default="all cores", min=1),
 ]
 POSITIONS = (
-    " NMEA, RTKLIB, an OXTS folder, a ROS bag with NavSatFix (BAG or BAG:/TOPIC), or rows of time, "
-    "easting, northing, height (s, m)."
+    " NMEA, RTKLIB, an OXTS folder, a ROS bag with NavSatFix (BAG or BAG:/TOPIC), rows of time, "
+    "easting, northing, height (s, m); for export also control points (gcp_list.txt)."
 )
 SOURCES_HELP = (
     "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "

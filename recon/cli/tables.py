@@ -74,6 +74,10 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
         shown[f"session {drive['number']}"] = (
             f"{drive['name']}: {counted(drive['frames'], 'frame')}{place}"
         )
+    for name, point in summary.get("control", {}).items():
+        off = ", ".join(f"{point[key]:+.3f}" for key in ("east_m", "north_m", "up_m"))
+        kind = "check point" if point["check"] else "used" if point["used"] else "left out"
+        shown[f"control {name}"] = f"{off} m ± {point['sigma_m']:.3f} m, {kind}"
     if stages:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
     print_figures("", shown)

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.core.errors import FormatError, SettingsError
+from recon.export.control import locate
 from recon.export.images import open_images
 from recon.export.make import PRODUCTS, known_products, make, need_rays
 from recon.export.pair import export_pair, finish_cloud_run, mesh_cloud
@@ -98,7 +99,9 @@ def run_export(
             open_images(map_, images)
         with run.stage("map"):
             placed = _placed(map_, settings, run, workers)
-        made = make(Order(map_, placed, run, settings.mesh, formats, survey, images), wanted)
+        with run.stage("survey"):
+            there = None if survey is None else locate(map_, survey, images, run.threads)
+        made = make(Order(map_, placed, run, settings.mesh, formats, there, images), wanted)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
         figures = {
             "run": str(source),

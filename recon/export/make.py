@@ -29,8 +29,8 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "octomap": Product(octomap_product, needs_occupancy=True),
     "grid": Product(grid_product, needs_occupancy=True),
     "costmap": Product(costmap_product, needs_occupancy=True),
-    "mesh": Product(mesh_product),
-    "texture": Product(texture_product, needs_images=True),
+    "mesh": Product(mesh_product, surveyed=True),
+    "texture": Product(texture_product, needs_images=True, surveyed=True),
     # Their cells, and the ground far from the path, are those of the voxels.
     **{
         name: Product(raster_product(name), needs_occupancy=True, surveyed=True) for name in RASTERS

@@ -9,7 +9,7 @@ from typing import Any
 
 from recon.export.mesh.poisson import MeshSettings
 from recon.map.map import Map
-from recon.map.sessions.measured import Survey
+from recon.map.sessions.georeference import Georeference
 from recon.map.sessions.placed import PlacedMap
 from recon.run.run import Run
 
@@ -23,8 +23,8 @@ class Order:
     run: Run  # the run, whose folder they go to
     mesh: MeshSettings  # settings of the mesh
     formats: Sequence[str] = ("ply",)  # formats of the mesh
-    # In whose coordinates products of surveys are written; None = in those of the map
-    survey: Survey | None = None
+    # Where the map is in a survey, as products of surveys are written; None = in its own axes
+    survey: Georeference | None = None
     images: Sequence[Path] = ()  # where drives are now, if not where the map says
 
 

@@ -119,6 +119,11 @@ class StereoSource(ABC):
         """Return the line of each pair in a file of one per frame; None = it has too few lines."""
         return list(range(len(self))) if count >= len(self) else None
 
+    def number_of(self, image: str) -> int | None:
+        """Return the number of the pair whose left image has this name, or number; None = none."""
+        stem = Path(image).stem
+        return int(stem) if is_count(stem) and int(stem) < len(self) else None
+
     def shift_of(self, pairs: int) -> int | None:
         """Return ``source.shift_frames`` for right images of so many pairs later; None = none."""
         return None
@@ -202,6 +207,11 @@ class Recording(StereoSource):
 
     def lines(self, count: int) -> list[int] | None:
         return self.listing.lines(count)
+
+    def number_of(self, image: str) -> int | None:
+        names = [self.listing.names[k] for k in self.listing.kept]
+        stem = Path(image).stem
+        return names.index(stem) if stem in names else super().number_of(image)
 
     def shift_of(self, pairs: int) -> int:
         chosen = self.listing.chosen

@@ -10,9 +10,9 @@ from recon.core.errors import EvaluationError, FormatError, ReconError, Settings
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.export.survey import georeference
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.map import Map
+from recon.map.sessions.georeference import georeference
 from recon.map.sessions.measured import Survey
 from recon.map.store.session import SessionInfo
 from recon.odometry.protocol import OdometryHealth

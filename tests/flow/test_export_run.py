@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from recon.commands.config import PAIR_DEFAULTS, load_config, run_settings
 from recon.commands.demo import demo_source
@@ -20,6 +21,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.pair import run_pair
 from recon.core.errors import EvaluationError, FormatError, ReconError, SettingsError
+from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
 from recon.io.models.mesh import read_mesh
 from recon.io.models.nav2 import read_nav2
@@ -102,6 +104,35 @@ def test_the_cloud_comes_as_laz_and_e57_in_survey_coordinates_and_as_arrays(smal
         camera = read_tum(small_demo / "trajectory_tum.txt").T_world_camera
         np.testing.assert_allclose(arrays["T_map_camera"], T_map_world @ camera, atol=1e-6)
         assert arrays["placed"].all()
+
+
+def test_a_mesh_of_a_survey_lies_at_its_place_from_the_offset_beside_it(small_demo, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    path, origin = read_tum(small_demo / "trajectory_map_base_tum.txt"), np.array([4e5, 5e6, 100])
+    turn = make_transform(exp_so3(np.array([0.0, 0.0, 0.5])), origin + 34.5)
+    there = np.column_stack([path.timestamps_s, apply(turn, path.positions_m)])
+    np.savetxt(tmp_path / "gnss.txt", there, fmt="%.6f")
+    height_m, out = summary_of(small_demo)["camera_height_m"], tmp_path / "out"
+    words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}", "--out", out]
+    words += ["--crs", "EPSG:25832", "--format", "ply", "--format", "obj"]
+    done = run("export", small_demo, "--to", "mesh,texture", *words)
+    assert done.code == 0, done.err
+    ours = read_mesh(out / "mesh/mesh.ply")
+    expected = apply(turn, ours.vertices.astype(np.float64))
+    for folder, count in (("mesh", len(expected)), ("texture", None)):
+        offset_m = np.loadtxt(out / folder / "survey/offset.xyz")
+        assert (offset_m % 100 == 0).all()
+        assert offset_m.tolist() == summary_of(out)["mesh_offset_m"]
+        assert "ETRS_1989_UTM_Zone_32N" in (out / folder / "survey/mesh.prj").read_text()
+        for suffix in ("ply", "obj"):
+            found = trimesh.load(out / folder / f"survey/mesh.{suffix}", process=False)
+            places = np.asarray(found.vertices) + offset_m
+            if count is None:  # charts share vertices
+                off_m, _ = cKDTree(expected).query(places)
+                assert off_m.max() < 0.001
+            else:
+                assert np.abs(places - expected).max() < 0.001
+    assert (out / "texture/survey/mesh.mtl").is_file()
 
 
 def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_path):

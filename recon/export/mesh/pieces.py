@@ -20,6 +20,7 @@ from recon.core.values.cloud import Frame
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import Plane, close_seam, cut_mesh, open_edges
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
+from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.voxels import reconstruct_map_surface
 from recon.export.product import Made, Order
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
@@ -52,7 +53,10 @@ class MeshPiece(NamedTuple):
 
 
 def mesh_product(order: Order) -> Made:
-    """Write ``mesh/``: the surface in its formats, and a MeshLab project beside the cloud."""
+    """Write ``mesh/``: the surface in its formats, and a MeshLab project beside the cloud.
+
+    With a survey, ``mesh/survey/`` has the surface in its coordinates.
+    """
     tiles, run, cloud = order.placed.tiles, order.run, order.run.path("map/cloud.ply")
     if not cloud.is_file():
         cloud = run.path(LAYER)
@@ -64,8 +68,12 @@ def mesh_product(order: Order) -> Made:
     warnings = [*made.warnings]
     if order.mesh.free_space and not has_occupancy(order.map):
         warnings.append("the map kept no rays: which faces lie in free space is not known")
-    shown = read_mesh(run.path(WHOLE)) if made.figures["faces"] <= SAMPLE_FACES else None
-    return Made(made.figures, warnings, shown)
+    small = made.figures["faces"] <= SAMPLE_FACES
+    mesh = read_mesh(run.path(WHOLE)) if small or order.survey is not None else None
+    figures, more = (
+        ({}, []) if mesh is None else write_surveyed(order, mesh, "mesh/survey", order.formats)
+    )
+    return Made({**made.figures, **figures}, [*warnings, *more], mesh if small else None)
 
 
 def in_other_formats(run: RunDirectory, formats: Sequence[str], frame: Frame | None) -> None:

@@ -14,6 +14,7 @@ from recon.core.values import Texture, TriangleMesh
 from recon.export.images import DriveImages, open_images
 from recon.export.mesh.charts import make_atlas
 from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product
+from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.views import BestViews, PosedImage, paint
 from recon.export.product import Made, Order
 from recon.io.images.image import write_image
@@ -50,7 +51,8 @@ def texture_product(order: Order) -> Made:
         write_mesh(run.path(f"{_FOLDER}/mesh.{suffix}"), textured, "map")
     photos = [*_photos(order, drives)]
     write_mlp(run.path(f"{_FOLDER}/mesh.mlp"), {"mesh": run.path(WHOLE)}, "map", photos)
-    return Made(figures, () if made is None else made.warnings)
+    there, more = write_surveyed(order, textured, f"{_FOLDER}/survey", named)
+    return Made({**figures, **there}, [*(() if made is None else made.warnings), *more])
 
 
 def textured_mesh(

@@ -21,6 +21,7 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
+from recon.io.control_points import ControlPoints, is_control, read_control
 from recon.io.positions import Positions
 from recon.map.sessions.clock import clock_error
 from recon.map.store.map_file import MapFile
@@ -76,8 +77,16 @@ class Survey:
             )
 
     @cached_property
+    def control(self) -> ControlPoints | None:
+        """The control points of the file; None = it has positions of a drive."""
+        return read_control(self.positions, self.crs) if is_control(self.positions) else None
+
+    @cached_property
     def found(self) -> Positions:
         """What the file has, in the order of time."""
+        if self.control is not None:
+            what, hint = "control points have no times", "recon export takes them"
+            raise EvaluationError(what, where=self.positions, hint=hint)
         return read_measured(self.positions)
 
     @cached_property

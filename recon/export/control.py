@@ -1,0 +1,192 @@
+"""A map placed by control points: what images show of them, against where they were surveyed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from recon.core.errors import EvaluationError
+from recon.core.geometry.alignment import find_agreeing, fit_points, fit_upright
+from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.core.values import Disparity, RectifiedCamera, StereoCalibration
+from recon.core.values.arrays import Float64
+from recon.core.values.camera import project, unproject
+from recon.export.images import DriveImages, open_images
+from recon.io.control_points import ControlPoints
+from recon.io.models.las import check_inside
+from recon.map.map import Map
+from recon.map.sessions.georeference import Georeference, georeference
+from recon.map.sessions.measured import Survey, span_m
+from recon.map.sessions.placed import settings_of
+from recon.stereo.frame import FrameReconstructor
+from recon.stereo.rectify.rectifier import turns_of
+
+_FEWEST: Final = 3
+_CLICK_PX: Final = 1.0  # standard deviation of a pixel that a person has chosen
+_SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
+_LEVEL_RAD: Final = np.radians(3.0)  # of the map's up, which is levelled where it is tilted more
+
+
+def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | None) -> Georeference:
+    """Place a map by what a survey measured: positions along its first drive, or control points."""
+    if survey.control is None:
+        return georeference(map_, survey)
+    return georeference_by_points(map_, survey.control, survey.positions, images, threads)
+
+
+class _Sighting(NamedTuple):
+    """What an image shows of a point."""
+
+    T_camera_map: Float64
+    camera: RectifiedCamera
+    uvd: Float64  # (3,), rectified; the disparity NaN where there is none
+    sigma_px: Float64  # (3,)
+
+
+def georeference_by_points(
+    map_: Map,
+    control: ControlPoints,
+    where: Path,
+    images: Sequence[Path] = (),
+    threads: int | None = None,
+) -> Georeference:
+    """Place a map by control points that its left images show.
+
+    Each point is found in map axes by all that images show of it, with their disparities, as
+    uncertain as these are; then the map is turned and moved, rigid, by the points that agree.
+
+    Raises:
+        EvaluationError: Fewer than three points can be found in the map, or an image is not there.
+    """
+    images_of = _Images(open_images(map_, images), where, threads)
+    lines, points, ours = [], [], []
+    for point in control.points:
+        found = _located([images_of.sighting(*seen) for seen in point.seen])
+        if found is None:
+            lines.append(f"control point {point.name} has no depth where it is seen: left out")
+        else:
+            points.append(point)
+            ours.append(found)
+    used = np.array([not point.check for point in points], np.bool_)
+    if used.sum() < _FEWEST:
+        what, expected = "too few control points", f"{_FEWEST} with depth, besides check points"
+        raise EvaluationError(what, where=where, got=int(used.sum()), expected=expected)
+    ours_m, place_m = np.array([xyz for xyz, _ in ours]), np.array([p.place_m for p in points])
+    check_inside(control.system, np.median(place_m, axis=0), where)
+    spread = np.array([covariance for _, covariance in ours]) + _SURVEYED_M**2 * np.eye(3)
+    sigma_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
+    allowed_m = 4 * float(np.median(sigma_m))
+    agree = used.copy()
+    agree[used] = find_agreeing(ours_m[used], place_m[used], allowed_m)
+    T = _fitted(ours_m[agree], place_m[agree], spread[agree])
+    off_m = apply(T, ours_m) - place_m
+    for n in np.flatnonzero(used & ~agree):
+        apart = f"{np.linalg.norm(off_m[n]):.2f} m off"
+        lines.append(f"control point {points[n].name} contradicts the others: {apart}, left out")
+    columns = [*off_m.T.tolist(), sigma_m.tolist(), agree.tolist(), (~used).tolist()]
+    names = ("east_m", "north_m", "up_m", "sigma_m", "used", "check")
+    rows = (dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True))
+    return Georeference(
+        T,
+        control.system,
+        np.linalg.norm(off_m[agree], axis=1),
+        span_m(place_m),
+        fit_points(ours_m[agree], place_m[agree], scaled=True).scale,
+        int((used & ~agree).sum()),
+        tuple(lines),
+        dict(zip((point.name for point in points), rows, strict=True)),
+    )
+
+
+class _Images:
+    """The left images of the drives of a map, matched once each."""
+
+    def __init__(self, drives: Sequence[DriveImages], where: Path, threads: int | None) -> None:
+        self._drives, self._where = drives, where
+        self._matchers = [
+            FrameReconstructor(one.rig, settings_of(one.session), threads=threads) for one in drives
+        ]
+        self._turns = [turns_of(one.rig, settings_of(one.session).rectification) for one in drives]
+        self._matched: dict[tuple[int, int], Disparity] = {}
+
+    def sighting(self, image: str, pixel: Float64) -> _Sighting:
+        number, frame = self._frame(image)
+        drive = self._drives[number]
+        at = pixel[None]
+        if isinstance(drive.rig, StereoCalibration):
+            at = self._turns[number].place(drive.rig, at)
+        camera, (u, v) = drive.session.camera, at[0]
+        if not (0 <= u <= camera.width_px - 1 and 0 <= v <= camera.height_px - 1):
+            got, expected = f"{pixel[0]:g}, {pixel[1]:g}", f"in {image}, where it is rectified"
+            raise EvaluationError("no such pixel", where=self._where, got=got, expected=expected)
+        if (number, frame) not in self._matched:
+            pair = next(drive.source.frames(frame))
+            self._matched[number, frame] = self._matchers[number].match(pair)[1]
+        seen = self._matched[number, frame]
+        row, column = round(float(v)), round(float(u))
+        uvd = np.array([u, v, seen.values[row, column]], np.float64)
+        sigma = np.array([_CLICK_PX, _CLICK_PX, seen.sigma_px[row, column]], np.float64)
+        return _Sighting(invert(drive.T_map_camera[frame]), camera, uvd, sigma)
+
+    def _frame(self, image: str) -> tuple[int, int]:
+        """Return the number of a drive with an image of that name or number, and of its frame."""
+        for number, drive in enumerate(self._drives):
+            frame = drive.source.number_of(image)
+            if frame is not None and frame < len(drive.placed):
+                if drive.placed[frame]:
+                    return number, frame
+                what = "the image has no place in the map"
+                raise EvaluationError(what, where=self._where, got=image)
+        what, expected = "no such image in the drive", "the name of a left image, or its number"
+        raise EvaluationError(what, where=self._where, got=image, expected=expected)
+
+
+def _located(sightings: Sequence[_Sighting]) -> tuple[Float64, Float64] | None:
+    """Return a point (3,), map axes, and its covariance; None without depth.
+
+    By least squares over columns, rows and disparities, as uncertain as they are.
+    """
+    deep = [one for one in sightings if np.isfinite(one.uvd[2])]
+    if not deep:
+        return None
+
+    def off(xyz: Float64) -> Float64:
+        parts = []
+        for one in sightings:
+            shown = np.stack(project(apply(one.T_camera_map, xyz[None]), one.camera), axis=1)[0]
+            parts.append(np.nan_to_num((shown - one.uvd) / one.sigma_px))
+        return np.concatenate(parts)
+
+    first = min(deep, key=lambda one: float(one.sigma_px[2] / one.uvd[2] ** 2))
+    u, v, d = first.uvd[:, None]
+    depth_m = first.camera.focal_px * first.camera.baseline_m / (d + first.camera.doffs_px)
+    xyz = apply(invert(first.T_camera_map), unproject(u, v, depth_m, first.camera))[0]
+    solved = least_squares(off, xyz)
+    return solved.x, np.linalg.inv(solved.jac.T @ solved.jac)
+
+
+def _fitted(ours_m: Float64, place_m: Float64, spread: Float64) -> Float64:
+    """Return T_survey_map, rigid, by points with covariances (N, 3, 3) in map axes.
+
+    That the map is level is known to a few degrees.
+    """
+    start = fit_upright(ours_m, place_m).T_to_from
+    middle_m = ours_m.mean(axis=0)
+
+    def moved(step: Float64) -> Float64:
+        turn = make_transform(exp_so3(step[:3]), apply(start, middle_m[None])[0] + step[3:])
+        back = make_transform(start[:3, :3], -start[:3, :3] @ middle_m)
+        return np.asarray(turn @ back)
+
+    weights = np.linalg.inv(np.linalg.cholesky(start[:3, :3] @ spread @ start[:3, :3].T))
+
+    def off(step: Float64) -> Float64:
+        T = moved(step)
+        apart = np.einsum("nij,nj->ni", weights, apply(T, ours_m) - place_m)
+        return np.concatenate([apart.ravel(), T[:2, 2] / _LEVEL_RAD])
+
+    return moved(least_squares(off, np.zeros(6)).x)

@@ -1,0 +1,115 @@
+"""Control points: places of a survey, and where images show them (``gcp_list.txt``)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import FormatError
+from recon.core.text import parse_numbers
+from recon.core.values.arrays import Float64
+from recon.io.files import StrPath, read_text, reader
+from recon.io.models.las import check_crs
+from recon.io.positions import Positions
+
+_UTM: Final = re.compile(r"WGS84 UTM (\d{1,2})([NS])$", re.IGNORECASE)
+_SYSTEM: Final = re.compile(r"(EPSG:\d+|\+proj|WGS84 UTM )", re.IGNORECASE)
+_CHECK: Final = "check"
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoint:
+    """A point of a survey, and its pixels: columns and rows from the centre of the first one."""
+
+    name: str
+    place_m: Float64  # (3,), east, north and up
+    seen: tuple[tuple[str, Float64], ...]  # name of an image and pixel (2,) in it, for each
+    check: bool = False  # whether it is only compared with
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """The points of a file, in the coordinate system ``system``."""
+
+    points: tuple[ControlPoint, ...]
+    system: str
+
+
+def is_control(path: StrPath) -> bool:
+    """Return whether a file begins with a coordinate system, as lists of control points do."""
+    if not Path(path).is_file():
+        return False
+    with Path(path).open("rb") as file:
+        return bool(_SYSTEM.match(file.read(200).decode(errors="replace").lstrip()))
+
+
+@reader
+def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
+    """Read a list of control points as OpenDroneMap has it.
+
+    The first line is a coordinate system; the others are ``x y z column row image [name]``, in
+    degrees longitude and latitude if the system has those, else metres; ``check`` behind the name
+    makes it a check point. Rows of one name, or without one of one place, are one point. ``crs`` is
+    the system to convert degrees to (None = that of UTM), or for the system of the file.
+
+    Raises:
+        FormatError: A row is not as above, or rows of one name have different places.
+
+    Ref: https://docs.opendronemap.org/gcp/
+    """
+    lines = [line.strip() for line in read_text(path).splitlines()]
+    rows = [(n, line.split()) for n, line in enumerate(lines, 1) if line and line[0] != "#"]
+    system = _system_of(" ".join(rows[0][1]))
+    named: dict[str, list[list[str]]] = {}
+    for number, words in rows[1:]:
+        if len(words) < 6 or (len(words) == 8 and words[7] != _CHECK) or len(words) > 8:
+            where, expected = f"{path}:{number}", "x y z column row image [name [check]]"
+            raise FormatError("not a control point", where=where, expected=expected)
+        try:
+            parse_numbers(words[:5])
+        except ValueError as error:
+            where, got = f"{path}:{number}", " ".join(words[:5])
+            raise FormatError("not five numbers", where=where, got=got) from error
+        named.setdefault(words[6] if len(words) > 6 else " ".join(words[:3]), []).append(words)
+    if not named:
+        raise FormatError("the file has no control point", where=path)
+    for name, found in named.items():
+        if len({tuple(words[:3]) for words in found}) > 1:
+            got = f"{found[0][:3]} and others"
+            raise FormatError("one point has several places", where=f"{path}: {name}", got=got)
+    places = np.array([parse_numbers(found[0][:3]) for found in named.values()], np.float64)
+    places, system = _in_metres(places, system, crs, path)
+    return ControlPoints(
+        tuple(
+            ControlPoint(
+                name if len(found[0]) > 6 else f"point {number}",
+                place_m,
+                tuple((words[5], np.array(parse_numbers(words[3:5]))) for words in found),
+                any(len(words) == 8 for words in found),
+            )
+            for number, ((name, found), place_m) in enumerate(
+                zip(named.items(), places, strict=True), 1
+            )
+        ),
+        system,
+    )
+
+
+def _system_of(text: str) -> str:
+    utm = _UTM.match(text)
+    return f"EPSG:{(32600 if utm[2] in 'Nn' else 32700) + int(utm[1])}" if utm else text
+
+
+def _in_metres(places: Float64, system: str, crs: str | None, path: StrPath) -> tuple[Float64, str]:
+    from pyproj import CRS  # noqa: PLC0415
+
+    if not CRS.from_user_input(system).is_geographic:
+        check_crs(system)
+        return places, crs or system
+    degrees = Positions(np.zeros(len(places)), places[:, [1, 0, 2]], np.zeros((0, 3)), degrees=True)
+    metres, chosen = degrees.projected(crs, path)
+    return metres, str(chosen)

@@ -1,0 +1,141 @@
+"""A map is placed by points that images show and a survey has measured."""
+
+import re
+
+import numpy as np
+import pytest
+
+from recon.commands.config import run_settings
+from recon.commands.demo import demo_source
+from recon.core.geometry.se3 import apply, exp_so3, make_transform
+from recon.core.values.camera import project, unproject
+from recon.map.ground.axes import AXES_MAP_WORLD
+from tests.flow.runs import summary_of
+from tests.hostile.refusals import assert_refused, run
+
+pytest.importorskip("pyproj")
+T_SURVEY_TRUE = make_transform(
+    exp_so3(np.array([0.0, 0.0, 0.7])), np.array([455_800.0, 5_429_300.0, 115.0])
+) @ make_transform(AXES_MAP_WORLD, np.zeros(3))
+HEAD = "EPSG:25832"
+PIXELS = ((60, 70), (200, 60), (30, 20), (220, 25), (128, 80), (90, 60), (160, 75))
+
+
+@pytest.fixture(scope="module")
+def rows(small_demo):
+    """Points on the surface of the rendered street, each where two frames show it."""
+    source, found = demo_source(run_settings(small_demo)), []
+    poses, camera = source.trajectory.T_world_camera, source.calibration
+    first, later = source.frame(0), source.frame(3)
+    for number, (u, v) in enumerate(PIXELS):
+        depth_m = float(first.depth_m[v, u])
+        if not depth_m < 15.0:
+            continue
+        xyz = unproject(*(np.array([float(x)]) for x in (u, v, depth_m)), camera)
+        world = apply(poses[0], xyz)
+        east, north, up = apply(T_SURVEY_TRUE, world)[0]
+        row = f"{east:.4f} {north:.4f} {up:.4f}"
+        found.append(f"{row} {u} {v} 0 p{number}")
+        inside = apply(np.linalg.inv(poses[3]), world)
+        x, y, _ = (float(each[0]) for each in project(inside, camera))
+        if 0 <= x < 255 and 0 <= y < 95:
+            seen_m = float(later.depth_m[round(y), round(x)])
+            if abs(seen_m - inside[0, 2]) < 0.02 * seen_m:
+                found.append(f"{row} {x:.3f} {y:.3f} 3 p{number}")
+    return found
+
+
+@pytest.fixture
+def placed(small_demo, tmp_path):
+    """What an export by such a file says."""
+
+    def export(lines, *words, head=HEAD):
+        file = tmp_path / "gcp_list.txt"
+        file.write_text("\n".join([head, *lines]) + "\n")
+        out = tmp_path / "out"
+        to = words or ("--to", "laz")
+        return run("export", small_demo, *to, "--georeference", file, "--out", out), out
+
+    return export
+
+
+def test_the_map_lies_where_its_control_points_are(rows, placed, small_demo):
+    names = {row.split()[6] for row in rows}
+    assert len(names) >= 5
+    assert len(rows) > len(names)
+    done, out = placed(rows)
+    assert done.code == 0, done.err
+    summary = summary_of(out)
+    T_map_world = np.array(summary_of(small_demo)["T_map_world"])
+    off = np.linalg.inv(T_SURVEY_TRUE) @ np.array(summary["T_survey_map"]) @ T_map_world
+    assert np.linalg.norm(off[:3, 3]) < 0.15
+    assert set(summary["control"]) == names
+    assert re.search(r"control p\d .*[+-]0\.\d+ m ± 0\.\d+ m, used", done.out)
+    for one in summary["control"].values():
+        apart = np.linalg.norm([one["east_m"], one["north_m"], one["up_m"]])
+        assert apart < 4 * one["sigma_m"]
+    assert not [line for line in summary["warnings"] if "control" in line]
+    assert (
+        pytest.importorskip("laspy").read(out / "map/cloud.laz").header.parse_crs().to_epsg()
+        == 25832
+    )
+
+
+def test_degrees_and_the_names_of_other_programs_say_the_same(rows, placed):
+    import pyproj
+
+    convert = pyproj.Transformer.from_crs(HEAD, "EPSG:4326", always_xy=True)
+    there = []
+    for row in rows:
+        east, north, *rest = row.split()
+        lon, lat = convert.transform(float(east), float(north))
+        there.append(" ".join([f"{lon:.10f}", f"{lat:.10f}", *rest]))
+    metres, degrees, named = (
+        summary_of(placed(lines, head=head)[1])
+        for lines, head in ((rows, HEAD), (there, "EPSG:4326"), (rows, "WGS84 UTM 32N"))
+    )
+    for other in (degrees, named):
+        np.testing.assert_allclose(other["T_survey_map"], metres["T_survey_map"], atol=1e-3)
+
+
+def test_a_typing_error_is_named_and_check_points_are_only_compared(rows, placed):
+    names = [*dict.fromkeys(row.split()[6] for row in rows)]
+    wrong = [
+        row.replace(" 4557", " 4547").replace(" 4558", " 4548") if row.endswith(names[1]) else row
+        for row in ["".join([" ", row]) for row in rows]
+    ]
+    checked = [f"{row} check" if row.endswith(names[0]) else row for row in wrong]
+    done, out = placed(checked)
+    assert done.code == 0, done.err
+    summary = summary_of(out)
+    assert any(f"control point {names[1]} contradicts" in line for line in summary["warnings"])
+    assert summary["positions_left_out"] == 1
+    assert summary["control"][names[0]]["check"]
+    used = [name for name, one in summary["control"].items() if one["used"]]
+    assert used == names[2:]
+    honest = summary["control"][names[0]]
+    assert abs(honest["east_m"]) < 4 * honest["sigma_m"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda rows: rows[:2], "too few control points"),
+        (lambda rows: [rows[0].replace(" 0 p", " 99 p"), *rows[1:]], "no such image in the drive"),
+        (lambda rows: [rows[0].replace(" 60 70 ", " 6000 70 "), *rows[1:]], "no such pixel"),
+        (lambda rows: [rows[0] + " twice", *rows[1:]], "gcp_list.txt:2: not a control point"),
+        (lambda rows: ["a b c 1 2 0 x"], "gcp_list.txt:2: not five numbers"),
+        (lambda rows: [], "no control point"),
+        (lambda rows: [*rows, "1 2 3 10 10 0 p0"], "one point has several places"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_and_leaves_nothing(rows, placed, change, said):
+    done, out = placed(change(rows))
+    assert_refused(done, said)
+    assert not out.exists()
+
+
+def test_paths_are_not_bent_by_control_points(rows, small_demo, tmp_path):
+    (tmp_path / "gcp.txt").write_text("\n".join([HEAD, *rows]))
+    done = run("merge", small_demo, "--georeference", tmp_path / "gcp.txt", "--out", tmp_path / "o")
+    assert_refused(done, "control points have no times")
