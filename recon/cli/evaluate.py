@@ -98,7 +98,7 @@ def middlebury(
 
 
 def _names(matcher: str | None) -> list[str] | None:
-    names = None if matcher is None else [name.strip() for name in matcher.split(",")]
+    names = None if matcher is None else opt.names_in([matcher])
     return [] if matcher == "none" else names
 
 

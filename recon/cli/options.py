@@ -56,7 +56,9 @@ Config = Annotated[
 ]
 Set = Annotated[
     list[str] | None,
-    option("Change one setting, e.g. matching.sad.window_px=9. May be repeated.", "--set", "-s"),
+    option(
+        "Change one setting, e.g. matching.sad.window_px=9. Several with commas.", "--set", "-s"
+    ),
 ]
 Matcher = Annotated[
     str | None,
@@ -100,6 +102,11 @@ SOURCES_HELP = (
     "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "
     "ROS bag, MCAP file, or Middlebury scene."
 )
+
+
+def names_in(texts: Sequence[str] | None) -> list[str]:
+    """Return the names that an option was given, several with commas or once each."""
+    return [name.strip() for text in texts or () for name in text.split(",")]
 
 
 def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:

@@ -107,7 +107,7 @@ def pair(
             with_truth(given, truth),
             settings,
             out=out,
-            formats=formats or (),
+            formats=opt.names_in(formats),
             threads=shared.threads,
             progress=shared.viewer(),
         )

@@ -72,8 +72,8 @@ def export(
         summary = run_export(
             run,
             run_settings(run, shared.config, shared.changes),
-            products=[name.strip() for text in to or () for name in text.split(",")],
-            formats=formats or ("ply",),
+            products=opt.names_in(to),
+            formats=opt.names_in(formats) or ("ply",),
             out=out,
             threads=shared.threads,
             workers=open_workers(workers, scheduler, shared),
@@ -116,7 +116,11 @@ def mesh(
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
         settings = shared.settings(defaults)
         summary = run_mesh(
-            source, settings, formats=formats or ("ply",), out=out, threads=shared.threads
+            source,
+            settings,
+            formats=opt.names_in(formats) or ("ply",),
+            out=out,
+            threads=shared.threads,
         )
     shared.show(summary)
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import socket
-from contextlib import redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any, Final
@@ -18,6 +21,7 @@ from recon.core.values.arrays import Float64
 from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
 
 HOST: Final = "127.0.0.1"
+_OURS: Final = re.compile(r"http://(127\.0\.0\.1|localhost):\d+")
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
 FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
@@ -36,7 +40,7 @@ class Viewer:
             what, where, hint = "cannot serve here", f"{HOST}:{port}", "give another --port"
             raise OutputError(what, where=where, got=error.strerror, hint=hint) from error
         logging.getLogger("websockets").addHandler(logging.NullHandler())  # a browser may vanish
-        with redirect_stdout(io.StringIO()):
+        with redirect_stdout(io.StringIO()), _for_pages_of_this_machine():
             self._server = viser.ViserServer(HOST, port, "recon", verbose=False)
         self.url = f"http://{HOST}:{self._server.get_port()}"
         self.looked_at = False  # by a browser
@@ -175,6 +179,21 @@ class Viewer:
             text, self._image.visible = "  \n".join([*lines, text]), image is not None
             self._image.image = self._image.image if image is None else image
         self._said.content = text
+
+
+@contextmanager
+def _for_pages_of_this_machine() -> Iterator[None]:
+    """Let what is served meanwhile refuse other sites, whose pages the same browser may show.
+
+    viser asks nobody where a connection comes from, and hands websockets no list of who may.
+    """
+    library: Any = require("websockets.asyncio.server", extra="view")
+    serve = library.serve
+    library.serve = partial(serve, origins=[None, _OURS])  # None: no browser
+    try:
+        yield
+    finally:
+        library.serve = serve
 
 
 def _add_grid(api: Any, name: str, grid: OccupancyGrid, height_m: float) -> None:

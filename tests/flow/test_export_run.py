@@ -114,7 +114,7 @@ def test_a_mesh_of_a_survey_lies_at_its_place_from_the_offset_beside_it(small_de
     np.savetxt(tmp_path / "gnss.txt", there, fmt="%.6f")
     height_m, out = summary_of(small_demo)["camera_height_m"], tmp_path / "out"
     words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}", "--out", out]
-    words += ["--crs", "EPSG:25832", "--format", "ply", "--format", "obj"]
+    words += ["--crs", "EPSG:25832", "--format", "ply,obj"]
     done = run("export", small_demo, "--to", "mesh,texture", *words)
     assert done.code == 0, done.err
     ours = read_mesh(out / "mesh/mesh.ply")
@@ -161,6 +161,8 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     highest = np.abs(at_points("dsm") - xyz[:, 2]) < 1e-3
     assert 0.1 < highest.mean() < 1
     assert (at_points("orthophoto", 4) == 255).mean() > 0.98
+    with rasterio.open(out / "map/orthophoto.tif") as file:  # else GIS draw what is unknown black
+        assert file.colorinterp[3] == rasterio.enums.ColorInterp.alpha
     assert np.mean(at_points("orthophoto")[highest] == cloud.rgb[highest, 0]) > 0.85
     # The base is driven over the ground, from where it is seen on; the rendered street is level.
     ahead = there[-1, 1:] - there[0, 1:]

@@ -195,6 +195,26 @@ def test_ctrl_c_ends_the_page_with_success_and_no_more_words(page):
     assert viewer.returncode == 0
 
 
+def test_a_page_of_another_site_sees_nothing(page):
+    client = pytest.importorskip("websockets.sync.client")
+    from websockets.exceptions import InvalidStatus
+
+    _, url = page
+    there = url.replace("http", "ws")
+    for origin in (url, url.replace("127.0.0.1", "localhost")):
+        with client.connect(there, origin=origin, subprotocols=_protocols(), max_size=None) as own:
+            assert len(own.recv(timeout=30)) > 0
+    for origin in ("https://elsewhere.example", "http://127.0.0.1.example:80", "null"):
+        with pytest.raises(InvalidStatus, match="403"):
+            client.connect(there, origin=origin, subprotocols=_protocols())
+
+
+def _protocols() -> list[str]:
+    import viser
+
+    return [f"viser-v{viser.__version__}"]
+
+
 @pytest.mark.slow
 def test_chromium_shows_it_without_an_error_or_a_request_to_anybody_else(
     page, small_demo, tmp_path

@@ -79,7 +79,7 @@ def write_geotiff(
         raise OutputError("the raster is too large", where=path, got=got, expected=expected)
     kind: dict[str, Any] = {"count": 1, "dtype": "float32", "nodata": float("nan")}
     if colours:
-        kind = {"count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "unspecified"}
+        kind = {"count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "yes"}
     west_m, north_m = place.west * place.cell_m, place.north * place.cell_m
     with (
         atomic_path(path) as temporary,
