@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, require
 from recon.core.text import parse_numbers
 from recon.core.values.arrays import Float64
 from recon.io.files import StrPath, read_text, reader
@@ -44,7 +44,7 @@ def is_control(path: StrPath) -> bool:
     if not Path(path).is_file():
         return False
     with Path(path).open("rb") as file:
-        return bool(_SYSTEM.match(file.read(200).decode(errors="replace").lstrip()))
+        return bool(_SYSTEM.match(file.read(200).decode("utf-8-sig", errors="replace").lstrip()))
 
 
 @reader
@@ -61,42 +61,52 @@ def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
 
     Ref: https://docs.opendronemap.org/gcp/
     """
-    lines = [line.strip() for line in read_text(path).splitlines()]
-    rows = [(n, line.split()) for n, line in enumerate(lines, 1) if line and line[0] != "#"]
+    lines = [line.split() for line in read_text(path).splitlines()]
+    rows = [(n, words) for n, words in enumerate(lines, 1) if words and words[0][0] != "#"]
     system = _system_of(" ".join(rows[0][1]))
-    named: dict[str, list[list[str]]] = {}
+    named: dict[str, list[_Row]] = {}
     for number, words in rows[1:]:
-        if len(words) < 6 or (len(words) == 8 and words[7] != _CHECK) or len(words) > 8:
-            where, expected = f"{path}:{number}", "x y z column row image [name [check]]"
-            raise FormatError("not a control point", where=where, expected=expected)
-        try:
-            parse_numbers(words[:5])
-        except ValueError as error:
-            where, got = f"{path}:{number}", " ".join(words[:5])
-            raise FormatError("not five numbers", where=where, got=got) from error
-        named.setdefault(words[6] if len(words) > 6 else " ".join(words[:3]), []).append(words)
+        row = _row(words, f"{path}:{number}")
+        named.setdefault(row.name or " ".join(words[:3]), []).append(row)
     if not named:
         raise FormatError("the file has no control point", where=path)
-    for name, found in named.items():
-        if len({tuple(words[:3]) for words in found}) > 1:
-            got = f"{found[0][:3]} and others"
+    for name, (first, *others) in named.items():
+        if any(row.numbers[:3] != first.numbers[:3] for row in others):
+            got = f"{first.numbers[:3]} and others"
             raise FormatError("one point has several places", where=f"{path}: {name}", got=got)
-    places = np.array([parse_numbers(found[0][:3]) for found in named.values()], np.float64)
-    places, system = _in_metres(places, system, crs, path)
-    return ControlPoints(
-        tuple(
-            ControlPoint(
-                name if len(found[0]) > 6 else f"point {number}",
-                place_m,
-                tuple((words[5], np.array(parse_numbers(words[3:5]))) for words in found),
-                any(len(words) == 8 for words in found),
-            )
-            for number, ((name, found), place_m) in enumerate(
-                zip(named.items(), places, strict=True), 1
-            )
-        ),
-        system,
+    firsts = np.array([found[0].numbers[:3] for found in named.values()], np.float64)
+    places_m, system = _in_metres(firsts, system, crs, path)
+    points = (
+        ControlPoint(
+            found[0].name or f"point {number}",
+            place_m,
+            tuple((row.image, np.array(row.numbers[3:])) for row in found),
+            any(row.check for row in found),
+        )
+        for number, (found, place_m) in enumerate(zip(named.values(), places_m, strict=True), 1)
     )
+    return ControlPoints(tuple(points), system)
+
+
+class _Row(NamedTuple):
+    numbers: list[float]  # place, column and row
+    image: str
+    name: str  # empty if there is none
+    check: bool
+
+
+def _row(words: list[str], where: str) -> _Row:
+    name, *more = words[6:] or [""]
+    if len(words) < 6 or more not in ([], [_CHECK]):
+        expected = "x y z column row image [name [check]]"
+        raise FormatError("not a control point", where=where, expected=expected)
+    try:
+        numbers = parse_numbers(words[:5])
+    except ValueError:
+        numbers = []
+    if not (numbers and np.isfinite(numbers).all()):
+        raise FormatError("not five numbers", where=where, got=" ".join(words[:5]))
+    return _Row(numbers, words[5], name, bool(more))
 
 
 def _system_of(text: str) -> str:
@@ -105,9 +115,12 @@ def _system_of(text: str) -> str:
 
 
 def _in_metres(places: Float64, system: str, crs: str | None, path: StrPath) -> tuple[Float64, str]:
-    from pyproj import CRS  # noqa: PLC0415
-
-    if not CRS.from_user_input(system).is_geographic:
+    pyproj = require("pyproj", extra="survey")
+    try:
+        geographic = pyproj.CRS.from_user_input(system).is_geographic
+    except pyproj.exceptions.CRSError as error:
+        raise FormatError("unknown coordinate system", where=path, got=system) from error
+    if not geographic:
         check_crs(system)
         return places, crs or system
     degrees = Positions(np.zeros(len(places)), places[:, [1, 0, 2]], np.zeros((0, 3)), degrees=True)

@@ -126,6 +126,7 @@ def test_a_typing_error_is_named_and_check_points_are_only_compared(rows, placed
         (lambda rows: [rows[0] + " twice", *rows[1:]], "gcp_list.txt:2: not a control point"),
         (lambda rows: ["a b c 1 2 0 x"], "gcp_list.txt:2: not five numbers"),
         (lambda rows: [], "no control point"),
+        (lambda rows: [rows[0].replace(" 60 70 ", " nan 70 "), *rows[1:]], "not five numbers"),
         (lambda rows: [*rows, "1 2 3 10 10 0 p0"], "one point has several places"),
     ],
 )
@@ -133,6 +134,11 @@ def test_what_cannot_be_used_is_one_line_and_leaves_nothing(rows, placed, change
     done, out = placed(change(rows))
     assert_refused(done, said)
     assert not out.exists()
+
+
+def test_a_system_that_there_is_not_is_refused(rows, placed):
+    assert_refused(placed(rows, head="EPSG:99999")[0], "unknown coordinate system")
+    assert_refused(placed(rows, head="EPSG:2263")[0], "not metres")  # feet
 
 
 def test_paths_are_not_bent_by_control_points(rows, small_demo, tmp_path):
