@@ -1,6 +1,6 @@
 """Draw the pictures of docs/next-tools.md: what other programs make of a rendered drive.
 
-    python scripts/next_tools_pictures.py
+    python scripts/next_tools_pictures.py [NAME…]
 
 MeshLab, CloudCompare, Blender and QGIS draw for themselves, in a display without a screen (Debian:
 `apt install meshlab cloudcompare blender qgis python3-qgis xvfb xdotool imagemagick`); what has no
@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -83,11 +83,14 @@ job.renderedImage().save(sys.argv[2])
 """
 
 
-def main() -> None:
+def main(names: Sequence[str]) -> None:
     IMAGES.mkdir(parents=True, exist_ok=True)
+    chosen = names or [*PICTURES]
     with tempfile.TemporaryDirectory() as folder:
-        out = exported(Path(folder))
-        for name, draw in PICTURES.items():
+        needed = {product for name in chosen for product in PICTURES[name][1]}
+        out = exported(Path(folder), sorted(needed))
+        for name in chosen:
+            draw, _ = PICTURES[name]
             picture = Path(folder) / f"{name}.png"
             try:
                 draw(out, picture)
@@ -97,15 +100,14 @@ def main() -> None:
                 keep(picture, IMAGES / f"{name}.jpg")
 
 
-def exported(folder: Path) -> Path:
-    """Map the rendered drive, and make all products of it that are drawn."""
+def exported(folder: Path, products: Sequence[str]) -> Path:
+    """Map the rendered drive, and make products of it."""
     config, run, out = load_config(None), folder / "run", folder / "out"
     run_map(demo_source(config), config, MapOptions("demo", run, audit=False))
     path = read_tum(run / "trajectory_map_base_tum.txt")
     there = path.positions_m + np.array([455_800.0, 5_429_300.0, 115.0])
     np.savetxt(folder / "gnss.txt", np.column_stack([path.timestamps_s, there]), fmt="%.4f")
-    products = ["cloud", "grid", "costmap", "texture", "orthophoto", "colmap", "nerfstudio", "mcap"]
-    survey = Survey(folder / "gnss.txt", crs="EPSG:25832")
+    survey = Survey(folder / "gnss.txt", crs="EPSG:25832") if "orthophoto" in products else None
     run_export(run, products=products, formats=("glb",), out=out, survey=survey)
     return out
 
@@ -154,7 +156,7 @@ def blender(out: Path, picture: Path) -> None:
 
 
 def qgis(out: Path, picture: Path) -> None:
-    script = picture.with_suffix(".py")
+    script = picture.with_name("draw.py")
     script.write_text(QGIS)
     if not Path("/usr/lib/python3/dist-packages/qgis").is_dir():
         raise FileNotFoundError("python3-qgis")
@@ -238,16 +240,17 @@ def foxglove(out: Path, picture: Path) -> None:
     figure.savefig(picture, dpi=100, bbox_inches="tight")
 
 
-PICTURES: Final[dict[str, Callable[[Path, Path], None]]] = {
-    "nav2": nav2,
-    "foxglove": foxglove,
-    "meshlab": meshlab,
-    "cloudcompare": cloudcompare,
-    "blender": blender,
-    "qgis": qgis,
-    "colmap": colmap,
-    "nerfstudio": nerfstudio,
+PICTURES: Final[dict[str, tuple[Callable[[Path, Path], None], tuple[str, ...]]]] = {
+    "nav2": (nav2, ("grid", "costmap")),
+    "foxglove": (foxglove, ("mcap",)),
+    "meshlab": (meshlab, ("texture",)),
+    "cloudcompare": (cloudcompare, ("cloud",)),
+    "blender": (blender, ("texture",)),
+    "qgis": (qgis, ("orthophoto",)),
+    "colmap": (colmap, ("colmap",)),
+    "nerfstudio": (nerfstudio, ("nerfstudio",)),
 }
+"""What draws a picture, and of which products."""
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main(sys.argv[1:])

@@ -1,8 +1,10 @@
 """Products for other tools are opened by the libraries of those tools, and are right there."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -349,3 +351,43 @@ def test_a_textured_drive_shows_its_images_in_other_programs(small_demo, tmp_pat
     images = re.findall(r'fileName="(images/.*?)"', project)
     assert len(images) >= 2
     assert all((out / "texture" / name).is_file() for name in images)
+
+
+TEXTURING = """<!DOCTYPE FilterScript><FilterScript>
+<filter name="Parameterization + texturing from registered rasters">
+<Param type="RichInt" value="1024" name="textureSize"/>
+<Param type="RichString" value="painted.png" name="textureName"/>
+<Param type="RichBool" value="false" name="colorCorrection"/>
+<Param type="RichInt" value="1" name="colorCorrectionFilterSize"/>
+<Param type="RichBool" value="true" name="useDistanceWeight"/>
+<Param type="RichBool" value="true" name="useImgBorderWeight"/>
+<Param type="RichBool" value="false" name="useAlphaWeight"/>
+<Param type="RichBool" value="true" name="cleanIsolatedTriangles"/>
+<Param type="RichBool" value="false" name="stretchingAllowed"/>
+<Param type="RichInt" value="4" name="textureGutter"/>
+</filter></FilterScript>"""
+
+
+@pytest.mark.slow
+def test_meshlab_paints_a_drive_with_the_rasters_of_its_project(small_demo, tmp_path):
+    """MeshLab of Debian, without a screen: its cameras lead where ours do."""
+    for program in ("meshlabserver", "xvfb-run"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is not installed")
+    out = tmp_path / "out"
+    run_export(small_demo, products=["texture"], out=out)
+    (tmp_path / "paint.mlx").write_text(TEXTURING)
+    words = ["xvfb-run", "-a", "-s", "-screen 0 1280x800x24 +extension GLX", "meshlabserver"]
+    words += ["-p", out / "texture/mesh.mlp", "-s", tmp_path / "paint.mlx"]
+    environment = {**os.environ, "LIBGL_ALWAYS_SOFTWARE": "1"}
+    painted = out / "texture/painted.obj"
+    subprocess.run([*words, "-o", painted, "-m", "wt"], check=True, env=environment, timeout=300)
+    mesh, shown = read_mesh(out / "mesh/mesh.ply"), o3d.io.read_triangle_mesh(str(painted), True)
+    picture, uv = read_image(out / "texture/painted.png"), np.asarray(shown.triangle_uvs)
+    corners = np.asarray(shown.vertices)[np.asarray(shown.triangles).ravel()]
+    nearest = cKDTree(mesh.vertices).query(corners)[1]
+    column, row = np.clip(uv * 1024, 0, 1023).astype(int).T
+    grey = picture[1023 - row, column].mean(axis=1), mesh.rgb[nearest].mean(axis=1)
+    seen = grey[0] > 0
+    assert seen.mean() > 0.3
+    assert np.corrcoef(grey[0][seen], grey[1][seen])[0, 1] > 0.6
