@@ -85,7 +85,6 @@ class MapOptions:
 
     @property
     def products(self) -> tuple[str, ...]:
-        """What is made of the map."""
         return tuple(name for name in USUAL if self.mesh or name != "mesh")
 
     @property

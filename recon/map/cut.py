@@ -75,7 +75,6 @@ class Cut:
         return np.insert(found, ends, -1)
 
     def to_tree(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
         return {
             "frames": self.frames,
             "known": sorted(self.known),
@@ -203,7 +202,6 @@ class TileParts:
         return list(self._keys)
 
     def bounds(self, key: TileKey) -> Rectangle:
-        """Return the bounds of a tile."""
         (x, y), edge_m = key, self.edge_m
         return Rectangle((x * edge_m, y * edge_m), ((x + 1) * edge_m, (y + 1) * edge_m))
 
@@ -282,7 +280,6 @@ class Rectangle:
     high: tuple[float, float]
 
     def wider(self, margin_m: float) -> Self:
-        """Return the rectangle with a margin around it."""
         (x0, y0), (x1, y1) = self.low, self.high
         return type(self)((x0 - margin_m, y0 - margin_m), (x1 + margin_m, y1 + margin_m))
 

@@ -144,7 +144,6 @@ class Tiles:
 
     @property
     def resolution_m(self) -> float:
-        """Edge of a voxel."""
         return self.config.occupancy.resolution_m
 
     def __len__(self) -> int:
@@ -154,7 +153,6 @@ class Tiles:
         return (Tile(key, self) for key in self._parts.keys)
 
     def bounds(self, key: TileKey) -> Rectangle:
-        """Return the bounds of a tile."""
         return self._parts.bounds(key)
 
     def put_cloud(self, cloud: PointCloud) -> None:

@@ -47,7 +47,6 @@ class Guided:
 
     @property
     def sigma_deg(self) -> float:
-        """That of the rotation."""
         return float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]) / 3)))
 
     @property

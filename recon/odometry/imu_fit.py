@@ -49,7 +49,6 @@ class FittedImu:
     figures: Mapping[str, Any] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Return what ``summary.json`` has of it."""
         return {"used": self.guide is not None, **self.figures}
 
 

@@ -55,13 +55,9 @@ class StoredKeyframes(Protocol):
     """Keyframes of a drive, by the number of their frame."""
 
     @property
-    def frames(self) -> list[int]:
-        """The numbers, in order."""
-        ...
+    def frames(self) -> list[int]: ...
 
-    def get(self, frame: int) -> StoredKeyframe:
-        """Return one."""
-        ...
+    def get(self, frame: int) -> StoredKeyframe: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +71,6 @@ class Adjustment:
     after_px: float  # and after
 
     def figures(self) -> dict[str, float]:
-        """Return the figures for ``summary.json``."""
         return {
             "keyframes": self.keyframes,
             "points": self.points,

@@ -39,7 +39,6 @@ class Seen:
     sigma_px: float  # standard deviation of a column or row
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Seen:
-        """Return some of the points."""
         return Seen(self.uvd[rows], self.xyz[rows], self.camera, self.sigma_px)
 
     @property

@@ -101,12 +101,10 @@ class Bundle:
         return np.stack(project(xyz, self.camera), axis=1) - self.seen.uvd
 
     def sightings_cost(self, state: State) -> float:
-        """Return what the sightings cost."""
         costs = (bundle.cost(*each, tuple(self._model)) for _, _, each in self._by_node(state))
         return self.cauchy_sigmas**2 * sum(costs)
 
     def cost(self, state: State) -> float:
-        """Return what edges and sightings cost."""
         return self.graph.cost(state[0]) + self.sightings_cost(state)
 
     def linearise(self, state: State) -> _Linear:

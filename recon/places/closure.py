@@ -207,7 +207,6 @@ def _numbered(stretch: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
 
 
 def _tied_frames(ties: Sequence[Tie], drive: int) -> list[int]:
-    """Return the frames of a drive that ties are at."""
     ends = ((one, tie.loop) for tie in ties for one in zip(tie.drives, (0, 1), strict=True))
     return sorted({(loop.first, loop.last)[end] for (number, end), loop in ends if number == drive})
 

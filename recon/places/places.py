@@ -54,7 +54,6 @@ class Places:
         return len(self._frames)
 
     def add(self, place: Place) -> None:
-        """Add the next place."""
         count = len(self)
         if count == len(self._path_m):
             self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
@@ -67,7 +66,6 @@ class Places:
 
     @property
     def frames(self) -> list[int]:
-        """The frame of each place."""
         return self._frames
 
     @property
@@ -137,7 +135,6 @@ class _Run:
     owners: NDArray[np.uint16]  # uint16 (W,), image of each word, counted from the first
 
     def followed_by(self, other: _Run) -> _Run:
-        """Return two runs as one."""
         words = np.concatenate([self.words, other.words])
         owners = np.concatenate([self.owners, other.owners + np.uint16(self.count)])
         # The stable sort detects the two sorted runs and merges them.

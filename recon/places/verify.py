@@ -110,7 +110,6 @@ class Matchable:
 
     @staticmethod
     def of(keyframe: Keyframe, camera: RectifiedCamera) -> Matchable:
-        """Return those of a keyframe."""
         known = np.isfinite(keyframe.uvd[:, 2])
         uvd = keyframe.uvd[known].astype(np.float64)
         return Matchable(uvd, points_of(uvd, camera), keyframe.descriptors[known], camera)

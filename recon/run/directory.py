@@ -180,7 +180,6 @@ class RunDirectory:
             _link_latest(self.folder)
 
     def _move(self) -> None:
-        """Move the files to their places one by one."""
         files = [Path(name) for name in self.files()]
         for stale in set(self._earlier) - set(files):
             (self.folder / stale).unlink(missing_ok=True)
@@ -256,7 +255,6 @@ def recorded_files(folder: Path) -> list[Path]:
 
 
 def _is_name(name: object) -> bool:
-    """Return whether a value can be the name of a file."""
     return isinstance(name, str) and "\0" not in name and os.fsencode(name) != b""
 
 

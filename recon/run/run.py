@@ -138,7 +138,6 @@ class Run(RunDirectory):
         }
 
     def _timings(self) -> dict[str, float]:
-        """Return seconds of each stage so far."""
         return {name: round(value, 3) for name, value in self.watch.seconds.items()}
 
 

@@ -79,7 +79,6 @@ class FrameReconstructor:
         return self._rectifier.camera
 
     def rectify(self, pair: StereoPair) -> RectifiedPair:
-        """Rectify one pair."""
         with self._stopwatch.stage("rectify"):
             return self._rectifier.rectify(pair)
 
@@ -103,7 +102,6 @@ class FrameReconstructor:
         return check_inspection(found, where=f"frame {pair.index}")
 
     def reconstruct(self, pair: StereoPair) -> ReconstructedFrame:
-        """Reconstruct one pair."""
         return self.reconstruct_rectified(self.rectify(pair))
 
     def reconstruct_rectified(self, rectified: RectifiedPair) -> ReconstructedFrame:

@@ -263,7 +263,6 @@ class Sight(NamedTuple):
     faces: Int32  # (N,), triangles; -1 = the sky
 
     def select(self, which: Bool) -> Sight:
-        """Return some of them."""
         return Sight(self.rays[which], self.origin, self.directions[which], self.faces[which])
 
 

@@ -185,7 +185,6 @@ def _table(width_m: float, depth_m: float, rng: np.random.Generator) -> Triangle
 
 
 def _shelf(width_m: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Yield a bookcase, and its books."""
     depth, boards = 0.32, np.arange(0.05, 2.0, 0.38)
     low = [[0.0, -depth, z] for z in boards] + [[x, -depth, 0.0] for x in (0.0, width_m - 0.03)]
     high = [[width_m, 0.0, z + 0.03] for z in boards]
@@ -203,7 +202,6 @@ def _shelf(width_m: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
 
 
 def _coloured(low: Float64, high: Float64, rng: np.random.Generator) -> TriangleSoup:
-    """Return boxes, each in a colour of its own."""
     soup = boxes(low, high, Paint(Material.PLAIN))
     rgb, part = rng.uniform(0.1, 0.9, (len(low), 3)), rng.integers(1, 2**30, len(low))
     each = np.tile(np.repeat(np.arange(len(low)), 2), 6)  # side after side, of two triangles

@@ -153,13 +153,11 @@ class SceneDone:
 
     @property
     def event(self) -> dict[str, Any]:
-        """The seconds of each matcher."""
         seconds = {matcher: one["seconds"] for matcher, one in (self.figures or {}).items()}
         return {"event": "scene", "name": self.name, "seconds": seconds}
 
     @property
     def state(self) -> str:
-        """The name of the scene."""
         return self.name if self.figures is not None else f"{self.name}: no truth"
 
 
@@ -199,7 +197,6 @@ def summarise_scenes(
 
 
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:
-    """Return the entry of one matcher in ``summary.json``."""
     own = {name: figures[matcher] for name, figures in scenes.items() if matcher in figures}
     meant = (*MASKS, "seconds")  # seconds are not a number, so null, where one is not known
     figures = weighted_figures({name: {key: own[name][key] for key in meant} for name in common})

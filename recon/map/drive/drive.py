@@ -154,7 +154,6 @@ class Drive:
         return self._last - self._start
 
     def _due(self) -> bool:
-        """Return whether the map is to be committed."""
         if self.source.live:
             return time.perf_counter() - self._saved_s >= _COMMIT_S
         return len(self.mapper) - self._saved >= self.config.checkpoints.every_frames
@@ -240,7 +239,6 @@ class MapBehind:
         self._thread.start()
 
     def add(self, registered: _Registered) -> None:
-        """Add the next frame."""
         with self._news:
             self._news.wait_for(lambda: len(self._waiting) < _MOST_WAITING or self._error)
             self._waiting.append(registered)

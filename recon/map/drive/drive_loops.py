@@ -49,7 +49,6 @@ class DriveLoops:
         return np.asarray(np.linalg.norm(moved, axis=1))
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures for ``summary.json``."""
         return {
             "keyframes": self.keyframes,
             "found": self.found,

@@ -58,7 +58,6 @@ class Mapper:
         self._grain = ray_grain(config.occupancy) if config.occupancy.keep_rays else None
 
     def __len__(self) -> int:
-        """Return the number of frames so far."""
         return len(self.session)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -110,7 +109,6 @@ class Mapper:
                 self.session.submaps.add(builder.close())
 
     def wait(self) -> None:
-        """Wait until all frames are integrated."""
         self._behind.wait()
 
     def abandon(self) -> None:
@@ -132,7 +130,6 @@ class Mapper:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
         self._odometry.restore(state["odometry"])
         for record in self.session.health:
             self._stretches.add(record)
@@ -195,7 +192,6 @@ class SubmapBuilder:
 
     @property
     def frames(self) -> int:
-        """Number of frames in the submap so far."""
         return self._frames
 
     def integrate(
@@ -212,7 +208,6 @@ class SubmapBuilder:
 
     @property
     def full(self) -> bool:
-        """Whether the submap is to be closed."""
         s, limit = self._settings, self._max_bytes
         long = self._path_m >= s.length_m or self._frames >= _MAX_FRAMES
         return long or (limit is not None and self._fused.nbytes + self._occupancy.nbytes >= limit)
@@ -241,7 +236,6 @@ class SubmapBuilder:
         return {"submap": tree_of(self.current()), "path_m": self._path_m, "last_m": self._last_m}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state`."""
         submap = Submap.from_tree(state["submap"])
         self._index, self._first_frame = submap.index, submap.first_frame
         self._frames = submap.frames
@@ -268,7 +262,6 @@ class FrameResult:
 
     @property
     def ok(self) -> bool:
-        """Whether the pose is trusted."""
         return self.health.ok
 
     @property

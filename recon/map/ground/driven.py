@@ -52,7 +52,6 @@ class DrivenPath:
         return cls(points[keep], np.append(submap[0], submap[end])[keep])
 
     def select(self, which: NDArray[Any]) -> DrivenPath:
-        """Return the points of a mask."""
         return DrivenPath(self.points_m[which], self.submap[which])
 
 

@@ -183,7 +183,6 @@ class _Fit:
         self._height_m = np.nan_to_num(relief.height_m - middle_m)
 
     def slopes(self, limit: float) -> Judged:
-        """Return the slope of the plane."""
         beta, covariance = self._solve(np.ones_like(self._x))
         slope = np.linalg.norm(beta[..., 1:3], axis=-1)
         sigma = np.sqrt(covariance[..., [1, 2], [1, 2]].max(axis=-1))

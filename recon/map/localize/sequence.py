@@ -61,7 +61,6 @@ class LocalizedFrame:
 
     @property
     def event(self) -> dict[str, Any]:
-        """The frame for programs."""
         T = self.located.T_world_camera
         return {
             "event": "frame",
@@ -78,7 +77,6 @@ class LocalizedFrame:
 
     @property
     def state(self) -> str:
-        """The frame for people."""
         found = self.located
         if found.state is not State.TRACKING:
             return f"{found.state.value}: {found.note}"
@@ -115,7 +113,6 @@ class LocalizedDrive:
         return Trajectory(poses.reshape(-1, 4, 4), times_s)
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures for ``summary.json``."""
         states = [frame.located.state for frame in self.frames]
         seconds = np.array([frame.seconds for frame in self.frames])
         sigmas_m = [frame.located.sigma_m for frame in self.tracked]
@@ -133,7 +130,6 @@ class LocalizedDrive:
         }
 
     def warnings(self) -> list[str]:
-        """Return what the user should know."""
         states = [frame.located.state for frame in self.frames]
         lost, coasting = states.count(State.LOST), states.count(State.COASTING)
         if not self.tracked:

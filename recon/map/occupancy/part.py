@@ -168,7 +168,6 @@ class SurfacePoints:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> SurfacePoints:
-        """Return the points in a tree of their arrays."""
         keys = array_in(tree, "keys", np.int64, (None,))
         sums = array_in(tree, "sums", np.float32, (len(keys), 5))
         if keys.min(initial=0) < 0 or sums[:, ::4].min(initial=1) <= 0:

@@ -92,7 +92,6 @@ def _kept_misfit(ours_m: Float64, there_m: Float64) -> tuple[float, Bool]:
 
 
 def _sigma(times_s: Float64, there_m: Float64, ours_at: Callable[[Float64], Float64]) -> float:
-    """Return the standard deviation of the error of a clock."""
     ours_m = ours_at(times_s)
     misfit_m, kept = _kept_misfit(ours_m, there_m)
     T = fit_upright(ours_m[kept], there_m[kept]).T_to_from

@@ -123,7 +123,6 @@ class Store:
 
     @property
     def name(self) -> str:
-        """The file, for messages."""
         return "temporary map" if self.path is None else str(self.path)
 
     def put(self, kind: str, key: Key, tree: Mapping[str, Any], *, compress: bool = False) -> None:
@@ -168,7 +167,6 @@ class Store:
                 self.cache.drop((kind, each))
 
     def keys(self, kind: str) -> list[Key]:
-        """Return the keys of a kind, in order."""
         with self._lock, reading(self.name):
             rows = self._database.execute("SELECT key FROM record WHERE kind = ?", (kind,))
             found = [_key(name) for (name,) in rows]
@@ -180,13 +178,11 @@ class Store:
         return [key[1] for key in keys if key[0] == session]
 
     def kinds(self) -> list[str]:
-        """Return the kinds of which there are records, in order."""
         with self._lock, reading(self.name):
             rows = self._database.execute("SELECT DISTINCT kind FROM record ORDER BY kind")
             return [str(kind) for (kind,) in rows]
 
     def has(self, kind: str, key: Key) -> bool:
-        """Return whether there is such a record."""
         query = "SELECT 1 FROM record WHERE kind = ? AND key = ?"
         with self._lock, reading(self.name):
             return self._database.execute(query, (kind, _name(key))).fetchone() is not None
@@ -246,7 +242,6 @@ class Store:
             self.cache.drop((kind, _key(name)))
 
     def _row(self, kind: str, name: str) -> tuple[str, Content, int]:
-        """Return text, content and checksum of a record."""
         query = "SELECT rowid, length(content), tree, checksum FROM record"
         query += " WHERE kind = ? AND key = ?"
         found = self._database.execute(query, (kind, name)).fetchone()
@@ -333,12 +328,10 @@ class Cache:
         return value
 
     def drop(self, key: Hashable) -> None:
-        """Forget a value."""
         with self._lock:
             self._size -= self._held.pop(key, (None, 0))[1]
 
     def clear(self) -> None:
-        """Forget all values."""
         with self._lock:
             self._held.clear()
             self._size = 0

@@ -93,7 +93,6 @@ class Session:
 
     @staticmethod
     def begin(store: Store, number: int, info: SessionInfo) -> Session:
-        """Add a session to a map."""
         store.put(SESSION, number, asdict(info))
         return Session(store, number)
 
@@ -105,7 +104,6 @@ class Session:
 
     @property
     def where(self) -> str:
-        """The file of the map, for messages."""
         return self._store.name
 
     @property
@@ -116,7 +114,6 @@ class Session:
 
     @property
     def odometry(self) -> Trajectory:
-        """The path by odometry."""
         if not self._poses:
             raise FormatError("the session has no frame", where=self._store.name)
         return Trajectory(np.stack(self._poses), np.array(self._times_s))
@@ -170,11 +167,9 @@ class Session:
 
     @property
     def ray_frames(self) -> int:
-        """Number of frames whose rays are kept."""
         return len(self._store.numbers(RAYS, self.number))
 
     def set_axes(self, T_map_world: Float64, camera: RectifiedCamera) -> None:
-        """Keep the axes of the map, and the camera."""
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
         self._store.put(AXES, self.number, content)
 
@@ -194,17 +189,14 @@ class Session:
             self._store.put(RIG, self.number, content)
 
     def add_frame(self, T_world_camera: Float64, time_s: float, health: OdometryHealth) -> None:
-        """Add the pose of the next frame."""
         self._poses.append(T_world_camera)
         self._times_s.append(time_s)
         self._health.append(health)
 
     def add_rays(self, frame: int, rays: RayCloud, grain: RayGrain) -> None:
-        """Keep the rays of a frame."""
         self._store.put(RAYS, (self.number, frame), rays_record(rays, grain), compress=True)
 
     def rays(self, frame: int) -> tuple[RayCloud, RayGrain]:
-        """Return the rays of a frame, as they were kept."""
         with reading(self._store.name):
             camera = self.camera
             most_bytes = RAY_BYTES * camera.width_px * camera.height_px
@@ -216,7 +208,6 @@ class Session:
         return self._store.alike(RAYS, *keys) and len(self.rays(frame)[0].sigma_m) > 0
 
     def set_loops(self, content: Mapping[str, Any]) -> None:
-        """Keep the result of loop closure."""
         self._store.put(LOOPS, self.number, content)
 
     @property
@@ -319,11 +310,9 @@ class Submaps:
 
     @property
     def frames(self) -> int:
-        """Number of frames in all submaps."""
         return sum(entry.frames for entry in self.entries)
 
     def add(self, submap: Submap, *, compress: bool = False) -> None:
-        """Store the next submap."""
         entry = _entry_of(submap)
         key = (self._session, submap.index)
         self.store.put(SUBMAP, key, tree_of(submap), compress=compress)
@@ -362,7 +351,6 @@ class Keyframes:
         self._session = session
 
     def put(self, stored: StoredKeyframe) -> None:
-        """Keep a keyframe."""
         content = {
             "keyframe": asdict(stored.keyframe),
             "T_world_camera": stored.T_world_camera,
@@ -374,13 +362,11 @@ class Keyframes:
         self._store.put(KEYFRAME, (self._session, stored.keyframe.frame), content, compress=True)
 
     def get(self, frame: int) -> StoredKeyframe:
-        """Return the keyframe of a frame, kept in the cache."""
         key = (KEYFRAME, self._session, frame, "keyframe")
         return self._store.cache.get(key, lambda: self._read(frame))
 
     @property
     def frames(self) -> list[int]:
-        """The numbers of the frames that are keyframes, in order."""
         return self._store.numbers(KEYFRAME, self._session)
 
     def __iter__(self) -> Iterator[StoredKeyframe]:

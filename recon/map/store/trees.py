@@ -119,7 +119,6 @@ class _Claim(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the array."""
         if self.dtype.kind not in _KINDS or min(self.shape, default=0) < 0:
             raise FormatError("an array of the map has an impossible type or shape")
         return math.prod(self.shape) * self.dtype.itemsize
@@ -340,12 +339,10 @@ class Link:
     kept: bool = True
 
     def to_tree(self) -> dict[str, Any]:
-        """Return all of it as a tree of arrays and plain values."""
         return {"sessions": self.sessions, "loop": asdict(self.loop), "kept": self.kept}
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> Link:
-        """Return what `to_tree` gave."""
         one, other = tree["sessions"]
         if not (isinstance(one, int) and isinstance(other, int) and one != other):
             raise FormatError("a link of the map is not between two drives", got=tree["sessions"])

@@ -58,7 +58,6 @@ class Colmap:
         self._sigma_px = _SIGMA_PX * max(1.0, math.sqrt(shrunk))
 
     def add_features(self, pairs: Iterable[RectifiedPair]) -> None:
-        """Put the features of all images into the database."""
         sides = (side for pair in pairs for side in (pair.left, pair.right))
         most, api = self._most_pixels, self._api
         found = side_by_side(lambda im: find_features(im, most), sides, threads=self._threads)

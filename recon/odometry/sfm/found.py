@@ -34,7 +34,6 @@ class FoundPoses:
     models: tuple[Model, ...]  # the largest first; no pair is in two of them
 
     def figures(self) -> dict[str, Any]:
-        """Return what was found, for ``summary.json``."""
         return {
             "pairs": self.pairs,
             "registered": len(self.models[0].frames),

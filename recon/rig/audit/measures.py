@@ -78,7 +78,6 @@ class RepeatCounter:
         self._last, self._run = None, [0, 0]
 
     def add(self, left: UInt8, right: UInt8) -> None:
-        """Compare a pair with the previous one."""
         if self._last is not None:
             self.steps += 1
             same = [

@@ -153,7 +153,6 @@ class Cluster:
             yield from zip(alike, futures, strict=True)
 
     def _declared(self) -> frozenset[str]:
-        """Return the resources that all workers declare."""
         with _reaching():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
         names = [frozenset(worker["resources"]) for worker in workers.values()]
@@ -217,7 +216,6 @@ async def _greet(address: str) -> None:
 
 
 def _work(job: Job, folder: str) -> Outcome:
-    """Run a job on a worker."""
     distributed = require("distributed", extra=EXTRA)
     worker, key = distributed.get_worker(), distributed.worker.thread_state.key
 
@@ -229,7 +227,6 @@ def _work(job: Job, folder: str) -> Outcome:
 
 
 def _outcome(future: Any, result: Any, job: Job, folder: Path) -> Outcome:
-    """Return how a try ended."""
     if future.status == "finished":
         return result  # type: ignore[no-any-return]
     if future.status != "error":

@@ -88,7 +88,6 @@ class Outcome:
     stale: bool = False  # whether what it left is of no use: it went on with that, and failed
 
     def line(self) -> bytes:
-        """Return it as a line of a log."""
         text = json.dumps({"try": asdict(self)}, ensure_ascii=False)
         return text.encode(errors="replace") + b"\n"
 

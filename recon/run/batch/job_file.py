@@ -83,7 +83,6 @@ class JobList(Settings):
         return self.model_copy(update={"job": [limited(one) for one in self.job]})
 
     def write(self, folder: Path) -> None:
-        """Write it into the folder of its batch."""
         write_text(folder / PLAN, self.model_dump_json(exclude_defaults=True))
 
 

@@ -56,7 +56,6 @@ class JobResult:
 
     @property
     def ok(self) -> bool:
-        """Whether it succeeded."""
         return self.last.state == "succeeded"
 
     @property
@@ -71,12 +70,10 @@ class JobResult:
 
     @property
     def state(self) -> str:
-        """Its name, for people."""
         return self.job.name
 
     @property
     def event(self) -> dict[str, Any]:
-        """How it ended."""
         return {"event": "job", **self.facts}
 
     @property

@@ -86,7 +86,6 @@ class FineMatcher:
         self._network: Any = None
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         height, width = pair.left.shape
         ndisp = self._settings.ndisp_within(pair.camera)
         rows = max(_VOLUME_BYTES // (padded(width) * ndisp), 4 * _OVERLAP_ROWS)

@@ -112,7 +112,6 @@ class OnnxMatcher:
         self._network: OnnxNetwork | None = None
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         network = self._loaded()
         left, right = pair.left, pair.right
         if network.channels == 3 and pair.left_rgb is not None and pair.right_rgb is not None:

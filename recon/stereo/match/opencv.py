@@ -51,7 +51,6 @@ class OpencvMatcher:
         self._semi_global = semi_global
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         s, ndisp = self._settings, _range(self._settings, pair.camera)
         block_px = s.block_px or (_SGBM_BLOCK_PX if self._semi_global else _BM_BLOCK_PX)
         make = _semi_global_engine if self._semi_global else _block_engine

@@ -54,7 +54,6 @@ class CheckedMatcher:
         self._name = name
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         try:
             found = self._matcher.match(pair)
         except (ReconError, MemoryError):

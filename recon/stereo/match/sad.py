@@ -75,7 +75,6 @@ class SadMatcher:
         self._half = _StripSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         search, rules = self._plan(pair.camera)
         s = self._settings
         with ThreadPoolExecutor(self._threads) as pool:
@@ -205,7 +204,6 @@ class AutoRangeMatcher:
         self._minimum_px = minimum_px
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         if pair.camera.ndisp is None:
             ndisp = estimate_ndisp(pair, self._minimum_px)
             pair = replace(pair, camera=replace(pair.camera, ndisp=ndisp))
@@ -264,7 +262,6 @@ class HalfSizeMatcher:
         self._matcher: Matcher = sad if half.ndisp else AutoRangeMatcher(sad, half.min_disparity_px)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         return _enlarged(self._matcher.match(_half(pair)), pair.left.shape)
 
 

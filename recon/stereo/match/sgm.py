@@ -89,7 +89,6 @@ class SgmMatcher:
         self._search = PathSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair."""
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
         window, size = _window(s), pair.left.shape

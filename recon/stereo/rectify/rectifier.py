@@ -85,7 +85,6 @@ class Rectifier:
             )
 
     def rectify(self, pair: StereoPair) -> RectifiedPair:
-        """Rectify one pair."""
         left, right = self.warp(pair)
         return RectifiedPair(
             left=to_grey(left),
