@@ -53,8 +53,8 @@ def export(
 ) -> None:
     """Make the cloud, grid, OctoMap or mesh of a run again, with other settings or formats.
 
-    Nothing is matched again (but for nerfstudio): products are made from the
-    cloud and the rays that the run has kept. Settings of occupancy, grid, ground,
+    Nothing is matched again (but for nerfstudio and control points): products are
+    made from the cloud and the rays that the run has kept. Settings of occupancy, grid, ground,
     submaps and mesh can be changed; all others are those of the run.
 
     Examples:

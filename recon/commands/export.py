@@ -99,8 +99,10 @@ def run_export(
             open_images(map_, images)
         with run.stage("map"):
             placed = _placed(map_, settings, run, workers)
-        with run.stage("survey"):
-            there = None if survey is None else locate(map_, survey, images, run.threads)
+        there = None
+        if survey is not None:
+            with run.stage("survey"):
+                there = locate(map_, survey, images, run.threads)
         made = make(Order(map_, placed, run, settings.mesh, formats, there, images), wanted)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
         figures = {
