@@ -17,7 +17,10 @@ from recon.cli.errors import one_line_errors, until_interrupted
 from recon.cli.tables import print_json
 
 View = Annotated[bool, opt.option("Show the map in the browser while it grows (extra view).")]
-Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Runs that made or make a map.")]
+Runs = Annotated[
+    list[Path],
+    typer.Argument(metavar="RUN...", help="Runs that made or make a map, or found a drive in one."),
+]
 Port = Annotated[int, opt.option("Port of this machine; 0 = any that is free.", min=0, max=65535)]
 Beside = Annotated[int | None, typer.Option(hidden=True)]
 

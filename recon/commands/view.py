@@ -15,7 +15,7 @@ from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
 from recon.map.store.database import check_format, connect
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
-from recon.run.finished import CLOUD, GRID, command_of_map, figure_of
+from recon.run.finished import CLOUD, GRID, STATES, command_of_map, figure_of
 from recon.run.run import SUMMARY
 from recon.view.scene import Scene, cut
 from recon.view.server import Viewer
@@ -33,14 +33,15 @@ def run_view(
     ``port`` is of this machine, for itself alone; ``announce`` gets the address, which is returned.
     `ReconError`: a run has no map or a damaged one, viser is missing, or the port is taken.
     """
-    for run in runs:
+    shown = [(map_of(run), run) for run in runs]
+    for run, _ in shown:
         if not (state_folder(run) / STARTED).is_file():
             path, _ = run / "map/map.recon", command_of_map(run)  # refuses what made no map
             with reading(path), closing(connect(path, read_only=True)) as database:
                 check_format(database, path)
     with closing(Viewer(port)) as viewer:
         announce(f"{viewer.url} until Ctrl-C")
-        coming = [(run, _scenes(run, viewer)) for run in runs]
+        coming = [(run, _scenes(folder, viewer, run)) for folder, run in shown]
         while not stopped():
             for run, scenes in coming:
                 if (new := next(scenes, None)) is not None:
@@ -49,7 +50,15 @@ def run_view(
     return viewer.url
 
 
-def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:
+def map_of(run: Path) -> Path:
+    """Return the folder of the map of a run: of one that located a drive, that which it was in."""
+    if not (run / STATES).is_file():
+        return run
+    with reading(run / SUMMARY):
+        return Path(json.loads(read_text(run / SUMMARY, RECORD_BYTES))["map_run"])
+
+
+def _scenes(run: Path, viewer: Viewer, asked: Path) -> Iterator[Scene | None]:
     path = state_folder(run) / STARTED
     if not (growing := path.is_file()):
         yield read_products(run)
@@ -59,12 +68,13 @@ def _scenes(run: Path, viewer: Viewer) -> Iterator[Scene | None]:
     while not viewer.looked_at and (turns < _TURNS or path.is_file()):
         turns += 1
         yield None
-    from recon.view.follow import finish, grow  # noqa: PLC0415
+    from recon.view.follow import add_located, finish, grow  # noqa: PLC0415
 
     if growing:
         yield from grow(run, path)
     if not growing or (run / RECORD).is_file():  # else it was given up
-        yield from finish(run, read_products(run))
+        scenes = finish(run, read_products(run))
+        yield from scenes if asked == run else (add_located(scene, asked) for scene in scenes)
 
 
 def read_products(run: Path) -> Scene:

@@ -20,6 +20,7 @@ from recon.map.store.trees import loop_in
 from recon.odometry.health import stretches
 from recon.places.loop import Loop
 from recon.run.directory import RunDirectory
+from recon.run.finished import STATES
 
 _AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 _POSE: Final = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -82,7 +83,7 @@ def export_localized(
     based = _of_base(drive.trajectory, drive.T_map_world, camera_height_m)
     write_tum(run.path("trajectory_map_base_tum.txt"), based)
     lines = [",".join(HEADER), *map(_line, drive.frames)]
-    write_text(run.path("states.csv"), "\n".join(lines) + "\n")
+    write_text(run.path(STATES), "\n".join(lines) + "\n")
 
 
 def _of_base(path: Trajectory, T_map_world: Float64, camera_height_m: float | None) -> Trajectory:

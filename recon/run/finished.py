@@ -17,6 +17,7 @@ from recon.io.files import StrPath, read_text, reader, reading, resolved
 from recon.run.directory import RECORD, RECORD_BYTES, refuse_links
 from recon.run.run import SUMMARY
 
+STATES: Final = "states.csv"  # of the frames of a drive that was located
 GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
 CLOUD: Final = "map/cloud.ply"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -13,18 +15,23 @@ from scipy.spatial import cKDTree
 
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import apply, invert, transform_cloud
+from recon.core.text import counted
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import project
 from recon.export.images import open_images
+from recon.io.files import read_text, reading
 from recon.io.models.mesh import read_mesh
 from recon.map.ground.grid import flatten
 from recon.map.ground.surface import estimate_ground_surface
+from recon.map.localize.localizer import State
 from recon.map.map import Map
 from recon.map.sessions.placed import settings_of
 from recon.map.store.map_file import MapViews
 from recon.report.scene import thin_mesh
 from recon.report.style import REASON_LABELS, colour_disparity, colour_reasons
+from recon.run.finished import STATES
+from recon.run.run import SUMMARY
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 from recon.view.scene import Points, Scene
@@ -32,6 +39,7 @@ from recon.view.scene import Points, Scene
 _MOST_FACES: Final = 400_000
 # Not to be trusted, trusted but without a place in the map, in the map.
 _TRUST: Final = np.array([(229, 57, 53), (255, 167, 38), (67, 200, 90)], np.uint8)
+_LOCATED: Final = 9  # number of a located drive among those of a map, for its colour
 _BEHIND_PX: Final = 1.0  # less disparity than was matched there: a place is hidden
 
 
@@ -54,6 +62,24 @@ def _paths(map_: Map) -> tuple[Points, ...]:
         seen = np.stack([np.full(len(xyz), number), path.timestamps_s - path.timestamps_s[0]], 1)
         paths.append(Points(f"{number}", PointCloud(xyz, rgb), seen.astype(np.float32)))
     return tuple(paths)
+
+
+def add_located(scene: Scene, run: Path) -> Scene:
+    """Add the path of a drive that a run located, by its table of states."""
+    table = run / STATES
+    with reading(table):
+        rows = [*csv.DictReader(read_text(table).splitlines())]
+        found = [row for row in rows if row["x_m"]]
+        xyz = np.array([[float(row[name]) for name in ("x_m", "y_m", "z_m")] for row in found])
+        times_s = [float(row["time_s"]) for row in found]
+        T_map_world = np.array(json.loads(read_text(run / SUMMARY))["T_map_world"])
+    trust = [2 if row["state"] == State.TRACKING.value else 1 for row in found]
+    ages_s = np.array(times_s) - min(times_s, default=0.0)
+    seen = np.column_stack([np.full(len(found), _LOCATED), ages_s]).astype(np.float32)
+    xyz = apply(T_map_world, xyz.reshape(-1, 3)).astype(np.float32)
+    path = Points("located", PointCloud(xyz, _TRUST[trust]), seen)
+    lines = [*scene.lines, f"{run}: {len(found)} of {counted(len(rows), 'frame')} located"]
+    return replace(scene, lines=lines, paths=(*scene.paths, path))
 
 
 def _dated(parts: Sequence[Points], paths: Sequence[Points]) -> tuple[Points, ...]:

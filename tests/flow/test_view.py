@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -15,15 +16,16 @@ import pytest
 
 from recon.cli.view import view_beside
 from recon.commands import view
-from recon.commands.config import load_config
+from recon.commands.config import load_config, run_settings
 from recon.commands.demo import demo_source
+from recon.commands.localize import run_localize
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.values import UNKNOWN
 from recon.io.models.ply import read_ply
 from recon.run.directory import STARTED, state_folder
 from recon.run.work import Silent
-from recon.view.follow import finish, grow
+from recon.view.follow import add_located, finish, grow
 from recon.view.scene import colours
 from tests.flow.conftest import SMALL_STREET
 from tests.hostile.refusals import assert_refused, run
@@ -94,6 +96,24 @@ def refuse(_: object) -> None:
     from recon.core.errors import SourceError
 
     raise SourceError("the drive is gone")
+
+
+def test_a_located_drive_is_shown_in_its_map(small_demo, tmp_path):
+    assert view.map_of(small_demo) == small_demo
+    config = run_settings(small_demo)
+    run_localize(
+        demo_source(config), small_demo, config, MapOptions("localize", tmp_path / "there")
+    )
+    assert view.map_of(tmp_path / "there") == small_demo
+    scene = add_located(
+        next(finish(small_demo, view.read_products(small_demo))), tmp_path / "there"
+    )
+    own, found = scene.paths
+    assert re.search(r"there: \d+ of 12 frames located", scene.lines[-1])
+    near = np.linalg.norm(found.cloud.xyz[:, None] - own.cloud.xyz, axis=2).min(axis=1)
+    assert near.max() < 0.2
+    assert {tuple(rgb) for rgb in found.cloud.rgb.tolist()} <= {(255, 167, 38), (67, 200, 90)}
+    assert found.values("age").max() > 0
 
 
 class Watching(Silent):

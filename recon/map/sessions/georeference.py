@@ -59,6 +59,8 @@ class Georeference:
         lines = list(self.lines)
         if self.rms_m <= LARGEST_MISFIT * self.span_m:
             return lines
+        if self.points:
+            return [*lines, f"the control points are {self.rms_m:.2f} m from the map (RMS)"]
         apart = f"the positions are {self.rms_m:.2f} m from the path of the map (RMS)"
         if abs(self.scale - 1.0) > _LARGEST_STRETCH:
             return [*lines, f"{apart}, {self.scale:.2f} times as far apart: not in metres?"]
