@@ -53,9 +53,10 @@ def export(
 ) -> None:
     """Make the cloud, grid, OctoMap or mesh of a run again, with other settings or formats.
 
-    Nothing is matched again (but for nerfstudio and control points): products are
-    made from the cloud and the rays that the run has kept. Settings of occupancy, grid, ground,
-    submaps and mesh can be changed; all others are those of the run.
+    Nothing is matched again (but for nerfstudio and control points): products
+    are made from the cloud and the rays that the run has kept. Settings of
+    occupancy, grid, ground, robot, submaps and mesh can be changed; all others
+    are those of the run.
 
     Examples:
       recon export outputs/map/latest --to grid,mesh --format glb --out robot
