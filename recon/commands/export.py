@@ -108,9 +108,10 @@ def run_export(
         figures = {
             "run": str(source),
             "frames": len(placed.path_m),
+            **({} if there is None else there.figures()),
             **made.figures,
             "T_map_world": T_map_world,
-            "warnings": [*doubts, *made.warnings],
+            "warnings": [*doubts, *(() if there is None else there.warnings()), *made.warnings],
         }
         record = {MAPPED_BY: mapped_by, "T_map_world": T_map_world, DOUBTS: doubts}
         run.finish(figures, source=str(source), inputs=[source / MAP_FILE], record=record)

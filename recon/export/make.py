@@ -105,7 +105,7 @@ def make(order: Order, products: Sequence[str] = USUAL) -> Products:
         else:
             warnings += made[name].warnings
         settings.memory.check(name)
-    return Products(made, tuple(warnings))
+    return Products(made, tuple(dict.fromkeys(warnings)))  # two may say the same
 
 
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:

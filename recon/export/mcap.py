@@ -16,7 +16,6 @@ from recon.export.cloud import even_sample
 from recon.export.images import DriveImages, open_images
 from recon.export.occupancy import export_grid
 from recon.export.product import Made, Order
-from recon.export.survey import placed_in_survey
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
 from recon.io.models.ros_bag import Message, RosBag, header, points, pose, write_bag
@@ -34,7 +33,7 @@ def mcap_product(order: Order) -> Made:
     Images are there if they can be read again. Beside it is a layout for Foxglove. Coordinates of
     a survey are a frame, ``survey``, in which that of the map lies.
     """
-    T_survey_map, figures, warnings = placed_in_survey(order)
+    warnings = []
     grid, height_m, _ = export_grid(order.placed, None)
     images: dict[int, DriveImages] = {}
     try:
@@ -42,9 +41,9 @@ def mcap_product(order: Order) -> Made:
     except ReconError as error:
         if order.images:
             raise
-        warnings = [*warnings, f"no images in the bag: {error}"]
+        warnings.append(f"no images in the bag: {error}")
     drives = [_Drive(order, session, height_m) for session in order.map.linked]
-    fixed = [] if order.survey is None else [("survey", "map", T_survey_map)]
+    fixed = [] if order.survey is None else [("survey", "map", order.T_survey_map)]
     fixed += [edge for drive in drives for edge in drive.mounted()]
     start_ns, frames = min(drive.times_ns[0] for drive in drives), 0
     with write_bag(order.run.path("bag")) as bag:
@@ -58,7 +57,7 @@ def mcap_product(order: Order) -> Made:
                 frames += 1
     layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", drives[0].name)
     write_text(order.run.path("bag/foxglove.json"), layout)
-    return Made({**figures, "bag_frames": frames}, warnings)
+    return Made({"bag_frames": frames}, warnings)
 
 
 def _transforms(time_ns: int, edges: Sequence[tuple[str, str, Float64]]) -> Message:

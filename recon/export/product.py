@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from recon.core.values.arrays import Float64
 from recon.export.mesh.poisson import MeshSettings
 from recon.map.map import Map
 from recon.map.sessions.georeference import Georeference
@@ -26,6 +29,16 @@ class Order:
     # Where the map is in a survey, as products of surveys are written; None = in its own axes
     survey: Georeference | None = None
     images: Sequence[Path] = ()  # where drives are now, if not where the map says
+
+    @property
+    def T_survey_map(self) -> Float64:
+        """How map axes become those of a survey (4, 4); without one they stay."""
+        return np.eye(4) if self.survey is None else self.survey.T_survey_map
+
+    @property
+    def crs(self) -> str | None:
+        """The coordinate system of the survey; None = not known."""
+        return None if self.survey is None else self.survey.system
 
 
 @dataclass(frozen=True, eq=False)

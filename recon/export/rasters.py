@@ -17,7 +17,6 @@ from recon.core.values import UNKNOWN, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
 from recon.export.occupancy import export_grid, grounds
 from recon.export.product import Made, Order
-from recon.export.survey import placed_in_survey
 from recon.io.models.geotiff import RasterFile, RasterPlace, write_geotiff
 from recon.map.ground.surface import GroundSurface
 
@@ -31,13 +30,12 @@ def raster_product(name: str) -> Callable[[Order], Made]:
     fill, colours = RASTERS[name]
 
     def write(order: Order) -> Made:
-        T_file_map, figures, warnings = placed_in_survey(order)
+        T_file_map = order.T_survey_map
         place = _place(order, T_file_map)
-        crs = None if order.survey is None else order.survey.system
         path = order.run.path(f"map/{name}.tif")
-        with write_geotiff(path, place, colours=colours, crs=crs) as file:
+        with write_geotiff(path, place, colours=colours, crs=order.crs) as file:
             fill(order, file, T_file_map)
-        return Made({**figures, f"{name}_size": [place.columns, place.rows]}, warnings)
+        return Made({f"{name}_size": [place.columns, place.rows]})
 
     return write
 

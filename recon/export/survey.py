@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
-import numpy as np
-
-from recon.core.values.arrays import Float64
 from recon.export.product import Made, Order
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
@@ -20,26 +16,15 @@ def survey_product(suffix: str) -> Callable[[Order], Made]:
     write_points = write_copc if suffix.startswith("copc") else write_las
 
     def write(order: Order) -> Made:
-        T_file_map, figures, warnings = placed_in_survey(order)
+        T_file_map = order.T_survey_map
         clouds = (tile.cloud for tile in order.placed.tiles)
         path = order.run.path(f"map/cloud.{suffix}")
-        crs = None if order.survey is None else order.survey.system
         if suffix == "e57":
-            points = write_e57(path, clouds, T_file_map, crs)
+            points = write_e57(path, clouds, T_file_map, order.crs)
         else:
             # A hundredth of a voxel, as a decimal: a millimetre on a road.
             step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
-            points = write_points(path, clouds, T_file_map, crs, step_m=step_m)
-        return Made({**figures, "points": points}, warnings)
+            points = write_points(path, clouds, T_file_map, order.crs, step_m=step_m)
+        return Made({"points": points})
 
     return write
-
-
-def placed_in_survey(order: Order) -> tuple[Float64, dict[str, Any], list[str]]:
-    """Return how map axes become those of a file (4, 4), figures of that, and warnings."""
-    there = order.survey
-    return (
-        (np.eye(4), {}, [])
-        if there is None
-        else (there.T_survey_map, there.figures(), there.warnings())
-    )

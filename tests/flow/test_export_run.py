@@ -106,6 +106,20 @@ def test_the_cloud_comes_as_laz_and_e57_in_survey_coordinates_and_as_arrays(smal
         assert arrays["placed"].all()
 
 
+def test_what_is_odd_in_a_survey_is_said_once_for_all_its_products(small_demo, tmp_path):
+    path = read_tum(small_demo / "trajectory_map_base_tum.txt")
+    there = np.column_stack([path.timestamps_s, path.positions_m])
+    there[len(there) // 2, 1:] += 50.0
+    np.savetxt(tmp_path / "gnss.txt", there, fmt="%.6f")
+    words = ["--to", "laz,npz,pcd,dsm,dtm,slope", "--out", tmp_path / "out"]
+    done = run("export", small_demo, "--georeference", tmp_path / "gnss.txt", *words)
+    assert done.code == 0, done.err
+    found = summary_of(tmp_path / "out")
+    left_out = [line for line in found["warnings"] if "left out" in line]
+    assert len(left_out) == found["positions_left_out"] == 1, found["warnings"]
+    assert done.err.count(left_out[0][:30]) == 1
+
+
 def test_a_mesh_of_a_survey_lies_at_its_place_from_the_offset_beside_it(small_demo, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     path, origin = read_tum(small_demo / "trajectory_map_base_tum.txt"), np.array([4e5, 5e6, 100])

@@ -70,10 +70,8 @@ def mesh_product(order: Order) -> Made:
         warnings.append("the map kept no rays: which faces lie in free space is not known")
     small = made.figures["faces"] <= SAMPLE_FACES
     mesh = read_mesh(run.path(WHOLE)) if small or order.survey is not None else None
-    figures, more = (
-        ({}, []) if mesh is None else write_surveyed(order, mesh, "mesh/survey", order.formats)
-    )
-    return Made({**made.figures, **figures}, [*warnings, *more], mesh if small else None)
+    there = {} if mesh is None else write_surveyed(order, mesh, "mesh/survey", order.formats)
+    return Made({**made.figures, **there}, warnings, mesh if small else None)
 
 
 def in_other_formats(run: RunDirectory, formats: Sequence[str], frame: Frame | None) -> None:

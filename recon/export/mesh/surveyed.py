@@ -14,7 +14,6 @@ import numpy as np
 from recon.core.geometry.se3 import apply, rotate
 from recon.core.values import TriangleMesh
 from recon.export.product import Order
-from recon.export.survey import placed_in_survey
 from recon.io.atomic import write_text
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import write_mesh
@@ -24,16 +23,16 @@ _ROUND_M: Final = 100.0
 
 def write_surveyed(
     order: Order, mesh: TriangleMesh, folder: str, formats: Sequence[str]
-) -> tuple[dict[str, Any], list[str]]:
-    """Write a mesh, map axes, once more into ``folder`` of the run; return figures and warnings.
+) -> dict[str, Any]:
+    """Write a mesh, map axes, once more into ``folder`` of the run; return its figures.
 
     Its axes are east, north and up. ``offset.xyz`` has what is to be added to its coordinates:
     hundreds of metres to the east and north; ``mesh.prj`` the coordinate system, if it is known.
     Without a survey nothing is written.
     """
     if order.survey is None:
-        return {}, []
-    T_survey_map, figures, warnings = placed_in_survey(order)
+        return {}
+    T_survey_map = order.T_survey_map
     offset_m = np.array([*(np.floor(T_survey_map[:2, 3] / _ROUND_M) * _ROUND_M), 0.0])
     T_mesh_map = T_survey_map.copy()
     T_mesh_map[:3, 3] -= offset_m
@@ -47,7 +46,7 @@ def write_surveyed(
         write_mesh(order.run.path(f"{folder}/mesh.{suffix}"), moved, "map")
     text = " ".join(f"{metres:.0f}" for metres in offset_m)
     write_text(order.run.path(f"{folder}/offset.xyz"), f"{text}\n")
-    if order.survey.system is not None:
-        wkt = check_crs(order.survey.system).to_wkt("WKT1_ESRI")
+    if order.crs is not None:
+        wkt = check_crs(order.crs).to_wkt("WKT1_ESRI")
         write_text(order.run.path(f"{folder}/mesh.prj"), f"{wkt}\n")
-    return {**figures, "mesh_offset_m": offset_m.tolist()}, warnings
+    return {"mesh_offset_m": offset_m.tolist()}

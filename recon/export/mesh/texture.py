@@ -51,8 +51,8 @@ def texture_product(order: Order) -> Made:
         write_mesh(run.path(f"{_FOLDER}/mesh.{suffix}"), textured, "map")
     photos = [*_photos(order, drives)]
     write_mlp(run.path(f"{_FOLDER}/mesh.mlp"), {"mesh": run.path(WHOLE)}, "map", photos)
-    there, more = write_surveyed(order, textured, f"{_FOLDER}/survey", named)
-    return Made({**figures, **there}, [*(() if made is None else made.warnings), *more])
+    there = write_surveyed(order, textured, f"{_FOLDER}/survey", named)
+    return Made({**figures, **there}, () if made is None else made.warnings)
 
 
 def textured_mesh(
