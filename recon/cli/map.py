@@ -272,8 +272,6 @@ def live(
       recon live rides/today --rate 2
       recon live rides/today --map outputs/map/latest
     """
-    if view and map_ is not None:
-        raise typer.BadParameter("--view shows a map that grows, and --map makes none")
     with shared.one_line_errors(), ExitStack() as stack:
         from recon.cli.progress import announce
         from recon.commands.localize import run_live
@@ -306,6 +304,7 @@ def localize(
     ],
     out: opt.Out = None,
     start: StartInMap = None,
+    view: View = False,
     *,
     reading: DriveOptions,
     shared: opt.Shared,
@@ -327,7 +326,8 @@ def localize(
 
         pose, _ = read_start(start)
         settings = shared.settings()
-        options = shared.options("localize", out, source=source, kind=reading.kind)
+        how: Any = {"begun": view_beside} if view else {}
+        options = shared.options("localize", out, source=source, kind=reading.kind, **how)
         drive, options = open_drive(options, settings, shared)
         run = run_localize(drive, map_, settings, options, start=pose)
     shared.show(run.summary)

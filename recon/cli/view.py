@@ -16,7 +16,7 @@ from recon.cli import options as opt
 from recon.cli.errors import one_line_errors, until_interrupted
 from recon.cli.tables import print_json
 
-View = Annotated[bool, opt.option("Show the map in the browser while it grows (extra view).")]
+View = Annotated[bool, opt.option("Show map and path in the browser while they grow (extra view).")]
 Runs = Annotated[
     list[Path],
     typer.Argument(metavar="RUN...", help="Runs that made or make a map, or found a drive in one."),

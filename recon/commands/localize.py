@@ -13,7 +13,7 @@ from recon.commands.map import refine_drive, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.values import StereoPair
-from recon.export.trajectories import export_localized
+from recon.export.trajectories import begin_states, export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
 from recon.map.drive.drive import Workspace
@@ -62,12 +62,15 @@ def run_localize(
         rig = refine_drive(source, config, run, map_.known_rig(source.calibration))
         source = rig.applied(source)
         workspace = Workspace(map_, run.watch, run.threads)
-        drive = localize_sequence(source, workspace, config, start=start, progress=options.progress)
+        T_map_world = map_.first.T_map_world.tolist()
+        where = {"map_run": str(map_path), "T_map_world": T_map_world}
+        how: Any = {"start": start, "progress": options.progress, "note": begin_states(where, run)}
+        options.begun(run.folder)
+        drive = localize_sequence(source, workspace, config, **how)
         has_grid = folder is not None and (folder / GRID).is_file()
         grid = read_nav2(map_path / GRID) if has_grid else None
         made = LocalizeRun(source.name, str(map_path), drive, grid)
-        made.summary.update(source=source.name, map_run=str(map_path), **drive.figures())
-        made.summary["T_map_world"] = drive.T_map_world.tolist()
+        made.summary.update(source=source.name, **where, **drive.figures())
         warnings = [*map_.doubts, *rig.warnings(), *drive.warnings(), *source.warnings()]
         made.summary["warnings"], made.summary["rig"] = warnings, rig.figures()
         made.summary.update(source.figures())

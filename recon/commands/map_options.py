@@ -56,7 +56,7 @@ class MapOptions:
         progress: Shown how far the run is.
         audit: Whether a quick audit of the recording comes first, unless the settings forbid it.
         warn: Given the findings of the audit, before the drive is mapped.
-        begun: Given the folder of the run, once its map can be read.
+        begun: Given the folder of the run, once its map or what it has located can be read.
         resume: Resume the unfinished run in ``out``.
         workers: Where pieces of the drive are mapped side by side; None = in one piece, here,
             unless a run that is resumed was begun in pieces.

@@ -15,7 +15,7 @@ from recon.io.models.nav2 import read_nav2
 from recon.io.models.ply import read_ply
 from recon.map.store.database import check_format, connect
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
-from recon.run.finished import CLOUD, GRID, STATES, command_of_map, figure_of
+from recon.run.finished import CLOUD, GRID, command_of_map, figure_of, states_of
 from recon.run.run import SUMMARY
 from recon.view.scene import Scene, cut
 from recon.view.server import Viewer
@@ -52,29 +52,31 @@ def run_view(
 
 def map_of(run: Path) -> Path:
     """Return the folder of the map of a run: of one that located a drive, that which it was in."""
-    if not (run / STATES).is_file():
+    table = states_of(run)
+    if not table.is_file():
         return run
-    with reading(run / SUMMARY):
-        return Path(json.loads(read_text(run / SUMMARY, RECORD_BYTES))["map_run"])
+    with reading(summary := table.with_name(SUMMARY)):
+        named = Path(json.loads(read_text(summary, RECORD_BYTES))["map_run"])
+    return named if named.is_dir() else named.parent.parent  # its file
 
 
 def _scenes(run: Path, viewer: Viewer, asked: Path) -> Iterator[Scene | None]:
-    path = state_folder(run) / STARTED
-    if not (growing := path.is_file()):
+    path, busy = state_folder(run) / STARTED, state_folder(asked).is_dir
+    if not (growing := path.is_file()) and not busy():
         yield read_products(run)
     # What opens maps takes seconds to load, and would slow down the browser that begins; beside a
     # map that grows nothing is done for nobody.
     turns = 0
-    while not viewer.looked_at and (turns < _TURNS or path.is_file()):
+    while not viewer.looked_at and (turns < _TURNS or busy()):
         turns += 1
         yield None
-    from recon.view.follow import add_located, finish, grow  # noqa: PLC0415
+    from recon.view.follow import finish, follow_located, grow  # noqa: PLC0415
 
     if growing:
         yield from grow(run, path)
     if not growing or (run / RECORD).is_file():  # else it was given up
         scenes = finish(run, read_products(run))
-        yield from scenes if asked == run else (add_located(scene, asked) for scene in scenes)
+        yield from scenes if asked == run else follow_located(scenes, asked)
 
 
 def read_products(run: Path) -> Scene:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 
@@ -21,6 +24,7 @@ from recon.odometry.health import stretches
 from recon.places.loop import Loop
 from recon.run.directory import RunDirectory
 from recon.run.finished import STATES
+from recon.run.run import SUMMARY
 
 _AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 _POSE: Final = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -32,6 +36,7 @@ HEADER: Final = (
     *("frame", "time_s", "state", "views", "inliers", "surfaces", "seconds"),
     *(*_POSE, *_SIGMAS, *_COVARIANCE),
 )
+_HEADING: Final = ",".join(HEADER) + "\n"
 
 
 def export_paths(
@@ -82,8 +87,24 @@ def export_localized(
     write_tum(run.path("trajectory_tum.txt"), drive.trajectory)
     based = _of_base(drive.trajectory, drive.T_map_world, camera_height_m)
     write_tum(run.path("trajectory_map_base_tum.txt"), based)
-    lines = [",".join(HEADER), *map(_line, drive.frames)]
-    write_text(run.path(STATES), "\n".join(lines) + "\n")
+    write_text(run.path(STATES), "".join([_HEADING, *map(_line, drive.frames)]))
+
+
+def begin_states(summary: Mapping[str, Any], run: RunDirectory) -> Callable[[LocalizedFrame], None]:
+    """Return what adds a frame to ``states.csv`` in the state of a run, for those who look on.
+
+    Beside it is ``summary.json``, with what the summary will say of the map.
+    """
+    write_text(run.state(SUMMARY), json.dumps(summary))
+    path = run.state(STATES)
+    write_text(path, _HEADING)
+
+    def add(frame: LocalizedFrame) -> None:
+        # It is no result: that the disk is full is said when there is one.
+        with suppress(OSError), path.open("a", encoding="ascii") as table:
+            table.write(_line(frame))
+
+    return add
 
 
 def _of_base(path: Trajectory, T_map_world: Float64, camera_height_m: float | None) -> Trajectory:
@@ -102,4 +123,4 @@ def _line(frame: LocalizedFrame) -> str:
         pose = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
         spread = [*np.sqrt(np.diag(covariance)), *(covariance[i, j] for i, j in _ENTRIES)]
         numbers = [*(f"{value:.9f}" for value in pose), *(f"{value:.6e}" for value in spread)]
-    return ",".join([*words, *numbers])
+    return ",".join([*words, *numbers]) + "\n"

@@ -14,7 +14,7 @@ from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.io.files import StrPath, read_text, reader, reading, resolved
-from recon.run.directory import RECORD, RECORD_BYTES, refuse_links
+from recon.run.directory import RECORD, RECORD_BYTES, refuse_links, state_folder
 from recon.run.run import SUMMARY
 
 STATES: Final = "states.csv"  # of the frames of a drive that was located
@@ -47,6 +47,12 @@ def made_from(folder: Path) -> tuple[Float64, list[str]]:
     if not isinstance(doubts, list) or not all(isinstance(line, str) for line in doubts):
         raise FormatError(f"record of the run has no valid {DOUBTS}", where=path)
     return T_map_world, doubts
+
+
+def states_of(folder: Path) -> Path:
+    """Return the table of a run that located a drive, or as far as it has, if it still does."""
+    growing = state_folder(folder) / STATES
+    return growing if growing.is_file() else folder / STATES
 
 
 def is_pair_run(folder: Path) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,8 @@ from recon.map.sessions.placed import settings_of
 from recon.map.store.map_file import MapViews
 from recon.report.scene import thin_mesh
 from recon.report.style import REASON_LABELS, colour_disparity, colour_reasons
-from recon.run.finished import STATES
+from recon.run.directory import state_folder
+from recon.run.finished import STATES, states_of
 from recon.run.run import SUMMARY
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
@@ -64,15 +65,30 @@ def _paths(map_: Map) -> tuple[Points, ...]:
     return tuple(paths)
 
 
+def follow_located(scenes: Iterable[Scene], run: Path) -> Iterator[Scene | None]:
+    """Add to scenes of a map what a run located in it; if it still does, as long as that lasts."""
+    for scene in scenes:
+        yield add_located(scene, run)
+    before, growing = 0, state_folder(run) / STATES
+    while growing.is_file():
+        new = None
+        with suppress(OSError, ReconError):  # it may be about to be moved
+            if (now := growing.stat().st_size) != before:
+                before, new = now, add_located(scene, run)
+        yield new
+    if before and (run / STATES).is_file():  # else it was given up
+        yield add_located(scene, run)
+
+
 def add_located(scene: Scene, run: Path) -> Scene:
-    """Add the path of a drive that a run located, by its table of states."""
-    table = run / STATES
+    """Add the path of a drive that a run located, by its table of states so far."""
+    table = states_of(run)
     with reading(table):
-        rows = [*csv.DictReader(read_text(table).splitlines())]
+        rows = [*csv.DictReader(read_text(table).rpartition("\n")[0].splitlines())]
         found = [row for row in rows if row["x_m"]]
         xyz = np.array([[float(row[name]) for name in ("x_m", "y_m", "z_m")] for row in found])
         times_s = [float(row["time_s"]) for row in found]
-        T_map_world = np.array(json.loads(read_text(run / SUMMARY))["T_map_world"])
+        T_map_world = np.array(json.loads(read_text(table.with_name(SUMMARY)))["T_map_world"])
     trust = [2 if row["state"] == State.TRACKING.value else 1 for row in found]
     ages_s = np.array(times_s) - min(times_s, default=0.0)
     seen = np.column_stack([np.full(len(found), _LOCATED), ages_s]).astype(np.float32)

@@ -25,7 +25,7 @@ from recon.core.values import UNKNOWN
 from recon.io.models.ply import read_ply
 from recon.run.directory import STARTED, state_folder
 from recon.run.work import Silent
-from recon.view.follow import add_located, finish, grow
+from recon.view.follow import add_located, finish, follow_located, grow
 from recon.view.scene import colours
 from tests.flow.conftest import SMALL_STREET
 from tests.hostile.refusals import assert_refused, run
@@ -127,6 +127,31 @@ class Watching(Silent):
 
     def on_step(self, _: object) -> None:
         self.seen.append(next(self.coming))
+
+
+def test_a_path_is_seen_to_grow_while_its_drive_is_located(small_demo, tmp_path):
+    class Following(Silent):
+        coming, seen = None, []
+
+        def on_step(self, _: object) -> None:
+            self.seen.append(next(self.coming))
+
+    following, out, config = Following(), tmp_path / "there", run_settings(small_demo)
+
+    def begin(folder: Path) -> None:
+        assert view.map_of(folder) == small_demo
+        of_map = next(finish(small_demo, view.read_products(small_demo)))
+        following.coming = follow_located([of_map], folder)
+        assert len(next(following.coming).paths[1].cloud) == 0
+
+    options = MapOptions("localize", out, progress=following, begun=begin)
+    run_localize(demo_source(config), small_demo, config, options)
+    counts = [len(scene.paths[1].cloud) for scene in following.seen if scene is not None]
+    assert counts == sorted(counts)
+    assert len(set(counts)) > 3
+    (last,) = following.coming  # it ends, as the run is at its place
+    assert len(last.paths[1].cloud) >= counts[-1]
+    assert not state_folder(out).exists()
 
 
 def map_street(out: Path, **how: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -169,10 +170,12 @@ def localize_sequence(
     *,
     start: StartPose | None = None,
     progress: Progress = SILENT,
+    note: Callable[[LocalizedFrame], object] = lambda frame: None,
 ) -> LocalizedDrive:
     """Find all frames of a source in a map, which is not changed.
 
-    The rig may be another than that of the map; ``start`` is as for `open_localizer`.
+    The rig may be another than that of the map; ``start`` is as for `open_localizer`. ``note`` gets
+    each frame once it is found or not.
     """
     check_source(source)
     map_, watch = workspace.map, workspace.stopwatch
@@ -201,6 +204,7 @@ def localize_sequence(
                     located = localizer.add(frame, hurried=source.hurried)
                     seconds = time.perf_counter() - start_s
                 frames.append(LocalizedFrame(index, frame.pair.timestamp_s, seconds, located))
+                note(frames[-1])
                 source.note_located(index)
                 progress.on_step(frames[-1])
                 config.memory.check(f"frame {index}")
