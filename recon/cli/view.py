@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -21,13 +18,14 @@ Runs = Annotated[
     list[Path],
     typer.Argument(metavar="RUN...", help="Runs that made or make a map, or found a drive in one."),
 ]
+PORT: Final = 8080
 Port = Annotated[int, opt.option("Port of this machine; 0 = any that is free.", min=0, max=65535)]
 Beside = Annotated[int | None, typer.Option(hidden=True)]
 
 
 def view(
     runs: Runs,
-    port: Port = 8080,
+    port: Port = PORT,
     beside: Beside = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -51,8 +49,7 @@ def view(
 
 
 def view_beside(run: Path) -> None:
-    """Show the map of a run in a process that ends with this one, and may fail without harm."""
-    words = [sys.executable, "-m", "recon", "view", str(run), "--beside", str(os.getpid())]
-    with suppress(OSError):
-        viewer = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-        os.setpriority(os.PRIO_PROCESS, viewer.pid, 19)  # it gets the time that is left
+    """Show a run to a browser that asks, while it lasts."""
+    from recon.view.door import show_beside
+
+    show_beside(run, PORT, partial(typer.echo, err=True))

@@ -15,6 +15,7 @@ from recon.core.values.arrays import Float32, Float64, UInt8
 if TYPE_CHECKING:
     from recon.view.follow import KeyframeViews
 
+HOST: Final = "127.0.0.1"  # whoever looks is on this machine
 MOST_POINTS: Final = 1_500_000  # in the browser: about 25 MB
 _TILE_VOXELS: Final = 256  # edge of what is thinned together
 _SCALES: Final = {

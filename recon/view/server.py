@@ -18,9 +18,8 @@ import numpy as np
 from recon.core.errors import OutputError, require
 from recon.core.values import UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64
-from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
+from recon.view.scene import HOST, MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
 
-HOST: Final = "127.0.0.1"
 _OURS: Final = re.compile(r"http://(127\.0\.0\.1|localhost):\d+")
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")

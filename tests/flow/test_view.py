@@ -10,11 +10,12 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 
-from recon.cli.view import view_beside
 from recon.commands import view
 from recon.commands.config import load_config, run_settings
 from recon.commands.demo import demo_source
@@ -25,6 +26,7 @@ from recon.core.values import UNKNOWN
 from recon.io.models.ply import read_ply
 from recon.run.directory import STARTED, state_folder
 from recon.run.work import Silent
+from recon.view.door import show_beside
 from recon.view.follow import add_located, finish, follow_located, grow
 from recon.view.scene import colours
 from tests.flow.conftest import SMALL_STREET
@@ -200,12 +202,49 @@ def test_a_taken_port_and_a_missing_package_are_refused_in_one_line(small_demo, 
     assert_refused(run("view", small_demo), "recon[view]")
 
 
-def test_nothing_that_happens_to_the_viewer_reaches_the_run(monkeypatch, tmp_path):
-    def fail(*_: object, **__: object) -> None:
-        raise OSError("no more processes")
+def test_a_viewer_begins_when_a_browser_asks_and_ends_with_its_run(small_demo, monkeypatch):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    begun, said = [], []
 
-    monkeypatch.setattr(subprocess, "Popen", fail)
-    view_beside(tmp_path)
+    class Begun(subprocess.Popen[str]):
+        def __init__(self, *words: Any, **how: Any) -> None:
+            super().__init__(*words, **how)
+            begun.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Begun)
+    url = show_beside(small_demo, 0, said.append)
+    assert said == [f"{url} until the run ends"]
+    with socket.create_connection(url.removeprefix("http://").split(":")):
+        assert not begun  # a browser that only makes sure that somebody is there
+    pages = [asked(url), asked(url)]
+    assert len(begun) == 1
+    assert {page.status for page in pages} == {200}
+    assert pages[0].url == pages[1].url != url
+    assert b"<html" in pages[0].read()
+    begun[0].kill()
+    begun[0].wait()
+    assert asked(url).status == 200  # the next one
+    begun[1].kill()
+    assert len(said) == 1
+
+
+def asked(url: str) -> Any:
+    return urlopen(url, timeout=60)  # noqa: S310 - its own
+
+
+def test_nothing_that_happens_to_the_viewer_reaches_the_run(monkeypatch, tmp_path):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    said: list[str] = []
+    with pytest.raises(HTTPError, match="503"):
+        asked(show_beside(tmp_path, 0, said.append))
+    assert "does not contain a finished run" in said[1]
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert show_beside(tmp_path, taken.getsockname()[1], said.append) == ""
+    monkeypatch.setattr("recon.view.door.find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert show_beside(tmp_path, 0, said.append) == ""
+    assert "in use" in said[2]
+    assert "recon[view]" in said[3]
 
 
 def test_a_viewer_beside_a_run_ends_with_it(small_demo):
