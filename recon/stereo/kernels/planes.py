@@ -38,6 +38,31 @@ class Changes(NamedTuple):
     minimum: int  # disparity of candidate 0, pixels
 
 
+@kernel(inline="always")
+def least_squares(
+    n: float,
+    sx: float,
+    sy: float,
+    r: float,
+    rx: float,
+    ry: float,
+    sxx: float,
+    sxy: float,
+    syy: float,
+) -> tuple[float, float, float]:
+    """Return the plane nearest to points: its value at the origin and its slopes.
+
+    Given are sums over the points: of their weights, of columns and rows, of values, of values by
+    columns and rows, and of the products of columns and rows, all by weight.
+    """
+    mx, my = sx / n, sy / n
+    a, b, d = sxx - mx * sx, sxy - mx * sy, syy - my * sy
+    det = max(a * d - b * b, 1e-12)
+    p, q = rx - mx * r, ry - my * r
+    across, down = (p * d - q * b) / det, (q * a - p * b) / det
+    return r / n - across * mx - down * my, across, down
+
+
 @kernel
 def fit_nodes(
     values: Float32,
@@ -91,13 +116,8 @@ def fit_nodes(
                         r, rx, ry = r + w * rest, rx + w * rest * dx, ry + w * rest * dy
                 if n < _LEAST_WEIGHT:
                     break
-                mx, my = sx / n, sy / n
-                a, b, d = sxx - mx * sx, sxy - mx * sy, syy - my * sy
-                det = max(a * d - b * b, 1e-12)
-                p, q = rx - mx * r, ry - my * r
-                more_across, more_down = (p * d - q * b) / det, (q * a - p * b) / det
-                value += r / n - more_across * mx - more_down * my
-                across, down, limit = across + more_across, down + more_down, within_px
+                more, a, b = least_squares(n, sx, sy, r, rx, ry, sxx, sxy, syy)
+                value, across, down, limit = value + more, across + a, down + b, within_px
             steep = max(abs(across), abs(down))
             if steep < STEEPEST and abs(value - values[y, x]) < limit:
                 nodes[0, i, j], nodes[1, i, j], nodes[2, i, j] = value, across, down

@@ -14,15 +14,17 @@ from recon.core.values.arrays import Float32, Int32, UInt8
 from recon.stereo.kernels import planes as kernels
 from recon.stereo.match import search as common
 from recon.stereo.match.holes import fill_holes
+from recon.stereo.match.segments import SEGMENTATIONS, fit_segments
 
-# Distances that planes come from in each round, near ones in eight directions, far ones in four.
+# Distances that planes come from in each round, near ones in six directions, far ones in three.
 _ROUNDS: Final = ((4, 24), (12, 70))
 _NEAR_FIT_PX, FAR_FIT_PX, _LAST_FIT_PX = 12, 30, 5  # half the square that a plane is fitted to
 _SAMPLES: Final = 5  # pixels of a fit, from its middle to its side, at least
 _COLOUR: Final = 30.0  # difference, over three channels, at which a weight falls to 1/e
 SAME_SURFACE_PX: Final = 1.0  # disparities that are farther apart are of two surfaces
-NOW, FIRST, FITTED = range(3)
-"""Whose planes a pixel may take: those chosen last, those seen at first, those fitted to either."""
+NOW, FIRST, FITTED, SEGMENTS = range(4)
+"""Whose planes a pixel may take: those chosen last, seen at first, or fitted to either; from there
+on those of the segments that it is in."""
 
 
 def search_planes(
@@ -38,13 +40,16 @@ def search_planes(
     """
     size = pair.left.shape
     filled = fill_holes(seen.values)
-    sources = np.zeros((3, 3, *size), np.float32)
+    sources = np.zeros((SEGMENTS + SEGMENTATIONS, 3, *size), np.float32)
     sources[:, 0] = np.where(np.isfinite(filled), filled, np.float32(changes.minimum))
     everywhere = np.ones(size, np.float32)
     with ThreadPoolExecutor(threads) as pool:
         fits = _Fits(pair, pool, threads)
         fits.fit(seen.values, seen.confidence, _NEAR_FIT_PX, sources[FIRST], own=True)
         fits.fit(seen.values, seen.confidence, FAR_FIT_PX, sources[FITTED])
+        sources[SEGMENTS:] = sources[FITTED]
+        reliable = seen.values, seen.confidence
+        fit_segments(fits.guide, reliable, SAME_SURFACE_PX, sources[SEGMENTS:], pool, threads)
         sources[NOW] = sources[FIRST]
         for number, (near, far) in enumerate(_ROUNDS):
             table = _table(near, far, number)
@@ -82,7 +87,7 @@ class _Fits:
         guide = pair.left_rgb
         if guide is None:
             guide = np.repeat(pair.left[..., None], 3, axis=2)
-        self._guide = np.asarray(cv2.blur(guide, (3, 3)), dtype=np.uint8)
+        self.guide = np.asarray(cv2.blur(guide, (3, 3)), dtype=np.uint8)
         self._alike = np.exp(np.arange(766) / -_COLOUR).astype(np.float32)
         self._pool, self._threads = pool, threads
 
@@ -95,7 +100,7 @@ class _Fits:
 
         def fit_rows(rows: range) -> None:
             kernels.fit_nodes(
-                *(values, weights, self._guide, self._alike, radius, stride),
+                *(values, weights, self.guide, self._alike, radius, stride),
                 *(SAME_SURFACE_PX, rows.start, rows.stop, nodes),
             )
 
@@ -109,9 +114,10 @@ class _Fits:
 def _table(near: int, far: int, number: int) -> Int32:
     """Return which planes a pixel may take in a round, int32 (K, 3): source, columns and rows."""
     around = []
-    for count, reach, turn in ((8, near, 0.3 * number), (4, far, 0.2 + 0.4 * number)):
+    for count, reach, turn in ((6, near, 0.3 * number), (3, far, 0.2 + 0.4 * number)):
         angles = turn + 2 * np.pi * np.arange(count) / count
         ends = np.rint(reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)).astype(int)
         around += [(NOW, *end) for end in ends]
     here = [(source, 0, 0) for source in (NOW, FIRST, FITTED)]
-    return np.array([*here, *around, (FITTED, far, 0)], np.int32)
+    planes = [(SEGMENTS + number, 0, 0) for number in range(SEGMENTATIONS)]
+    return np.array([*here, *around, *planes], np.int32)

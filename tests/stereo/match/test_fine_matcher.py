@@ -11,7 +11,7 @@ from recon.commands.evaluate_middlebury import run_middlebury
 from recon.core.errors import MatchingError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.match import fine, sgm
+from recon.stereo.match import fine, segments, sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network
 from recon.stereo.match.fine import FineMatcher, FineSettings
 
@@ -72,6 +72,22 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     seen = found.reason == Reason.VALID
     assert np.median(found.sigma_px[filled]) > 2 * np.median(found.sigma_px[seen])
     assert np.median(found.confidence[filled]) < np.median(found.confidence[seen])
+
+
+def test_a_wide_plain_wall_is_the_plane_of_its_rim():
+    height, width = 200, 420
+    y, x = np.mgrid[:height, :width]
+    truth = 12 + x / 40 + y / 50
+    texture = np.random.default_rng(5).normal(size=(height, width + 64))
+    texture = 120 + 60 * cv2.GaussianBlur(texture, (0, 0), 1.2)
+    texture[20:180, 60:400] = 120
+    pair = rendered(truth, texture.astype(np.float32), noise=0.5)
+    middle = np.s_[40:160, 110:350]
+    right = np.abs(match(pair).values - truth)[middle] < 1
+    with patch.object(segments, "_LEAST_PX", height * width):
+        without = np.abs(match(pair).values - truth)[middle] < 1
+    assert right.mean() > 0.95
+    assert right.mean() > without.mean() + 0.1
 
 
 def square_before_wall() -> tuple[RectifiedPair, np.ndarray]:

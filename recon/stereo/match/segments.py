@@ -1,0 +1,69 @@
+"""Planes of segments: of parts of an image that no edge divides, at several sizes of an edge.
+
+What windows cannot tell in the middle of a plain wall, its rim and its few marks can.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from functools import partial
+from typing import Final
+
+import cv2
+import numpy as np
+
+from recon.core.kernels.compiled import UInt16
+from recon.core.values.arrays import Float32, Float64, Int64, UInt8
+from recon.stereo.kernels import segments as kernels
+from recon.stereo.match import search as common
+
+_EDGES: Final = (3, 6, 12, 24)
+"""Differences of neighbouring colours, over three channels, above which there is an edge: from the
+noise of a good image to what divides any two surfaces. Which is right differs within one image, so
+the planes of all are offered."""
+SEGMENTATIONS: Final = len(_EDGES)
+_LEAST_PX: Final = 100  # smaller segments have the planes of windows
+_Given = tuple[Float32, Float32, Int64, Int64, Int64, Float64, float]
+_TRIES: Final = 150  # planes through three pixels: one of them is right where a third lies on it
+
+
+def fit_segments(
+    guide: UInt8,
+    seen: tuple[Float32, Float32],
+    within_px: float,
+    to: Float32,
+    pool: Executor,
+    threads: int,
+) -> None:
+    """Write the planes of the pixels in segments that have one, (SEGMENTATIONS, 3, H, W).
+
+    ``guide``, uint8 (H, W, 3), are smoothed colours; ``seen`` are disparities and their weights,
+    float32 (H, W), NaN = unknown. Those farther than ``within_px`` from a plane do not count.
+    """
+    steps, draws = _steps(guide), np.random.default_rng(0).random((_TRIES, 3))
+    for edge, planes in zip(_EDGES, to, strict=True):
+        alike = (steps <= edge).view(np.uint8)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(alike, connectivity=4)
+        sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
+        starts, order = np.concatenate([[0], np.cumsum(sizes)]), np.empty(steps.size, np.int64)
+        kernels.sort_by_label(labels.ravel(), starts, order)
+        wanted = np.flatnonzero(sizes >= _LEAST_PX)
+        wanted = wanted[wanted > 0]  # 0 are edges
+        if len(wanted):
+            given = (*seen, order, starts, wanted, draws, within_px)
+            common.in_strips(pool, threads, partial(_fit, given, planes), len(wanted))
+
+
+def _fit(given: _Given, to: Float32, segments: range) -> None:
+    kernels.fit_segments(*given, segments.start, segments.stop, to)
+
+
+def _steps(guide: UInt8) -> UInt16:
+    """Return by how much each pixel differs from those above and to the left, over the channels."""
+    steps = np.zeros(guide.shape[:2], np.uint16)
+    for axis in (0, 1):
+        later, earlier = (guide[1:], guide[:-1]) if axis == 0 else (guide[:, 1:], guide[:, :-1])
+        apart = cv2.absdiff(later, earlier).sum(axis=2, dtype=np.uint16)
+        here = steps[1:] if axis == 0 else steps[:, 1:]
+        np.maximum(here, apart, out=here)
+    return steps
