@@ -22,6 +22,7 @@ from recon.view.server import Viewer
 
 _TURN_S: Final = 0.2  # between two looks at whether there is anything new
 _TURNS: Final = 25  # that are waited for a browser
+_FORMATS: Final = {int: ",", float: ".4g"}
 _FIGURES: Final = re.compile("frames|path_length|points$|.*drift")
 
 
@@ -85,8 +86,8 @@ def read_products(run: Path) -> Scene:
     with reading(run / SUMMARY):
         summary = json.loads(read_text(run / SUMMARY, RECORD_BYTES))
         ground_m = float(summary["T_map_world"][2][3]) - (height_m or 0.0)
-        known = {n: v for n, v in summary.items() if _FIGURES.match(n) and type(v) in (int, float)}
-        lines = [f"{name} {with_unit(f'{known[name]:.6g}', name)}" for name in known]
+        known = {n: v for n, v in summary.items() if _FIGURES.match(n) and type(v) in _FORMATS}
+        lines = [f"{n} {with_unit(format(v, _FORMATS[type(v)]), n)}" for n, v in known.items()]
     cloud, grid, spacing_m = run / CLOUD, run / GRID, voxel_m or 0.1  # merged: unsaid
     points = cut(read_ply(cloud), spacing_m) if cloud.is_file() else ()
     grids = ((read_nav2(grid), ground_m),) if grid.is_file() else ()

@@ -50,6 +50,7 @@ def test_a_finished_run_shows_all_points_of_its_cloud_its_grid_path_and_drift(sm
     assert -3 < height_m < -1
     assert (grid.cells != UNKNOWN).any()
     assert any(line.startswith("expected_drift_percent") for line in scene.lines)
+    assert f"points {len(whole):,}" in scene.lines
 
 
 def test_points_know_the_drive_and_time_that_passed_nearest(scenes):
