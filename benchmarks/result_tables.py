@@ -78,6 +78,14 @@ REFINED: Final = {
     "refined (default)": (),
 }
 
+MOVED_KEPT: Final = "--set fusion.remove_moving=false"
+KNOWN: Final[dict[str, tuple[str, ...]]] = {
+    "": (),
+    ", what moved kept": (MOVED_KEPT,),
+    ", `fine`": ("--matcher fine",),
+    ", `fine`, what moved kept": ("--matcher fine", MOVED_KEPT),
+}
+
 TABLES: Final[dict[str, Table]] = {
     "kitti-drift": Table(
         {f"{name} visual": map_drive(drive, name[-2:]) for name, drive in DRIVES.items()}
@@ -91,8 +99,11 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "kitti-lidar": Table(
         {
-            "known poses": f"{map_drive(D13, 'known', f'--poses {D13}/poses.txt')} && "
-            + against_lidar("known"),
+            f"known poses{how}": map_drive(D13, f"known{n}", f"--poses {D13}/poses.txt", *options)
+            + f" && {against_lidar(f'known{n}')}"
+            for n, (how, options) in enumerate(KNOWN.items())
+        }
+        | {
             "own path, `--align-to`": f"{map_drive(D13, 'own')} && "
             + against_lidar("own", f"--align-to {D13}/poses.txt"),
             "own path, `--align icp`": against_lidar(
