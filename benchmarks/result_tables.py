@@ -78,6 +78,7 @@ REFINED: Final = {
     "refined (default)": (),
 }
 
+FILLED: Final = "--set matching.fill=true"
 MOVED_KEPT: Final = "--set fusion.remove_moving=false"
 KNOWN: Final[dict[str, tuple[str, ...]]] = {
     "": (),
@@ -204,9 +205,13 @@ TABLES: Final[dict[str, Table]] = {
     "middlebury": Table(
         {
             "": f"{MIDDLEBURY} --matcher sad,sgm,fine,opencv-bm,opencv-sgbm --out $OUT/plain",
+            ", filled": f"{MIDDLEBURY} --matcher sad,sgm {FILLED} --out $OUT/filled",
             ", padded": f"{MIDDLEBURY} --matcher opencv-bm,opencv-sgbm "
             "--set matching.opencv.pad=true --out $OUT/padded",
+            ", padded, filled": f"{MIDDLEBURY} --matcher opencv-bm,opencv-sgbm "
+            f"--set matching.opencv.pad=true {FILLED} --out $OUT/padded-filled",
             ", half size": f"{HALF_SIZE} --matcher sgm,fine --out $OUT/half",
+            ", half size, filled": f"{HALF_SIZE} --matcher sgm {FILLED} --out $OUT/half-filled",
             ", half size, padded": f"{HALF_SIZE} --matcher opencv-sgbm "
             "--set matching.opencv.pad=true --out $OUT/half-padded",
         },

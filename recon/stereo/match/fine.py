@@ -3,7 +3,8 @@
 A network of some 100,000 weights describes each pixel by what is around it, in the image and at
 half and a quarter of its size. How unlike two descriptions are is added to the costs of `sgm`, and
 paths are followed as there. What they find is where a search among planes starts
-(`kernels/planes.py`): where windows see nothing, planes go on from where they do.
+(`kernels/planes.py`): where windows see nothing, planes go on from where they do, or
+are those of whole segments.
 """
 
 from __future__ import annotations
@@ -30,13 +31,14 @@ from recon.stereo.kernels.path_costs import (
     write_views,
 )
 from recon.stereo.kernels.plane_minima import PARTS
-from recon.stereo.kernels.refine import SIGMA_LARGEST_PX
 from recon.stereo.kernels.semi_global import divided
 from recon.stereo.kernels.similarity import Blend, add_unlikeness
 from recon.stereo.match import search as common
 from recon.stereo.match import sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network, rows_at_once
-from recon.stereo.match.plane_search import FAR_FIT_PX, SAME_SURFACE_PX, search_planes
+from recon.stereo.match.fill import spread
+from recon.stereo.match.plane_search import search_planes
+from recon.stereo.match.segments import SAME_SURFACE_PX
 
 # Costs of one pixel, in units of those of `sgm`.
 _LEARNED: Final = 14.0  # of features that are orthogonal; added to the costs of `sgm`
@@ -200,26 +202,10 @@ def _judged(pair: RectifiedPair, seen: Disparity, values: Float32) -> Disparity:
     least, more = _AGREED_CONFIDENCE
     sure = np.float32(least) + np.float32(more) * seen.confidence**2
     none, nan = hidden | border, np.float32(np.nan)
-    spread = _spread(np.where(agree & ~none, values, nan))
+    spread_px = spread(np.where(agree & ~none, values, nan))
     return Disparity(
         values=np.where(none, nan, values),
         confidence=np.where(none, np.float32(0), np.where(agree, sure, _FILLED_CONFIDENCE)),
-        sigma_px=np.where(none, nan, np.where(agree, seen.sigma_px, spread)),
+        sigma_px=np.where(none, nan, np.where(agree, seen.sigma_px, spread_px)),
         reason=reason,
     )
-
-
-def _spread(values: Float32) -> Float32:
-    """Return the standard deviation of a disparity that is anywhere among those around it.
-
-    float32 (H, W); of a uniform distribution from the least to the largest value around a pixel,
-    and at least that of a flat minimum. Where none is around, of the whole map.
-    """
-    known = np.isfinite(values)
-    side = np.ones((2 * FAR_FIT_PX + 1,) * 2, np.uint8)
-    high = cv2.dilate(np.where(known, values, np.float32(-np.inf)), side)
-    low = cv2.erode(np.where(known, values, np.float32(np.inf)), side)
-    wide = np.full_like(high, np.ptp(values[known]) if known.any() else 0)
-    np.subtract(high, low, out=wide, where=high >= low)
-    sigma = np.maximum(wide / np.sqrt(12), SIGMA_LARGEST_PX)
-    return np.asarray(sigma, dtype=np.float32)

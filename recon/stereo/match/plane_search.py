@@ -6,7 +6,6 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 from typing import Final
 
-import cv2
 import numpy as np
 
 from recon.core.values import Disparity, RectifiedPair
@@ -14,14 +13,13 @@ from recon.core.values.arrays import Float32, Int32, UInt8
 from recon.stereo.kernels import planes as kernels
 from recon.stereo.match import search as common
 from recon.stereo.match.holes import fill_holes
-from recon.stereo.match.segments import SEGMENTATIONS, fit_segments
+from recon.stereo.match.segments import SAME_SURFACE_PX, SEGMENTATIONS, fit_segments, smooth_colours
 
 # Distances that planes come from in each round, near ones in six directions, far ones in three.
 _ROUNDS: Final = ((4, 24), (12, 70))
-_NEAR_FIT_PX, FAR_FIT_PX, _LAST_FIT_PX = 12, 30, 5  # half the square that a plane is fitted to
+_NEAR_FIT_PX, _FAR_FIT_PX, _LAST_FIT_PX = 12, 30, 5  # half the square that a plane is fitted to
 _SAMPLES: Final = 5  # pixels of a fit, from its middle to its side, at least
 _COLOUR: Final = 30.0  # difference, over three channels, at which a weight falls to 1/e
-SAME_SURFACE_PX: Final = 1.0  # disparities that are farther apart are of two surfaces
 NOW, FIRST, FITTED, SEGMENTS = range(4)
 """Whose planes a pixel may take: those chosen last, seen at first, or fitted to either; from there
 on those of the segments that it is in."""
@@ -46,7 +44,7 @@ def search_planes(
     with ThreadPoolExecutor(threads) as pool:
         fits = _Fits(pair, pool, threads)
         fits.fit(seen.values, seen.confidence, _NEAR_FIT_PX, sources[FIRST], own=True)
-        fits.fit(seen.values, seen.confidence, FAR_FIT_PX, sources[FITTED])
+        fits.fit(seen.values, seen.confidence, _FAR_FIT_PX, sources[FITTED])
         sources[SEGMENTS:] = sources[FITTED]
         reliable = seen.values, seen.confidence
         fit_segments(fits.guide, reliable, SAME_SURFACE_PX, sources[SEGMENTS:], pool, threads)
@@ -84,10 +82,7 @@ class _Fits:
     """Fits planes to disparities, of pixels of like colour."""
 
     def __init__(self, pair: RectifiedPair, pool: Executor, threads: int) -> None:
-        guide = pair.left_rgb
-        if guide is None:
-            guide = np.repeat(pair.left[..., None], 3, axis=2)
-        self.guide = np.asarray(cv2.blur(guide, (3, 3)), dtype=np.uint8)
+        self.guide = smooth_colours(pair)
         self._alike = np.exp(np.arange(766) / -_COLOUR).astype(np.float32)
         self._pool, self._threads = pool, threads
 

@@ -11,6 +11,7 @@ from recon.core.plugins import name_of
 from recon.core.settings import Settings
 from recon.core.values import RectifiedPair
 from recon.stereo.match import protocol
+from recon.stereo.match.fill import FillingMatcher
 from recon.stereo.match.fine import FineMatcher, FineSettings
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
@@ -35,6 +36,9 @@ class MatchingSettings(Settings):
     matcher: str | InstanceOf[Matcher] = "sad"
     """Name of the matcher: sad, sgm, fine, opencv-bm, opencv-sgbm, onnx, or one that an installed
     package registers; in Python also a matcher of your own."""
+    fill: bool = False
+    """Fill what is not found, or not surely, with planes of the segments of the image around it,
+    marked as filled: denser maps of rooms and plain walls, in 0.1 s more per megapixel."""
     sad: SadSettings = SadSettings()
     sgm: SgmSettings = SgmSettings()
     fine: FineSettings = FineSettings()
@@ -55,6 +59,11 @@ def make_matcher(
     checked. ``settings`` are those of all matchers; threads (None = all cores) are for ours.
     """
     settings = settings or MatchingSettings()
+    made = _made(matcher, settings, threads)
+    return FillingMatcher(made, threads) if settings.fill else made
+
+
+def _made(matcher: str | Matcher, settings: MatchingSettings, threads: int | None) -> Matcher:
     if not isinstance(matcher, str) or matcher not in MATCHERS:
         check_matcher(matcher)
         given = protocol.PLUGINS.load(matcher)

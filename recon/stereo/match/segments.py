@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from recon.core.kernels.compiled import UInt16
+from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float32, Float64, Int64, UInt8
 from recon.stereo.kernels import segments as kernels
 from recon.stereo.match import search as common
@@ -22,6 +23,7 @@ _EDGES: Final = (3, 6, 12, 24)
 noise of a good image to what divides any two surfaces. Which is right differs within one image, so
 the planes of all are offered."""
 SEGMENTATIONS: Final = len(_EDGES)
+SAME_SURFACE_PX: Final = 1.0  # disparities that are farther apart are of two surfaces
 _LEAST_PX: Final = 100  # smaller segments have the planes of windows
 _Given = tuple[Float32, Float32, Int64, Int64, Int64, Float64, float]
 _TRIES: Final = 150  # planes through three pixels: one of them is right where a third lies on it
@@ -56,6 +58,14 @@ def fit_segments(
 
 def _fit(given: _Given, to: Float32, segments: range) -> None:
     kernels.fit_segments(*given, segments.start, segments.stop, to)
+
+
+def smooth_colours(pair: RectifiedPair) -> UInt8:
+    """Return the colours of the left view, uint8 (H, W, 3), without the noise of single pixels."""
+    colours = pair.left_rgb
+    if colours is None:
+        colours = np.repeat(pair.left[..., None], 3, axis=2)
+    return np.asarray(cv2.blur(colours, (3, 3)), dtype=np.uint8)
 
 
 def _steps(guide: UInt8) -> UInt16:
