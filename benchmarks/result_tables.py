@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,19 +25,13 @@ D13, D06 = DRIVES.values()
 
 @dataclass(frozen=True)
 class Table:
-    """One table.
+    """One table."""
 
-    Attributes:
-        commands: Shell lines, by name.
-        columns: Format of the cells, by heading.
-        rows: Makes the cells of the printed JSON of all commands, by label and heading.
-        timed: Whether it depends on what else the machine does.
-    """
-
-    commands: dict[str, str]
-    columns: dict[str, str]
+    commands: dict[str, str]  # shell lines, by name
+    columns: dict[str, str]  # format of the cells, by heading
+    # What makes the cells of the printed JSON of all commands, by label and heading.
     rows: Callable[[dict[str, Any]], Rows]
-    timed: bool = False
+    timed: bool = False  # whether it depends on what else the machine does
 
     def lacking(self) -> str:
         """What is needed and not there; empty if nothing is."""
@@ -59,6 +54,10 @@ def against_lidar(name: str, *options: str) -> str:
     return " ".join([*words, *options])
 
 
+def scored(scenes: str, name: str, matchers: str, *options: str) -> str:
+    return " ".join([scenes, "--matcher", matchers, *options, f"--out $OUT/{name}"])
+
+
 PERCENT: Final = "{:.2f} %"
 SHARE: Final = "{:.3f}"
 CM: Final = "{:.1f} cm"
@@ -78,14 +77,9 @@ REFINED: Final = {
     "refined (default)": (),
 }
 
-FILLED: Final = "--set matching.fill=true"
-MOVED_KEPT: Final = "--set fusion.remove_moving=false"
-KNOWN: Final[dict[str, tuple[str, ...]]] = {
-    "": (),
-    ", what moved kept": (MOVED_KEPT,),
-    ", `fine`": ("--matcher fine",),
-    ", `fine`, what moved kept": ("--matcher fine", MOVED_KEPT),
-}
+OPENCV, FILLED = "opencv-bm,opencv-sgbm", "--set matching.fill=true"
+PADDED, MOVED_KEPT = "--set matching.opencv.pad=true", "--set fusion.remove_moving=false"
+KNOWN: Final = {"": "", ", `fine`": "--matcher fine", ", what moved kept": MOVED_KEPT}
 
 TABLES: Final[dict[str, Table]] = {
     "kitti-drift": Table(
@@ -100,9 +94,11 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "kitti-lidar": Table(
         {
-            f"known poses{how}": map_drive(D13, f"known{n}", f"--poses {D13}/poses.txt", *options)
+            f"known poses{by}{kept}": map_drive(
+                *(D13, f"known{n}", f"--poses {D13}/poses.txt", KNOWN[by], KNOWN[kept])
+            )
             + f" && {against_lidar(f'known{n}')}"
-            for n, (how, options) in enumerate(KNOWN.items())
+            for n, (by, kept) in enumerate(product([*KNOWN][:2], [*KNOWN][::2]))
         }
         | {
             "own path, `--align-to`": f"{map_drive(D13, 'own')} && "
@@ -204,16 +200,13 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "middlebury": Table(
         {
-            "": f"{MIDDLEBURY} --matcher sad,sgm,fine,opencv-bm,opencv-sgbm --out $OUT/plain",
-            ", filled": f"{MIDDLEBURY} --matcher sad,sgm {FILLED} --out $OUT/filled",
-            ", padded": f"{MIDDLEBURY} --matcher opencv-bm,opencv-sgbm "
-            "--set matching.opencv.pad=true --out $OUT/padded",
-            ", padded, filled": f"{MIDDLEBURY} --matcher opencv-bm,opencv-sgbm "
-            f"--set matching.opencv.pad=true {FILLED} --out $OUT/padded-filled",
-            ", half size": f"{HALF_SIZE} --matcher sgm,fine --out $OUT/half",
-            ", half size, filled": f"{HALF_SIZE} --matcher sgm {FILLED} --out $OUT/half-filled",
-            ", half size, padded": f"{HALF_SIZE} --matcher opencv-sgbm "
-            "--set matching.opencv.pad=true --out $OUT/half-padded",
+            "": scored(MIDDLEBURY, "plain", "sad,sgm,fine,opencv-bm,opencv-sgbm"),
+            ", filled": scored(MIDDLEBURY, "filled", "sad,sgm", FILLED),
+            ", padded": scored(MIDDLEBURY, "padded", OPENCV, PADDED),
+            ", padded, filled": scored(MIDDLEBURY, "padded-filled", OPENCV, PADDED, FILLED),
+            ", half size": scored(HALF_SIZE, "half", "sgm,fine"),
+            ", half size, filled": scored(HALF_SIZE, "half-filled", "sgm", FILLED),
+            ", half size, padded": scored(HALF_SIZE, "half-padded", "opencv-sgbm", PADDED),
         },
         {"bad 1": "{:.1f} %", "bad 2": "{:.1f} %", "bad 4": "{:.1f} %", "mean error": "{:.1f} px"},
         rows_of.middlebury,
