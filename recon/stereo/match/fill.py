@@ -50,9 +50,10 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     wanted = (seen.confidence < _UNLIKELY) & ~kept
     filled, values = np.zeros_like(wanted), seen.values.copy()
     low, high = _ends_around(values)
+    low = np.maximum(low - SAME_SURFACE_PX, np.nanmin(values))  # nothing beyond what was searched
+    high = np.minimum(high + SAME_SURFACE_PX, np.nanmax(values))
     for value in planes[:, 0]:  # those of the smallest segments first
-        near = (value >= low - SAME_SURFACE_PX) & (value <= high + SAME_SURFACE_PX)
-        taken = wanted & ~filled & near & ~_outside(value)
+        taken = wanted & ~filled & (value >= low) & (value <= high) & ~_outside(value)
         values[taken] = value[taken]
         filled |= taken
     hidden = np.empty_like(filled)

@@ -74,6 +74,15 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     assert np.median(found.confidence[filled]) < np.median(found.confidence[seen])
 
 
+def test_no_plane_leads_beyond_what_is_searched():
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    truth = np.maximum(6 - x / 20, 0.0) + 0 * y  # as far as can be, on the right
+    texture = cloth()
+    texture[:, 70:] = 120
+    found = match(rendered(truth, texture, noise=1.0))
+    assert np.nanmin(found.values) >= 0
+
+
 def test_a_wide_plain_wall_is_the_plane_of_its_rim():
     height, width = 200, 420
     y, x = np.mgrid[:height, :width]
