@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.core.values.arrays import Float32, UInt8
+from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.stereo.kernels import planes as kernels
 from recon.stereo.kernels.path_costs import (
     Views,
@@ -111,7 +111,9 @@ class FineMatcher:
         if not seen.valid.any():
             return seen
         values = search_planes(pair, seen, volume, _changes(s.min_disparity_px), self._threads)
-        return _judged(pair, seen, values)
+        last = s.min_disparity_px + ndisp - 1
+        beyond = (values < s.min_disparity_px) | (values > last)
+        return _judged(pair, seen, values, beyond)
 
     def _volume(self, pair: RectifiedPair, ndisp: int) -> UInt8:
         """Return the costs of all pixels, uint8 (H, P, at least W)."""
@@ -178,11 +180,12 @@ def _rows(pair: RectifiedPair, start: int, end: int) -> RectifiedPair:
     return replace(pair, camera=replace(pair.camera, height_px=end - start), **rows)
 
 
-def _judged(pair: RectifiedPair, seen: Disparity, values: Float32) -> Disparity:
+def _judged(pair: RectifiedPair, seen: Disparity, values: Float32, beyond: Bool) -> Disparity:
     """Return the disparity with reasons, confidence and uncertainty.
 
     That a plane and what was seen agree makes both more probable than either. A disparity that
-    only planes explain may as well be that of any surface around it.
+    only planes explain may as well be that of any surface around it. What planes lead to ``beyond``
+    the range is not found.
     """
     height, width = values.shape
     hidden = np.empty(values.shape, np.bool_)
@@ -198,10 +201,11 @@ def _judged(pair: RectifiedPair, seen: Disparity, values: Float32) -> Disparity:
     # Single pixels are noise, of what is plain.
     hidden = (hidden | (cv2.medianBlur(shadow, _SHADOW_PX) > 0)) & ~agree
     reason = np.where(agree, np.uint8(Reason.VALID), np.uint8(Reason.FILLED))
-    reason[hidden], reason[border] = np.uint8(Reason.OCCLUDED), np.uint8(Reason.BORDER)
+    reason[beyond], reason[hidden] = np.uint8(Reason.OUT_OF_RANGE), np.uint8(Reason.OCCLUDED)
+    reason[border] = np.uint8(Reason.BORDER)
     least, more = _AGREED_CONFIDENCE
     sure = np.float32(least) + np.float32(more) * seen.confidence**2
-    none, nan = hidden | border, np.float32(np.nan)
+    none, nan = hidden | border | beyond, np.float32(np.nan)
     spread_px = spread(np.where(agree & ~none, values, nan))
     return Disparity(
         values=np.where(none, nan, values),

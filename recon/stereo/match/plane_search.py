@@ -71,9 +71,7 @@ def search_planes(
     # Planes of neighbours on one surface differ by parts of a pixel.
     chosen, fitted = sources[NOW, 0], sources[FITTED, 0]
     near_by = np.abs(fitted - chosen) < SAME_SURFACE_PX / 2
-    last = changes.minimum + volume.shape[1] - 1
-    found = np.where(near_by, fitted, chosen).clip(changes.minimum, last)
-    return np.asarray(found, dtype=np.float32)
+    return np.asarray(np.where(near_by, fitted, chosen), dtype=np.float32)
 
 
 def _choose(sums: Float32, sources: Float32, table: Int32, to: Float32, rows: range) -> None:

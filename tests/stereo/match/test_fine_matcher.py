@@ -74,13 +74,16 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     assert np.median(found.confidence[filled]) < np.median(found.confidence[seen])
 
 
-def test_no_plane_leads_beyond_what_is_searched():
-    y, x = np.mgrid[:HEIGHT, :WIDTH]
-    truth = np.maximum(6 - x / 20, 0.0) + 0 * y  # as far as can be, on the right
-    texture = cloth()
-    texture[:, 70:] = 120
-    found = match(rendered(truth, texture, noise=1.0))
-    assert np.nanmin(found.values) >= 0
+def test_what_planes_lead_to_beyond_the_range_is_not_found():
+    pair, values = rendered(ground(), cloth()), ground().astype(np.float32)
+    values[:20, 100:] -= 30
+    values[100:, 100:] += 30
+    with patch.object(fine, "search_planes", lambda *_: values):
+        found = match(pair)
+    beyond = (values < 0) | (values > 47)
+    assert (found.reason[beyond] == Reason.OUT_OF_RANGE).mean() > 0.5
+    assert np.isnan(found.values[beyond]).all()
+    assert np.isfinite(found.values[~beyond]).mean() > 0.5
 
 
 def test_a_wide_plain_wall_is_the_plane_of_its_rim():
