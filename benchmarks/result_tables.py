@@ -79,7 +79,7 @@ REFINED: Final = {
 
 OPENCV, FILLED = "opencv-bm,opencv-sgbm", "--set matching.fill=true"
 PADDED, MOVED_KEPT = "--set matching.opencv.pad=true", "--set fusion.remove_moving=false"
-KNOWN: Final = {"": "", ", `fine`": "--matcher fine", ", what moved kept": MOVED_KEPT}
+HOW: Final = {"": "", ", `fine`": "--matcher fine", ", what moved kept": MOVED_KEPT}
 
 TABLES: Final[dict[str, Table]] = {
     "kitti-drift": Table(
@@ -95,10 +95,10 @@ TABLES: Final[dict[str, Table]] = {
     "kitti-lidar": Table(
         {
             f"known poses{by}{kept}": map_drive(
-                *(D13, f"known{n}", f"--poses {D13}/poses.txt", KNOWN[by], KNOWN[kept])
+                *(D13, f"known{n}", f"--poses {D13}/poses.txt", HOW[by], HOW[kept])
             )
             + f" && {against_lidar(f'known{n}')}"
-            for n, (by, kept) in enumerate(product([*KNOWN][:2], [*KNOWN][::2]))
+            for n, (by, kept) in enumerate(product(("", ", `fine`"), ("", ", what moved kept")))
         }
         | {
             "own path, `--align-to`": f"{map_drive(D13, 'own')} && "

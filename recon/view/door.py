@@ -1,6 +1,6 @@
 """Where a browser asks for a map that is being made: a viewer begins when one does.
 
-To start it takes two seconds of a processor, which a drive would lose although nobody looks.
+A drive would lose the time that it takes to start although nobody looks.
 """
 
 from __future__ import annotations
@@ -55,11 +55,18 @@ class _Door(ThreadingTCPServer):
         self._viewer: subprocess.Popen[str] | None = None
 
     def viewer_url(self) -> str:
-        """Return the address of the viewer; empty = it has ended at once, and said why."""
+        """Return the address of the viewer; empty = there is none, and it is said why."""
         with self._starting:
             if self._viewer is None or self._viewer.poll() is not None:
-                self._url = self._start()
+                try:
+                    self._url = self._start()
+                except OSError as error:
+                    self._url = ""
+                    self._say(f"no viewer could be started: {error}")
             return self._url
+
+    def handle_error(self, *_: object) -> None:
+        """Leave alone what became of a browser: it may go while it is answered."""
 
     def _start(self) -> str:
         quiet, pipe = subprocess.DEVNULL, subprocess.PIPE
@@ -82,6 +89,8 @@ class _Door(ThreadingTCPServer):
 
 class _Caller(BaseHTTPRequestHandler):
     """What a browser asks for."""
+
+    timeout = 10.0  # of one that connects and asks for nothing
 
     def do_GET(self) -> None:
         url = cast("_Door", self.server).viewer_url()

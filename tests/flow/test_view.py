@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -233,19 +234,33 @@ def asked(url: str) -> Any:
     return urlopen(url, timeout=60)  # noqa: S310 - its own
 
 
-def test_nothing_that_happens_to_the_viewer_reaches_the_run(monkeypatch, tmp_path):
+def test_nothing_that_happens_to_the_viewer_reaches_the_run(monkeypatch, tmp_path, capfd):
     pytest.importorskip("viser", reason="the extra view is not installed")
     said: list[str] = []
     with pytest.raises(HTTPError, match="503"):
         asked(show_beside(tmp_path, 0, said.append))
     assert "does not contain a finished run" in said[1]
+    url = show_beside(tmp_path, 0, said.append)
+    with monkeypatch.context() as patched:
+        patched.setattr(subprocess, "Popen", fail)
+        with pytest.raises(HTTPError, match="503"):
+            asked(url)
+    assert "no more processes" in said[-1]
+    with socket.create_connection(url.removeprefix("http://").split(":")) as gone:
+        gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset
+        gone.sendall(b"GET / HTTP/1.1\r\n")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         assert show_beside(tmp_path, taken.getsockname()[1], said.append) == ""
     monkeypatch.setattr("recon.view.door.find_spec", lambda _: None)
     monkeypatch.setitem(sys.modules, "viser", None)
     assert show_beside(tmp_path, 0, said.append) == ""
-    assert "in use" in said[2]
-    assert "recon[view]" in said[3]
+    assert "in use" in said[-2]
+    assert "recon[view]" in said[-1]
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def fail(*_: object, **__: object) -> None:
+    raise OSError("no more processes")
 
 
 def test_a_viewer_beside_a_run_ends_with_it(small_demo):

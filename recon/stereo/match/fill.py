@@ -44,8 +44,7 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
         return seen
     planes = np.full((SEGMENTATIONS, 3, *seen.values.shape), np.nan, np.float32)
     with ThreadPoolExecutor(threads) as pool:
-        likely = seen.values, seen.confidence
-        fit_segments(smooth_colours(pair), likely, SAME_SURFACE_PX, planes, pool, threads)
+        fit_segments(smooth_colours(pair), seen, planes, pool, threads)
     kept = np.isin(seen.reason, (Reason.BORDER, Reason.FILLED))
     wanted = (seen.confidence < _UNLIKELY) & ~kept
     filled, values = np.zeros_like(wanted), seen.values.copy()
@@ -53,7 +52,7 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     low = np.maximum(low - SAME_SURFACE_PX, np.nanmin(values))  # nothing beyond what was searched
     high = np.minimum(high + SAME_SURFACE_PX, np.nanmax(values))
     for value in planes[:, 0]:  # those of the smallest segments first
-        taken = wanted & ~filled & (value >= low) & (value <= high) & ~_outside(value)
+        taken = wanted & ~filled & (value >= low) & (value <= high) & ~outside(value)
         values[taken] = value[taken]
         filled |= taken
     hidden = np.empty_like(filled)
@@ -69,7 +68,7 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     )
 
 
-def _outside(values: Float32) -> Bool:
+def outside(values: Float32) -> Bool:
     """Return where disparities (H, W) lead beyond the right image."""
     width = values.shape[1]
     there = np.arange(width, dtype=np.float32) - values

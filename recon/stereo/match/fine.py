@@ -36,7 +36,7 @@ from recon.stereo.kernels.similarity import Blend, add_unlikeness
 from recon.stereo.match import search as common
 from recon.stereo.match import sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network, rows_at_once
-from recon.stereo.match.fill import spread
+from recon.stereo.match.fill import outside, spread
 from recon.stereo.match.plane_search import search_planes
 from recon.stereo.match.segments import SAME_SURFACE_PX
 
@@ -187,11 +187,9 @@ def _judged(pair: RectifiedPair, seen: Disparity, values: Float32, beyond: Bool)
     only planes explain may as well be that of any surface around it. What planes lead to ``beyond``
     the range is not found.
     """
-    height, width = values.shape
     hidden = np.empty(values.shape, np.bool_)
-    kernels.mark_hidden(values, SAME_SURFACE_PX, 0, height, hidden)
-    there = np.arange(width, dtype=np.float32) - values
-    border = (there < -0.5) | (there > width - 0.5)
+    kernels.mark_hidden(values, SAME_SURFACE_PX, 0, len(values), hidden)
+    border = outside(values)
     if pair.valid is not None:
         border |= ~pair.valid
     with np.errstate(invalid="ignore"):

@@ -46,8 +46,7 @@ def search_planes(
         fits.fit(seen.values, seen.confidence, _NEAR_FIT_PX, sources[FIRST], own=True)
         fits.fit(seen.values, seen.confidence, _FAR_FIT_PX, sources[FITTED])
         sources[SEGMENTS:] = sources[FITTED]
-        reliable = seen.values, seen.confidence
-        fit_segments(fits.guide, reliable, SAME_SURFACE_PX, sources[SEGMENTS:], pool, threads)
+        fit_segments(fits.guide, seen, sources[SEGMENTS:], pool, threads)
         sources[NOW] = sources[FIRST]
         for number, (near, far) in enumerate(_ROUNDS):
             table = _table(near, far, number)

@@ -38,7 +38,8 @@ class MatchingSettings(Settings):
     package registers; in Python also a matcher of your own."""
     fill: bool = False
     """Fill what is not found, or not surely, with planes of the segments of the image around it,
-    marked as filled: denser maps of rooms and plain walls, in 0.1 s more per megapixel."""
+    marked as filled: denser maps of rooms and plain walls, in some tenths of a second more per
+    megapixel."""
     sad: SadSettings = SadSettings()
     sgm: SgmSettings = SgmSettings()
     fine: FineSettings = FineSettings()

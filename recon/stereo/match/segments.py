@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from recon.core.kernels.compiled import UInt16
-from recon.core.values import RectifiedPair
+from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, Int64, UInt8
 from recon.stereo.kernels import segments as kernels
 from recon.stereo.match import search as common
@@ -25,22 +25,14 @@ the planes of all are offered."""
 SEGMENTATIONS: Final = len(_EDGES)
 SAME_SURFACE_PX: Final = 1.0  # disparities that are farther apart are of two surfaces
 _LEAST_PX: Final = 100  # smaller segments have the planes of windows
-_Given = tuple[Float32, Float32, Int64, Int64, Int64, Float64, float]
+_Known = tuple[Float32, Float32, Int64, Int64, Int64, Float64, float]
 _TRIES: Final = 150  # planes through three pixels: one of them is right where a third lies on it
 
 
-def fit_segments(
-    guide: UInt8,
-    seen: tuple[Float32, Float32],
-    within_px: float,
-    to: Float32,
-    pool: Executor,
-    threads: int,
-) -> None:
+def fit_segments(guide: UInt8, seen: Disparity, to: Float32, pool: Executor, threads: int) -> None:
     """Write the planes of the pixels in segments that have one, (SEGMENTATIONS, 3, H, W).
 
-    ``guide``, uint8 (H, W, 3), are smoothed colours; ``seen`` are disparities and their weights,
-    float32 (H, W), NaN = unknown. Those farther than ``within_px`` from a plane do not count.
+    ``guide``, uint8 (H, W, 3), are smoothed colours. What was seen counts by its confidence.
     """
     steps, draws = _steps(guide), np.random.default_rng(0).random((_TRIES, 3))
     for edge, planes in zip(_EDGES, to, strict=True):
@@ -52,12 +44,12 @@ def fit_segments(
         wanted = np.flatnonzero(sizes >= _LEAST_PX)
         wanted = wanted[wanted > 0]  # 0 are edges
         if len(wanted):
-            given = (*seen, order, starts, wanted, draws, within_px)
-            common.in_strips(pool, threads, partial(_fit, given, planes), len(wanted))
+            known = seen.values, seen.confidence, order, starts, wanted, draws, SAME_SURFACE_PX
+            common.in_strips(pool, threads, partial(_fit, known, planes), len(wanted))
 
 
-def _fit(given: _Given, to: Float32, segments: range) -> None:
-    kernels.fit_segments(*given, segments.start, segments.stop, to)
+def _fit(known: _Known, to: Float32, segments: range) -> None:
+    kernels.fit_segments(*known, segments.start, segments.stop, to)
 
 
 def smooth_colours(pair: RectifiedPair) -> UInt8:
@@ -71,9 +63,7 @@ def smooth_colours(pair: RectifiedPair) -> UInt8:
 def _steps(guide: UInt8) -> UInt16:
     """Return by how much each pixel differs from those above and to the left, over the channels."""
     steps = np.zeros(guide.shape[:2], np.uint16)
-    for axis in (0, 1):
-        later, earlier = (guide[1:], guide[:-1]) if axis == 0 else (guide[:, 1:], guide[:, :-1])
-        apart = cv2.absdiff(later, earlier).sum(axis=2, dtype=np.uint16)
-        here = steps[1:] if axis == 0 else steps[:, 1:]
-        np.maximum(here, apart, out=here)
+    steps[1:] = cv2.absdiff(guide[1:], guide[:-1]).sum(axis=2, dtype=np.uint16)
+    beside = cv2.absdiff(guide[:, 1:], guide[:, :-1]).sum(axis=2, dtype=np.uint16)
+    steps[:, 1:] = np.maximum(steps[:, 1:], beside)
     return steps
