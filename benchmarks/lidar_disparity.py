@@ -6,14 +6,21 @@ too: a road changes its disparity by a third of a pixel from row to row, so that
 degree counts. `aligned` has the LiDAR moved and turned to where disparities fit best, six numbers
 for all frames.
 
-Example: python benchmarks/lidar_disparity.py DRIVE LIDAR_MAP.ply --json
+With ``--matchers`` these are compared instead, with the refined rig and the LiDAR as it fits the
+first of them: in each range of depth, how many points of the LiDAR have a disparity, how many have
+one that is right to 1 px, and how many of those that are given are wrong; and how many would be, if
+each matcher gave only as many as the one that gives the fewest, its surest.
+
+Examples:
+    python benchmarks/lidar_disparity.py DRIVE LIDAR_MAP.ply --json
+    python benchmarks/lidar_disparity.py DRIVE LIDAR_MAP.ply --matchers sad,sgm,fine
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -27,8 +34,8 @@ from altered_drives import true_path
 
 from recon.commands.config import load_config
 from recon.core.geometry.se3 import apply, as_transform, invert
-from recon.core.values import RectifiedCamera
-from recon.core.values.arrays import Float32, Float64
+from recon.core.values import Disparity, RectifiedCamera
+from recon.core.values.arrays import Float64
 from recon.core.values.camera import project
 from recon.io.models.ply import read_ply
 from recon.odometry.rig.refine import RefinedRig, refine_rig
@@ -38,9 +45,11 @@ from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 DEPTHS_M: Final = (4, 8, 12, 16, 22, 30, 45)
+RIGS: Final = {"as calibrated": False, "refined": True}
 PARTS: Final = (3, 6)  # of the image, down and across
 FEWEST: Final = 1000  # disparities that are worth a median
 OUTLIER_PX: Final = 3.0
+WRONG_PX: Final = 1.0
 KERNEL_PX: Final = 0.3
 HIDING_PX: Final = 13  # what is much nearer, and no farther aside, hides a point
 STEPS: Final = np.repeat([0.005, 0.0003], 3)  # for derivatives by metres and radians
@@ -51,7 +60,7 @@ class Seen:
     """Frames with the LiDAR points that they see."""
 
     camera: RectifiedCamera
-    frames: list[tuple[Float64, Float32]]  # points (N, 3) in camera axes, disparity (H, W)
+    frames: list[tuple[Float64, Disparity]]  # points (N, 3) in camera axes
 
     def compared(self, step: Float64) -> tuple[Float64, Float64]:
         """Column, row, depth (N, 3) with the LiDAR moved; measured minus true disparity (N,)."""
@@ -60,10 +69,19 @@ class Seen:
             moved = apply(as_transform(step), xyz)
             u, v, true = project(moved, self.camera)
             at = (np.float32(u)[None], np.float32(v)[None])
-            seen = cv2.remap(disparity, *at, cv2.INTER_LINEAR, borderValue=float("nan"))[0]
+            seen = cv2.remap(disparity.values, *at, cv2.INTER_LINEAR, borderValue=float("nan"))[0]
             places.append(np.stack([u, v, moved[:, 2]], axis=1))
             errors_px.append(seen - true)
         return np.concatenate(places), np.concatenate(errors_px)
+
+    def confidence(self, step: Float64) -> Float64:
+        """float64 (N,), of the pixels nearest to the points of `compared`."""
+        found = []
+        for xyz, disparity in self.frames:
+            u, v, _ = project(apply(as_transform(step), xyz), self.camera)
+            at = (np.float32(np.rint(u))[None], np.float32(np.rint(v))[None])
+            found.append(cv2.remap(disparity.confidence, *at, cv2.INTER_NEAREST)[0])
+        return np.concatenate(found).astype(np.float64)
 
     def aligned(self, rounds: int = 8) -> Float64:
         """The motion (6,) of the LiDAR, metres and radians, with which disparities fit best."""
@@ -83,17 +101,19 @@ class Seen:
         return step
 
 
-def see(source: StereoSource, rig: RefinedRig, xyz_world: Float64, every: int) -> Seen:
+def see(
+    source: StereoSource, xyz_world: Float64, every: int, rig: RefinedRig, matcher: str = "sad"
+) -> Seen:
     """Match every so-manyth frame, and find the points in its view that nothing hides."""
-    config = load_config()
+    config = load_config(overrides=[f"matching.matcher={matcher}"])
     reconstructor = FrameReconstructor(rig.calibration, config)
     path = rig.poses(true_path(source), config.rectification).T_world_camera
 
-    def frames() -> Iterator[tuple[Float64, Float32]]:
+    def frames() -> Iterator[tuple[Float64, Disparity]]:
         for k in range(every // 2, len(source), every):
             _, disparity = reconstructor.match(next(source.frames(k)))
             xyz = apply(invert(path[k]), xyz_world)
-            yield visible(xyz, reconstructor.camera), disparity.values
+            yield visible(xyz, reconstructor.camera), disparity
 
     return Seen(reconstructor.camera, list(frames()))
 
@@ -140,21 +160,55 @@ def summary(seen: Seen, step: Float64) -> dict[str, Any]:
     }
 
 
+def by_matcher(seen: Mapping[str, Seen]) -> dict[str, dict[str, dict[str, float]]]:
+    """What matchers give of the same points, in each range of depth; shares."""
+    step = next(iter(seen.values())).aligned()
+    compared = {name: (*one.compared(step), one.confidence(step)) for name, one in seen.items()}
+    found: dict[str, dict[str, dict[str, float]]] = {name: {} for name in seen}
+    for near, far in pairwise(DEPTHS_M):
+        inside = {
+            name: (error[there], sure[there])
+            for name, (places, error, sure) in compared.items()
+            for there in [(places[:, 2] >= near) & (places[:, 2] < far)]
+        }
+        fewest = min(np.isfinite(error).sum() for error, _ in inside.values())
+        for name, (error, sure) in inside.items():
+            given = np.isfinite(error)
+            wrong = np.abs(error[given]) > WRONG_PX
+            surest = np.argsort(-sure[given], kind="stable")[:fewest]
+            found[name][f"{near} to {far}"] = {
+                "given": float(given.mean()),
+                "right": float((~wrong).sum() / len(error)),
+                "wrong of given": float(wrong.mean()),
+                "wrong of surest": float(wrong[surest].mean()),
+            }
+    return found
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("drive", type=Path)
     parser.add_argument("cloud", type=Path, help="LiDAR map, in the axes of the first true pose")
     parser.add_argument("--every", type=int, default=9, help="frames from one to the next")
+    parser.add_argument("--matchers", help="compare these, with commas between them")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     options = parser.parse_args(arguments)
-    source, config = open_source(options.drive), load_config()
-    xyz_world = np.float64(read_ply(options.cloud).xyz)
-    refined = partial(refine_rig, source, config)
+    source, xyz_world = open_source(options.drive), np.float64(read_ply(options.cloud).xyz)
+    look = partial(see, source, xyz_world, options.every)
+    rigs = {
+        name: refine_rig(source, load_config(), RigSettings(refine=refine))
+        for name, refine in RIGS.items()
+        if refine or not options.matchers
+    }
     result: dict[str, Any] = {}
-    for name, refine in (("as calibrated", False), ("refined", True)):
-        seen = see(source, refined(RigSettings(refine=refine)), xyz_world, options.every)
-        result[name] = summary(seen, np.zeros(6))
-        result[f"{name}, aligned"] = summary(seen, seen.aligned())
+    if options.matchers:
+        names = options.matchers.split(",")
+        result = by_matcher({name: look(rigs["refined"], name) for name in names})
+    else:
+        for name, rig in rigs.items():
+            seen = look(rig)
+            result[name] = summary(seen, np.zeros(6))
+            result[f"{name}, aligned"] = summary(seen, seen.aligned())
     print(json.dumps(result, indent=2) if options.json else "\n".join(map(str, result.items())))
 
 

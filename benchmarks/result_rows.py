@@ -91,6 +91,18 @@ def disparities(found: Found) -> Rows:
     }
 
 
+def depths(found: Found) -> Rows:
+    """By depth, in per cent: points given, right, and wrong among as many as all give."""
+    shown = ("given", "right", "wrong of surest")
+    return {
+        f"`{matcher}`": {
+            f"{metres} m": " / ".join(f"{100 * one[name]:.0f}" for name in shown)
+            for metres, one in by_depth.items()
+        }
+        for matcher, by_depth in found[""].items()
+    }
+
+
 def planted(found: Found) -> Rows:
     rows: Rows = {}
     for drive, faults in found.items():

@@ -9,18 +9,28 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
 import result_rows as rows_of
+from result_commands import (
+    D06,
+    D13,
+    DRIVES,
+    FILLED,
+    HALF_SIZE,
+    KNOWN_POSES,
+    MEASURED,
+    MIDDLEBURY,
+    OPENCV,
+    PADDED,
+    REFINED,
+    RIGS,
+    against_lidar,
+    map_drive,
+    scored,
+)
 from result_rows import Rows
-
-DRIVES: Final = {
-    "kitti_raw_0013": "$RECON_DATA/driven/kitti_raw_0013",
-    "sequence 06": "$RECON_DATA/driven/kitti_06_51",
-}
-D13, D06 = DRIVES.values()
 
 
 @dataclass(frozen=True)
@@ -43,44 +53,10 @@ class Table:
         return f"there is no {missing[0]}" if missing else ""
 
 
-def map_drive(drive: str, name: str, *options: str) -> str:
-    return " ".join(
-        ["recon map", drive, *options, "--no-mesh --json --quiet --out", f"$OUT/{name}"]
-    )
-
-
-def against_lidar(name: str, *options: str) -> str:
-    words = ["recon evaluate map", f"$OUT/{name}", f"{D13}/lidar_map.ply --threshold 0.2 --json"]
-    return " ".join([*words, *options])
-
-
-def scored(scenes: str, name: str, matchers: str, *options: str) -> str:
-    return " ".join([scenes, "--matcher", matchers, *options, f"--out $OUT/{name}"])
-
-
 PERCENT: Final = "{:.2f} %"
 SHARE: Final = "{:.3f}"
 CM: Final = "{:.1f} cm"
 MB: Final = "{:.0f} MB"
-MIDDLEBURY: Final = "recon evaluate middlebury $RECON_DATA/middlebury/MiddEval3/trainingQ --json"
-HALF_SIZE: Final = (
-    "recon evaluate middlebury $RECON_DATA/middlebury/MiddEval3/trainingH --json "
-    "--truth $RECON_DATA/middlebury/MiddEval3/trainingQ"
-)
-RIGS: Final = {
-    "kitti_raw_0013": (D13, "13"),
-    "sequence 06": (D06, "06"),
-    "kitti_05_100": ("$RECON_DATA/driven/kitti_05_100", "05"),
-}
-REFINED: Final = {
-    "as calibrated (`rig.refine=off`)": ("--set rig.refine=off",),
-    "refined (default)": (),
-}
-
-OPENCV, FILLED = "opencv-bm,opencv-sgbm", "--set matching.fill=true"
-PADDED, MOVED_KEPT = "--set matching.opencv.pad=true", "--set fusion.remove_moving=false"
-HOW: Final = {"": "", ", `fine`": "--matcher fine", ", what moved kept": MOVED_KEPT}
-
 TABLES: Final[dict[str, Table]] = {
     "kitti-drift": Table(
         {f"{name} visual": map_drive(drive, name[-2:]) for name, drive in DRIVES.items()}
@@ -94,11 +70,9 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "kitti-lidar": Table(
         {
-            f"known poses{by}{kept}": map_drive(
-                *(D13, f"known{n}", f"--poses {D13}/poses.txt", HOW[by], HOW[kept])
-            )
+            f"known poses{how}": map_drive(D13, f"known{n}", f"--poses {D13}/poses.txt", options)
             + f" && {against_lidar(f'known{n}')}"
-            for n, (by, kept) in enumerate(product(("", ", `fine`"), ("", ", what moved kept")))
+            for n, (how, options) in enumerate(KNOWN_POSES.items())
         }
         | {
             "own path, `--align-to`": f"{map_drive(D13, 'own')} && "
@@ -155,6 +129,15 @@ TABLES: Final[dict[str, Table]] = {
         | {"LiDAR moved": "{:.0f} mm", "turned": "{:.2f}°"},
         rows_of.disparities,
     ),
+    "kitti-depth": Table(
+        {
+            "": f"python benchmarks/lidar_disparity.py {D13} {D13}/lidar_map.ply --json "
+            "--matchers sgm,sad,fine"
+        },
+        dict.fromkeys(("4 to 8 m", "8 to 12 m", "12 to 16 m", "16 to 22 m"), "{}")
+        | dict.fromkeys(("22 to 30 m", "30 to 45 m"), "{}"),
+        rows_of.depths,
+    ),
     "planted": Table(
         {
             Path(folder).name: f"python benchmarks/planted_faults.py $RECON_DATA/{folder} --json"
@@ -185,6 +168,10 @@ TABLES: Final[dict[str, Table]] = {
         {
             name: f"python benchmarks/mapping.py --json --no-rays --drive {drive}"
             for name, drive in DRIVES.items()
+        }
+        | {
+            "kitti_raw_0013, voxels of 5 cm": "python benchmarks/mapping.py --json --no-rays "
+            f"--drive {D13} --set fusion.voxel_m=0.05"
         },
         {"frames per second": "{:.1f}", "whole run": "{:.0f} s", "processor": "{:.0f} s"}
         | {"memory": MB},
@@ -201,11 +188,11 @@ TABLES: Final[dict[str, Table]] = {
     "middlebury": Table(
         {
             "": scored(MIDDLEBURY, "plain", "sad,sgm,fine,opencv-bm,opencv-sgbm"),
-            ", filled": scored(MIDDLEBURY, "filled", "sad,sgm", FILLED),
+            ", as measured": scored(MIDDLEBURY, "measured", "sad,sgm", MEASURED),
             ", padded": scored(MIDDLEBURY, "padded", OPENCV, PADDED),
             ", padded, filled": scored(MIDDLEBURY, "padded-filled", OPENCV, PADDED, FILLED),
             ", half size": scored(HALF_SIZE, "half", "sgm,fine"),
-            ", half size, filled": scored(HALF_SIZE, "half-filled", "sgm", FILLED),
+            ", half size, as measured": scored(HALF_SIZE, "half-measured", "sgm", MEASURED),
             ", half size, padded": scored(HALF_SIZE, "half-padded", "opencv-sgbm", PADDED),
         },
         {"bad 1": "{:.1f} %", "bad 2": "{:.1f} %", "bad 4": "{:.1f} %", "mean error": "{:.1f} px"},

@@ -74,8 +74,8 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
         every = _recorded(self, usual)
         groups = {name: every[name] for name in GROUPS.get(command, every) if name in every}
         if "matching" in groups:
-            own = field_of(name_of(self.matching.matcher))
-            unused = {field_of(name) for name in MATCHERS} - {own}
+            used = {name_of(self.matching.matcher), self.matching.keyframe_matcher or ""}
+            unused = {field_of(name) for name in MATCHERS} - {field_of(name) for name in used}
             groups["matching"] = {k: v for k, v in groups["matching"].items() if k not in unused}
         if self.street == usual[0].street:
             groups.pop("street", None)
@@ -104,6 +104,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 """The groups of settings that determine the result of each command."""
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
+    "matching": {"sad": {"fill": True}, "sgm": {"fill": True}},
     "cloud": {"min_range_m": 0.0, "max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
     "mesh": {"point_weight": 16.0},

@@ -181,7 +181,8 @@ def match(
         SettingsError: There is no such matcher, or a setting is unknown or out of its range.
         MatchingError: A matcher that is not recon's fails, or returns no disparity of the pair.
     """
-    config = ReconConfig.parse({"matching": _own_settings(matcher, settings)}).with_matcher(matcher)
+    own = _own_settings(matcher, settings)
+    config = load_config(None, [own], PAIR_DEFAULTS).with_matcher(matcher)
     pair = StereoPair(left, right)
     height_px, width_px = pair.left.shape[:2]
     camera = stand_in_camera(width_px, height_px) if calibration is None else calibration
@@ -222,7 +223,7 @@ def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
 
 def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(matcher, str) and matcher in MATCHERS:
-        return {field_of(matcher): settings}
+        return {f"matching.{field_of(matcher)}.{name}": value for name, value in settings.items()}
     if settings:
         check_matcher(matcher)
         where, hint = f"matcher {name_of(matcher)!r}", "make the object with them"

@@ -28,7 +28,8 @@ class FusionSettings(Settings):
     """Edge of a voxel. Half of it takes about four times the memory."""
     min_count: int = Field(3, ge=1, le=1000)
     """Voxels seen by fewer frames are not exported, or by fewer than one less where they are
-    precise. Lower it for slow or sparse drives, raise it where noise is left."""
+    precise. Lower it for sparse drives and small voxels (2 for half the usual edge), raise it where
+    noise is left."""
     max_depth_error_m: float | None = Length(0.25, ge=1e-09, le=1000.0)
     """Points are fused up to the depth at which a matching error of 0.3 px makes this error; none =
     all. Raise it to map farther and less precisely."""

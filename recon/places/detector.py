@@ -68,6 +68,45 @@ class KeyframeStore(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class LastView:
+    """The last view that showed something new."""
+
+    coarse: Float32  # (h, w), `coarse_of` its disparity
+    T_world_camera: Float64  # (4, 4)
+    stretch: int = 0  # of the drive
+
+
+class NewViews:
+    """Tells which views show enough that the last of them did not, or too little of what it did.
+
+    ``last`` is set by who takes a view for new; None = there was none.
+    """
+
+    def __init__(self, camera: RectifiedCamera) -> None:
+        self._camera = camera
+        self.last: LastView | None = None
+
+    def is_new(self, disparity: Disparity, T_world_camera: Float64, stretch: int = 0) -> bool:
+        last = self.last
+        if last is None or last.stretch != stretch:
+            return True
+        T_last_new = invert(last.T_world_camera) @ T_world_camera
+        shares = (
+            self._share_in_view(coarse_of(disparity), T_last_new),
+            self._share_in_view(last.coarse, invert(T_last_new)),
+        )
+        return min(shares) < _SEEN_SHARE
+
+    def _share_in_view(self, coarse: Float32, T: Float64) -> float:
+        """Return the share of what one view shows that another one can see."""
+        camera = self._camera
+        u, v, _ = project(apply(T, coarse_points(coarse, camera)), camera)
+        with np.errstate(invalid="ignore"):
+            inside = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
+        return float(inside.mean()) if inside.size else 0.0
+
+
 class LoopDetector:
     """Searches the earlier keyframes of a drive for the place of each new one.
 
@@ -92,7 +131,7 @@ class LoopDetector:
         self._store, self._camera = store, camera
         self._search, self._scale = search, scale
         self._places = Places(scale)
-        self._last: StoredKeyframe | None = None
+        self._views = NewViews(camera)
         self.loops: list[Loop] = []
         self.refused: Counter[str] = Counter()
 
@@ -116,7 +155,7 @@ class LoopDetector:
         pose that is not trusted, of stretch -1. ``path_m`` is the path up to it, by `path_lengths`.
         """
         seen = stretch >= 0 and bool(disparity.valid.any())
-        if not seen or not self._is_new(disparity, T_world_camera, stretch):
+        if not seen or not self._views.is_new(disparity, T_world_camera, stretch):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
         return self.look(StoredKeyframe(keyframe, T_world_camera, path_m, stretch))
@@ -131,7 +170,7 @@ class LoopDetector:
     def restore(self, stored: StoredKeyframe) -> None:
         """Add a keyframe of an interrupted drive, with its loops."""
         self._places.add(self._place(stored))
-        self._last = stored
+        self._views.last = LastView(stored.keyframe.coarse, stored.T_world_camera, stored.stretch)
         self.loops.extend(stored.loops)
         self.refused.update(stored.refused)
 
@@ -155,26 +194,6 @@ class LoopDetector:
         words = words_of(keyframe.descriptors)
         pose = stored.T_world_camera
         return Place(keyframe.frame, pose, stored.path_m, stored.stretch, reach_m, words)
-
-    def _is_new(self, disparity: Disparity, T_world_camera: Float64, stretch: int) -> bool:
-        """Whether a view shows enough that the last keyframe did not, or the other way round."""
-        last = self._last
-        if last is None or last.stretch != stretch:
-            return True
-        T_last_new = invert(last.T_world_camera) @ T_world_camera
-        shares = (
-            self._share_in_view(coarse_of(disparity), T_last_new),
-            self._share_in_view(last.keyframe.coarse, invert(T_last_new)),
-        )
-        return min(shares) < _SEEN_SHARE
-
-    def _share_in_view(self, coarse: Float32, T: Float64) -> float:
-        """Return the share of what one view shows that another one can see."""
-        camera = self._camera
-        u, v, _ = project(apply(T, coarse_points(coarse, camera)), camera)
-        with np.errstate(invalid="ignore"):
-            inside = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
-        return float(inside.mean()) if inside.size else 0.0
 
     def _compared(self, new: StoredKeyframe) -> StoredKeyframe:
         """The keyframe with its loops to the candidates that are verified."""

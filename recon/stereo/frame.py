@@ -70,8 +70,12 @@ class FrameReconstructor:
         self._config = config
         self._stopwatch = stopwatch or Stopwatch()
         self._rectifier = Rectifier(calibration, config.rectification)
-        self._matcher = make_matcher(config.matching.matcher, config.matching, threads)
-        self._rough_matcher = HalfSizeMatcher(searched(config.matching), threads=1)
+        matching = config.matching
+        self._matcher = make_matcher(matching.matcher, matching, threads)
+        self._keyframe_matcher = None
+        if matching.keyframe_matcher is not None:
+            self._keyframe_matcher = make_matcher(matching.keyframe_matcher, matching, threads)
+        self._rough_matcher = HalfSizeMatcher(searched(matching), threads=1)
 
     @property
     def camera(self) -> RectifiedCamera:
@@ -106,9 +110,25 @@ class FrameReconstructor:
 
     def reconstruct_rectified(self, rectified: RectifiedPair) -> ReconstructedFrame:
         """Reconstruct one pair that is rectified; see `reconstruct`."""
+        return self._frame_of(rectified, self._match(rectified), self.inspect(rectified))
+
+    @property
+    def matches_keyframes(self) -> bool:
+        """Whether there is a matcher for keyframes alone."""
+        return self._keyframe_matcher is not None
+
+    def reconstruct_keyframe(self, frame: ReconstructedFrame) -> ReconstructedFrame:
+        """Reconstruct a frame again, by the matcher of keyframes."""
+        if self._keyframe_matcher is None:
+            return frame
+        with self._stopwatch.stage("match_keyframes"):
+            disparity = self._keyframe_matcher.match(frame.pair)
+        return self._frame_of(frame.pair, self._without_edges(disparity), frame.warnings)
+
+    def _frame_of(
+        self, rectified: RectifiedPair, disparity: Disparity, warnings: tuple[str, ...]
+    ) -> ReconstructedFrame:
         config, stage = self._config, self._stopwatch.stage
-        disparity = self._match(rectified)
-        warnings = self.inspect(rectified)
         with stage("back_project"):
             cloud = back_project(disparity, rectified, config.cloud)
         with stage("filter"):
@@ -129,12 +149,14 @@ class FrameReconstructor:
         return ReconstructedFrame(black, disparity, cloud)
 
     def _match(self, rectified: RectifiedPair) -> Disparity:
-        stage = self._stopwatch.stage
-        with stage("match"):
+        with self._stopwatch.stage("match"):
             disparity = self._matcher.match(rectified)
+        return self._without_edges(disparity)
+
+    def _without_edges(self, disparity: Disparity) -> Disparity:
         if not self._config.cloud.remove_flying_edges:
             return disparity
-        with stage("edges"):
+        with self._stopwatch.stage("edges"):
             return remove_flying_edges(disparity)
 
 

@@ -40,8 +40,10 @@ def test_a_command_writes_only_what_determines_its_result(tmp_path):
     groups = yaml.safe_load(drive)
     assert {"source", "odometry", "grid", "mesh"} <= {*groups}
     assert not {"calibration", "capture", "audit", "paper", "street", "checkpoints"} & {*groups}
-    assert {*groups["matching"]} == {"matcher", "fill", "sad"}
+    assert {*groups["matching"]} == {"matcher", "sad"}
     assert {*load_config().recorded("mesh")} == {"mesh"}
+    again = load_config(overrides=["matching.keyframe_matcher=fine"]).recorded("map")
+    assert {*again["matching"]} == {"matcher", "keyframe_matcher", "sad", "fine"}
 
 
 @pytest.mark.parametrize("command", GROUPS)

@@ -19,6 +19,7 @@ import numpy as np
 
 from recon.core.errors import FormatError, ReconError, RegistrationError
 from recon.core.values import RectifiedPair, Trajectory
+from recon.core.values.arrays import tree_of
 from recon.io.files import reading
 from recon.map.builders import thin_rays
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
@@ -29,6 +30,8 @@ from recon.map.store.session import Session, SessionInfo
 from recon.odometry.health import stretches
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.rig.tracks import LiveTracks
+from recon.places.detector import LastView, NewViews
+from recon.places.keyframe import coarse_of
 from recon.run.machine import versions
 from recon.run.work import Stopwatch, look_ahead, work_in_background
 from recon.sources.source import StereoSource
@@ -57,6 +60,7 @@ class Drive:
         self.mapper, self.session = mapper, mapper.session
         self._total = len(source)
         self._loops, self._map = loops, workspace.map
+        self._views = NewViews(reconstructor.camera)
         self._stage = workspace.stopwatch.stage
         self.sample: ReconstructedFrame | None = None
         self._saved = 0
@@ -93,13 +97,26 @@ class Drive:
         for frame in look_ahead(self._reconstruct, pairs):
             found = self.mapper.register(OdometryFrame(frame.pair, frame.disparity))
             led = len(self.mapper) < self.source.lead
-            yield self._add(frame.unmapped() if led else frame, found)
+            yield self._add(frame.unmapped() if led else self._seen_anew(frame, found), found)
+
+    def _seen_anew(self, frame: ReconstructedFrame, found: OdometryResult) -> ReconstructedFrame:
+        """Match a view that shows something new again, if there is a matcher for it."""
+        T, reconstructor = found.T_world_camera, self.reconstructor
+        if not (reconstructor.matches_keyframes and found.health.ok):
+            return frame
+        if not self._views.is_new(frame.disparity, T):
+            return frame
+        anew = self._with_rays(reconstructor.reconstruct_keyframe(frame))
+        self._views.last = LastView(coarse_of(anew.disparity), T)
+        return anew
 
     def _map_behind(self, pair: RectifiedPair, found: OdometryResult, matched: bool) -> None:
         self._add(self._reconstruct(pair) if matched else self.reconstructor.unmatched(pair), found)
 
     def _reconstruct(self, pair: RectifiedPair) -> ReconstructedFrame:
-        frame = self.reconstructor.reconstruct_rectified(pair)
+        return self._with_rays(self.reconstructor.reconstruct_rectified(pair))
+
+    def _with_rays(self, frame: ReconstructedFrame) -> ReconstructedFrame:
         with self._stage("thin"):
             return replace(frame, rays=thin_rays(frame.cloud, self.config.occupancy))
 
@@ -160,6 +177,8 @@ class Drive:
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.mapper.restore(state["mapper"])
+        if state.get("last_view") is not None:  # none of a drive that was put together of pieces
+            self._views.last = LastView(**state["last_view"])
         if len(self.session):
             path, health = self.session.odometry, self.session.health
             self._loops.restore(path.T_world_camera, stretches(health))
@@ -176,7 +195,10 @@ class Drive:
                 self.mapper.close()  # not to be resumed: frames that were dropped do not come again
             else:
                 seconds = time.perf_counter() - self._start
-                self.session.set_state({"mapper": self.mapper.state(), "seconds": seconds})
+                last = self._views.last
+                state = {"mapper": self.mapper.state(), "seconds": seconds}
+                state["last_view"] = None if last is None else tree_of(last)
+                self.session.set_state(state)
             self._map.commit()
         self._saved, self._saved_s = len(self.mapper), time.perf_counter()
 

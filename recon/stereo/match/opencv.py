@@ -16,7 +16,7 @@ from pydantic import Field
 from recon.core.errors import MatchingError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.stereo.match.protocol import unrated_disparity
-from recon.stereo.match.search import LEFT_RIGHT_PX, OddInt, SearchSettings
+from recon.stereo.match.search import LEFT_RIGHT_PX, FillableSettings, OddInt
 
 _STEPS: Final = 16  # OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities
 _LIMIT_PX: Final = 2**15 // _STEPS - 1  # 16ths of a pixel are counted in 16 bits
@@ -32,7 +32,7 @@ _BM_BLOCK_PX: Final = 9  # where the settings name none, as below
 _SGBM_BLOCK_PX: Final = 3  # a single window of SGBM smooths by its paths instead
 
 
-class OpencvSettings(SearchSettings):
+class OpencvSettings(FillableSettings):
     """Settings of `opencv-bm` (``cv2.StereoBM``) and `opencv-sgbm` (``cv2.StereoSGBM``)."""
 
     pad: bool = False

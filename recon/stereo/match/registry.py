@@ -17,7 +17,7 @@ from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import AutoRangeMatcher, SadMatcher, SadSettings, estimate_ndisp
-from recon.stereo.match.search import SearchSettings
+from recon.stereo.match.search import FillableSettings, SearchSettings
 from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 
 MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
@@ -36,10 +36,10 @@ class MatchingSettings(Settings):
     matcher: str | InstanceOf[Matcher] = "sad"
     """Name of the matcher: sad, sgm, fine, opencv-bm, opencv-sgbm, onnx, or one that an installed
     package registers; in Python also a matcher of your own."""
-    fill: bool = False
-    """Fill what is not found, or not surely, with planes of the segments of the image around it,
-    marked as filled: denser maps of rooms and plain walls, in some tenths of a second more per
-    megapixel."""
+    keyframe_matcher: str | None = None
+    """Name of a slower matcher, such as fine, for those views of a recorded drive that show
+    something new; the others are matched as ever. The map is denser and more accurate, and takes
+    seconds more for each such view."""
     sad: SadSettings = SadSettings()
     sgm: SgmSettings = SgmSettings()
     fine: FineSettings = FineSettings()
@@ -60,17 +60,14 @@ def make_matcher(
     checked. ``settings`` are those of all matchers; threads (None = all cores) are for ours.
     """
     settings = settings or MatchingSettings()
-    made = _made(matcher, settings, threads)
-    return FillingMatcher(made, threads) if settings.fill else made
-
-
-def _made(matcher: str | Matcher, settings: MatchingSettings, threads: int | None) -> Matcher:
     if not isinstance(matcher, str) or matcher not in MATCHERS:
         check_matcher(matcher)
         given = protocol.PLUGINS.load(matcher)
         return AutoRangeMatcher(protocol.CheckedMatcher(given, name_of(matcher)))
     own = getattr(settings, field_of(matcher))
     made = MATCHERS[matcher](own, threads)
+    if isinstance(own, FillableSettings) and own.fill:
+        made = FillingMatcher(made, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.
     if getattr(own, "ndisp", 0) is not None:
         return made

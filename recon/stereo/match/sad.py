@@ -48,7 +48,7 @@ _TILE_COLUMNS: Final = 160  # columns of a tile together with those that its win
 SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0.03, least=4)
 
 
-class SadSettings(common.MeasuredSettings):
+class SadSettings(common.MeasuredSettings, common.FillableSettings):
     """Settings of the SAD matcher."""
 
     window_px: common.OddInt = Field(11, ge=1, le=55)

@@ -78,6 +78,15 @@ class SearchSettings(Settings):
         return ndisp
 
 
+class FillableSettings(SearchSettings):
+    """Settings of the matchers that leave out what they do not find."""
+
+    fill: bool = False
+    """Fill what is not found, or not surely, with planes of the segments of the image around it,
+    marked as filled: more is covered where walls are plain, in some tenths of a second more per
+    megapixel. Turn it off to have only what was measured."""
+
+
 class MeasuredSettings(SearchSettings):
     """Settings of the matchers with sub-pixel disparities and uncertainties of their own."""
 

@@ -48,7 +48,7 @@ _OVERLAP_ROWS: Final = 4  # rows that strips share, for vertical paths to start 
 _MEMORY_BYTES: Final = 1536 << 20  # what strips that are worked on at once need together, at most
 
 
-class SgmSettings(common.MeasuredSettings):
+class SgmSettings(common.MeasuredSettings, common.FillableSettings):
     """Settings of the semi-global matcher."""
 
     window_px: common.OddInt = Field(5, ge=1, le=31)
