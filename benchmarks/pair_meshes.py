@@ -61,9 +61,9 @@ def not_manifold(mesh: TriangleMesh) -> tuple[int, int]:
     return len(edges), len(surface.get_non_manifold_vertices())
 
 
-def compare(scene: Path, *settings: str) -> dict[str, dict[str, Any]]:
+def compare(scene: Path) -> dict[str, dict[str, Any]]:
     """Mesh a scene of Middlebury in both ways."""
-    config = load_config(None, settings, PAIR_DEFAULTS)
+    config = load_config(defaults=PAIR_DEFAULTS)
     given = read_pair_input(*(scene / name for name in ("im0.png", "im1.png", "calib.txt")))
     frame = FrameReconstructor(given.calibration, config).reconstruct(given.pair)
     truth_px, camera = read_disparity(scene / "disp0GT.pfm").astype(np.float64), frame.pair.camera
