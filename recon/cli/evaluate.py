@@ -70,13 +70,14 @@ def middlebury(
     if shared.json and latex:
         raise typer.BadParameter("--json and --latex exclude each other")
     with shared.one_line_errors():
+        from recon.commands.config import PAIR_DEFAULTS
         from recon.commands.evaluate_middlebury import run_middlebury
         from recon.report.middlebury_page import middlebury_tables
         from recon.report.table import Table, join
 
         summary = run_middlebury(
             folder,
-            shared.settings(),
+            shared.settings(PAIR_DEFAULTS),
             matchers=_names(matcher),
             results=results or (),
             truth=truth,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from recon.commands.config import ReconConfig, load_config
+from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
 from recon.evaluation.middlebury.bench import (
     Bench,
@@ -52,7 +52,7 @@ def run_middlebury(
 
     Args:
         folder: A scene, or a folder with scenes at any depth.
-        config: The configuration; None = the defaults.
+        config: The configuration; None = the defaults of single pairs.
         matchers: The matchers, by name or as objects; None = the configured one.
         results: Folders with results of other programs, one for each program. They are scored
             beside the matchers, under the names of their folders.
@@ -74,7 +74,8 @@ def run_middlebury(
         ReconError: A scene cannot be read or matched, or the folder cannot be written; nothing is
             left behind.
     """
-    config, truths = config or load_config(), None if truth is None else Path(truth)
+    config = config or load_config(defaults=PAIR_DEFAULTS)
+    truths = None if truth is None else Path(truth)
     chosen = (config.matching.matcher,) if matchers is None else matchers
     names = check_names(chosen)
     if truths is not None:
