@@ -195,9 +195,8 @@ class Drive:
                 self.mapper.close()  # not to be resumed: frames that were dropped do not come again
             else:
                 seconds = time.perf_counter() - self._start
-                last = self._views.last
-                state = {"mapper": self.mapper.state(), "seconds": seconds}
-                state["last_view"] = None if last is None else tree_of(last)
+                last_view = tree_of(self._views.last)
+                state = {"mapper": self.mapper.state(), "seconds": seconds, "last_view": last_view}
                 self.session.set_state(state)
             self._map.commit()
         self._saved, self._saved_s = len(self.mapper), time.perf_counter()
