@@ -64,6 +64,8 @@ def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     except KeyboardInterrupt as interrupt:
         typer.echo("; ".join(["interrupted", *map(str, interrupt.args)]), err=True)
         raise typer.Exit(INTERRUPTED) from None
+    except SystemExit as ended:  # whatever code it gave, there is no result
+        _fail(f"a package that recon uses ended the program (sys.exit({ended.code!r}))")
     except Exception as error:  # noqa: BLE001 - whatever it is, it is a bug
         raise typer.Exit(report_unforeseen(error)) from None
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from recon.core.errors import SettingsError
+from recon.core.errors import ReconError, SettingsError
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,8 @@ class Plugins:
                 got=" and ".join(map(_origin, (point, *others))),
                 hint="uninstall one of them",
             )
-        try:
+        with calling(SettingsError, "the plug-in does not load", where=origin):
             made = point.load()()
-        except Exception as error:
-            what, got = "the plug-in does not load", described(error)
-            raise SettingsError(what, where=origin, got=got) from error
         if inspect.isclass(made) or not self._fits(made):
             raise SettingsError(
                 f"the plug-in makes no {self.kind}",
@@ -79,9 +77,20 @@ def name_of(given: str | object) -> str:
     return name if isinstance(name, str) and name else type(given).__name__
 
 
-def described(error: Exception) -> str:
-    """Return an error of code that is not ours, for a line of ours."""
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+@contextmanager
+def calling(kind: type[ReconError], what: str, *, where: str) -> Iterator[None]:
+    """Raise errors of code that is not ours as one of ours.
+
+    Its ``sys.exit`` too: with 0 a command would end as if it had succeeded. What the user asks for
+    (Ctrl-C), and a lack of memory, are no errors of that code.
+    """
+    try:
+        yield
+    except (ReconError, MemoryError):
+        raise
+    except (Exception, SystemExit) as error:
+        got = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise kind(what, where=where, got=got) from error
 
 
 def kind_of(found: Any) -> str:

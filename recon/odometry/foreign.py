@@ -8,9 +8,9 @@ from typing import Any, Final
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from recon.core.errors import FormatError, ReconError, RegistrationError
+from recon.core.errors import FormatError, RegistrationError
 from recon.core.geometry.se3 import check_rigid, orthonormalise
-from recon.core.plugins import Plugins, described, kind_of
+from recon.core.plugins import Plugins, calling, kind_of
 from recon.core.values.arrays import Float64
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 
@@ -57,13 +57,8 @@ class ForeignOdometry:
         self._begun = bool(state["begun"])
 
     def _call(self, method: Callable[..., Any], *given: Any, where: str) -> Any:
-        try:
+        with calling(RegistrationError, "the odometry fails", where=where):
             return method(*given)
-        except (ReconError, MemoryError):
-            raise
-        except Exception as error:
-            what, got = "the odometry fails", described(error)
-            raise RegistrationError(what, where=where, got=got) from error
 
     def _pose(self, given: Any, where: str) -> Float64:
         """Return a pose with an exact rotation."""

@@ -149,6 +149,16 @@ def test_an_import_that_ctrl_c_stops_is_an_interruption_and_any_other_an_error(c
     assert ended.value.exit_code == 1
 
 
+@pytest.mark.parametrize("code", [0, None, 7])
+def test_a_package_that_ends_the_program_is_an_error_whatever_its_code(code, capsys):
+    with pytest.raises(typer.Exit) as ended, one_line_errors():
+        raise SystemExit(code)
+    assert ended.value.exit_code == 1
+    assert capsys.readouterr().err == (
+        f"error: a package that recon uses ended the program (sys.exit({code}))\n"
+    )
+
+
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True

@@ -98,6 +98,20 @@ def test_an_error_inside_is_reported_and_kept_as_the_cause(blind):
         odometry.restore({"odometry": {"own": {}, "begun": True}, "last": None})
 
 
+@pytest.mark.parametrize("method", ["register", "state", "restore"])
+def test_an_odometry_that_exits_ends_nothing(method, blind):
+    class Exiting(Ahead):
+        pass
+
+    def leave(*_: object) -> None:
+        raise SystemExit(0)
+
+    setattr(Exiting, method, leave)
+    odometry, given = ForeignOdometry(Exiting(), "mine"), {"register": [blind()], "state": []}
+    with pytest.raises(RegistrationError, match="'mine'.*fails.*SystemExit: 0"):
+        getattr(odometry, method)(*given.get(method, [{"own": {}, "begun": True}]))
+
+
 @pytest.mark.parametrize(
     "state", [None, [1], {1: 2}, {"a": {3}}, {"a": np.array(["x"])}, {"a": [{"b": object()}]}]
 )

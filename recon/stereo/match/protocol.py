@@ -6,8 +6,8 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from recon.core.errors import MatchingError, ReconError
-from recon.core.plugins import Plugins, described, kind_of
+from recon.core.errors import MatchingError
+from recon.core.plugins import Plugins, calling, kind_of
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.core.values.image import ASSUMED_CONFIDENCE, ASSUMED_SIGMA_PX
@@ -54,14 +54,8 @@ class CheckedMatcher:
         self._name = name
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        try:
+        with calling(MatchingError, "the matcher fails", where=f"matcher {self._name!r}"):
             found = self._matcher.match(pair)
-        except (ReconError, MemoryError):
-            raise
-        except Exception as error:
-            raise MatchingError(
-                "the matcher fails", where=f"matcher {self._name!r}", got=described(error)
-            ) from error
         disparity = _checked(found, pair, self._name)
         return disparity if pair.valid is None else disparity.reject(~pair.valid, Reason.BORDER)
 

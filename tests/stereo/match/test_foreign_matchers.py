@@ -13,6 +13,7 @@ from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
+from tests.hostile.refusals import assert_refused, run
 
 
 def install_plugin(site, package, modules, points, group="matchers"):
@@ -25,11 +26,6 @@ def install_plugin(site, package, modules, points, group="matchers"):
     lines = "".join(f"{name} = {value}\n" for name, value in points.items())
     (info / "entry_points.txt").write_text(f"[recon.{group}]\n{lines}")
 
-
-if sys.version_info >= (3, 11):
-    pass
-else:
-    pass
 
 SHAPE = (20, 60)
 CAMERA = RectifiedCamera(100.0, 30.0, 10.0, 30.0, 0.1, SHAPE[1], SHAPE[0])
@@ -105,6 +101,16 @@ def test_an_error_inside_is_reported_with_its_matcher_and_kept_as_the_cause():
     assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
 
+@pytest.mark.parametrize("code", [0, 1, None, "done"])
+def test_a_matcher_that_exits_ends_nothing(code):
+    class Exiting(Flat):
+        def match(self, pair: RectifiedPair) -> Disparity:
+            sys.exit(code)
+
+    with pytest.raises(MatchingError, match="'Exiting': the matcher fails.*SystemExit"):
+        recon.match(image(), image(), matcher=Exiting())
+
+
 def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named():
     valid, mine = np.ones(SHAPE, bool), Flat()
     valid[:, :9] = False
@@ -140,17 +146,24 @@ def nothing():
 
 def fails():
     raise RuntimeError("no model here")
+
+def leaves():
+    raise SystemExit(0)
+
+class Ends:
+    def match(self, pair):
+        raise SystemExit(0)
 """
 
 
 @pytest.fixture
 def plugin(tmp_path, monkeypatch):
-    places = {"flat": "Flat", "sad": "Flat", "missing": "Nowhere"}
+    places = {"flat": "Flat", "sad": "Flat", "missing": "Nowhere", "ends": "Ends"}
     names = {name: f"flat_matcher:{place}" for name, place in places.items()}
-    names |= {name: f"flat_matcher:{name}" for name in ("nothing", "fails")}
-    install_plugin(
-        tmp_path, "flat-matcher", {"flat_matcher.py": FLAT}, {**names, "gone": "not_there:Flat"}
-    )
+    names |= {name: f"flat_matcher:{name}" for name in ("nothing", "fails", "leaves")}
+    names |= {"gone": "not_there:Flat", "exiting": "exiting_matcher:Flat"}
+    modules = {"flat_matcher.py": FLAT, "exiting_matcher.py": "import sys\nsys.exit(0)\n"}
+    install_plugin(tmp_path, "flat-matcher", modules, names)
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
@@ -160,7 +173,7 @@ def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
     assert type(made) is MATCHERS["sad"]
     with pytest.raises(
-        SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad, sgm"
+        SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad"
     ):
         recon.match(image(), image(), matcher="cencus")
     install_plugin(tmp_path, "other-matcher", {}, {"flat": "other_matcher:Flat"})
@@ -176,6 +189,8 @@ def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
         ("gone", "does not load.*ModuleNotFoundError.*not_there"),
         ("nothing", "makes no matcher.*int"),
         ("fails", "does not load.*RuntimeError: no model here"),
+        ("leaves", "does not load.*SystemExit: 0"),
+        ("exiting", "does not load.*SystemExit: 0"),
     ],
 )
 def test_a_broken_plugin_is_named_in_one_line(name, words):
@@ -183,6 +198,17 @@ def test_a_broken_plugin_is_named_in_one_line(name, words):
         recon.match(image(), image(), matcher=name)
     assert f"matcher {name!r}" in str(raised.value)
     assert "of package flat-matcher" in str(raised.value)
+
+
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.parametrize("name", ["leaves", "exiting", "ends"])
+def test_a_command_whose_plugin_exits_with_0_fails(name, tmp_path):
+    for seed, side in enumerate(("left", "right")):
+        cv2.imwrite(str(tmp_path / f"{side}.png"), image(seed))
+    images = (tmp_path / "left.png", tmp_path / "right.png")
+    ended = run("disparity", *images, "--matcher", name, "--out", tmp_path / "out")
+    assert_refused(ended, f"matcher '{name}'", "SystemExit: 0")
+    assert not (tmp_path / "out").exists()
 
 
 NAMES = ("opencv-bm", "opencv-sgbm")
