@@ -91,7 +91,12 @@ class Flattening:
         self._tiles, self._path_m, self._trusted = placed.tiles, placed.path_m, placed.trusted
         self._config, self._resolution_m = placed.tiles.config, placed.tiles.resolution_m
         self._settings, self._finish = settings or self._config.grid, finish
-        self._margin_m = self._config.scale * _MARGIN_M
+        width_m, around_m = self._config.grid.vehicle_width_m, self._config.scale * _MARGIN_M
+        # What is wider than all that is shown on both sides of the path did not drive there.
+        self._too_wide = width_m > 2 * around_m
+        self._width_m = 0.0 if self._too_wide else width_m
+        # It frees cells whose centres are within half its width.
+        self._margin_m = max(around_m, self._width_m / 2 + self._resolution_m)
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> WrittenGrid:
@@ -106,7 +111,7 @@ class Flattening:
             raise MappingError("the grid would be too large", got=got, expected=expected, hint=hint)
         cells = np.full(shape, UNKNOWN, np.int8)
         path = None
-        if driven and self._config.grid.vehicle_width_m > 0:
+        if driven and self._width_m > 0:
             submap, step_m = self._tiles.submap_of_frame, self._resolution_m / 2
             path = DrivenPath.through(self._path_m, self._trusted, submap, step_m)
         keys = [tile.key for tile in self._tiles]
@@ -128,6 +133,11 @@ class Flattening:
             text = "the camera was not carried at one height above the ground: the grid has only "
             yield text + "what was seen, and the base of the trajectory in the map is the camera"
         settings, cell_m = self._settings, self._resolution_m
+        if driven and self._too_wide:
+            yield (
+                f"a vehicle of grid.vehicle_width_m={self._config.grid.vehicle_width_m:g} is wider "
+                "than this map is around the path: the grid has only what was seen; set its width"
+            )
         depths_m = np.concatenate(self._ground_depths)
         if len(depths_m):
             # What is seen as thin as can be still lies up to half a voxel off its centre.
@@ -200,11 +210,10 @@ class Flattening:
     ) -> dict[int, OccupancyPart]:
         """Return the space that the vehicle took up in a tile and its margin, by submap."""
         path = path.select(self._tiles.bounds(key).wider(self._margin_m).contains(path.points_m))
-        width_m, free = self._config.grid.vehicle_width_m, log_odds(MIN_PROBABILITY)
-        passed = {}
+        free, passed = log_odds(MIN_PROBABILITY), {}
         for submap in np.unique(path.submap).tolist():
             points_m = path.points_m[path.submap == submap]
-            keys = sweep(points_m, ground, width_m, self._resolution_m)
+            keys = sweep(points_m, ground, self._width_m, self._resolution_m)
             passed[submap] = free_part(keys, free)
         return passed
 

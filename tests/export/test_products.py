@@ -110,6 +110,30 @@ def test_the_vehicle_frees_its_own_track_alone(mapped, folder):
     assert away.max() < np.hypot(0.3, 0.55)
 
 
+@pytest.mark.parametrize("width_m", [9.9, 10.0])
+def test_a_vehicle_as_wide_as_the_margin_frees_what_it_passed(mapped, folder, width_m):
+    wide = load_config(None, [*SETTINGS, f"grid.vehicle_width_m={width_m}"])
+    grid = write_products(replace(mapped, config=wide), folder).grid
+    path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)[:, :2]
+    beside_m = path_m[5:15] + np.array([0.0, 2.5])
+    aside = np.floor((beside_m - grid.origin_m) / 0.2).astype(int)
+    assert (grid.cells[aside[:, 1], aside[:, 0]] == FREE).mean() > 0.5
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.02, 0.05, 0.08, 50.0])
+def test_a_scene_of_any_size_has_a_grid_and_a_vehicle_only_where_it_fits(scale):
+    drive = SyntheticSource(STREET.model_copy(update={"frames": 8}))
+    small = replace(drive.calibration, baseline_m=scale * drive.calibration.baseline_m)
+    lengths = ["submaps.length_m", "submaps.tile_m"]
+    sizes = [f"{n}={scale * v}" for n, v in zip(lengths, (4, 12.8), strict=True)]
+    config = load_config(None, [*sizes, "fusion.min_count=1", f"scene.scale={scale}"])
+    made = map_sequence(drive.with_calibration(small), config.at_scale(scale))
+    grid, _, warnings = export_grid(made.placed, None)
+    assert (grid.cells != UNKNOWN).any()
+    too_wide = [text for text in warnings if "vehicle_width_m=0.6 is wider than" in text]
+    assert len(too_wide) == (scale < 0.06)
+
+
 def test_a_map_too_large_for_an_octomap_has_all_else(mapped, folder, monkeypatch):
     whole = write_products(mapped, folder)
     monkeypatch.setattr("recon.io.models.octomap.KEY_LIMIT", 20)
