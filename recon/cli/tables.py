@@ -87,7 +87,7 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
 
 
 def print_batch(summary: Mapping[str, Any]) -> None:
-    """Print a line per job, what is wrong first; then why jobs failed, and what is unusual."""
+    """Print a line per job, what is wrong first; then remarks, and why jobs failed."""
     from recon.run.batch.results import urgency
 
     jobs = sorted(summary["jobs"], key=lambda job: urgency(job, job["figures"]))
@@ -96,7 +96,7 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         typer.echo(f"and {more} more, in table.csv")
     for job in jobs:
         if "remark" in job:
-            typer.echo(f"unusual: {job['name']}: {job['remark']}")
+            typer.echo(f"remark: {job['name']}: {job['remark']}")
         if job["state"] == "failed":
             typer.echo(f"error: {job['name']}: {job['error']}", err=True)
     typer.echo(f"results: {summary['out']}")

@@ -188,7 +188,7 @@ def test_the_table_has_the_accuracy_of_each_command_and_not_all_of_very_many_job
     for word in ("trajectory t", "disparity bad", "0.5123", "6.5", "drive_window=9"):
         assert word in out
     assert "points" not in out
-    assert "unusual: pair_window=9: odd" in out
+    assert "remark: pair_window=9: odd" in out
     assert err == "error: nowhere: there is no such folder\n"
     assert max(map(len, out.splitlines())) <= 80
     print_batch({"jobs": [job(f"j{n}") for n in range(1000)], "out": "outputs/week"})

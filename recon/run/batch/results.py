@@ -123,20 +123,22 @@ def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
         if not outcome.seconds:  # its worker died before it could say so
             outcome = replace(outcome, seconds=float(summary.get("seconds", 0.0)))
         warnings = tuple(map(str, summary.get("warnings", ())))
-        return JobResult(job, outcome, dict(_flat(summary)), warnings, bytes=size)
+        remark = next(iter(warnings), "")
+        return JobResult(job, outcome, dict(_flat(summary)), warnings, remark, size)
 
 
 def compare(results: Sequence[JobResult]) -> list[JobResult]:
     """Return the results with a remark where drift or trust are much worse than in other jobs.
 
-    Others are those of the same command with the same swept settings.
+    Others are those of the same command with the same swept settings. Elsewhere the remark is what
+    the job was warned of first.
     """
     groups: dict[str, list[JobResult]] = {}
     for one in results:
         key = json.dumps([one.job.command, dict(one.job.swept)], sort_keys=True, default=str)
         groups.setdefault(key, []).append(one)
     remarks = dict(found for group in groups.values() for found in _remarks(group))
-    return [replace(one, remark=remarks.get(one.job.name, "")) for one in results]
+    return [replace(one, remark=remarks.get(one.job.name, one.remark)) for one in results]
 
 
 def wrong_first(results: Iterable[JobResult]) -> list[JobResult]:
