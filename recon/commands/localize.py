@@ -23,6 +23,7 @@ from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequenc
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
+from recon.rig.audit.audit import quick_warnings
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
 from recon.sources.source import DerivedSource, StereoSource
@@ -52,6 +53,8 @@ def run_localize(
     config, options = config or load_config(), options or MapOptions(command="localize")
     map_path = Path(map_path)
     refuse_as_target(map_path, options.out)
+    findings = quick_warnings(source, config) if options.audit else ()
+    options.warn(findings)
     with (
         Map.open(map_path, cache_bytes=config.memory.cache_bytes) as map_,
         options.run(config.at_scale(map_.first.scale)) as run,
@@ -60,6 +63,7 @@ def run_localize(
         inputs = [*source.files, map_path if folder is None else folder / MAP_FILE]
         run.check_targets(inputs)
         rig = refine_drive(source, config, run, map_.known_rig(source.calibration))
+        options.warn(rig.not_rigid)
         source = rig.applied(source)
         workspace = Workspace(map_, run.watch, run.threads)
         T_map_world = map_.first.T_map_world.tolist()
@@ -71,7 +75,8 @@ def run_localize(
         grid = read_nav2(map_path / GRID) if has_grid else None
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, **where, **drive.figures())
-        warnings = [*map_.doubts, *rig.warnings(), *drive.warnings(), *source.warnings()]
+        seen = [*findings, *rig.warnings(findings), *drive.warnings(), *source.warnings()]
+        warnings = [*rig.not_rigid, *map_.doubts, *seen]
         made.summary["warnings"], made.summary["rig"] = warnings, rig.figures()
         made.summary.update(source.figures())
         with run.stage("write"):

@@ -124,6 +124,7 @@ def run_map(
     with _begun(source, config, options) as (run, map_, found, scene, config):
         if config.rig.refine:
             map_.session().set_rig(found)
+        options.warn(found.not_rigid)
         source = found.applied(source)
         if options.known_poses is not None and found.refined:
             poses = found.poses(options.known_poses, config.rectification)
@@ -133,7 +134,7 @@ def run_map(
         mapped = map_drive(source, config, options, run, map_)
         rig = _shown_live(mapped, source, config, run) if source.live else found
         with run.stage("cloud"):
-            check_map(mapped, source.name, findings)
+            check_map(mapped, source.name, (*found.not_rigid, *findings))
         made = make(Order(map_, mapped.placed, run, config.mesh), options.products)
         with run.stage("compare"):
             given = options.known_poses is not None
@@ -144,7 +145,8 @@ def run_map(
         doubts = [*said, *_warnings(source, mapped, drift)]
         breaks = break_warnings(mapped)
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
-        warnings = [*first, *breaks, *findings, *doubts, *made.warnings, *errors.warnings]
+        known = [*first, *breaks, *findings]
+        warnings = [*found.not_rigid, *known, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         result.summary["typical_depth_m"] = scene.depth_m

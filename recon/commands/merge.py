@@ -34,6 +34,7 @@ from recon.map.store.map_file import MAP_FILE
 from recon.map.store.session import Session
 from recon.odometry.rig.refine import RefinedRig
 from recon.report.map_page import write_joined_page
+from recon.rig.audit.audit import quick_warnings
 from recon.run.finished import command_of_map, refuse_as_target
 from recon.run.run import Run, WholeRun
 from recon.sources.source import StereoSource
@@ -104,11 +105,13 @@ def run_map_into(
         _copied(folder / MAP_FILE, map_, settings)
         kept = run.state("kept.recon")
         known = map_.known_rig(source.calibration)
+        options.warn(quick_warnings(source, settings) if options.audit else ())
         rig = refine_drive(source, settings, run, known, options.prior)
+        options.warn(rig.not_rigid)
         with Map.create(run.state("drive.recon")) as drive:
             drive.begin(session_info(source, settings, options.images_of(source)))
             mapped = map_drive(rig.applied(source), settings, options, run, drive)
-            check_map(mapped, source.name)
+            check_map(mapped, source.name, rig.not_rigid)
             if settings.rig.refine:
                 mapped.session.set_rig(rig)
             keep_map(drive, kept)

@@ -72,7 +72,7 @@ def run_pair(
             faults = find_pair_faults(given, config, metric=not given.up_to_scale)
         progress.on_stage("match")
         frame = reconstructor.reconstruct(given.pair)
-        few = check_found(frame.disparity, given.pair, faults)
+        found = check_found(frame.disparity, given.pair.name, frame.support, faults)
         check_cloud(frame, config.cloud, given.pair.name)
         progress.on_stage("mesh")
         with run.stage("mesh"):
@@ -87,7 +87,7 @@ def run_pair(
             "up_to_scale": given.up_to_scale,
             "disparity_png_scale": scale,
         }
-        warnings = (*given.notes, *(one.text for one in faults), *few, *frame.warnings, *unmeshed)
+        warnings = (*given.notes, *found, *frame.warnings, *unmeshed)
         result = _compared(given, config, (frame.pair, frame.disparity), figures, warnings)
         result = replace(result, cloud=frame.cloud, mesh=mesh)
         with run.report(result.summary):
@@ -115,11 +115,11 @@ def run_disparity(
             faults = find_pair_faults(given, config, metric=False)
         progress.on_stage("match")
         pair, disparity = reconstructor.match(given.pair)
-        inspected = reconstructor.inspect(pair)
-        few = check_found(disparity, given.pair, faults)
+        inspected, support = reconstructor.inspect(pair)
+        found = check_found(disparity, given.pair.name, support, faults)
         with run.stage("write"):
             figures = {"disparity_png_scale": write_disparity_files(disparity, run)}
-        warnings = (*given.notes, *(fault.text for fault in faults), *few, *inspected)
+        warnings = (*given.notes, *found, *inspected)
         result = _compared(given, config, (pair, disparity), figures, warnings)
         with run.report(result.summary):
             write_disparity_images(result, run)
@@ -207,11 +207,15 @@ def reconstruct(
         matcher: As for `match`; None = that of the settings.
 
     Raises:
-        ReconError: The images, the calibration and the settings do not fit together.
+        ReconError: The images, the calibration and the settings do not fit together, or nothing
+            supports that the images do.
     """
     settings = (config or load_config(defaults=PAIR_DEFAULTS)).with_matcher(matcher)
     pair = StereoPair(left, right)
-    return FrameReconstructor(_rig_of(calibration, pair), settings).reconstruct(pair)
+    frame = FrameReconstructor(_rig_of(calibration, pair), settings).reconstruct(pair)
+    if frame.support is not None and frame.disparity.valid.any():
+        frame.support.check(None)
+    return frame
 
 
 def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
@@ -233,13 +237,17 @@ def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[s
 
 
 def _disparity_figures(disparity: Disparity) -> dict[str, Any]:
-    """Return size, share of pixels for each reason, and median of a disparity, ready for JSON."""
-    found = disparity.values[disparity.valid]
+    """Return size, share of pixels for each reason, and median of a disparity, ready for JSON.
+
+    What was measured and what was filled are counted apart; the median is of the former.
+    """
+    found = disparity.values[disparity.measured]
     shares = disparity.reason_shares
     return {
         "width_px": disparity.values.shape[1],
         "height_px": disparity.values.shape[0],
-        "valid_percent": 100.0 * float(disparity.valid.mean()),
+        "valid_percent": 100.0 * float(disparity.measured.mean()),
+        "filled_percent": 100.0 * shares.get(Reason.FILLED, 0.0),
         "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
         "disparity_median_px": float(np.median(found)) if len(found) else None,
     }

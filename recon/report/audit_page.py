@@ -50,7 +50,7 @@ def _pair(look: Look, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
         "images": pair_figure(pair),
         "rows": rows_figure(look, pair) if len(look.features) else None,
         "disparity": disparity_figure(disparity, pair.camera),
-        "valid_percent": 100 * disparity.valid.mean(),
+        "valid_percent": 100 * disparity.measured.mean(),
     }
 
 

@@ -20,6 +20,7 @@ from recon.core.values import (
     DisparityMetrics,
     DisparityTruth,
     PointCloud,
+    Reason,
     RectifiedCamera,
     RectifiedPair,
     TriangleMesh,
@@ -115,7 +116,8 @@ def stereo_figures(pair: RectifiedPair, disparity: Disparity) -> dict[str, Any]:
         "depth": depth_figure(depth_from_disparity(disparity.values, pair.camera)),
         "reasons": reasons_figure(disparity),
         "confidence": confidence_figure(disparity),
-        "valid_percent": float(100 * disparity.valid.mean()),
+        "valid_percent": float(100 * disparity.measured.mean()),
+        "filled_percent": 100 * disparity.reason_shares.get(Reason.FILLED, 0.0),
         "wide": is_wide(disparity.values.shape),
     }
 

@@ -18,7 +18,8 @@ class AuditSettings(Settings):
     fixed: ClassVar = {"frames": 300}
 
     quick: bool = True
-    """Whether `recon map`, `pair` and `disparity` start with a quick audit. Off saves a second."""
+    """Whether `recon map`, `localize`, `pair` and `disparity` start with a quick audit. Off saves a
+    second."""
     baseline_m: tuple[Metres, Metres] = Field((0.01, 2.0))
     """Smallest and largest plausible baseline, in metres. Widen it for an unusual rig."""
 

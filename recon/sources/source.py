@@ -64,6 +64,8 @@ class StereoSource(ABC):
     def calibration(self) -> Rig:
         """A `RectifiedCamera` if the images are already rectified."""
 
+    rigid: bool = True  # whether both cameras are rigid to each other; else frames are distrusted
+
     @cached_property
     def files(self) -> Sequence[Path]:
         """The files that pairs and calibration are read from, for the record of a run."""
@@ -103,13 +105,13 @@ class StereoSource(ABC):
     def __iter__(self) -> Iterator[StereoPair]:
         return self.frames()
 
-    def with_calibration(self, calibration: Rig) -> StereoSource:
+    def with_calibration(self, calibration: Rig, *, rigid: bool = True) -> StereoSource:
         """Return this source with another calibration of the same cameras."""
         other = copy(self)
         # Of a subclass the calibration may be a property, or an attribute of its own, and frozen.
         kind = type(type(self).__name__, (type(self),), {"calibration": calibration})
         object.__setattr__(other, "__class__", kind)
-        vars(other)["calibration"] = calibration
+        vars(other).update(calibration=calibration, rigid=rigid)
         return other
 
     def __repr__(self) -> str:

@@ -35,8 +35,15 @@ from recon.stereo.kernels import points
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, check_matcher, make_matcher, searched
 from recon.stereo.match.sad import HalfSizeMatcher
-from recon.stereo.rectify.features import check_inspection, inspect_pair
+from recon.stereo.rectify.features import (
+    INSPECTED,
+    check_inspection,
+    inspect_features,
+    inspect_pair,
+    match_features,
+)
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
+from recon.stereo.support import Support, measure_support
 
 _INSPECT_EVERY: Final = 50  # frames: swapped cameras and rows that are off do not change
 
@@ -50,6 +57,8 @@ class ReconstructedFrame:
     cloud: PointCloud  # its points in camera axes, filtered
     warnings: tuple[str, ...] = ()  # problems of the images that did not prevent a result
     rays: RayCloud | None = None  # its rays for the occupancy map; None if no map is made
+    rows_px: float | None = None  # epipolar error; NaN = unknown, None = not measured
+    support: Support | None = None  # that both images belong together; None: not judged
 
     def unmapped(self) -> ReconstructedFrame:
         """Return the frame with nothing for a map, only for odometry and place recognition."""
@@ -66,8 +75,9 @@ class FrameReconstructor:
         *,
         threads: int | None = None,  # of the matcher; results do not depend on them
         stopwatch: Stopwatch | None = None,
+        check_rows: bool = False,  # of every frame: the cameras move against each other
     ) -> None:
-        self._config = config
+        self._config, self._threads, self._check_rows = config, threads, check_rows
         self._stopwatch = stopwatch or Stopwatch()
         self._rectifier = Rectifier(calibration, config.rectification)
         matching = config.matching
@@ -97,20 +107,28 @@ class FrameReconstructor:
         with self._stopwatch.stage("match_roughly"):
             return rectified, self._rough_matcher.match(rectified)
 
-    def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
-        """Return warnings about the geometry of a pair; every 50th frame is inspected."""
-        if pair.index % _INSPECT_EVERY:
-            return ()
+    def inspect(self, pair: RectifiedPair) -> tuple[tuple[str, ...], Support | None]:
+        """Return warnings about a pair, and what supports that its images belong together."""
         with self._stopwatch.stage("inspect"):
-            found = inspect_pair(pair)
-        return check_inspection(found, where=f"frame {pair.index}")
+            features = match_features(pair.left, pair.right, INSPECTED)
+            found = inspect_features(features, pair.camera.doffs_px)
+            warnings = check_inspection(found, where=f"frame {pair.index}")
+            search = searched(self._config.matching)
+            support = measure_support(pair, features, search, self._threads)
+        return (*warnings, *(() if support is None else support.warnings())), support
 
     def reconstruct(self, pair: StereoPair) -> ReconstructedFrame:
-        return self.reconstruct_rectified(self.rectify(pair))
+        """Reconstruct one pair, and inspect it."""
+        rectified = self.rectify(pair)
+        return self._frame_of(rectified, self._match(rectified), *self.inspect(rectified))
 
     def reconstruct_rectified(self, rectified: RectifiedPair) -> ReconstructedFrame:
-        """Reconstruct one pair that is rectified; see `reconstruct`."""
-        return self._frame_of(rectified, self._match(rectified), self.inspect(rectified))
+        """Reconstruct one pair of a drive that is rectified; every 50th is inspected."""
+        inspected = ((), None) if rectified.index % _INSPECT_EVERY else self.inspect(rectified)
+        frame = self._frame_of(rectified, self._match(rectified), *inspected)
+        if not self._check_rows:
+            return frame
+        return replace(frame, rows_px=inspect_pair(rectified).row_error_px)
 
     @property
     def matches_keyframes(self) -> bool:
@@ -126,14 +144,18 @@ class FrameReconstructor:
         return self._frame_of(frame.pair, self._without_edges(disparity), frame.warnings)
 
     def _frame_of(
-        self, rectified: RectifiedPair, disparity: Disparity, warnings: tuple[str, ...]
+        self,
+        rectified: RectifiedPair,
+        disparity: Disparity,
+        warnings: tuple[str, ...],
+        support: Support | None = None,
     ) -> ReconstructedFrame:
         config, stage = self._config, self._stopwatch.stage
         with stage("back_project"):
             cloud = back_project(disparity, rectified, config.cloud)
         with stage("filter"):
             cloud = filter_cloud(cloud, config.filters)
-        return ReconstructedFrame(rectified, disparity, cloud, warnings)
+        return ReconstructedFrame(rectified, disparity, cloud, warnings, support=support)
 
     def unmatched(self, rectified: RectifiedPair) -> ReconstructedFrame:
         """Return a frame in which nothing is matched: no disparity, no point."""

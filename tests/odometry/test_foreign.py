@@ -108,7 +108,7 @@ def test_an_odometry_that_exits_ends_nothing(method, blind):
 
     setattr(Exiting, method, leave)
     odometry, given = ForeignOdometry(Exiting(), "mine"), {"register": [blind()], "state": []}
-    with pytest.raises(RegistrationError, match="'mine'.*fails.*SystemExit: 0"):
+    with pytest.raises(RegistrationError, match=r"'mine'.*fails.*SystemExit: 0"):
         getattr(odometry, method)(*given.get(method, [{"own": {}, "begun": True}]))
 
 

@@ -109,7 +109,8 @@ def test_every_figure_of_a_pair_is_a_png(which, pair, disparity, nothing_found):
     shown = {"disparity": disparity, "nothing_found": nothing_found}.get(which, below)
     found = pair_page.stereo_figures(pair, shown)
     assert found.pop("wide")
-    assert found.pop("valid_percent") == 100 * shown.valid.mean()
+    assert found.pop("valid_percent") == 100 * shown.measured.mean()
+    assert found.pop("filled_percent") == 0.0
     for png in (*found.values(), pair_page.error_figure(shown.values)):
         picture(png)
 

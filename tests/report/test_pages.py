@@ -252,7 +252,7 @@ def test_page_of_a_pair_shows_all_that_the_run_has(view):
     assert {"Input pair", "Disparity", "Disparity error", "In 3-D"} <= shown.keys()
     assert ("pixels compared", "1,440") in rows(shown["Disparity against truth"])
     figures = key_figures(page)
-    assert figures["Pixels with a disparity"] == "75.0 %"
+    assert figures["Pixels measured"] == "75.0 %"
     assert (figures["Bad 2: off by more than 2 px"], figures["Points"]) == ("10.0 %", "2,000")
     assert len(page.encode()) < MAX_BYTES
     assert "baseline 0.5 m" in page
@@ -339,7 +339,7 @@ def test_page_of_a_pair_with_truth_of_another_size_or_without_any_disparity_is_m
     view.disparity, view.cloud = nothing_found, PointCloud(np.zeros((0, 3), dtype=np.float32))
     view.truth = view.metrics = None
     page = pair_html(view)
-    assert key_figures(page)["Pixels with a disparity"] == "0.0 %"
+    assert key_figures(page)["Pixels measured"] == "0.0 %"
     assert "Against the truth" not in page
     assert "In 3-D" not in page
 

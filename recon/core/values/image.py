@@ -211,6 +211,12 @@ class Disparity(Shown):
         """bool (H, W), where there is a disparity; read-only."""
         return frozen_array("Disparity.valid", np.isfinite(self.values), np.bool_, (None, None))
 
+    @cached_property
+    def measured(self) -> Bool:
+        """bool (H, W), where a match was found: ``valid`` without what was FILLED; read-only."""
+        found = self.reason == np.uint8(Reason.VALID)
+        return frozen_array("Disparity.measured", found, np.bool_, (None, None))
+
     @property
     def reason_shares(self) -> dict[Reason, float]:
         """Share of the pixels, in [0, 1], for each reason that occurs; the largest first."""

@@ -230,7 +230,7 @@ def poses_first(
             frame = OdometryFrame(rectified, disparity, rough=True)
             found = register(frame)
             source.note_located(index)
-            valid_share = float(np.mean(disparity.valid))
+            valid_share = float(np.mean(disparity.measured))
             T = found.T_world_camera
             yield FrameResult(index, len(source), 0.0, valid_share, 0, T, found.health)
             behind.add((rectified, found))

@@ -28,6 +28,7 @@ from recon.map.store.session import Session
 from recon.map.submaps import Submap, SubmapSettings
 from recon.odometry.checked import StretchCounter
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.rig.rigidity import MOST_ROWS_PX
 from recon.run.work import OneBehind, Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
@@ -71,6 +72,9 @@ class Mapper:
         """Add the next frame, whose pose is known, and start its integration."""
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
+        if frame.rows_px is not None and not abs(frame.rows_px) <= MOST_ROWS_PX:
+            note = f"left and right rows are {frame.rows_px:.0f} px apart"
+            health = replace(health, ok=False, notes=(*health.notes, note))
         # A hole in the map is better than wrong geometry.
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
         rays = frame.rays if health.ok else None
@@ -84,7 +88,7 @@ class Mapper:
         work = (builder, len(self), cloud, rays, T_world_camera)
         self._behind.begin(partial(self._integrate, *work))
         self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
-        valid_share = float(np.mean(frame.disparity.valid))
+        valid_share = float(np.mean(frame.disparity.measured))
         found = (len(frame.cloud), T_world_camera, health, stretch)
         return FrameResult(len(self) - 1, total, 0.0, valid_share, *found)
 

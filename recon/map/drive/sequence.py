@@ -215,7 +215,11 @@ def map_sequence(
     check_source(source)
     work = workspace or Workspace()
     reconstructor = FrameReconstructor(
-        source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
+        source.calibration,
+        config,
+        threads=work.threads,
+        stopwatch=work.stopwatch,
+        check_rows=not source.rigid,
     )
     by_sfm = config.odometry.method == "sfm" and known_poses is None
     used = imu = None
@@ -345,7 +349,7 @@ def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
 
 def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:
     """Return the share of pixels with a match, and their depths."""
-    share = f"{100 * float(disparity.valid.mean()):.1f} % of the pixels matched"
+    share = f"{100 * float(disparity.measured.mean()):.1f} % of the pixels matched"
     if not disparity.valid.any():
         return share
     depth_m = depth_from_disparity(disparity.values[disparity.valid], camera)

@@ -22,6 +22,7 @@ from recon.core.values.arrays import Float64
 from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
 from recon.odometry.rig.fit import FittedFault, fit_fault
 from recon.odometry.rig.length import SeenBaseline
+from recon.odometry.rig.rigidity import Rigidity, measure_rigidity
 from recon.odometry.rig.tracks import FRAMES, StereoTracks, plan_stretches, track_stretches
 from recon.odometry.settings import RigSettings
 from recon.run.run import plain
@@ -89,11 +90,18 @@ class RefinedRig:
     begun_with: str | None = None  # the drive whose rig this one began with
     period_s: float = float("nan")  # of frames; NaN = not known
     baseline: SeenBaseline | None = None  # None: no length was measured
+    rigidity: Rigidity | None = None  # None: not measured
 
     @property
     def refined(self) -> bool:
         """Whether another rig than was given is used."""
         return self.calibration is not self.given
+
+    @property
+    def not_rigid(self) -> tuple[str, ...]:
+        """What to know first of all of cameras that move against each other; else empty."""
+        known = self.rigidity
+        return () if known is None or known.kept else (known.describe(),)
 
     @property
     def length_share(self) -> float | None:
@@ -109,8 +117,11 @@ class RefinedRig:
         return float(np.sqrt(by @ squares @ by + kept**2 + wider**2))
 
     def applied(self, source: StereoSource) -> StereoSource:
-        """Return the drive with the refined rig."""
-        return source.with_calibration(self.calibration) if self.refined else source
+        """Return the drive with the refined rig, marked if its cameras are not rigid."""
+        rigid = not self.not_rigid
+        if rigid and not self.refined:
+            return source
+        return source.with_calibration(self.calibration, rigid=rigid)
 
     def with_baseline(self, seen: SeenBaseline, settings: RigSettings) -> RefinedRig:
         """Return the rig with the baseline that lengths show; if it is to be kept, it says so."""
@@ -265,8 +276,9 @@ def refine_rig(
     A few windows of frames, from all over the drive, show how the right camera is turned, how long
     its focal length is, and what both lenses bend; see `recon.odometry.rig.fault`. Where a drive
     shows little the calibration stays, or what is ``known`` by an earlier drive of the rig. Drives
-    of less than 36 frames, and live ones, are not refined: they take that as it is. If
-    ``rig.refine`` is off, the calibration stays, and what the drive shows is only said.
+    of less than 36 frames, live ones, and those whose cameras move against each other are not
+    refined: they take that as it is. If ``rig.refine`` is off, the calibration stays, and what the
+    drive shows is only said.
     """
     given, known = source.calibration, known if rig.refine else None
     begun = Rectifier(given, config.rectification)
@@ -274,7 +286,10 @@ def refine_rig(
     if known is not None:
         found = known.begun(config.rectification)
         begun = Rectifier(found.calibration, config.rectification)
-    if source.live or len(source) < MIN_WINDOWS * FRAMES:
+    if source.live:
+        return found
+    found = replace(found, rigidity=measure_rigidity(source, begun))
+    if found.not_rigid or len(source) < MIN_WINDOWS * FRAMES:
         return found
     values = np.zeros(len(NAMES)) if known is None else known.fitted.values.copy()
     refined, turn = _with_rows_aligned(source, found.calibration, begun)
@@ -300,7 +315,8 @@ def refine_rig(
     period_s = float(np.median(steps_s)) if len(steps_s) else float("nan")
     if not rig.refine:
         described = replace(described, calibration=given)
-    return replace(described, begun_with=found.begun_with, period_s=period_s)
+    described = replace(described, begun_with=found.begun_with, period_s=period_s)
+    return replace(described, rigidity=found.rigidity)
 
 
 def rig_shown(

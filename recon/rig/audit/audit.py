@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import CalibrationError, MatchingError
-from recon.core.values import Disparity, RectifiedCamera, Rig, StereoPair
+from recon.core.errors import CalibrationError, MatchingError, SourceError
+from recon.core.values import Disparity, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
 from recon.odometry.rig.refine import RefinedRig, refine_rig
@@ -26,15 +26,18 @@ from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.rectify.rectifier import Rectifier, turns_of
 from recon.stereo.rectify.row_alignment import RowAlignment, correct_rig
+from recon.stereo.support import Support
 
 _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
 # Findings of a pair that images alone support, and those that need a calibration. The inspection of
-# the frame reports others, except few features, which do not matter if the disparity is dense.
-_BY_IMAGES: Final = frozenset({"black", "gain", "blur"})
+# the frame reports others.
+_BY_IMAGES: Final = frozenset({"black", "gain", "blur", "features"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
-# Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs, even
-# of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %.
-_FEW_VALID_SHARE: Final = 0.25
+# Share of pixels with a measured disparity below which a pair is warned of: real ones, even of bare
+# walls, exceed 40 %.
+_FEW_MEASURED_SHARE: Final = 0.25
+# Findings with which rows and motion say nothing about the calibration.
+_NOT_OF_THE_RIG: Final = frozenset({"lag", "nonrigid", "swapped", "size", "frozen", "unreadable"})
 _TURNED: Final = ("pitch_deg", "yaw_deg", "roll_deg", "focal_percent")
 _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 
@@ -83,6 +86,9 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     camera = rectifier.camera
     sample = take_sample(source, rectifier, quick=quick)
     geometry = measure_geometry(sample, camera)
+    if quick and geometry.out_of_step:  # which a few pairs do not tell from half a frame, or chance
+        sample = take_sample(source, rectifier, quick=False)
+        geometry = measure_geometry(sample, camera)
     readable = not quick and sample.broken is None
     rig = refine_rig(source, config, RigSettings()) if readable else None
     measured = Measured(source, camera, sample, geometry, find_gaps(source), rig)
@@ -100,8 +106,16 @@ def correct_calibration(
     It is the one that `recon map` uses; of a drive that is too short for it, rows alone are
     aligned. The baseline stays. The name of the file tells its format; where that is kalibr's,
     lenses are the nearest that it knows.
+
+    Raises:
+        CalibrationError: There are too few features, or what the recording shows is no fault of the
+            calibration, such as images of different moments.
     """
     rig, rows = audit.rig, audit.alignment
+    for finding in audit.findings:
+        if finding.code in _NOT_OF_THE_RIG:
+            what = "the recording does not show the rig: a calibration from it would be wrong"
+            raise CalibrationError(what, where=source.name, got=finding.text)
     if rows is None:
         raise CalibrationError(
             "too few features to correct the calibration",
@@ -193,8 +207,17 @@ def _alignment_figures(
 
 
 def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, ...]:
-    """Return findings of a quick audit, one line each; none if it is switched off."""
-    return tuple(f"{finding.text} [quick audit]" for finding in _quick_findings(source, config))
+    """Return findings of a quick audit, one line each; none if it is switched off.
+
+    Raises:
+        SourceError: One camera is late by whole frames: whatever is made of such pairs is wrong.
+    """
+    found = _quick_findings(source, config)
+    for finding in found:
+        if finding.code == "lag":
+            what = "left and right images are of different moments"
+            raise SourceError(what, where=source.name, got=finding.text)
+    return tuple(f"{finding.text} [quick audit]" for finding in found)
 
 
 def find_pair_faults(
@@ -212,25 +235,31 @@ def find_pair_faults(
 
 
 def check_found(
-    disparity: Disparity, pair: StereoPair, faults: tuple[Finding, ...] = ()
+    disparity: Disparity, name: str, support: Support | None, faults: tuple[Finding, ...] = ()
 ) -> tuple[str, ...]:
-    """Return warnings about the share of pixels with a disparity."""
-    share = float(disparity.valid.mean())
-    if share >= _FEW_VALID_SHARE:
-        return ()
-    found = f"{100 * share:.0f} % of the pixels have a disparity ({_reasons(disparity)})"
+    """Return the warnings of a matched pair: those of its faults, and of how little was measured.
+
+    What was filled in counts for nothing. `MatchingError`: nothing was found, or nothing supports
+    that both images belong together.
+    """
+    fatal = next((fault.text for fault in faults if fault.fatal), None)
+    if support is not None and disparity.valid.any():
+        support.check(name or None, fatal)
+    # Few features do not matter where much else matches.
+    doubtful = support is None or support.doubtful
+    known = tuple(one.text for one in faults if one.code != "features" or doubtful)
+    share = float(disparity.measured.mean())
+    if share >= _FEW_MEASURED_SHARE:
+        return known
+    found = f"{100 * share:.0f} % of the pixels have a measured disparity ({_reasons(disparity)})"
     advice = (
         "check that both images show the same moment, that left and right are not swapped, that "
         "the calibration is theirs, and the range (--ndisp)"
     )
-    if share > 0:
-        return (f"only {found}; {advice}",)
-    raise MatchingError(
-        "no pixel has a match in the other image",
-        where=pair.name or None,
-        got=_reasons(disparity),
-        hint=next((fault.text for fault in faults if fault.fatal), advice),
-    )
+    if disparity.valid.any():
+        return (*known, f"only {found}; {advice}")
+    what, got = "no pixel has a match in the other image", _reasons(disparity)
+    raise MatchingError(what, where=name or None, got=got, hint=fatal or advice)
 
 
 def _reasons(disparity: Disparity) -> str:

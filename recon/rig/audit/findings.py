@@ -20,7 +20,7 @@ from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
-_FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "size", "baseline"}
+_FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "nonrigid", "size", "baseline"}
 _SIDES = ("left", "right")
 _SWAPPED_SHARE: Final = 0.8  # share of negative disparities from which the cameras count as swapped
 _ROW_PX: Final = 0.75  # rms row error above which it is reported
@@ -55,6 +55,7 @@ _TEXTS: Final = {
     "lag": "the {late} camera is {frames} late; {in_step}",
     "skew": f"the right images are taken {{skew:+.2f}} frames {LATER}; trigger both cameras "
     "together, or drive slowly",
+    "nonrigid": "{found}",
     "features": "too few features match between left and right ({matched} matched) to check the "
     "geometry: the images show too little texture, or different scenes",
     "rows": "rows of left and right are not aligned: {rows.rms_px:.2f} px rms, mean "
@@ -185,7 +186,9 @@ def _of_geometry(measured: Measured) -> Found:
     elif skew is not None and abs(skew[0]) > max(MOST_LATE, 4 * skew[1]):
         yield "skew", {"skew": skew[0]}
     rows = geometry.alignment
-    if rows is None and geometry.pairs:
+    if measured.rig is not None and measured.rig.not_rigid:
+        yield "nonrigid", {"found": measured.rig.not_rigid[0]}
+    elif rows is None and geometry.pairs:
         yield "features", {"matched": geometry.matched}
     elif rows is not None and rows.rms_px > _ROW_PX:
         pitch, _, roll, _ = np.degrees(rows.turn)

@@ -156,10 +156,12 @@ class _Sampler:
         self.sample.repeats.restart()
         self._recent.clear()
         waiting = [centre for centre in self._centres if start <= centre < stop]
-        for recorded in islice(self._source.frames(start), stop - start):
+        recordings = islice(self._source.frames(start), stop - start)
+        for number, recorded in enumerate(recordings, start):
             self.sample.frames += 1
             self.sample.repeats.add(recorded.left, recorded.right)
-            pair = self._rectifier.rectify(recorded)
+            # A pair, or part of a drive, may have its numbers from elsewhere.
+            pair = replace(self._rectifier.rectify(recorded), index=number)
             self._recent[pair.index] = pair
             self._recent.pop(pair.index - 2 * self._lag - 1, None)
             while waiting and pair.index >= min(waiting[0] + self._lag, stop - 1):
@@ -232,6 +234,7 @@ class Geometry:
     alignment: RowAlignment | None  # row errors; None if there are too few features
     disparity_px: Float64  # (M,), of the features whose rows agree; 0 is at infinity
     swapped_share: float  # of near features, farther right in the right image; NaN = too few
+    out_of_step: bool  # whether images of other moments fit better
     lag: int  # delay of the right camera in whole frames
     # its delay in parts of a frame, and the standard error; None if unknown, or whole frames
     skew: tuple[float, float] | None
@@ -254,6 +257,7 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
         alignment=alignment,
         disparity_px=_disparities(features, alignment, camera),
         swapped_share=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share,
+        out_of_step=bool(lag) or _best_fit(sample)[1] > _LAG_FACTOR,
         lag=lag,
         skew=skew,
     )
@@ -281,19 +285,26 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: Rectifie
 
     A delay of half a frame fits both neighbours badly; it is a skew, which moving features show.
     """
-    if not sample.lagged:
-        return 0
-    # Lags were tried on different numbers of pairs.
-    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in sample.lagged.items()}
-    best = max(fit, key=lambda lag: (fit[lag], -abs(lag)))
+    best, times = _best_fit(sample)
     if abs(best) == 1:
+        # Where little moves, neighbours fit as well; what moves most in rows still tells.
+        if skew is not None and abs(skew[0]) + 4 * skew[1] < 1 - _LARGEST_SKEW:
+            return 0
         found, flows, _ = zip(*sample.lagged[best], strict=True)
         left = _time_skew(found, flows, camera, _align(pool_features(found), camera))
         if left is not None:
             return best if abs(left[0]) < 1 - _LARGEST_SKEW else 0
         if skew is not None and 4 * skew[1] < abs(skew[0]) < _LARGEST_SKEW:
             return 0
-    return best if fit[best] > _LAG_FACTOR * fit.get(0, 0.0) else 0
+    return best if times > _LAG_FACTOR else 0
+
+
+def _best_fit(sample: Sample) -> tuple[int, float]:
+    """Return the lag that fits best, and how many times as well as none."""
+    # Lags were tried on different numbers of pairs.
+    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in sample.lagged.items()}
+    best = max(fit, key=lambda lag: (fit[lag], -abs(lag)), default=0)
+    return best, fit.get(best, 0.0) / max(fit.get(0, 0.0), 1.0)
 
 
 def _time_skew(

@@ -190,7 +190,7 @@ def _mutual_best(left: Float32, right: Float32) -> Int32:
 
 _NEAR_PX: Final = 1.0  # of smaller disparities: too far away to show that cameras are swapped
 _OUTLIER_PX: Final = 3.0  # between the row error of a wrong match and that of the others
-_FEATURES: Final = 1000  # maximum number of features per image
+INSPECTED: Final = 1000  # maximum number of features per image of a pair that is inspected
 _MIN_FEATURES: Final = 40  # with fewer matched features there is no verdict
 _WARN_ROW_PX: Final = 1.0  # median row error that gives a warning, in pixels
 _SWAPPED_SHARE: Final = 0.8  # of near features with negative disparity: swapped cameras
@@ -210,7 +210,7 @@ class PairInspection:
 
 def inspect_pair(pair: RectifiedPair) -> PairInspection:
     """Measure how well a pair that should be rectified is."""
-    features = match_features(pair.left, pair.right, _FEATURES)
+    features = match_features(pair.left, pair.right, INSPECTED)
     return inspect_features(features, pair.camera.doffs_px)
 
 

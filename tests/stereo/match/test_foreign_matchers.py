@@ -107,7 +107,7 @@ def test_a_matcher_that_exits_ends_nothing(code):
         def match(self, pair: RectifiedPair) -> Disparity:
             sys.exit(code)
 
-    with pytest.raises(MatchingError, match="'Exiting': the matcher fails.*SystemExit"):
+    with pytest.raises(MatchingError, match=r"'Exiting': the matcher fails.*SystemExit"):
         recon.match(image(), image(), matcher=Exiting())
 
 
@@ -172,9 +172,7 @@ def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
     made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
     assert type(made) is MATCHERS["sad"]
-    with pytest.raises(
-        SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad"
-    ):
+    with pytest.raises(SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad"):
         recon.match(image(), image(), matcher="cencus")
     install_plugin(tmp_path, "other-matcher", {}, {"flat": "other_matcher:Flat"})
     with pytest.raises(SettingsError, match=r"same name.*flat-matcher.*and.*other-matcher"):

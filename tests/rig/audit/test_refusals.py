@@ -1,0 +1,116 @@
+"""Recordings that show no rig: nothing is corrected by them, and nothing is made of late ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.commands.config import load_config
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
+from recon.core.errors import CalibrationError, SourceError
+from recon.odometry.rig.refine import refine_rig
+from recon.odometry.rig.rigidity import Rigidity, measure_rigidity
+from recon.odometry.settings import RigSettings
+from recon.rig.audit.audit import audit_source, correct_calibration, quick_warnings
+from recon.sources.registry import open_source
+from recon.sources.settings import SourceSettings
+from recon.sources.source import SourcePart
+from recon.stereo.rectify.rectifier import Rectifier
+from tests.hostile.refusals import assert_refused, run
+from tests.rig.audit import faults
+from tests.rig.audit.test_audit_run import CONFIG, rendered
+from tests.sources import drives
+
+FRAMES = 16
+
+
+@pytest.fixture(scope="module")
+def street():
+    return rendered(5, FRAMES)
+
+
+def loose(street: faults.Spoiled, sizes_px: tuple[int, ...] = (-9, 0, 6, 12)) -> faults.Spoiled:
+    """The right camera nods against the left one, every few frames by another angle."""
+
+    def take(index: int):
+        pair = street.take(index)
+        rows = sizes_px[index * len(sizes_px) // len(street)]
+        return replace(pair, right=np.roll(pair.right, rows, axis=0))
+
+    return faults.Spoiled(street.camera, len(street), take)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (lambda s: faults.lag(s, 2), "right camera is 2 frames late"),
+        (lambda s: faults.changed(s, lambda left, right: (right, left)), "swapped"),
+        (faults.silently_wrong_size, "of another size"),
+        (loose, "move against each other"),
+    ],
+)
+def test_a_recording_that_does_not_show_the_rig_corrects_none(street, tmp_path, fault, words):
+    spoiled = fault(street)
+    audit = audit_source(spoiled, CONFIG)
+    with pytest.raises(CalibrationError, match=f"^spoiled: .* does not show the rig.*{words}"):
+        correct_calibration(spoiled, CONFIG, audit, tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+@pytest.fixture
+def late(street, tmp_path):
+    """A folder with a drive whose right images are two frames late."""
+    pairs = list(faults.lag(street, 2).frames())
+    grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
+    return drives.write_kitti(grey, faults.rectified(street), tmp_path)
+
+
+def test_a_late_drive_is_refused_with_the_setting_that_pairs_it(late, tmp_path):
+    found = "right camera is 2 frames late; --set source.shift_frames=2 pairs"
+    with pytest.raises(SourceError, match=f"of different moments.*{found}"):
+        run_map(open_source(late), CONFIG, MapOptions(out=tmp_path / "out"))
+    out = tmp_path / "out"
+    assert_refused(run("map", late, "--out", out), found)
+    assert_refused(run("audit", late, "--mend", tmp_path / "rig.yaml"), found)
+    assert not out.exists()
+    assert not (tmp_path / "rig.yaml").exists()
+    shifted = open_source(late, settings=SourceSettings(shift_frames=2))
+    assert quick_warnings(shifted, CONFIG) == ()
+    assert quick_warnings(open_source(late), load_config(None, ["audit.quick=false"])) == ()
+
+
+def test_a_clean_drive_a_part_of_it_and_one_that_stands_are_not_refused(street):
+    part = SourcePart(street, 3, FRAMES)
+    still = faults.Spoiled(street.camera, FRAMES, lambda _: street.take(4))
+    assert quick_warnings(street, CONFIG) == quick_warnings(part, CONFIG) == ()
+    assert not any("different moments" in text for text in quick_warnings(still, CONFIG))
+
+
+def test_cameras_that_move_against_each_other_are_found_and_keep_their_calibration(street):
+    moved = loose(street)
+    (finding,) = [one for one in audit_source(moved, CONFIG).findings if one.code == "nonrigid"]
+    assert finding.fatal
+    assert "-9 px in frame 0" in finding.text
+    found = refine_rig(moved, CONFIG, RigSettings())
+    assert found.not_rigid == (finding.text,)
+    assert not found.refined
+    assert not found.applied(moved).rigid
+
+
+@pytest.mark.parametrize("fault", ["none", "a turn", "one wrong pair"])
+def test_a_rig_that_is_only_turned_or_one_odd_pair_is_rigid(street, fault):
+    plant = {
+        "none": lambda s: s,
+        "a turn": lambda s: faults.turned(s, pitch_deg=0.6, roll_deg=0.5),
+        "one wrong pair": lambda s: loose(s, (0,) * (FRAMES - 1) + (20,)),
+    }[fault]
+    found = measure_rigidity(plant(street), Rectifier(street.camera, CONFIG.rectification))
+    assert len(found.frames) >= 5
+    assert found.kept
+    assert found.spread_px < 1.0
+
+
+def test_too_few_pairs_say_nothing_of_the_rig():
+    assert Rigidity((0, 9), np.array([-9.0, 9.0])).kept
+    assert not Rigidity((0, 5, 9), np.array([-9.0, 0.0, 9.0])).kept
