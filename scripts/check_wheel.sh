@@ -87,12 +87,12 @@ check_extra() {
     local extra=$1 python=$FOLDER/env/bin/python
     shift
     "$python" -m pip freeze --all | sort >"$FOLDER/before"
-    if recon "$@" --quiet --out "$extra" >"$LOG" 2>&1 || ! grep -qF "pip install 'recon[$extra]'" "$LOG"; then
+    if recon "$@" --quiet --out "$extra" >"$LOG" 2>&1 || ! grep -qF "pip install 'recon-stereo[$extra]'" "$LOG"; then
         cat "$LOG" >&2
         say "without the extra $extra this should have failed, and said what to install: $*" >&2
         return 1
     fi
-    quietly pip "recon[$extra]"
+    quietly pip "recon-stereo[$extra]"
     quietly recon "$@" --quiet --out "$extra"
     "$python" -m pip freeze --all | sort | comm -13 "$FOLDER/before" - >"$FOLDER/brought"
     say "extra $extra: runs, with $(wc -l <"$FOLDER/brought") more packages"

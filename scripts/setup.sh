@@ -82,6 +82,8 @@ ensure_venv() {
 
 ensure_package() {
     say "installing recon and its libraries into .venv (about 2 GB, some minutes the first time)"
+    # An earlier checkout installed itself by a name that is another project's.
+    .venv/bin/python -m pip uninstall --quiet --yes recon 2>/dev/null || true
     .venv/bin/python -m pip install --quiet --disable-pip-version-check \
         -c constraints.txt -e '.[dev]'
     .venv/bin/python -W ignore -c "import $HEAVY" ||

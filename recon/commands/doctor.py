@@ -19,6 +19,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+from recon.core.errors import DISTRIBUTION
 from recon.core.kernels.cache import cache_parent
 from recon.run.machine import available_cores
 
@@ -98,8 +99,19 @@ def check_packages() -> Iterator[Check]:
     """Check Python, and whether each package can be imported."""
     new = sys.version_info >= (3, 10)
     yield Check("Python", new, platform.python_version(), "install Python >= 3.10")
+    yield check_name()
     with ThreadPoolExecutor(max_workers=available_cores()) as pool:
         yield from pool.map(check_package, PACKAGES, PACKAGES.values())
+
+
+def check_name() -> Check:
+    """Check that no other project is installed whose import package has the name of ours."""
+    hint = f"run: pip uninstall recon; then install {DISTRIBUTION} again"
+    try:
+        found = f"recon {version('recon')} is another project, with files at the places of ours"
+    except PackageNotFoundError:
+        return Check(DISTRIBUTION, ok=True, found="nothing else has its import name")
+    return Check(DISTRIBUTION, ok=False, found=found, hint=hint)
 
 
 def check_package(name: str, module: str) -> Check:

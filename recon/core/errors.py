@@ -125,6 +125,10 @@ class MissingDependencyError(ReconError):
     """An optional package is not installed."""
 
 
+DISTRIBUTION: Final = "recon-stereo"
+"""What pip calls this package: ``recon`` is one of biology there, with the same import name."""
+
+
 def require(module: str, *, extra: str) -> ModuleType:
     """Import an optional package, which the extra of that name installs."""
     try:
@@ -132,5 +136,5 @@ def require(module: str, *, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
             f"the optional package {module!r} is not installed",
-            hint=f"run: pip install 'recon[{extra}]'",
+            hint=f"run: pip install '{DISTRIBUTION}[{extra}]'",
         ) from error

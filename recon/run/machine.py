@@ -12,8 +12,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+from recon.core.errors import DISTRIBUTION
+
 _RECORDED: Final = (
-    "recon", "numpy", "numba", "opencv-python-headless", "open3d", "kiss-icp", "pymeshlab",
+    "numpy", "numba", "opencv-python-headless", "open3d", "kiss-icp", "pymeshlab",
 )  # fmt: skip
 _STATUS: Final = Path("/proc/self/status")
 _PEAK: Final = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
@@ -49,7 +51,8 @@ def return_free_memory() -> None:
 
 def versions() -> dict[str, str]:
     """Return versions of Python and of the packages that affect results."""
-    return {"python": platform.python_version(), **{name: _version(name) for name in _RECORDED}}
+    own = {"python": platform.python_version(), "recon": _version(DISTRIBUTION)}
+    return {**own, **{name: _version(name) for name in _RECORDED}}
 
 
 def _version(package: str) -> str:

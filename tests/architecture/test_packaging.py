@@ -13,6 +13,7 @@ import pytest
 import recon
 from recon.commands.doctor import PACKAGES, SYSTEM_LIBRARIES
 from recon.commands.kernel_samples import SAMPLES
+from recon.core.errors import DISTRIBUTION
 
 # What numba takes from scipy: it is compiled without, and fails when it is called.
 FROM_SCIPY = {"linalg", "dot", "vdot", "matmul", "tensordot", "roots", "cov", "corrcoef"}
@@ -96,6 +97,15 @@ def test_version_is_the_same_everywhere(root, pyproject):
     version = pyproject["project"]["version"]
     assert recon.__version__ == version
     assert f"## [{version}]" in (root / "CHANGELOG.md").read_text()
+
+
+def test_what_messages_and_pages_tell_to_install_is_this_package(root, pyproject):
+    """And not the project of biology that is called as what is imported."""
+    assert pyproject["project"]["name"] == DISTRIBUTION != "recon"
+    pages = [root / "README.md", *(root / "docs").glob("*.md"), *(root / "scripts").iterdir()]
+    files = [*pages, *(root / "recon").rglob("*.py")]
+    wrong = re.compile(r"(?<![\w-])recon\\?\[(?:cluster|onnx|ros|sfm|survey|view|dev|NAME)\\?\]")
+    assert [path.name for path in files if wrong.search(path.read_text())] == []
 
 
 def test_doctor_looks_for_what_is_installed_and_runs_kernels_of_each_room_that_has_some(

@@ -28,6 +28,14 @@ def test_this_machine_is_examined_and_ready(tmp_path):
     assert not (tmp_path / "outputs").exists()
 
 
+def test_another_project_of_our_import_name_is_reported(monkeypatch):
+    monkeypatch.setattr(doctor, "version", lambda name: {"recon": "0.0.4"}[name])
+    found = doctor.check_name()
+    assert (found.ok, found.needed) == (False, True)
+    assert "recon 0.0.4 is another project" in found.found
+    assert "pip uninstall recon" in found.hint
+
+
 def test_what_kernels_lack_is_named(tmp_path, monkeypatch):
     (tmp_path / "llvmlite.py").write_text("raise ImportError('half of it is gone')")
     paths = os.pathsep.join([str(tmp_path), str(Path(recon.__file__).parents[1])])

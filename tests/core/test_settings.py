@@ -113,7 +113,7 @@ def test_the_line_of_an_error_has_the_known_parts(parts, line):
 
 def test_an_optional_package_is_imported_and_a_missing_one_gets_the_pip_line():
     assert require("json", extra="ros").dumps([1]) == "[1]"
-    words = r"'no_such_thing'.*pip install 'recon\[ros\]'"
+    words = r"'no_such_thing'.*pip install 'recon-stereo\[ros\]'"
     with pytest.raises(MissingDependencyError, match=words):
         require("no_such_thing", extra="ros")
 

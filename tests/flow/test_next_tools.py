@@ -254,7 +254,7 @@ def test_a_bag_says_in_messages_of_ros_what_the_map_is(small_demo, mapped, tmp_p
 def test_a_bag_without_its_package_says_what_to_install(small_demo, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     done = run("export", small_demo, "--to", "mcap", "--out", tmp_path / "out")
-    assert_refused(done, "pip install 'recon[ros]'")
+    assert_refused(done, "pip install 'recon-stereo[ros]'")
     assert not (tmp_path / "out").exists()
 
 

@@ -201,7 +201,7 @@ def test_a_taken_port_and_a_missing_package_are_refused_in_one_line(small_demo, 
         port = taken.getsockname()[1]
         assert_refused(run("view", small_demo, "--port", f"{port}"), f"{port}", "another --port")
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert_refused(run("view", small_demo), "recon[view]")
+    assert_refused(run("view", small_demo), "recon-stereo[view]")
 
 
 def test_a_viewer_begins_when_a_browser_asks_and_ends_with_its_run(small_demo, monkeypatch):
@@ -255,7 +255,7 @@ def test_nothing_that_happens_to_the_viewer_reaches_the_run(monkeypatch, tmp_pat
     monkeypatch.setitem(sys.modules, "viser", None)
     assert show_beside(tmp_path, 0, said.append) == ""
     assert "in use" in said[-2]
-    assert "recon[view]" in said[-1]
+    assert "recon-stereo[view]" in said[-1]
     assert "Traceback" not in capfd.readouterr().err
 
 

@@ -199,7 +199,7 @@ def test_the_first_failure_ends_a_batch_that_fails_fast(batches, tmp_path):
     ("map DRIVE --workers 2 --prior DRIVE/prior.txt", "--poses or --prior is mapped in one"),
     ("map DRIVE --workers 2 --set occupancy.keep_rays=false", "joined by their rays"),
     ("map DRIVE --scheduler nonsense", "nonsense: the scheduler cannot be reached"),
-    ("map DRIVE --workers 2", "pip install 'recon[cluster]'"),
+    ("map DRIVE --workers 2", "pip install 'recon-stereo[cluster]'"),
 ])  # fmt: skip
 def test_what_cannot_be_asked_of_workers_is_refused_before_anything_runs(
     short, tmp_path, monkeypatch, words, told

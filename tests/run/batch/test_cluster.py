@@ -197,5 +197,5 @@ def test_a_scheduler_that_goes_and_dask_that_is_not_there_are_one_line(monkeypat
         Cluster(Gone()).workers  # noqa: B018
     monkeypatch.setitem(sys.modules, "distributed", None)
     for there in (join_cluster("tcp://127.0.0.1:9"), local_cluster(1)):
-        with pytest.raises(MissingDependencyError, match=r"pip install 'recon\[cluster\]'"):
+        with pytest.raises(MissingDependencyError, match=r"pip install 'recon-stereo\[cluster\]'"):
             there.__enter__()

@@ -15,7 +15,7 @@ from recon.stereo.match.self_test import rendered_pair
 from recon.stereo.match.tiles import match_in_tiles
 
 onnx = pytest.importorskip("onnx", reason="the package onnx builds the network: pip install onnx")
-pytest.importorskip("onnxruntime", reason="extra onnx: pip install 'recon[onnx]'")
+pytest.importorskip("onnxruntime", reason="extra onnx: pip install 'recon-stereo[onnx]'")
 
 from tests.stereo.match.networks import Graph, write_matcher  # noqa: E402 (it needs onnx)
 
