@@ -48,7 +48,7 @@ from recon.odometry.rig.refine import DEPTHS_M, KnownRig, RefinedRig, refine_rig
 from recon.odometry.sfm.find import check_sfm
 from recon.report.map_page import map_content
 from recon.report.page import write_page
-from recon.rig.audit.audit import quick_warnings
+from recon.rig.audit.audit import check_related, quick_warnings
 from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.run import Run, plain
 from recon.sources.source import StereoSource, check_source
@@ -209,6 +209,8 @@ def refine_drive(
         check_length(source, config.source.length)
     with run.stage("rig"):
         rig = refine_rig(source, config, config.rig, known)
+        if rig.rigidity is not None and not rig.rigidity.frames:
+            check_related(source, config)
         if measured is not None:
             seen = see_baseline(rig.applied(source), config, measured, rig.length_share)
             rig = rig if seen is None else rig.with_baseline(seen, config.rig)

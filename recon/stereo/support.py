@@ -63,12 +63,17 @@ class Support:
         return self.times_chance >= _BY_PIXELS and beyond >= _LEAST_SHARE
 
     @property
+    def shown(self) -> bool:
+        """Whether anything supports the pair."""
+        return self.by_features or self.by_pixels
+
+    @property
     def doubtful(self) -> bool:
         return not self.by_features or self.times_chance < _DOUBTED
 
     def check(self, where: str | None, hint: str | None = None) -> None:
         """Raise `MatchingError` where nothing supports the pair."""
-        if self.by_features or self.by_pixels:
+        if self.shown:
             return
         advice = (
             "give two images of one moment, neither mirrored nor upside down, with the "
@@ -94,7 +99,8 @@ def measure_support(
     """Measure what supports a pair with matched features, over the range that is searched.
 
     Its own images say what chance gives: with the rows of the right one shifted, nothing belongs
-    together, while texture, noise and exposure are the same. None: the images are too small.
+    together, while texture, noise and exposure are the same. None: the images are too small, or
+    show nothing.
     """
     height = len(pair.left)
     if height < _LEAST_ROWS:
@@ -108,6 +114,8 @@ def measure_support(
         float(matcher.match(replace(pair, right=right)).confidence.mean())
         for right in (pair.right, *(np.roll(pair.right, shift, axis=0) for shift in (-rows, rows)))
     )
+    if not measured and not any(by_chance):
+        return None
     columns_px = features.left_uv[:, 0] - features.right_uv[:, 0] - searched.min_disparity_px
     within = (columns_px > -1) & (columns_px < searched.ndisp_for(pair.camera) + 1)
     agreeing = inspect_features(features.select(within)).features

@@ -22,6 +22,7 @@ from recon.rig.written import form_of, nearest_of_kalibr, write_rig
 from recon.run.run import plain
 from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import StereoSource, check_source
+from recon.stereo.frame import FrameReconstructor
 from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.rectify.rectifier import Rectifier, turns_of
@@ -38,6 +39,7 @@ _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 _FEW_MEASURED_SHARE: Final = 0.25
 # Findings with which rows and motion say nothing about the calibration.
 _NOT_OF_THE_RIG: Final = frozenset({"lag", "nonrigid", "swapped", "size", "frozen", "unreadable"})
+_RELATED_PAIRS: Final = 3
 _TURNED: Final = ("pitch_deg", "yaw_deg", "roll_deg", "focal_percent")
 _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 
@@ -218,6 +220,19 @@ def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, 
             what = "left and right images are of different moments"
             raise SourceError(what, where=source.name, got=finding.text)
     return tuple(f"{finding.text} [quick audit]" for finding in found)
+
+
+def check_related(source: StereoSource, config: AuditedSettings) -> None:
+    """Refuse a drive if in none of a few pairs left and right belong together."""
+    reconstructor, where = FrameReconstructor(source.calibration, config), source.name
+    last: Support | None = None
+    for number in np.unique(np.linspace(0, len(source) - 1, _RELATED_PAIRS).astype(int)).tolist():
+        last = reconstructor.inspect(reconstructor.rectify(next(source.frames(number))))[1]
+        if last is None or last.shown:
+            return
+        where = f"{source.name}, frame {number}"
+    if last is not None:
+        last.check(where)
 
 
 def find_pair_faults(

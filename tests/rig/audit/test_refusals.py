@@ -8,11 +8,16 @@ import pytest
 from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.errors import CalibrationError, SourceError
+from recon.core.errors import CalibrationError, MatchingError, SourceError
 from recon.odometry.rig.refine import refine_rig
 from recon.odometry.rig.rigidity import Rigidity, measure_rigidity
 from recon.odometry.settings import RigSettings
-from recon.rig.audit.audit import audit_source, correct_calibration, quick_warnings
+from recon.rig.audit.audit import (
+    audit_source,
+    check_related,
+    correct_calibration,
+    quick_warnings,
+)
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from recon.sources.source import SourcePart
@@ -114,3 +119,16 @@ def test_a_rig_that_is_only_turned_or_one_odd_pair_is_rigid(street, fault):
 def test_too_few_pairs_say_nothing_of_the_rig():
     assert Rigidity((0, 9), np.array([-9.0, 9.0])).kept
     assert not Rigidity((0, 5, 9), np.array([-9.0, 0.0, 9.0])).kept
+
+
+def test_a_drive_of_two_drives_is_refused_and_one_in_the_dark_is_not_for_that(street, tmp_path):
+    other = rendered(7, FRAMES)
+    mixed = faults.Spoiled(
+        street.camera, FRAMES, lambda k: replace(street.take(k), right=other.take(k).right)
+    )
+    with pytest.raises(MatchingError, match=r"^spoiled, frame 15: left and right do not belong"):
+        run_map(mixed, CONFIG, MapOptions(out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+    black = faults.changed(street, lambda left, right: (0 * left, 0 * right))
+    check_related(black, CONFIG)
+    check_related(street, CONFIG)
