@@ -1,0 +1,76 @@
+"""A viewer with a small scene, in this process, and its page as a program asks for it."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from recon.core.values import PointCloud
+from recon.view.scene import Points, Scene
+from recon.view.server import Viewer
+
+
+class Served:
+    """A viewer that does what is asked for, in a thread, and what became of that."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        self.viewer, self.url = viewer, viewer.url
+        self.host, self.path = urlsplit(viewer.url).netloc, urlsplit(viewer.url).path
+        self.port = urlsplit(viewer.url).port
+        self.ended: BaseException | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self.viewer.serve(0.02)
+        except BaseException as error:  # noqa: BLE001 - whatever ends it
+            self.ended = error
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+class Views:
+    """Keyframes that have everything in view."""
+
+    T_map_camera = (np.eye(4), np.eye(4))
+
+    def sees(self, *_: object) -> bool:
+        return True
+
+    def look(self, number: int) -> tuple[list[str], None]:
+        return [f"keyframe {number}"], None
+
+
+def small_scene(count: int = 1000, **how: object) -> Scene:
+    rng = np.random.default_rng(0)
+    cloud = PointCloud(
+        rng.random((count, 3), np.float32), rng.integers(0, 255, (count, 3), np.uint8), frame="map"
+    )
+    return Scene(["a scene"], (Points("0", cloud),), keyframes=Views(), **how)
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    with closing(Viewer(0)) as viewer:
+        viewer.show(Path("run"), small_scene())
+        one = Served(viewer)
+        yield one
+        one.stop()
+        assert one.ended is None
+
+
+@pytest.fixture
+def protocol() -> str:
+    viser: SimpleNamespace = pytest.importorskip("viser")
+    return f"viser-v{viser.__version__}"
