@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import socket
+from base64 import b64encode
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
@@ -209,7 +210,7 @@ class Guard(Gate):
         What stands before viser is tied to how viser and websockets are made.
         """
         (host,), evil = self._hosts[0], "elsewhere.example"
-        look, key = {"Host": host}, secrets.token_urlsafe(16)[:22] + "=="
+        look, key = {"Host": host}, b64encode(bytes(16)).decode()
         join = {
             **look, "Origin": f"http://{host}", "Upgrade": "websocket", "Connection": "Upgrade",
             "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key,
@@ -241,7 +242,7 @@ class Guard(Gate):
 
     def _unsafe(self, why: str) -> OutputError:
         hint = "install the versions of constraints.txt"
-        return OutputError("nothing is served", got=f"{why} ({self._protocol})", hint=hint)
+        return OutputError(f"nothing is served, as {why}", got=self._protocol, hint=hint)
 
 
 class _Connection:

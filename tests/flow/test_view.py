@@ -9,10 +9,10 @@ import socket
 import struct
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 from contextlib import closing
 from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen

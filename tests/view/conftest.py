@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
@@ -59,8 +59,8 @@ def small_scene(count: int = 1000, **how: object) -> Scene:
     return Scene(["a scene"], (Points("0", cloud),), keyframes=Views(), **how)
 
 
-@pytest.fixture
-def served() -> Iterator[Served]:
+@contextmanager
+def serving() -> Iterator[Served]:
     pytest.importorskip("viser", reason="the extra view is not installed")
     with closing(Viewer(0)) as viewer:
         viewer.show(Path("run"), small_scene())
@@ -68,6 +68,20 @@ def served() -> Iterator[Served]:
         yield one
         one.stop()
         assert one.ended is None
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    """A viewer for one test, which may change what is shown."""
+    with serving() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def standing() -> Iterator[Served]:
+    """A viewer for all tests that only ask for its page."""
+    with serving() as one:
+        yield one
 
 
 @pytest.fixture
