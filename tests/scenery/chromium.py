@@ -42,7 +42,7 @@ class Page:
 
     def run(self, script: str) -> Any:
         """Return the value of an expression, of a promise that which it comes to."""
-        how = {"awaitPromise": True, "returnByValue": True}
+        how = {"awaitPromise": True, "returnByValue": True, "allowUnsafeEvalBlockedByCSP": False}
         self._send("Runtime.evaluate", {"expression": script, **how}, id=2)
         while (answer := json.loads(self._tools.recv(timeout=_PATIENCE_S))).get("id") != 2:
             self._note(answer)
@@ -89,7 +89,7 @@ def opened(profile: Path, *more: str) -> Iterator[Page]:
     quiet = subprocess.DEVNULL
     with subprocess.Popen(words, stdout=quiet, stderr=quiet) as process:
         try:
-            yield Page(connect(_address(profile), max_size=None))
+            yield Page(connect(_address(profile), max_size=None, ping_interval=None))
         finally:
             process.terminate()
 

@@ -1,9 +1,10 @@
 """A viewer with a small scene, in this process, and its page as a program asks for it."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from time import monotonic, sleep
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
@@ -34,9 +35,21 @@ class Served:
         except BaseException as error:  # noqa: BLE001 - whatever ends it
             self.ended = error
 
+    def pages(self) -> int:
+        """Return how many pages are connected."""
+        return len(self.viewer._server._websock_server._live_connections)
+
     def stop(self) -> None:
         self._stop.set()
         self._thread.join()
+
+
+def until(what: Callable[[], object], seconds: float = 60.0) -> object:
+    """Wait for something to be true, and return it."""
+    end = monotonic() + seconds
+    while not (found := what()) and monotonic() < end:
+        sleep(0.02)
+    return found
 
 
 class Views:

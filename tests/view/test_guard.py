@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from http.client import HTTPConnection
 from pathlib import Path
-from time import monotonic, sleep
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from recon.core.errors import OutputError
 from recon.view import guard
 from recon.view.guard import Gate, Guard
 from recon.view.server import Viewer
-from tests.view.conftest import Served, small_scene
+from tests.view.conftest import Served, small_scene, until
 
 msgspec = pytest.importorskip("msgspec", reason="the extra view is not installed")
 client = pytest.importorskip("websockets.sync.client")
@@ -168,13 +167,6 @@ def choice(served: Served, label: str, value: object) -> dict:
     controls = served.viewer._controls
     (uuid,) = (uuid for uuid, control in controls.items() if control.label == label)
     return {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
-
-
-def until(what: object, seconds: float = 60.0) -> bool:
-    end = monotonic() + seconds
-    while not what() and monotonic() < end:
-        sleep(0.02)
-    return what()
 
 
 def test_what_the_page_sends_is_done(served, protocol):
@@ -348,10 +340,6 @@ def stalled(served: Served, protocol: str) -> socket.socket:
     return one
 
 
-def pages(served: Served) -> int:
-    return len(served.viewer._server._websock_server._live_connections)
-
-
 def queued_bytes(served: Served) -> list[int]:
     connections = served.viewer._server._websock_server._live_connections.values()
     return [one.transport.get_write_buffer_size() for one in connections]
@@ -367,9 +355,9 @@ def test_pages_that_take_nothing_are_few_wait_with_little_and_are_dropped(
         for _ in range(3 * guard.MOST_PAGES):
             waiting.enter_context(stalled(served, protocol))
         assert until(lambda: any(queued_bytes(served)))
-        assert pages(served) <= guard.MOST_PAGES
+        assert served.pages() <= guard.MOST_PAGES
         assert max(queued_bytes(served)) < 2 * guard._PART_BYTES
-        assert until(lambda: pages(served) == 0)
+        assert until(lambda: served.pages() == 0)
         with joined(served, protocol) as page:  # one that takes what it is given
             received = 0
             while received < 15 * 100_000:
@@ -385,7 +373,7 @@ def test_as_many_pages_as_are_offered_may_look(served, protocol):
         with joined(served, protocol) as more, pytest.raises(exceptions.ConnectionClosed):
             more.recv(timeout=30)
         assert (more.close_code, more.close_reason) == (1013, "8 pages are open already")
-    assert until(lambda: pages(served) == 0)
+    assert until(lambda: served.pages() == 0)
     with joined(served, protocol) as again:
         assert len(again.recv(timeout=30)) > 0
 
