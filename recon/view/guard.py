@@ -93,7 +93,7 @@ class Gate:
     def __init__(self, port: int) -> None:
         self.port, self.path = port, f"/{secrets.token_urlsafe(32)}"
         self.url = f"http://{HOST}:{port}{self.path}"
-        self._hosts = [[f"{name}:{port}"] for name in (HOST, "localhost")]
+        self.hosts = f"{HOST}:{port}", f"localhost:{port}"
 
     def admits(self, path: str, hosts: Sequence[str]) -> bool:
         """Return whether a request asks for the page, by a name of this machine.
@@ -101,7 +101,8 @@ class Gate:
         A site can have a name that leads to 127.0.0.1; it stays in ``hosts``, the ``Host`` header.
         """
         given = path.encode("utf-8", "surrogateescape")
-        return compare_digest(given, self.path.encode()) and [*hosts] in self._hosts
+        named = len(hosts) == 1 and hosts[0] in self.hosts
+        return compare_digest(given, self.path.encode()) and named
 
 
 class Guard(Gate):
@@ -111,16 +112,16 @@ class Guard(Gate):
     """
 
     def __init__(self, viser: Any, port: int, offers: Callable[[str, _Value], bool]) -> None:
+        self._protocol, self._offers, self._pages = f"viser-v{viser.__version__}", offers, 0
+        self._nonce = secrets.token_urlsafe(16)
+        file = Path(viser.__file__).parent / "client/build/index.html"
+        self._page = self._with_nonce(file.read_text("utf-8"))
         try:
             self._socket = socket.create_server((HOST, port))
         except OSError as error:
             what, where, hint = "cannot serve here", f"{HOST}:{port}", "give another --port"
             raise OutputError(what, where=where, got=error.strerror, hint=hint) from error
         super().__init__(self._socket.getsockname()[1])
-        self._protocol, self._offers, self._pages = f"viser-v{viser.__version__}", offers, 0
-        self._nonce = secrets.token_urlsafe(16)
-        file = Path(viser.__file__).parent / "client/build/index.html"
-        self._page = self._with_nonce(file.read_text("utf-8"))
 
     def _with_nonce(self, page: str) -> str:
         """Return viser's page with its own scripts, and no others, allowed to run."""
@@ -209,7 +210,7 @@ class Guard(Gate):
 
         What stands before viser is tied to how viser and websockets are made.
         """
-        (host,), evil = self._hosts[0], "elsewhere.example"
+        host, evil = self.hosts[0], "elsewhere.example"
         look, key = {"Host": host}, b64encode(bytes(16)).decode()
         join = {
             **look, "Origin": f"http://{host}", "Upgrade": "websocket", "Connection": "Upgrade",

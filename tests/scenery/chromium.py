@@ -48,6 +48,16 @@ class Page:
             self._note(answer)
         return answer["result"]["result"].get("value")
 
+    def press(self, key: str) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self._send("Input.dispatchKeyEvent", {"type": kind, "key": key, "code": key})
+
+    def click(self, x_px: float, y_px: float) -> None:
+        for kind, button in (("Moved", "none"), ("Pressed", "left"), ("Released", "left")):
+            where = {"x": x_px, "y": y_px, "button": button, "clickCount": 1}
+            self._send("Input.dispatchMouseEvent", {"type": f"mouse{kind}", **where})
+            self.wait(0.5)
+
     def _follow(self, to: dict[str, Any]) -> None:
         for domain in ("Runtime", "Log", "Network"):
             self._send(f"{domain}.enable", {}, **to)

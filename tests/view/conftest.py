@@ -14,6 +14,7 @@ import pytest
 from recon.core.values import PointCloud
 from recon.view.scene import Points, Scene
 from recon.view.server import Viewer
+from tests.scenery import chromium
 
 
 class Served:
@@ -50,6 +51,11 @@ def until(what: Callable[[], object], seconds: float = 60.0) -> object:
     while not (found := what()) and monotonic() < end:
         sleep(0.02)
     return found
+
+
+def comes(page: chromium.Page, what: Callable[[], object]) -> object:
+    """Follow a page until something is true."""
+    return until(lambda: page.wait(0.05) or what())
 
 
 class Views:

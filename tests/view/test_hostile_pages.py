@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import pytest
 
 from tests.scenery import chromium
-from tests.view.conftest import Served, small_scene, until
+from tests.view.conftest import Served, comes, small_scene
 
 viser = pytest.importorskip("viser", reason="the extra view is not installed")
 server = pytest.importorskip("websockets.sync.server")
@@ -74,11 +74,6 @@ def packed(message) -> bytes:
     inner = msgspec.msgpack.encode({**parts, "binaryBufferLengths": ()})
     compressed = zstandard.ZstdCompressor().compress(inner)
     return b"".join((*(len(one).to_bytes(8, "little") for one in (inner, compressed)), compressed))
-
-
-def comes(browser: chromium.Page, what) -> object:
-    """Follow a page until something is true."""
-    return until(lambda: browser.wait(0.05) or what())
 
 
 @pytest.fixture(scope="module")
