@@ -310,6 +310,17 @@ def page(small_demo):
             viewer.kill()
 
 
+def test_the_address_is_printed_however_quiet_and_in_json(small_demo):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    words = [*VIEW, str(small_demo), "--port", "0", "--quiet", "--json"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True) as viewer:
+        url = viewer.stderr.readline().split()[0]
+        viewer.send_signal(signal.SIGINT)
+        out, err = viewer.communicate(timeout=60)
+    assert (json.loads(out), err) == ({"url": url}, "")
+
+
 def test_ctrl_c_ends_the_page_with_success_and_no_more_words(page):
     viewer, url = page
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}", url)
