@@ -7,19 +7,19 @@ connect to a port of 127.0.0.1. So a page has one address, whose path is a secre
 from __future__ import annotations
 
 import asyncio
+import io
 import secrets
 import socket
-from base64 import b64encode
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import closing, redirect_stdout
 from functools import partial
 from hmac import compare_digest
 from http import HTTPStatus
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+import numpy as np
 
 from recon.core.errors import OutputError, require
 from recon.view.scene import HOST
@@ -38,53 +38,19 @@ fetch = (url, ...how) =>
 #: Where viser's page begins, and where it begins the program that it has unpacked.
 _SCRIPTS: Final = ("<script data-p=", 'e.type="module";')
 
-_Number = Annotated[float, Field(ge=-1e9, le=1e9)]
-_Three = Annotated[list[_Number], Field(min_length=3, max_length=3)]
-_Value = str | bool | int
-
-
-class _Message(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-
-
-class _Camera(_Message):
-    type: Literal["ViewerCameraMessage"]
-    wxyz: Annotated[list[_Number], Field(min_length=4, max_length=4)]
-    position: _Three
-    fov: _Number
-    near: _Number
-    far: _Number
-    image_height: Annotated[int, Field(ge=0, le=100_000)]
-    image_width: Annotated[int, Field(ge=0, le=100_000)]
-    look_at: _Three
-    up_direction: _Three
-
-
-class _Click(_Message):
-    type: Literal["ScenePointerMessage"]
-    event_type: Literal["click"]
-    ray_origin: _Three
-    ray_direction: _Three
-    screen_pos: Annotated[
-        list[Annotated[list[_Number], Field(min_length=2, max_length=2)]],
-        Field(min_length=1, max_length=1),
-    ]
-    modifier: None
-
-
-class _Updates(_Message):
-    value: _Value
-
-
-class _Choice(_Message):
-    type: Literal["GuiUpdateMessage"]
-    uuid: str
-    updates: _Updates
-
-
-_MESSAGES: Final[TypeAdapter[_Camera | _Click | _Choice]] = TypeAdapter(
-    Annotated[_Camera | _Click | _Choice, Field(discriminator="type")]
-)
+_UNSAFE: Final = {
+    200: "its page is not as it should be", 101: "its page could not connect",
+    403: "strangers would be let in",
+}  # fmt: skip
+#: Shapes of the numbers that two messages of the page consist of.
+_CAMERA: Final[dict[str, tuple[int, ...]]] = {
+    "wxyz": (4,), "position": (3,), "look_at": (3,), "up_direction": (3,), "fov": (), "near": (),
+    "far": (), "image_height": (), "image_width": (),
+}  # fmt: skip
+_CLICK: Final[dict[str, tuple[int, ...]]] = {
+    "ray_origin": (3,), "ray_direction": (3,), "screen_pos": (1, 2),
+}  # fmt: skip
+_MOST: Final = 1e9  # of a number: its square is one, too
 
 
 class Gate:
@@ -111,7 +77,7 @@ class Guard(Gate):
     ``offers(control, value)``: whether a control of the page, by its number, can have a value.
     """
 
-    def __init__(self, viser: Any, port: int, offers: Callable[[str, _Value], bool]) -> None:
+    def __init__(self, viser: Any, port: int, offers: Callable[[Any, Any], bool]) -> None:
         self._protocol, self._offers, self._pages = f"viser-v{viser.__version__}", offers, 0
         self._nonce = secrets.token_urlsafe(16)
         file = Path(viser.__file__).parent / "client/build/index.html"
@@ -141,19 +107,14 @@ class Guard(Gate):
             "form-action 'none'", "base-uri 'none'",
         )  # fmt: skip
         return {
-            "Content-Type": "text/html; charset=utf-8",
-            "Content-Security-Policy": "; ".join(policy),
-            "Cache-Control": "no-store",
-            "Cross-Origin-Opener-Policy": "same-origin",
-            "Cross-Origin-Resource-Policy": "same-origin",
-            "Referrer-Policy": "no-referrer",  # the address is the secret
-            "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
-        }
+            "Content-Type": "text/html; charset=utf-8", "X-Content-Type-Options": "nosniff",
+            "Content-Security-Policy": "; ".join(policy), "X-Frame-Options": "DENY",
+            "Cross-Origin-Opener-Policy": "same-origin", "Cache-Control": "no-store",
+            "Cross-Origin-Resource-Policy": "same-origin", "Referrer-Policy": "no-referrer",
+        }  # fmt: skip
 
-    @contextmanager
-    def before(self) -> Iterator[None]:
-        """Stand before the server that viser starts meanwhile."""
+    def start(self, viser: Any) -> Any:
+        """Return viser's server, which has nobody to share with, when strangers were refused."""
         library: Any = require("websockets.asyncio.server", extra="view")
         serve = library.serve
 
@@ -162,27 +123,36 @@ class Guard(Gate):
             enter = partial(self._enter, handler)
             return serve(enter, **{**how, **ours, "max_size": _MESSAGE_BYTES})
 
-        library.serve = serve_here
-        try:
-            yield
-        finally:
-            library.serve = serve
+        with redirect_stdout(io.StringIO()):
+            library.serve = serve_here
+            try:
+                server = viser.ViserServer(HOST, self.port, "recon", verbose=False)
+            finally:
+                library.serve = serve
+            for gone in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
+                server._websock_server.unregister_handler(gone)  # a tunnel from the internet
+            try:
+                self._check()
+            except OutputError:
+                server.stop()
+                raise
+        return server
 
     def _answer(self, connection: Any, request: Any) -> Any:
         """Return the page or a refusal; None = a page of ours opens its websocket."""
         asked = request.headers.get_all
         hosts, origins, upgrade = asked("Host"), asked("Origin"), asked("Upgrade")
-        if not self.admits(request.path, hosts) or bool(origins) != bool(upgrade):
+        if not self.admits(request.path, hosts):
             return connection.respond(HTTPStatus.FORBIDDEN, _REFUSED)
-        if not upgrade:
+        if not origins and not upgrade:
             answer = connection.respond(HTTPStatus.OK, self._page)
             del answer.headers["Content-Type"]
             answer.headers.update(self.headers(hosts[0]))
             return answer
-        own = (origins, asked("Sec-WebSocket-Protocol"))
-        if own != ([f"http://{hosts[0]}"], [self._protocol]):
-            return connection.respond(HTTPStatus.FORBIDDEN, _REFUSED)
-        return None
+        own = [f"http://{hosts[0]}"], [self._protocol]
+        if upgrade and (origins, asked("Sec-WebSocket-Protocol")) == own:
+            return None
+        return connection.respond(HTTPStatus.FORBIDDEN, _REFUSED)
 
     async def _enter(self, handler: Callable[[Any], Any], connection: Any) -> None:
         if self._pages >= MOST_PAGES:
@@ -190,54 +160,64 @@ class Guard(Gate):
             return
         self._pages += 1
         try:
-            await handler(_Connection(connection, self._fits))
+            drop, send = connection.transport.abort, connection.send
+            connection.recv = partial(self._take, connection.recv)
+            connection.send = lambda message: send(_parts(message, drop))
+            await handler(connection)
         finally:
             self._pages -= 1
+
+    async def _take(self, recv: Callable[[], Awaitable[str | bytes]]) -> str | bytes:
+        """Return the next message of a page that fits."""
+        while not self._fits(raw := await recv()):
+            pass
+        return raw
 
     def _fits(self, raw: str | bytes) -> bool:
         """Return whether a message is one that the page sends, with values that it can have."""
         msgspec: Any = require("msgspec", extra="view")
         try:
-            message = _MESSAGES.validate_python(msgspec.msgpack.decode(raw))
-        except (ValueError, TypeError, RecursionError, msgspec.MsgspecError):
-            return False
-        if isinstance(message, _Choice):
-            return self._offers(message.uuid, message.updates.value)
-        return True
+            match msgspec.msgpack.decode(raw):
+                case {"type": "ViewerCameraMessage", **values}:
+                    return _are_numbers(values, _CAMERA)
+                case {
+                    "type": "ScenePointerMessage", "event_type": "click", "modifier": None, **values
+                }:  # fmt: skip
+                    return _are_numbers(values, _CLICK)
+                case {"type": "GuiUpdateMessage", "uuid": one, "updates": updates, **more}:
+                    known = not more and updates.keys() == {"value"}
+                    return known and self._offers(one, updates["value"])
+        except (ValueError, TypeError, AttributeError, RecursionError, msgspec.MsgspecError):
+            pass
+        return False
 
-    def check(self) -> None:
+    def _check(self) -> None:
         """Ask for the page as strangers would; `ReconError` where one is let in.
 
         What stands before viser is tied to how viser and websockets are made.
         """
         host, evil = self.hosts[0], "elsewhere.example"
-        look, key = {"Host": host}, b64encode(bytes(16)).decode()
+        look = {"Host": host}
         join = {
             **look, "Origin": f"http://{host}", "Upgrade": "websocket", "Connection": "Upgrade",
-            "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key,
+            "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "A" * 22 + "==",
             "Sec-WebSocket-Protocol": self._protocol,
         }  # fmt: skip
-        strangers = [
-            ("/", look), ("/", join), (f"{self.path}?websocket=ws://{evil}", look),
-            (self.path, {**look, "Host": evil}), (self.path, {**join, "Host": evil}),
-            (self.path, {**join, "Origin": f"http://{evil}"}),
-            (self.path, {name: value for name, value in join.items() if name != "Origin"}),
+        callers = [
+            (200, self.path, look), (101, self.path, join), (403, "/", look), (403, "/", join),
+            (403, f"{self.path}?websocket=ws://{evil}", look),
+            (403, self.path, {**look, "Host": evil}), (403, self.path, {**join, "Host": evil}),
+            (403, self.path, {**join, "Origin": f"http://{evil}"}),
+            (403, self.path, {name: value for name, value in join.items() if name != "Origin"}),
         ]  # fmt: skip
-        page, wanted = self._ask(self.path, look), self.headers(host).items()
-        if page[0] != HTTPStatus.OK or not wanted <= page[1].items():
-            raise self._unsafe("its page is not served as it should be")
-        if self._ask(self.path, join)[0] != HTTPStatus.SWITCHING_PROTOCOLS:
-            raise self._unsafe("its page could not connect")
-        for path, headers in strangers:
-            if self._ask(path, headers)[0] != HTTPStatus.FORBIDDEN:
-                raise self._unsafe("strangers would be let in")
-
-    def _ask(self, path: str, headers: dict[str, str]) -> tuple[int, dict[str, str]]:
         try:
-            with closing(HTTPConnection(HOST, self.port, timeout=_PATIENCE_S)) as asking:
-                asking.request("GET", path, headers=headers)
-                answer = asking.getresponse()
-                return answer.status, dict(answer.getheaders())
+            for status, path, headers in callers:
+                with closing(HTTPConnection(HOST, self.port, timeout=_PATIENCE_S)) as asking:
+                    asking.request("GET", path, headers=headers)
+                    answer = asking.getresponse()
+                lacks = self.headers(host).items() - answer.headers.items()
+                if answer.status != status or (status == HTTPStatus.OK and lacks):
+                    raise self._unsafe(_UNSAFE[status])
         except (OSError, HTTPException) as error:
             raise self._unsafe("it does not answer") from error
 
@@ -246,31 +226,20 @@ class Guard(Gate):
         return OutputError(f"nothing is served, as {why}", got=self._protocol, hint=hint)
 
 
-class _Connection:
-    """The connection of a page as viser has it: what comes is checked, what goes is bounded."""
+def _are_numbers(values: dict[object, object], shapes: dict[str, tuple[int, ...]]) -> bool:
+    """Return whether values are numbers of these shapes, none of them NaN."""
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    return {name: one.shape for name, one in arrays.items()} == shapes and all(
+        one.dtype.kind in "if" and (np.abs(one, dtype=np.float64) <= _MOST).all()
+        for one in arrays.values()
+    )
 
-    def __init__(self, connection: Any, fits: Callable[[str | bytes], bool]) -> None:
-        self._connection, self._fits = connection, fits
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._connection, name)
-
-    async def recv(self) -> str | bytes:
-        """Return the next message that fits."""
-        while True:
-            raw: str | bytes = await self._connection.recv()
-            if self._fits(raw):
-                return raw
-
-    async def send(self, message: bytes) -> None:
-        """Send a message in parts, each when the one before was taken."""
-        await self._connection.send(self._parts(message))
-
-    async def _parts(self, message: bytes) -> AsyncIterator[bytes]:
-        loop, drop = asyncio.get_running_loop(), self._connection.transport.abort
-        for start in range(0, len(message), _PART_BYTES):
-            patience = loop.call_later(_PATIENCE_S, drop)
-            try:
-                yield message[start : start + _PART_BYTES]
-            finally:
-                patience.cancel()
+async def _parts(message: bytes, drop: Callable[[], None]) -> AsyncIterator[bytes]:
+    """Yield parts of a message, each when a page took the one before, or drop the page."""
+    for start in range(0, len(message), _PART_BYTES):
+        patience = asyncio.get_running_loop().call_later(_PATIENCE_S, drop)
+        try:
+            yield message[start : start + _PART_BYTES]
+        finally:
+            patience.cancel()

@@ -13,11 +13,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import ReconError, require
+from recon.core.errors import require
 from recon.core.values import UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64
 from recon.view.guard import Guard
-from recon.view.scene import HOST, MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
+from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
 
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
@@ -35,19 +35,9 @@ class Viewer:
     def __init__(self, port: int) -> None:
         viser: Any = require("viser", extra="view")
         logging.getLogger("websockets").addHandler(logging.NullHandler())  # a browser may vanish
-        guard = Guard(viser, port, self._offers)
         self._controls: dict[str, Any] = {}
-        with redirect_stdout(io.StringIO()), guard.before():
-            self._server = viser.ViserServer(HOST, guard.port, "recon", verbose=False)
-        handlers = self._server._websock_server  # of what a page can ask for
-        for gone in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
-            handlers.unregister_handler(gone)  # a tunnel from the internet
-        try:
-            guard.check()
-        except ReconError:
-            self.close()
-            raise
-        self.url = guard.url
+        guard = Guard(viser, port, self._offers)
+        self._server, self.url = guard.start(viser), guard.url
         self.looked_at = False  # by a browser
         self._scenes: dict[Path, Scene] = {}
         self._parts: list[Points] = []
@@ -85,9 +75,8 @@ class Viewer:
         self._eye_m = wanted.get("eye", self._eye_m)
         self.looked_at |= "eye" in wanted
         place_m = pick(self._parts, *wanted["ray"]) if "ray" in wanted else None
-        keyframe = wanted.get("keyframe")
-        if self._keyframes and (place_m is not None or keyframe is not None):
-            self._choose(keyframe, place_m)
+        if self._keyframes and (place_m is not None or "keyframe" in wanted):
+            self._choose(wanted.get("keyframe"), place_m)
         if wanted:
             self._draw()
 
@@ -100,12 +89,10 @@ class Viewer:
         self._wanted.update({name: one for name, one in wanted.items() if one is not None})
         self._news.set()
 
-    def _offers(self, control: str, value: str | bool | int) -> bool:
+    def _offers(self, control: Any, value: Any) -> bool:
         known = self._controls.get(control)
-        if known is None:
-            return False
-        if known is self._by:
-            return value in known.options
+        if known is None or known is self._by:
+            return known is not None and value in known.options
         if known is self._slider:
             return type(value) is int and not known.disabled and 0 <= value <= known.max
         return type(value) is bool
@@ -187,8 +174,9 @@ class Viewer:
     def _choose(self, keyframe: int | None, place_m: Float64 | None) -> None:
         """Show a keyframe and who saw it, or a place and the nearest keyframe that saw that."""
         known, api = self._keyframes, self._server.scene
+        keyframe = keyframe and min(keyframe, len(known) - 1)  # of one there may be a slider to 1
         eyes_m = np.array([of.T_map_camera[n][:3, 3] for of, n in known])
-        place_m = eyes_m[min(keyframe or 0, len(known) - 1)] if place_m is None else place_m
+        place_m = eyes_m[keyframe] if place_m is None else place_m
         seen = [k for k, (of, n) in enumerate(known) if of.sees(n, place_m)]
         ends = np.array([(place_m, eyes_m[k]) for k in seen]).reshape(-1, 2, 3)
         api.add_line_segments("/path/seen", ends, (255, 213, 79), **_LINE)
@@ -197,7 +185,7 @@ class Viewer:
             keyframe = min(seen, key=lambda k: float(np.linalg.norm(eyes_m[k] - place_m)))
             self._slider.value = keyframe
         if keyframe is not None:
-            of, number = known[min(keyframe, len(known) - 1)]
+            of, number = known[keyframe]
             said, image = of.look(number)
             lines, self._image.visible = [*said, *lines], image is not None
             self._image.image = self._image.image if image is None else image
