@@ -7,6 +7,7 @@ connect to a port of 127.0.0.1. So a page has one address, whose path is a secre
 from __future__ import annotations
 
 import asyncio
+import gc
 import io
 import secrets
 import socket
@@ -22,6 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import OutputError, require
+from recon.run.machine import return_free_memory
 from recon.view.scene import HOST
 
 MOST_PAGES: Final = 8  # that look at a time: each takes a copy of what is shown
@@ -166,6 +168,7 @@ class Guard(Gate):
             await handler(connection)
         finally:
             self._pages -= 1
+            asyncio.get_running_loop().call_later(1.0, _give_back)
 
     async def _take(self, recv: Callable[[], Awaitable[str | bytes]]) -> str | bytes:
         """Return the next message of a page that fits."""
@@ -233,6 +236,12 @@ def _are_numbers(values: dict[object, object], shapes: dict[str, tuple[int, ...]
         one.dtype.kind in "if" and (np.abs(one, dtype=np.float64) <= _MOST).all()
         for one in arrays.values()
     )
+
+
+def _give_back() -> None:
+    """Give back what was queued for a page that is gone, which its tasks hold in circles."""
+    gc.collect()
+    return_free_memory()
 
 
 async def _parts(message: bytes, drop: Callable[[], None]) -> AsyncIterator[bytes]:
