@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import statistics
 import subprocess
 import sys
@@ -30,7 +29,7 @@ import viser
 from viser._messages import ViewerCameraMessage
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
-from websockets.typing import Subprotocol
+from websockets.typing import Origin, Subprotocol
 
 from recon.io.models.ply import read_ply
 from recon.view.server import FIRST_POINTS
@@ -80,9 +79,9 @@ def look(door: str) -> None:
     turn, eye_m, ahead_m, up = (1.0, 0.0, 0.0, 0.0), (-9.0, 0.0, 9.0), (0.0,) * 3, (0.0, 0.0, 1.0)
     camera = ViewerCameraMessage(turn, eye_m, 1.0, 0.1, 1e3, 900, 1600, ahead_m, up)
     protocols = [Subprotocol(f"viser-v{viser.__version__}")]
-    address = url.replace("http", "ws")
+    address, origin = url.replace("http", "ws", 1), Origin(url.rpartition("/")[0])
     with (
-        connect(address, subprotocols=protocols, max_size=None) as page,
+        connect(address, origin=origin, subprotocols=protocols, max_size=None) as page,
         suppress(ConnectionClosed),
     ):
         page.send(msgspec.msgpack.encode(camera.as_serializable_dict()))
@@ -91,12 +90,8 @@ def look(door: str) -> None:
 
 
 def first_picture_s(run: Path, profile: Path) -> float:
-    found = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
-    program = next(filter(None, found), None)
-    if program is None:
-        raise LookupError("Chromium is not installed")
     least = POINT_BYTES * min(FIRST_POINTS // 2, len(read_ply(run / "map/cloud.ply")))
-    with chromium.opened(program, profile) as page:
+    with chromium.opened(profile) as page:
         start = time.monotonic()
         words = [*RECON, "view", str(run), "--port", "0"]
         with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as viewer:

@@ -32,8 +32,8 @@ def view(
 ) -> None:
     """Look at maps in the browser: points, grid, mesh, path, keyframes.
 
-    For this machine alone, until Ctrl-C. Runs that are being made grow; a click
-    shows which keyframes saw a place, and what they saw.
+    For this machine alone, at a secret address, until Ctrl-C. Runs that are being
+    made grow; a click shows which keyframes saw a place, and what they saw.
 
     Examples:
       recon view outputs/map/latest
@@ -42,7 +42,8 @@ def view(
     with until_interrupted() as stopped, one_line_errors(quiet=quiet):
         from recon.commands.view import run_view
 
-        say = str if quiet else partial(typer.echo, err=True)
+        # Also where it is quiet: nobody can guess the address.
+        say = partial(typer.echo, err=True)
         url = run_view(runs, port, say, lambda: stopped() or beside not in (None, os.getppid()))
     if json:
         print_json({"url": url})

@@ -17,6 +17,7 @@ from threading import Lock, Thread
 from typing import Any, cast
 
 from recon.core.errors import ReconError, require
+from recon.view.guard import Gate
 from recon.view.scene import HOST
 
 Say = Callable[[str], object]
@@ -36,9 +37,8 @@ def show_beside(run: Path, port: int, say: Say) -> str:
         say(f"nothing is shown at {HOST}:{port}: {error}")
         return ""
     Thread(target=door.serve_forever, daemon=True).start()
-    url = f"http://{HOST}:{door.server_address[1]}"
-    say(f"{url} until the run ends")
-    return url
+    say(f"{door.gate.url} until the run ends")
+    return door.gate.url
 
 
 class _Door(ThreadingTCPServer):
@@ -49,6 +49,7 @@ class _Door(ThreadingTCPServer):
 
     def __init__(self, run: Path, port: int, say: Say) -> None:
         super().__init__((HOST, port), _Caller)
+        self.gate = Gate(self.server_address[1])
         beside = ["--port", "0", "--beside", str(os.getpid())]
         self._words = [sys.executable, "-m", "recon", "view", str(run), *beside]
         self._say, self._starting, self._url = say, Lock(), ""
@@ -93,9 +94,13 @@ class _Caller(BaseHTTPRequestHandler):
     timeout = 10.0  # of one that connects and asks for nothing
 
     def do_GET(self) -> None:
-        url = cast("_Door", self.server).viewer_url()
-        self.send_response(302 if url else 503)
+        door = cast("_Door", self.server)
+        admitted = door.gate.admits(self.path, self.headers.get_all("Host", []))
+        url = door.viewer_url() if admitted else ""
+        self.send_response((302 if url else 503) if admitted else 403)
         self.send_header("Content-Length", "0")
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Referrer-Policy", "no-referrer")
         if url:
             self.send_header("Location", url)
         self.end_headers()

@@ -1,26 +1,24 @@
-"""The page in the browser, served to this machine alone; the only file that knows viser."""
+"""The page in the browser, made by viser, and what is asked for in it."""
 
 from __future__ import annotations
 
 import io
 import logging
-import re
-import socket
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
-from functools import partial
+from collections.abc import Iterable
+from contextlib import redirect_stdout
+from html import escape
 from pathlib import Path
 from threading import Event
 from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import OutputError, require
+from recon.core.errors import require
 from recon.core.values import UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64
-from recon.view.scene import HOST, MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
+from recon.view.guard import Guard
+from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
 
-_OURS: Final = re.compile(r"http://(127\.0\.0\.1|localhost):\d+")
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
 FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
@@ -29,23 +27,22 @@ _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
 
 
 class Viewer:
-    """Shows scenes of runs at ``url``; `ReconError` without viser, or where the port is taken."""
+    """Shows scenes of runs at ``url``, which nobody else knows.
+
+    `ReconError`: viser is missing, or is not as it was tested, or the port is taken.
+    """
 
     def __init__(self, port: int) -> None:
         viser: Any = require("viser", extra="view")
-        try:
-            socket.create_server((HOST, port)).close()
-        except OSError as error:
-            what, where, hint = "cannot serve here", f"{HOST}:{port}", "give another --port"
-            raise OutputError(what, where=where, got=error.strerror, hint=hint) from error
         logging.getLogger("websockets").addHandler(logging.NullHandler())  # a browser may vanish
-        with redirect_stdout(io.StringIO()), _for_pages_of_this_machine():
-            self._server = viser.ViserServer(HOST, port, "recon", verbose=False)
-        self.url = f"http://{HOST}:{self._server.get_port()}"
+        self._controls: dict[str, Any] = {}
+        guard = Guard(viser, port, self._offers)
+        self._server, self.url = guard.start(viser), guard.url
         self.looked_at = False  # by a browser
         self._scenes: dict[Path, Scene] = {}
         self._parts: list[Points] = []
         self._keyframes: list[tuple[Any, int]] = []  # each by its views, and its number there
+        self._known: list[str] = [*_COLOURINGS[:1]]  # of colourings
         self._drawn: dict[str, tuple[Any, ...]] = {}  # what each node was made of
         self._eye_m: Float64 = np.zeros(3)
         self._wanted: dict[str, Any] = {}
@@ -65,7 +62,8 @@ class Viewer:
         self._keyframes = [(of, n) for of in views for n in range(len(of.T_map_camera))]
         known = [by for by in _COLOURINGS if all(p.values(by) is not None for p in self._parts)]
         self._by.options, last = known, len(self._keyframes) - 1
-        self._text.content = "\n\n".join("  \n".join(one.lines) for one in scenes)
+        self._known = known
+        self._text.content = "<br>".join(_html(one.lines) for one in scenes)
         self._slider.max, self._slider.disabled = max(1, last), last < 0
         self._draw()
 
@@ -91,20 +89,30 @@ class Viewer:
         self._wanted.update({name: one for name, one in wanted.items() if one is not None})
         self._news.set()
 
+    def _offers(self, control: Any, value: Any) -> bool:
+        known = self._controls.get(control)
+        if known is None or known is self._by:
+            return known is not None and value in known.options
+        if known is self._slider:
+            return type(value) is int and not known.disabled and 0 <= value <= known.max
+        return type(value) is bool
+
     def _lay_out(self) -> None:
         gui, scene = self._server.gui, self._server.scene
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._text = gui.add_markdown("nothing to be seen yet")
+        self._text = gui.add_html(_html(["nothing to be seen yet"]))
         self._by = gui.add_dropdown("Colours", _COLOURINGS[:1])
-        self._legend = gui.add_markdown("")
+        self._legend = gui.add_html("")
         self._layers = [
             (gui.add_checkbox(f"Show {name}", name != "mesh"), scene.add_frame(f"/{name}", False))
             for name in _LAYERS
         ]
         self._slider = gui.add_slider("Keyframe", 0, 1, 1, 0, disabled=True)
-        self._said = gui.add_markdown("Move the slider, or click into the scene.")
+        self._said = gui.add_html(_html(["Move the slider, or click into the scene."]))
         self._image = gui.add_image(np.zeros((1, 1, 3), np.uint8), format="jpeg", visible=False)
-        for control in (self._by, *(box for box, _ in self._layers)):
+        drawn = (self._by, *(box for box, _ in self._layers))
+        self._controls = {one._impl.uuid: one for one in (*drawn, self._slider)}
+        for control in drawn:
             control.on_update(lambda _: self._note(drawn=True))
         self._slider.on_update(lambda e: self._note(keyframe=e.client and e.target.value))
         scene.on_click()(lambda e: self._note(ray=np.array([e.ray_origin, e.ray_direction])))
@@ -121,6 +129,8 @@ class Viewer:
     def _draw(self) -> None:
         for box, frame in self._layers:
             frame.visible = box.value
+        # What was chosen may be older than what is known now.
+        self._colour = self._by.value if self._by.value in self._known else self._known[0]
         self._kept: set[str] = set()
         if self._parts:
             self._draw_clouds()
@@ -131,9 +141,10 @@ class Viewer:
             del self._drawn[name]
 
     def _draw_clouds(self) -> None:
-        by, parts, scenes = self._by.value, self._parts, enumerate(self._scenes.values())
+        by, parts, scenes = self._colour, self._parts, enumerate(self._scenes.values())
         if self._changed("colours", by, *parts):
-            self._colours, self._legend.content = colours(parts, by)
+            self._colours, legend = colours(parts, by)
+            self._legend.content = _html([legend])
         halved = halvings(parts, self._eye_m, MOST_POINTS if self.looked_at else FIRST_POINTS)
         named = {f"/cloud/{n}_{part.name}": one for n, one in scenes for part in one.points}
         for name, part, rgb, times in zip(named, parts, self._colours, halved, strict=True):
@@ -144,7 +155,7 @@ class Viewer:
                 self._server.scene.add_point_cloud(name, xyz, shown, **how)
 
     def _draw_rest(self, number: int, scene: Scene) -> None:
-        api, by, mesh = self._server.scene, self._by.value, scene.mesh
+        api, by, mesh = self._server.scene, self._colour, scene.mesh
         for part, (grid, height_m) in enumerate(scene.grids):
             name = f"/grid/{number}_{part}"
             if self._changed(name, grid):
@@ -163,36 +174,28 @@ class Viewer:
     def _choose(self, keyframe: int | None, place_m: Float64 | None) -> None:
         """Show a keyframe and who saw it, or a place and the nearest keyframe that saw that."""
         known, api = self._keyframes, self._server.scene
+        keyframe = keyframe and min(keyframe, len(known) - 1)  # of one there may be a slider to 1
         eyes_m = np.array([of.T_map_camera[n][:3, 3] for of, n in known])
         place_m = eyes_m[keyframe] if place_m is None else place_m
         seen = [k for k, (of, n) in enumerate(known) if of.sees(n, place_m)]
         ends = np.array([(place_m, eyes_m[k]) for k in seen]).reshape(-1, 2, 3)
         api.add_line_segments("/path/seen", ends, (255, 213, 79), **_LINE)
-        text = f"{np.round(place_m, 1)} m was seen by keyframes {seen or 'none'}"
+        lines = [f"{np.round(place_m, 1)} m was seen by keyframes {seen or 'none'}"]
         if keyframe is None and seen:
             keyframe = min(seen, key=lambda k: float(np.linalg.norm(eyes_m[k] - place_m)))
             self._slider.value = keyframe
         if keyframe is not None:
             of, number = known[keyframe]
-            lines, image = of.look(number)
-            text, self._image.visible = "  \n".join([*lines, text]), image is not None
+            said, image = of.look(number)
+            lines, self._image.visible = [*said, *lines], image is not None
             self._image.image = self._image.image if image is None else image
-        self._said.content = text
+        self._said.content = _html(lines)
 
 
-@contextmanager
-def _for_pages_of_this_machine() -> Iterator[None]:
-    """Let what is served meanwhile refuse other sites, whose pages the same browser may show.
-
-    viser asks nobody where a connection comes from, and hands websockets no list of who may.
-    """
-    library: Any = require("websockets.asyncio.server", extra="view")
-    serve = library.serve
-    library.serve = partial(serve, origins=[None, _OURS])  # None: no browser
-    try:
-        yield
-    finally:
-        library.serve = serve
+def _html(lines: Iterable[str]) -> str:
+    """Return lines as a page shows them, of which none is markup: they name files of others."""
+    text = "<br>".join(map(escape, lines))
+    return f'<div style="padding: 0 10px; font-size: 14px; overflow-wrap: anywhere">{text}</div>'
 
 
 def _add_grid(api: Any, name: str, grid: OccupancyGrid, height_m: float) -> None:

@@ -1,6 +1,7 @@
 """A page in headless Chromium, as its developer tools see it; with a package that viser brings."""
 
 import json
+import shutil
 import subprocess
 import time
 from collections.abc import Iterator
@@ -11,6 +12,8 @@ from typing import Any
 
 from websockets.sync.client import connect
 
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
+PROGRAM = next(filter(None, map(shutil.which, _NAMES)), None)
 _QUIET = (
     "--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking",
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0",
@@ -35,7 +38,25 @@ class Page:
         self._send("Page.navigate", {"url": url})
 
     def _send(self, method: str, about: dict[str, Any], **to: Any) -> None:
-        self._tools.send(json.dumps({"id": 1, "method": method, "params": about, **to}))
+        self._tools.send(json.dumps({"id": 1, "method": method, "params": about} | to))
+
+    def run(self, script: str) -> Any:
+        """Return the value of an expression, of a promise that which it comes to."""
+        how = {"awaitPromise": True, "returnByValue": True, "allowUnsafeEvalBlockedByCSP": False}
+        self._send("Runtime.evaluate", {"expression": script, **how}, id=2)
+        while (answer := json.loads(self._tools.recv(timeout=_PATIENCE_S))).get("id") != 2:
+            self._note(answer)
+        return answer["result"]["result"].get("value")
+
+    def press(self, key: str) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self._send("Input.dispatchKeyEvent", {"type": kind, "key": key, "code": key})
+
+    def click(self, x_px: float, y_px: float) -> None:
+        for kind, button in (("Moved", "none"), ("Pressed", "left"), ("Released", "left")):
+            where = {"x": x_px, "y": y_px, "button": button, "clickCount": 1}
+            self._send("Input.dispatchMouseEvent", {"type": f"mouse{kind}", **where})
+            self.wait(0.5)
 
     def _follow(self, to: dict[str, Any]) -> None:
         for domain in ("Runtime", "Log", "Network"):
@@ -70,13 +91,15 @@ class Page:
 
 
 @contextmanager
-def opened(program: str, profile: Path) -> Iterator[Page]:
+def opened(profile: Path, *more: str) -> Iterator[Page]:
     """Start Chromium with an empty page."""
-    words = [program, *_QUIET, f"--user-data-dir={profile}", "about:blank"]
+    if PROGRAM is None:
+        raise LookupError("Chromium is not installed")
+    words = [PROGRAM, *_QUIET, *more, f"--user-data-dir={profile}", "about:blank"]
     quiet = subprocess.DEVNULL
     with subprocess.Popen(words, stdout=quiet, stderr=quiet) as process:
         try:
-            yield Page(connect(_address(profile), max_size=None))
+            yield Page(connect(_address(profile), max_size=None, ping_interval=None))
         finally:
             process.terminate()
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final, Literal, TypeVar, overload
 
 import numpy as np
-from numba import config, njit
+from numba import __version__, config, njit
 from numba.core.caching import FunctionCache
 from numpy.typing import NDArray
 
@@ -67,7 +67,17 @@ def kernel(function: Any = None, **options: str) -> Any:
     try:
         compiled = njit(nogil=True, **options)(function)
         if compiled is not function:  # it is where NUMBA_DISABLE_JIT is set
-            compiled._cache = _KernelCache(function)  # as `enable_caching` does
+            _keep(compiled, function)
         return compiled
     finally:
         config.CACHE_DIR = kept
+
+
+def _keep(compiled: Any, function: Callable[..., Any]) -> None:
+    """Give a compiled function our cache, as `enable_caching` does its own."""
+    before, own = getattr(compiled, "_cache", None), _KernelCache(function)
+    used = all(hasattr(before, name) for name in ("load_overload", "save_overload"))
+    if not (used and own.cache_path.startswith(_CACHE)):
+        # Code of earlier sources would run, or two processes would mix up what they write.
+        raise ImportError(f"numba {__version__} keeps machine code in another way", name="numba")
+    compiled._cache = own

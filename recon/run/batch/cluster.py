@@ -32,7 +32,11 @@ _LOCAL: Final[dict[str, Any]] = {
     # Workers that die are started again, however long that takes.
     "distributed.deploy.lost-worker-timeout": "1 day",
     "distributed.scheduler.no-workers-timeout": _WORKERS_S,
-}
+    # Not every site that a browser of this machine shows may read the dashboard.
+    "distributed.scheduler.dashboard.bokeh-application.allow_websocket_origin": [
+        "127.0.0.1", "localhost",
+    ],
+}  # fmt: skip
 
 #: An address or file that is none; a protocol without certificates or library; a mad answer.
 _NO_SCHEDULER: Final = (

@@ -106,6 +106,28 @@ def test_one_process_at_a_time_writes_the_code_of_a_kernel(monkeypatch):
 
 
 @compiled
+@pytest.mark.parametrize("change", ["no place", "other names", "other folder"])
+def test_a_numba_that_keeps_code_in_another_way_is_refused(monkeypatch, change):
+    """Else code of earlier sources would run, or two would write at a time, and nobody know."""
+    dispatcher = type(kernel(lambda value: value))
+    begin = dispatcher.__init__
+
+    def begin_otherwise(self: Any, *given: Any, **how: Any) -> None:
+        begin(self, *given, **how)
+        del self._cache
+        if change == "other names":
+            self._cache = object()
+
+    if change == "other folder":
+        monkeypatch.setattr(FunctionCache, "cache_path", "/elsewhere")
+    else:
+        monkeypatch.setattr(dispatcher, "__init__", begin_otherwise)
+    with pytest.raises(ImportError, match="keeps machine code in another way") as refused:
+        kernel(lambda value: value)
+    assert refused.value.name == "numba"  # of which the command line says what to do
+
+
+@compiled
 def test_what_is_compiled_is_announced_unless_it_is_cached(monkeypatch):
     assert Path(voxels.pack_key.stats.cache_path).parent == cache_folder(cache_parent())
     # Other users of numba keep their cache.

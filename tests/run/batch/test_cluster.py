@@ -4,7 +4,7 @@ import socket
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -199,3 +199,22 @@ def test_a_scheduler_that_goes_and_dask_that_is_not_there_are_one_line(monkeypat
     for there in (join_cluster("tcp://127.0.0.1:9"), local_cluster(1)):
         with pytest.raises(MissingDependencyError, match=r"pip install 'recon-stereo\[cluster\]'"):
             there.__enter__()
+
+
+def test_the_dashboard_of_this_machine_is_not_for_other_sites():
+    client = pytest.importorskip("websockets.sync.client")
+    refused = pytest.importorskip("websockets.exceptions").InvalidStatus
+    token = pytest.importorskip("bokeh.util.token")
+    with local_cluster(1) as one:
+        page = one.dashboard.rpartition("/")[0]
+        there = page.replace("http", "ws", 1) + "/individual-progress/ws"
+
+        def join(origin: str) -> AbstractContextManager[object]:
+            words = ["bokeh", token.generate_jwt_token(token.generate_session_id())]
+            return client.connect(there, origin=origin, subprotocols=words)
+
+        with join(page):
+            pass
+        for origin in ("http://elsewhere.example", page.replace("127.0.0.1", "127.0.0.1.example")):
+            with pytest.raises(refused, match="403"), join(origin):
+                pass
