@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from functools import partial
+import subprocess
+import sys
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -20,6 +21,7 @@ Runs = Annotated[
 ]
 PORT: Final = 8080
 Port = Annotated[int, opt.option("Port of this machine; 0 = any that is free.", min=0, max=65535)]
+_LEAST_PRIORITY: Final = 19
 Beside = Annotated[int | None, typer.Option(hidden=True)]
 
 
@@ -40,17 +42,28 @@ def view(
       recon view outputs/monday outputs/friday --port 8090
     """
     with until_interrupted() as stopped, one_line_errors(quiet=quiet):
+        if beside is not None:
+            os.nice(_LEAST_PRIORITY)
         from recon.commands.view import run_view
 
-        # Also where it is quiet: nobody can guess the address.
-        say = partial(typer.echo, err=True)
-        url = run_view(runs, port, say, lambda: stopped() or beside not in (None, os.getppid()))
+        ends = "Ctrl-C" if beside is None else "the run ends"
+
+        def announce(url: str) -> None:  # also where it is quiet: nobody can guess the address
+            typer.echo(f"{url} until {ends}", err=True)
+
+        def over() -> bool:
+            return stopped() or beside not in (None, os.getppid())
+
+        url = run_view(runs, port, announce, over)
     if json:
         print_json({"url": url})
 
 
 def view_beside(run: Path) -> None:
-    """Show a run to a browser that asks, while it lasts."""
-    from recon.view.door import show_beside
+    """Show a run while it lasts, in a process that gets the time that is left.
 
-    show_beside(run, PORT, partial(typer.echo, err=True))
+    It says its address, and what goes wrong; either way the run goes on.
+    """
+    words = ["view", str(run), "--port", str(PORT), "--beside", str(os.getpid())]
+    quiet = subprocess.DEVNULL
+    subprocess.Popen([sys.executable, "-m", "recon", *words], stdin=quiet, stdout=quiet)

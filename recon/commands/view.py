@@ -41,7 +41,7 @@ def run_view(
             with reading(path), closing(connect(path, read_only=True)) as database:
                 check_format(database, path)
     with closing(Viewer(port)) as viewer:
-        announce(f"{viewer.url} until Ctrl-C")
+        announce(viewer.url)
         coming = [(run, _scenes(folder, viewer, run)) for folder, run in shown]
         while not stopped():
             for run, scenes in coming:

@@ -2,5 +2,5 @@
 
 `scene.py`: what is shown, as values; `follow.py`: the scene of a map, also of one that grows, and
 what its keyframes saw; `server.py`: the page, made by viser; `guard.py`: who is let into it, and
-what is taken from it; `door.py`: where a browser asks for a run that lasts.
+what is taken from it.
 """

@@ -55,27 +55,10 @@ _CLICK: Final[dict[str, tuple[int, ...]]] = {
 _MOST: Final = 1e9  # of a number: its square is one, too
 
 
-class Gate:
-    """The one address of a page of this machine: host, port, and a secret as its path."""
-
-    def __init__(self, port: int) -> None:
-        self.port, self.path = port, f"/{secrets.token_urlsafe(32)}"
-        self.url = f"http://{HOST}:{port}{self.path}"
-        self.hosts = f"{HOST}:{port}", f"localhost:{port}"
-
-    def admits(self, path: str, hosts: Sequence[str]) -> bool:
-        """Return whether a request asks for the page, by a name of this machine.
-
-        A site can have a name that leads to 127.0.0.1; it stays in ``hosts``, the ``Host`` header.
-        """
-        given = path.encode("utf-8", "surrogateescape")
-        named = len(hosts) == 1 and hosts[0] in self.hosts
-        return compare_digest(given, self.path.encode()) and named
-
-
-class Guard(Gate):
+class Guard:
     """Stands before viser on a port, of which it holds the socket.
 
+    The page has one address: host, port, and a secret as its path.
     ``offers(control, value)``: whether a control of the page, by its number, can have a value.
     """
 
@@ -89,7 +72,18 @@ class Guard(Gate):
         except OSError as error:
             what, where, hint = "cannot serve here", f"{HOST}:{port}", "give another --port"
             raise OutputError(what, where=where, got=error.strerror, hint=hint) from error
-        super().__init__(self._socket.getsockname()[1])
+        self.port, self.path = self._socket.getsockname()[1], f"/{secrets.token_urlsafe(32)}"
+        self.url = f"http://{HOST}:{self.port}{self.path}"
+        self.hosts = f"{HOST}:{self.port}", f"localhost:{self.port}"
+
+    def admits(self, path: str, hosts: Sequence[str]) -> bool:
+        """Return whether a request asks for the page, by a name of this machine.
+
+        A site can have a name that leads to 127.0.0.1; it stays in ``hosts``, the ``Host`` header.
+        """
+        given = path.encode("utf-8", "surrogateescape")
+        named = len(hosts) == 1 and hosts[0] in self.hosts
+        return compare_digest(given, self.path.encode()) and named
 
     def _with_nonce(self, page: str) -> str:
         """Return viser's page with its own scripts, and no others, allowed to run."""

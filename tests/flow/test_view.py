@@ -6,14 +6,10 @@ import re
 import shutil
 import signal
 import socket
-import struct
 import subprocess
 import sys
-from contextlib import closing
-from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
-from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
@@ -30,7 +26,6 @@ from recon.core.values import UNKNOWN
 from recon.io.models.ply import read_ply
 from recon.run.directory import STARTED, state_folder
 from recon.run.work import Silent
-from recon.view.door import show_beside
 from recon.view.follow import add_located, finish, follow_located, grow
 from recon.view.scene import colours
 from tests.flow.conftest import SMALL_STREET
@@ -207,87 +202,45 @@ def test_a_taken_port_and_a_missing_package_are_refused_in_one_line(small_demo, 
     assert_refused(run("view", small_demo), "recon-stereo[view]")
 
 
-def test_a_viewer_begins_when_a_browser_asks_and_ends_with_its_run(small_demo, monkeypatch):
+def test_a_viewer_beside_a_run_says_its_secret_address_and_ends_with_it(small_demo):
+    """The run is a process that shows itself, waits for a word, and ends."""
     pytest.importorskip("viser", reason="the extra view is not installed")
-    begun, said = [], []
-
-    class Begun(subprocess.Popen[str]):
-        def __init__(self, *words: Any, **how: Any) -> None:
-            super().__init__(*words, **how)
-            begun.append(self)
-
-    monkeypatch.setattr(subprocess, "Popen", Begun)
-    url = show_beside(small_demo, 0, said.append)
-    assert said == [f"{url} until the run ends"]
-    with socket.create_connection(place_of(url)):
-        assert not begun  # a browser that only makes sure that somebody is there
-    pages = [asked(url), asked(url)]
-    assert len(begun) == 1
-    assert {page.status for page in pages} == {200}
-    assert pages[0].url == pages[1].url != url
-    assert b"<html" in pages[0].read()
-    assert not any(urlsplit(pages[0].url).path in word for word in begun[0].args)  # `ps` shows them
-    begun[0].kill()
-    begun[0].wait()
-    assert asked(url).status == 200  # the next one
-    begun[1].kill()
-    assert len(said) == 1
+    code = (
+        "import sys; from pathlib import Path; import recon.cli; "
+        "cli = sys.modules['recon.cli.view']; "
+        f"cli.PORT = 0; cli.view_beside(Path({str(small_demo)!r})); sys.stdin.readline()"
+    )
+    words, pipe = [sys.executable, "-c", code], subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stderr=pipe, text=True) as shown:
+        url, *rest = shown.stderr.readline().split()
+        assert rest == ["until", "the", "run", "ends"]
+        assert asked(url).status == 200
+        path = urlsplit(url).path
+        commands = [at.read_bytes() for at in Path("/proc").glob("[0-9]*/cmdline")]
+        assert not any(path.encode() in one for one in commands)  # `ps` shows them
+        shown.stdin.write("\n")
+        shown.stdin.flush()
+        assert shown.wait(60) == 0
+        assert shown.stderr.read() == ""  # closed, as the viewer has ended, too
+    with pytest.raises(OSError, match="refused"):
+        asked(url)
 
 
 def asked(url: str) -> Any:
     return urlopen(url, timeout=60)  # noqa: S310 - its own
 
 
-def place_of(url: str) -> tuple[str, int]:
-    place = urlsplit(url)
-    return str(place.hostname), int(place.port or 0)
-
-
-def test_a_viewer_begins_for_nobody_who_lacks_the_address(monkeypatch, tmp_path):
+def test_nothing_that_happens_to_the_viewer_reaches_the_run(tmp_path):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    monkeypatch.setattr(subprocess, "Popen", fail)
-    said: list[str] = []
-    url = show_beside(tmp_path, 0, said.append)
-    host, port = place_of(url)
-    path = urlsplit(url).path
-    for asked_for, name in (
-        ("/", f"{host}:{port}"), (path[:-1], f"{host}:{port}"), (f"{path}?a=b", f"{host}:{port}"),
-        (path, "elsewhere.example"), (path, f"elsewhere.example:{port}"), (path, f"{host}:1"),
-    ):  # fmt: skip
-        with closing(HTTPConnection(host, port, timeout=60)) as caller:
-            caller.request("GET", asked_for, headers={"Host": name})
-            answer = caller.getresponse()
-            assert (answer.status, answer.getheader("Location")) == (403, None)
-    assert len(said) == 1
-
-
-def test_nothing_that_happens_to_the_viewer_reaches_the_run(monkeypatch, tmp_path, capfd):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    said: list[str] = []
-    with pytest.raises(HTTPError, match="503"):
-        asked(show_beside(tmp_path, 0, said.append))
-    assert "does not contain a finished run" in said[1]
-    url = show_beside(tmp_path, 0, said.append)
-    with monkeypatch.context() as patched:
-        patched.setattr(subprocess, "Popen", fail)
-        with pytest.raises(HTTPError, match="503"):
-            asked(url)
-    assert "no more processes" in said[-1]
-    with socket.create_connection(place_of(url)) as gone:
-        gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset
-        gone.sendall(b"GET / HTTP/1.1\r\n")
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        assert show_beside(tmp_path, taken.getsockname()[1], said.append) == ""
-    monkeypatch.setattr("recon.view.door.find_spec", lambda _: None)
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert show_beside(tmp_path, 0, said.append) == ""
-    assert "in use" in said[-2]
-    assert "recon-stereo[view]" in said[-1]
-    assert "Traceback" not in capfd.readouterr().err
-
-
-def fail(*_: object, **__: object) -> None:
-    raise OSError("no more processes")
+    code = (
+        "import sys; from pathlib import Path; from recon.cli.view import view_beside; "
+        f"view_beside(Path({str(tmp_path)!r})); sys.stdin.readline(); print('done')"
+    )
+    words, pipe = [sys.executable, "-c", code], subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as shown:
+        assert "does not contain a finished run" in shown.stderr.readline()
+        assert shown.communicate("\n", timeout=60) == ("done\n", "")
+        assert shown.returncode == 0
 
 
 def test_a_viewer_beside_a_run_ends_with_it(small_demo):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from recon.core.errors import OutputError
 from recon.view import guard
-from recon.view.guard import Gate, Guard
+from recon.view.guard import Guard
 from recon.view.server import Viewer
 from tests.view.conftest import Served, small_scene, until
 
@@ -140,8 +140,9 @@ def test_without_the_secret_nobody_is_let_in(standing, protocol):
 
 
 def test_secrets_are_long_and_never_the_same():
-    paths = {Gate(1).path for _ in range(100)}
-    assert len(paths) == 100
+    viser = pytest.importorskip("viser")
+    paths = {Guard(viser, 0, lambda *_: True).path for _ in range(20)}
+    assert len(paths) == 20
     assert {len(path) for path in paths} == {44}  # 256 bits
 
 
