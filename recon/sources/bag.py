@@ -22,7 +22,8 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
-from recon.io.cameras.ros import NS, ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
+from recon.io.cameras.kitti import projected_rig
+from recon.io.cameras.ros import NS, ROS_MODELS, lens_of, rig_of_camera_infos, step_between
 from recon.io.files import reading, resolved
 from recon.sources.bag_prior import find_imu, read_imu_topic, read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
@@ -240,12 +241,11 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
             raise CalibrationError(what, where=where, got=got, hint=hint)
     if not rectified:
         cameras = [(_camera(info, where), info.R) for info in (left, right)]
-        return rig_of_camera_infos(cameras[0], cameras[1], right.P, where)
-    check_shift(right.P, float(left.P[0, 3]), where)
-    baseline_m = (left.P[0, 3] - right.P[0, 3]) / left.P[0, 0]
-    size = (left.width_px, left.height_px)
+        return rig_of_camera_infos(cameras[0], cameras[1], (left.P, right.P), where)
+    step_between((left.P, right.P), where)
+    named = {"P of the left": left.P, "P of the right": right.P}
     with reading(where):
-        return RectifiedCamera.from_matrices(left.P, right.P, baseline_m, *size)
+        return projected_rig(named, left.width_px, left.height_px)
 
 
 def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:

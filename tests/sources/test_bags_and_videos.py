@@ -124,6 +124,30 @@ def test_messages_without_lengths_are_refused(rectified, focal_px, message):
         rig_of_messages(info, info, Path("drive.bag"), rectified)
 
 
+def info_of(P: np.ndarray) -> BagCameraInfo:
+    return BagCameraInfo(1242, 375, "plumb_bob", np.zeros(5), P[:, :3], np.eye(3), P)
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+@pytest.mark.parametrize("centre", [-0.06, 0.0, 0.27, 3.0])
+def test_the_baseline_is_between_the_cameras_wherever_both_measure_from(rectified, centre):
+    """KITTI's colour pair measures from the grey left camera, others from the middle."""
+    K = np.array([[721.5, 0, 609.6], [0, 721.5, 172.9], [0, 0, 1]])
+    infos = [info_of(K @ np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0.0027]]))
+             for x in (centre, centre - 0.5327)]  # fmt: skip
+    rig = rig_of_messages(*infos, Path("drive.bag"), rectified)
+    assert rig.baseline_m == pytest.approx(0.5327, rel=1e-9)
+    with pytest.raises(ReconError, match="to the left of the left camera"):
+        rig_of_messages(*infos[::-1], Path("drive.bag"), rectified)
+
+
+def test_rectified_messages_of_two_focal_lengths_are_refused():
+    left, right = (np.array([[f, 0, 31.5, x], [0, f, 15.5, 0], [0, 0, 1, 0]])
+                   for f, x in ((60.0, 0.0), (61.0, -30.0)))  # fmt: skip
+    with pytest.raises(ReconError, match=r"drive\.bag: P of the left and P of the right have diff"):
+        rig_of_messages(info_of(left), info_of(right), Path("drive.bag"), rectified=True)
+
+
 # The camera sits 1 m ahead and 0.4 m up, looks ahead and is tilted; by way of a bracket.
 T_BASE_BRACKET = make_transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
 T_BRACKET_CAM = make_transform(

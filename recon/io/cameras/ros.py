@@ -25,6 +25,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
+from recon.io.cameras.kitti import offset_m
 from recon.io.fields import Fields, read_yaml
 from recon.io.files import StrPath, read_table, reader, reading
 
@@ -63,44 +64,47 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
 
 @reader
 def read_camera_info(path: StrPath) -> StereoCalibration:
-    """Read a rig from either of its two files; its pose follows from ``R`` and ``P[0, 3]``."""
+    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both."""
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
         hint = "give both files the same name but for 'left' and 'right'"
         raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
-    left, R_left, _ = _read_one(left_path)
-    right, R_right, P_right = _read_one(right_path)
-    return rig_of_camera_infos((left, R_left), (right, R_right), P_right, right_path)
+    (left, R_left, P_left), (right, R_right, P_right) = map(_read_one, (left_path, right_path))
+    projections = P_left, P_right
+    return rig_of_camera_infos((left, R_left), (right, R_right), projections, right_path)
 
 
 def rig_of_camera_infos(
     left: tuple[CameraIntrinsics, Float64],
     right: tuple[CameraIntrinsics, Float64],
-    P_right: Float64,
+    projections: tuple[Float64, Float64],
     where: StrPath,
 ) -> StereoCalibration:
-    """Return the rig of cameras and their rectifying rotations (3, 3); ``P_right`` is (3, 4)."""
-    check_shift(P_right, 0.0, where)
-    offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
+    """Return the rig of cameras, their rectifying rotations (3, 3) and both ``P`` (3, 4)."""
+    step_m = step_between(projections, where)
     with reading(where):
-        T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ offset))
+        T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ step_m))
         return StereoCalibration(left[0], right[0], T)
 
 
-def check_shift(P_right: Float64, left_shift: float, where: StrPath) -> None:
-    """Check that the right ``P`` (3, 4) has a baseline; ``left_shift`` is the left ``P[0, 3]``."""
-    shift = float(P_right[0, 3]) - left_shift
-    if shift < 0:
-        return
+def step_between(projections: tuple[Float64, Float64], where: StrPath) -> Float64:
+    """Return ``xyz_right - xyz_left`` (3,) of a point, rectified axes, by both ``P`` (3, 4)."""
+    with reading(where):
+        left_m, right_m = map(offset_m, projections, (f"P of the {side}" for side in _SIDES))
+    step_m: Float64 = right_m - left_m
+    if step_m[0] < 0:
+        return step_m
     what, hint = "right camera is to the left of the left camera", "swap left and right"
-    if shift == 0:
+    if step_m[0] == 0:
         what = "CameraInfo has no baseline"
         hint = (
             "the right camera was calibrated alone: calibrate both as a pair, or name a "
             "calibration file with --calib"
         )
-    got, expected = f"P[0, 3] = {P_right[0, 3]:g}", "-fx * baseline, below 0"
+    left, right = (P[0, 3] for P in projections)
+    got = f"P[0, 3] = {right:g}" + (f", {left:g} of the left" if left else "")
+    expected = "-fx * baseline, below that of the left"
     raise CalibrationError(what, where=where, got=got, expected=expected, hint=hint)
 
 

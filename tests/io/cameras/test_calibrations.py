@@ -173,6 +173,17 @@ def test_camera_infos_that_are_no_rig_are_refused(tmp_path, spoil, message):
         read_calibration(left, 640, 480)
 
 
+def test_camera_infos_that_measure_from_another_camera_give_the_same_rig(tmp_path):
+    paths = write_ros(tmp_path / "rig.yaml", rig("brown"))
+    for path in paths:
+        content = yaml.safe_load(path.read_text())
+        P = content["projection_matrix"]["data"]
+        P[3] += 0.27 * P[0]
+        path.write_text(yaml.safe_dump(content))
+    have = read_calibration(paths[0], 640, 480)
+    np.testing.assert_allclose(have.T_right_left, T_RIGHT_LEFT, atol=1e-12)
+
+
 @pytest.mark.parametrize("write", [write_kalibr, write_ros])
 def test_a_header_of_opencv_does_not_hide_the_format(tmp_path, write):
     write(tmp_path / "rig.yaml", rig("radtan"))
