@@ -49,6 +49,7 @@ _EUROC_MODELS: Final[Models] = {
 }
 NS: Final = 1e-9
 _SIDES: Final = ("left", "right")
+_OFF_CENTRE: Final = 0.05  # of a principal point, in image sizes: hardly a lens is mounted worse
 
 
 def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
@@ -63,8 +64,11 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
 
 
 @reader
-def read_camera_info(path: StrPath) -> StereoCalibration:
-    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both."""
+def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> StereoCalibration:
+    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both.
+
+    ``size`` is width and height of the images; rectified ones that ``K`` is not of are refused.
+    """
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
@@ -72,6 +76,15 @@ def read_camera_info(path: StrPath) -> StereoCalibration:
         raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
     (left, R_left, P_left), (right, R_right, P_right) = map(_read_one, (left_path, right_path))
     projections = P_left, P_right
+    stated = left.width_px, left.height_px
+    if size and are_rectified((left.matrix, right.matrix), projections, stated, size):
+        focal, cx, cy = P_left[[0, 0, 1], [0, 2, 2]]
+        hint = f"--focal {focal:g} --baseline {-step_between(projections, path)[0]:g}"
+        raise CalibrationError(
+            "the images are rectified: K and D of the CameraInfo are of others, and P is of them",
+            got=f"images of {size[0]}x{size[1]} pixels",
+            hint=f"instead of the file give {hint} --cx {cx:g} --cy {cy:g}",
+        )
     return rig_of_camera_infos((left, R_left), (right, R_right), projections, right_path)
 
 
@@ -86,6 +99,30 @@ def rig_of_camera_infos(
     with reading(where):
         T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ step_m))
         return StereoCalibration(left[0], right[0], T)
+
+
+def are_rectified(
+    matrices: tuple[Float64, Float64],
+    projections: tuple[Float64, Float64],
+    stated: tuple[int, int],
+    size: tuple[int, int],
+) -> bool:
+    """Return whether images of a size (width, height) are what both ``P`` are of, and no ``K``.
+
+    What writes rectified images may state ``K`` and ``D`` of the cameras, whose images were larger,
+    as kitti2bag does, under the ``stated`` size (0 = none) of either.
+    """
+
+    def off(both: tuple[Float64, Float64], of: tuple[int, int]) -> float:
+        # Of both cameras together: that turned ones see to the sides is no other size.
+        centres = [(matrix[:2, 2] + 0.5) / of - 0.5 for matrix in both]
+        return float(np.abs(np.mean(centres, axis=0)).max())
+
+    if 0 in stated or stated == size:
+        return off(matrices, size) > max(_OFF_CENTRE, 2 * off(projections, size))
+    return off(matrices, stated) < off(matrices, size) and (
+        off(projections, size) < off(projections, stated)
+    )
 
 
 def step_between(projections: tuple[Float64, Float64], where: StrPath) -> Float64:
