@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -9,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.alignment import fit_points
+from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Float64
 from recon.io.models.las import check_inside
 from recon.map.map import Map
@@ -28,6 +30,8 @@ class Georeference:
     scale: float  # how many times as far apart the positions are as those of the map
     left_out: int  # number of positions that contradict the others
     lines: tuple[str, ...]  # warnings that name them
+    turn_rad: tuple[float, float]  # of `fixed_turn`
+    reach_m: float  # from the middle of the positions to the farthest frame of the map
     points: Mapping[str, Any] = field(default_factory=dict)  # figures of each control point
 
     @property
@@ -50,6 +54,9 @@ class Georeference:
             "span_m": self.span_m,
             "scale": self.scale,
             "tilt_deg": self.tilt_deg,
+            "yaw_sigma_deg": math.degrees(self.turn_rad[0]),
+            "rotation_sigma_deg": math.degrees(self.turn_rad[1]),
+            "edge_sigma_m": self.turn_rad[1] * self.reach_m,
             "T_survey_map": self.T_survey_map.tolist(),
             **({"control": dict(self.points)} if self.points else {}),
         }
@@ -86,4 +93,12 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
         fit_points(ours_m, position_m, scaled=True).scale,
         len(agree) - len(ours_m),
         (*survey.notes(), *measured.warnings()),
+        measured.turn_rad,
+        reach_m(map_, ours_m),
     )
+
+
+def reach_m(map_: Map, places_m: Float64) -> float:
+    """Return how far the frames of a map are from the middle of places (N, 3) in it, at most."""
+    paths = [apply(one.T_map_world, one.trajectory.positions_m) for one in map_.linked]
+    return float(np.linalg.norm(np.concatenate(paths) - places_m.mean(axis=0), axis=1).max())
