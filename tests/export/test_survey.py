@@ -193,6 +193,13 @@ def test_how_well_positions_fix_the_rotation_is_stated(place):
     assert figures["edge_sigma_m"] == pytest.approx(np.radians(3.0) * 70.0, rel=0.2)
 
 
+def test_a_direction_that_is_known_badly_is_warned_of(place):
+    rows = np.column_stack([each_second()[:3], np.full(3, 1.0)])
+    (said,) = [line for line in place(rows).warnings() if "known to" in line]
+    assert "turned by an angle known to 8." in said
+    assert "m at its farthest frame" in said
+
+
 def test_the_stated_yaw_is_what_noise_makes_of_it(place):
     turned = []
     for seed in range(60):

@@ -16,6 +16,7 @@ from recon.io.models.las import check_inside
 from recon.map.map import Map
 from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, span_m
 
+_LARGEST_YAW_RAD: Final = 0.1  # sigma that is said: places are off by a tenth of their distance
 _LARGEST_STRETCH: Final = 0.05  # by how much the path may be too long or short before it is said
 
 
@@ -63,7 +64,12 @@ class Georeference:
 
     def warnings(self) -> list[str]:
         """Return lines of what is left out, and of map and positions that differ."""
-        lines = list(self.lines)
+        lines, yaw_rad = list(self.lines), self.turn_rad[0]
+        if yaw_rad > _LARGEST_YAW_RAD:
+            far = f"{yaw_rad * self.reach_m:.2g} m at its farthest frame"
+            lines.append(
+                f"the map is turned by an angle known to {math.degrees(yaw_rad):.1f} deg, {far}"
+            )
         if self.rms_m <= LARGEST_MISFIT * self.span_m:
             return lines
         if self.points:

@@ -37,9 +37,9 @@ _LONGEST_ARM_M: Final = 100.0
 """The axes of a vehicle are known to a degree or so: an antenna farther away is off by metres."""
 LEVEL_RAD: Final = np.radians(3.0)
 """Of the map's up, which is levelled where it is tilted more; standard deviation."""
-_MOST_YAW_RAD: Final = 0.1
-"""A direction that is known worse puts the edge of the map a tenth of its distance elsewhere."""
-_UNSTATED_M: Final = 1.0
+_MOST_YAW_RAD: Final = 0.5 * np.pi / SIGMAS
+"""A direction that is known worse may be any: its largest error is a right angle."""
+_UNSTATED_M: Final = 2.0
 """What positions of unknown quality are off by together at least: two always fit a path."""
 _LONGEST_GAP_S: Final = 1.0
 """Between frames farther apart than this, nobody knows where the camera was."""
