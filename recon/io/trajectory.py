@@ -60,9 +60,8 @@ def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Traje
     another number of poses than times, is a `FormatError`.
     """
     rows = _read_rows(path, (12, 8, _EUROC_COLUMNS))
-    return (
-        _from_tum(rows, path) if rows.table.shape[1] == 8 else _from_kitti(rows, path, timestamps_s)
-    )
+    timed = rows.table.shape[1] == 8
+    return _from_tum(rows, path) if timed else _from_kitti(rows, path, timestamps_s)
 
 
 @reader
