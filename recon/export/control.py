@@ -19,7 +19,7 @@ from recon.export.images import DriveImages, open_images
 from recon.io.control_points import ControlPoints
 from recon.io.models.las import check_inside
 from recon.map.map import Map
-from recon.map.sessions.georeference import Georeference, georeference, reach_m
+from recon.map.sessions.georeference import Georeference, edge_m, georeference
 from recon.map.sessions.measured import LEVEL_RAD, Survey, fixed_turn, span_m
 from recon.map.sessions.placed import settings_of
 from recon.stereo.frame import FrameReconstructor
@@ -87,7 +87,8 @@ def georeference_by_points(
     freedom = max(1, 3 * int(agree.sum()) - 6)
     worse = np.sqrt(np.sum((off_m[agree] / sigma_m[agree, None]) ** 2) / freedom)
     known_m = sigma_m[agree] * max(1.0, float(worse))
-    turn_rad = fixed_turn(ours_m[agree], place_m[agree], known_m, where, "control points")
+    there_m = apply(T, ours_m[agree])
+    turn = fixed_turn(there_m, place_m[agree], known_m, where, "control points")
     for n in np.flatnonzero(used & ~agree):
         apart = f"{np.linalg.norm(off_m[n]):.2f} m off"
         lines.append(f"control point {points[n].name} contradicts the others: {apart}, left out")
@@ -102,8 +103,8 @@ def georeference_by_points(
         fit_points(ours_m[agree], place_m[agree], scaled=True).scale,
         int((used & ~agree).sum()),
         tuple(lines),
-        turn_rad,
-        reach_m(map_, ours_m[agree]),
+        turn,
+        edge_m(map_, T, turn, place_m[agree]),
         dict(zip((point.name for point in points), rows, strict=True)),
     )
 

@@ -31,8 +31,8 @@ class Georeference:
     scale: float  # how many times as far apart the positions are as those of the map
     left_out: int  # number of positions that contradict the others
     lines: tuple[str, ...]  # warnings that name them
-    turn_rad: tuple[float, float]  # of `fixed_turn`
-    reach_m: float  # from the middle of the positions to the farthest frame of the map
+    turn: Float64  # (3, 3), rad², of `fixed_turn`
+    edge_m: float  # by which it moves the frame of the map that it moves most, sigma
     points: Mapping[str, Any] = field(default_factory=dict)  # figures of each control point
 
     @property
@@ -55,18 +55,18 @@ class Georeference:
             "span_m": self.span_m,
             "scale": self.scale,
             "tilt_deg": self.tilt_deg,
-            "yaw_sigma_deg": math.degrees(self.turn_rad[0]),
-            "rotation_sigma_deg": math.degrees(self.turn_rad[1]),
-            "edge_sigma_m": self.turn_rad[1] * self.reach_m,
+            "yaw_sigma_deg": math.degrees(math.sqrt(self.turn[2, 2])),
+            "rotation_sigma_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(self.turn)[-1])),
+            "edge_sigma_m": self.edge_m,
             "T_survey_map": self.T_survey_map.tolist(),
             **({"control": dict(self.points)} if self.points else {}),
         }
 
     def warnings(self) -> list[str]:
         """Return lines of what is left out, and of map and positions that differ."""
-        lines, yaw_rad = list(self.lines), self.turn_rad[0]
+        lines, yaw_rad = list(self.lines), math.sqrt(self.turn[2, 2])
         if yaw_rad > _LARGEST_YAW_RAD:
-            far = f"{yaw_rad * self.reach_m:.2g} m at its farthest frame"
+            far = f"{self.edge_m:.2g} m at its farthest frame"
             lines.append(
                 f"the map is turned by an angle known to {math.degrees(yaw_rad):.1f} deg, {far}"
             )
@@ -89,7 +89,7 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
     measured = measure_along(map_.first, survey)
     if survey.system is not None:
         check_inside(survey.system, np.median(measured.position_m, axis=0), survey.positions)
-    agree = measured.agree
+    agree, turn = measured.agree, np.eye(3) if measured.turn is None else measured.turn
     ours_m, position_m = measured.ours_m[agree], measured.position_m[agree]
     return Georeference(
         measured.T_survey_map,
@@ -99,12 +99,14 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
         fit_points(ours_m, position_m, scaled=True).scale,
         len(agree) - len(ours_m),
         (*survey.notes(), *measured.warnings()),
-        measured.turn_rad,
-        reach_m(map_, ours_m),
+        turn,
+        edge_m(map_, measured.T_survey_map, turn, position_m),
     )
 
 
-def reach_m(map_: Map, places_m: Float64) -> float:
-    """Return how far the frames of a map are from the middle of places (N, 3) in it, at most."""
+def edge_m(map_: Map, T_survey_map: Float64, turn: Float64, places_m: Float64) -> float:
+    """Return by how much a rotation (3, 3) about places (N, 3) moves a frame of a map at most."""
     paths = [apply(one.T_map_world, one.trajectory.positions_m) for one in map_.linked]
-    return float(np.linalg.norm(np.concatenate(paths) - places_m.mean(axis=0), axis=1).max())
+    arms_m = apply(T_survey_map, np.concatenate(paths)) - places_m.mean(axis=0)
+    across = np.sum(arms_m**2, axis=1) * np.trace(turn)
+    return float(np.sqrt(np.max(across - np.einsum("ni,ij,nj->n", arms_m, turn, arms_m))))

@@ -139,7 +139,7 @@ class Measured:
     late_s: float = 0.0  # by how much their clock was late; times are those of the images
     late_sigma_s: float = 0.0
     degrees: bool = False  # whether the file has latitude and longitude
-    turn_rad: tuple[float, float] = (0.0, 0.0)  # of `fixed_turn`
+    turn: Float64 | None = None  # of `fixed_turn`
 
     @cached_property
     def T_survey_map(self) -> Float64:
@@ -276,11 +276,9 @@ def measure_along(session: Session, survey: Survey) -> Measured:
         *(here[:, 0], position_m, ours_m, agree, stated_m, survey.swapped_m[during]),
         *(late_s, late_sigma_s, survey.found.degrees),
     )
-    places_m = ours_m[agree], position_m[agree]
-    measured = replace(
-        measured,
-        turn_rad=fixed_turn(*places_m, measured.turn_sigma_m, survey.positions, "positions"),
-    )
+    places_m = apply(measured.T_survey_map, ours_m[agree]), position_m[agree]
+    turn = fixed_turn(*places_m, measured.turn_sigma_m, survey.positions, "positions")
+    measured = replace(measured, turn=turn)
     path = session.odometry
     stated = expected_drift(path, session.health, session.camera)
     drift_m = drift_at_end(path, session.trusted, None if stated is None else stated.percent)
@@ -290,11 +288,11 @@ def measure_along(session: Session, survey: Survey) -> Measured:
 
 def fixed_turn(
     ours_m: Float64, there_m: Float64, sigma_m: Float64, where: Path, what: str
-) -> tuple[float, float]:
-    """Return how well points (N, 3) of map and survey, both upright, fix how the map is turned.
+) -> Float64:
+    """Return the covariance (3, 3), rad², of the rotation that points (N, 3) fix, survey axes.
 
-    Standard deviations in radians, of the yaw and about the axis that is known worst; by those of
-    the points (N,) and their spread in the map or the survey, wherever that is less.
+    By their standard deviations (N,) and their spread as the map or the survey has them, wherever
+    that says less of the yaw.
 
     Raises:
         EvaluationError: The yaw is not fixed.
@@ -312,7 +310,7 @@ def fixed_turn(
             expected=f"{math.degrees(_MOST_YAW_RAD):.0f} deg or better",
             hint="measure places farther apart; eastings and northings are in metres, not degrees",
         )
-    return yaw_rad, math.sqrt(float(np.linalg.eigvalsh(worse)[-1]))
+    return worse
 
 
 def hold(map_: MapFile, survey: Survey) -> list[str]:
