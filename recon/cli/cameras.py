@@ -227,6 +227,8 @@ def audit(
         print_json(found.summary)
         return
     print_figures("", audit_lines(found.summary))
+    for line in found.summary["warnings"]:
+        typer.echo(f"warning: {line}")
     for finding in found.findings:
         typer.echo(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}")
     typer.echo(f"verdict: {found.verdict}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from os import PathLike
 from typing import Annotated, Final, Literal, NamedTuple
@@ -17,13 +18,14 @@ from recon.core.text import counted
 from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Bool, Float64, Int32
 from recon.io.files import StrPath
-from recon.io.trajectory import read_trajectory
+from recon.io.trajectory import ORDER_HINT, read_trajectory, reordered
 from recon.places.places import drift_at_end, fit_to_path
 
 # A camera that moved less stood still, be it an endoscope: errors relative to it say nothing.
 MIN_PATH_M: Final = 0.01
 _STRAIGHT: Final = 0.05  # largest width of a straight path, as share of its length (both rms)
 # The positions fix the roll to about their error over the width of the path, in radians.
+_NONSENSE: Final = 0.5  # of the length of a motion, by which it is off: of one turned by 29 degrees
 _FIXED_RAD: Final = float(np.radians(0.5))
 
 
@@ -130,8 +132,9 @@ def compare_paths(
     rules = rules or TrajectoryRules()
     _check(estimate, truth, rules)
     motion = align(estimate, truth, rules.alignment)
-    estimate = motion.move(estimate)
     segments = choose_segments(truth.distances_m, rules.lengths_m, rules.step_frames)
+    _check_orders(estimate, truth, motion, segments)
+    estimate = motion.move(estimate)
     translation_m, rotation_rad = motion_errors(estimate, truth, segments.first, segments.last)
     percent = 100.0 * translation_m / segments.length_m
     degrees = 100.0 * np.rad2deg(rotation_rad) / segments.length_m
@@ -182,6 +185,29 @@ def motion_errors(
     motion: Float64 = invert(poses[first]) @ poses[last]
     wrong = invert(motion) @ (invert(true[first]) @ true[last])
     return np.linalg.norm(wrong[:, :3, 3], axis=1), angle_rad(wrong)
+
+
+def _check_orders(
+    estimate: Trajectory, truth: Trajectory, motion: Similarity, segments: Segments
+) -> None:
+    """Refuse orientations that agree only with the quaternions of one path in the other order."""
+
+    def off(ours: Trajectory, true: Trajectory) -> float:
+        wrong_m, _ = motion_errors(motion.move(ours), true, segments.first, segments.last)
+        return float(np.mean(wrong_m / segments.length_m))
+
+    share = off(estimate, truth)
+    if share < _NONSENSE:
+        return
+    others = {
+        "estimate": off(reordered(estimate), truth),
+        "truth": off(estimate, reordered(truth)),
+    }
+    name, least = min(others.items(), key=lambda item: item[1])
+    if least < 0.1 * share:
+        what = f"the quaternions of the {name} are not in the order of TUM, qx qy qz qw"
+        got = f"t_rel {share:.0%}, and {least:.2%} as qw qx qy qz"
+        raise EvaluationError(what, got=got, hint=ORDER_HINT)
 
 
 def _rms(values: Float64) -> float:
@@ -275,6 +301,8 @@ def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -
     return Segments(first[fits].astype(np.int32), last[fits].astype(np.int32), length_m[fits])
 
 
+_UNITS: Final = {1: "milliseconds", 2: "microseconds", 3: "nanoseconds"}
+_SAME_UNIT: Final = 0.1  # a third of a decade: of one drive, paths that last twice as long do not
 TOLERANCE_S: Final = 0.01  # largest time difference of two associated poses
 
 
@@ -292,8 +320,20 @@ def associate(
         expected = f"times within {tolerance_s:g} s of each other"
         what = "no poses of the two trajectories match in time"
         hint = "raise --tolerance, or make sure that both use the same clock"
+        hint = _units_apart(estimate, truth) or hint
         raise EvaluationError(what, got=got, expected=expected, hint=hint)
     return estimate.select(mutual), truth.select(there[mutual])
+
+
+def _units_apart(estimate: Trajectory, truth: Trajectory) -> str:
+    """Return a line if one path lasts a thousand, million or billion times as long; else none."""
+    ours_s, true_s = (float(np.ptp(path.timestamps_s)) for path in (estimate, truth))
+    powers = math.log10(ours_s / true_s) / 3 if min(ours_s, true_s) > 0 else 0.0
+    unit = _UNITS.get(abs(round(powers)))
+    if unit is None or abs(powers - round(powers)) > _SAME_UNIT:
+        return ""
+    names = ("estimate", "truth")[:: 1 if powers > 0 else -1]
+    return f"timestamps of the {names[0]} are {unit}, where those of the {names[1]} are seconds"
 
 
 # A turn changes evenly from frame to frame if it does so less than this share of the median.

@@ -19,8 +19,8 @@ from recon.export.images import DriveImages, open_images
 from recon.io.control_points import ControlPoints
 from recon.io.models.las import check_inside
 from recon.map.map import Map
-from recon.map.sessions.georeference import Georeference, georeference
-from recon.map.sessions.measured import Survey, span_m
+from recon.map.sessions.georeference import Georeference, edge_m, georeference
+from recon.map.sessions.measured import LEVEL_RAD, Survey, fixed_turn, span_m
 from recon.map.sessions.placed import settings_of
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.rectify.rectifier import turns_of
@@ -28,7 +28,6 @@ from recon.stereo.rectify.rectifier import turns_of
 _FEWEST: Final = 3
 _CLICK_PX: Final = 1.0  # standard deviation of a pixel that a person has chosen
 _SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
-_LEVEL_RAD: Final = np.radians(3.0)  # of the map's up, which is levelled where it is tilted more
 
 
 def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | None) -> Georeference:
@@ -60,7 +59,8 @@ def georeference_by_points(
     uncertain as these are; then the map is turned and moved, rigid, by the points that agree.
 
     Raises:
-        EvaluationError: Fewer than three points can be found in the map, or an image is not there.
+        EvaluationError: Fewer than three points can be found in the map, an image is not there, or
+            the points do not fix how the map is turned.
     """
     images_of = _Images(open_images(map_, images), where, threads)
     lines, points, ours = [], [], []
@@ -84,6 +84,11 @@ def georeference_by_points(
     agree[used] = find_agreeing(ours_m[used], place_m[used], allowed_m)
     T = _fitted(ours_m[agree], place_m[agree], spread[agree])
     off_m = apply(T, ours_m) - place_m
+    freedom = max(1, 3 * int(agree.sum()) - 6)
+    worse = np.sqrt(np.sum((off_m[agree] / sigma_m[agree, None]) ** 2) / freedom)
+    known_m = sigma_m[agree] * max(1.0, float(worse))
+    there_m = apply(T, ours_m[agree])
+    turn = fixed_turn(there_m, place_m[agree], known_m, where, "control points")
     for n in np.flatnonzero(used & ~agree):
         apart = f"{np.linalg.norm(off_m[n]):.2f} m off"
         lines.append(f"control point {points[n].name} contradicts the others: {apart}, left out")
@@ -98,6 +103,8 @@ def georeference_by_points(
         fit_points(ours_m[agree], place_m[agree], scaled=True).scale,
         int((used & ~agree).sum()),
         tuple(lines),
+        turn,
+        edge_m(map_, T, turn, place_m[agree]),
         dict(zip((point.name for point in points), rows, strict=True)),
     )
 
@@ -187,6 +194,6 @@ def _fitted(ours_m: Float64, place_m: Float64, spread: Float64) -> Float64:
     def off(step: Float64) -> Float64:
         T = moved(step)
         apart = np.einsum("nij,nj->ni", weights, apply(T, ours_m) - place_m)
-        return np.concatenate([apart.ravel(), T[:2, 2] / _LEVEL_RAD])
+        return np.concatenate([apart.ravel(), T[:2, 2] / LEVEL_RAD])
 
     return moved(least_squares(off, np.zeros(6)).x)

@@ -139,7 +139,7 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue
-        rows.append(_parse_row(words, columns, f"{path}:{number}"))
+        rows.append(parse_row(words, columns, f"{path}:{number}"))
         lines.append(number)
         columns = (len(words),)
     if not rows:
@@ -147,7 +147,8 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
     return np.array(rows, dtype=np.float64), lines
 
 
-def _parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[float]:
+def parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[float]:
+    """Return the numbers of a row with one of so many ``columns``."""
     if len(words) not in columns:
         expected = " or ".join(str(count) for count in columns)
         what, got = "wrong number of columns", str(len(words))

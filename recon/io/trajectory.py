@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -19,46 +21,73 @@ from recon.core.text import counted, parse_number
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
-from recon.io.files import StrPath, read_table, read_text, reader
+from recon.io.files import StrPath, parse_row, read_table, read_text, reader
 
 # Files print rotations with four to seven digits; a larger deviation means it is not a rotation.
 _RIGID_TOLERANCE = 1e-3
 _UNIT_TOLERANCE = 1e-2
 # Geocentric and projected map coordinates stay below 1e7 m.
 _FARTHEST_M = 1e8
+_EUROC_COLUMNS: Final = 17  # time, pose, velocity and biases
+_EUROC_ORDER: Final = [0, 1, 2, 3, 5, 6, 7, 4]  # its quaternion is w x y z
+_COLUMNS: Final = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")  # of TUM
+# A row of data begins with a number; lines before the first may be a header.
+_DATA: Final = re.compile(r"\s*[\"']?[-+.]?\d", re.ASCII)
+_IN_BRACKETS: Final = re.compile(r"\s*[\[(]([^])]*)[\])]")
+#: Names of times, quaternions and places, in lower case: of EuRoC, TUM, and what ROS exports.
+_SIGNS: Final = (
+    re.compile(r"%?(.*[._])?(t|time\w*|stamp(_[num]?s)?)"),
+    re.compile(r"(.*[._])?(q|quat\w*|orientation|rot\w*)([._]\w*)?[._]?[xyzw]"),
+    re.compile(r"((.*[._])?(t|p|pos|position|trans|translation)([._]\w*)?[._]?)?[xyz]"),
+)
+_UNIT: Final = re.compile(r"[_[]([nuµm]?)s(ec\w*)?$")
+_UNITS_S: Final = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "": 1.0}
+_SINCE_1970_S: Final = (1e9, 4e9)  # from 2001 to 2096
+_STEP_S: Final = 3600.0  # more is not between poses of one drive
+# Vehicles slip sideways by less; an order that is wrong gives twice the angle that they turn by.
+_WANDERS_RAD: Final = np.radians(5.0)
+_MUCH: Final = 3.0
+ORDER_HINT: Final = "a first line '# timestamp tx ty tz qw qx qy qz' tells the order of a file"
 FRAMES: Final = "frames.csv"
 HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
 
 
 @reader
 def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
-    """Read a KITTI or TUM trajectory, recognised by the number of columns (12 or 8).
+    """Read a KITTI trajectory (12 columns), or one with times, see `read_tum`.
 
-    TUM files contain their times; ``timestamps_s``, float64 (N,), are those of a KITTI file. A file
-    that is damaged, or has another number of poses than times, is a `FormatError`.
+    ``timestamps_s``, float64 (N,), are those of a KITTI file. A file that is damaged, or has
+    another number of poses than times, is a `FormatError`.
     """
-    table, lines = read_table(path, (12, 8))
-    if table.shape[1] == 12:
-        return _from_kitti(table, lines, path, timestamps_s)
-    return _from_tum(table, lines, path)
+    rows = _read_rows(path, (12, 8, _EUROC_COLUMNS))
+    timed = rows.table.shape[1] == 8
+    return _from_tum(rows, path) if timed else _from_kitti(rows, path, timestamps_s)
 
 
 @reader
 def holds_times(path: StrPath) -> bool:
-    """Return whether a trajectory file has timestamps: TUM files do, KITTI files do not."""
-    return bool(read_table(path, (12, 8))[0].shape[1] == 8)
+    """Return whether a trajectory file has timestamps: all but KITTI's do."""
+    return bool(_read_rows(path, (12, 8, _EUROC_COLUMNS)).table.shape[1] == 8)
 
 
 @reader
 def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
     """Read poses, a row-major 3×4 matrix per line; without times, pose ``i`` gets ``i`` seconds."""
-    return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
+    return _from_kitti(Rows(*read_table(path, (12,))), path, timestamps_s)
 
 
 @reader
 def read_tum(path: StrPath) -> Trajectory:
-    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line."""
-    return _from_tum(*read_table(path, (8,)), path)
+    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line, or as a header names them.
+
+    So tables of EuRoC, motion capture and ROS are read, whatever else they have; EuRoC's 17 columns
+    need no header. Times are seconds, or in the unit that the header states; since 1970 they may be
+    milli-, micro- or nanoseconds.
+
+    Raises:
+        FormatError: A row is no pose; or, without a header, ``qw qx qy qz`` is clearly meant.
+    """
+    return _from_tum(_read_rows(path, (8, _EUROC_COLUMNS)), path)
 
 
 def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
@@ -77,9 +106,70 @@ def write_tum(path: StrPath, trajectory: Trajectory) -> None:
     write_text(path, "".join(lines))
 
 
-def _from_kitti(
-    table: Float64, lines: list[int], path: StrPath, timestamps_s: Float64 | None
-) -> Trajectory:
+class Rows(NamedTuple):
+    """Numbers of a trajectory file, (N, 12) of KITTI or (N, 8) in the order of TUM."""
+
+    table: Float64
+    lines: Sequence[int]
+    named: bool = False  # whether the file itself tells the order
+
+
+def _read_rows(path: StrPath, counts: tuple[int, ...]) -> Rows:
+    """Read what a header names, else rows of as many columns as permitted; times in seconds."""
+    texts = [text.partition("#") for text in read_text(path).splitlines()]
+    first = next((n for n, (text, *_) in enumerate(texts) if _DATA.match(text)), len(texts))
+    heads = (_columns_of(text or comment) for text, _, comment in texts[:first])
+    head = next(filter(None, heads), None)
+    if head is None or first == len(texts):
+        table, lines = read_table(path, counts)
+        if table.shape[1] == 12:
+            return Rows(table, lines)
+        head = (_EUROC_ORDER, 1e-9) if table.shape[1] == _EUROC_COLUMNS else None
+        table = table if head is None else table[:, _EUROC_ORDER]
+    else:
+        lines = [n + 1 for n, (text, *_) in enumerate(texts) if n >= first and text.strip()]
+        rows = [_parts(texts[n - 1][0]) for n in lines]
+        picked = ([row[n] for n in head[0] if n < len(row)] for row in rows)
+        places = (f"{path}:{line}" for line in lines)
+        table = np.array([parse_row(row, (8,), at) for row, at in zip(picked, places, strict=True)])
+    stated_s = None if head is None else head[1]
+    table[:, 0] *= stated_s or _unit_of(table[:, 0])
+    return Rows(table, lines, head is not None)
+
+
+def _parts(line: str) -> list[str]:
+    """Split a line at its semicolons, else at tabs, commas or spaces."""
+    mark = next((mark for mark in ";\t," if mark in line), None)
+    return [word.strip(" \"'") for word in line.strip().split(mark)]
+
+
+def _columns_of(head: str) -> tuple[list[int], float | None] | None:
+    """Return where a header has the columns of TUM, and the unit of times; None = it has not."""
+    names = _parts(_IN_BRACKETS.sub(lambda unit: f"[{unit[1].replace(' ', '')}", head.lower()))
+    found: dict[str, int] = {}
+    for number, name in enumerate(names):
+        signs = (sign.fullmatch(name.partition("[")[0]) for sign in _SIGNS)
+        kind = next((kind for kind, sign in zip(("t", "q", ""), signs, strict=True) if sign), None)
+        if kind is not None:
+            found.setdefault(kind if kind == "t" else kind + name.partition("[")[0][-1], number)
+    if not found.keys() >= set(_COLUMNS):
+        return None
+    unit = _UNIT.search(names[found["t"]])
+    return [found[name] for name in _COLUMNS], None if unit is None else _UNITS_S[unit[1]]
+
+
+def _unit_of(times: Float64) -> float:
+    """Return the seconds of a unit in which times since 1970 are counted, else 1."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    for unit_s in (1e-3, 1e-6, 1e-9):
+        # Nanoseconds since a computer was started may look like milliseconds since 1970.
+        if _SINCE_1970_S[0] <= times[0] * unit_s < _SINCE_1970_S[1] and step * unit_s < _STEP_S:
+            return unit_s
+    return 1.0
+
+
+def _from_kitti(rows: Rows, path: StrPath, timestamps_s: Float64 | None) -> Trajectory:
+    table, lines, _ = rows
     times = np.arange(len(table), dtype=np.float64) if timestamps_s is None else timestamps_s
     if len(times) != len(table):
         what, got = "numbers of poses and timestamps differ", counted(len(table), "pose")
@@ -98,7 +188,8 @@ def _from_kitti(
     return Trajectory(np.stack([orthonormalise(pose) for pose in poses]), times)
 
 
-def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
+def _from_tum(rows: Rows, path: StrPath) -> Trajectory:
+    table, lines, named = rows
     check_positions(table[:, 1:4], lines, path)
     norms = np.linalg.norm(table[:, 4:], axis=1)
     for norm, line in zip(norms, lines, strict=True):
@@ -110,10 +201,50 @@ def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
         line = lines[int(np.argmax(backwards)) + 1]
         raise FormatError("time runs backwards", where=f"{path}:{line}")
     poses = [make_transform(rotation_from_quaternion(row[4:]), row[1:4]) for row in table]
-    return Trajectory(np.stack(poses), table[:, 0].copy())
+    trajectory = Trajectory(np.stack(poses), table[:, 0].copy())
+    if not named:
+        _check_order(trajectory, path)
+    return trajectory
 
 
-def check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
+def reordered(path: Trajectory) -> Trajectory:
+    """Return a path whose quaternions were ``w x y z``, and were read as ``x y z w``."""
+    poses = path.T_world_camera.copy()
+    for pose in poses:
+        pose[:3, :3] = rotation_from_quaternion(np.roll(quaternion_from_rotation(pose[:3, :3]), -1))
+    return Trajectory(poses, path.timestamps_s)
+
+
+def _check_order(path: Trajectory, where: StrPath) -> None:
+    """Refuse orientations that the path follows only with their quaternions in the other order.
+
+    A rig that moves along one of its own directions does so in one order alone, once it turns; of
+    one that stands, goes straight or is carried anyhow, both orders say the same.
+    """
+    apart_rad, other_rad = _wander_rad(path), _wander_rad(reordered(path))
+    if apart_rad > max(_WANDERS_RAD, _MUCH * other_rad):
+        apart, other = (f"{np.degrees(angle):.1f} deg" for angle in (apart_rad, other_rad))
+        raise FormatError(
+            "the quaternions are not in the order of TUM",
+            where=where,
+            got=f"motions that differ by {apart} from one direction of the rig, and by {other} "
+            "as qw qx qy qz",
+            expected="t tx ty tz qx qy qz qw",
+            hint=ORDER_HINT,
+        )
+
+
+def _wander_rad(path: Trajectory) -> float:
+    """Return by how much directions of motion differ (RMS), in axes of the rig, by length."""
+    poses = path.T_world_camera
+    steps_m = np.diff(path.positions_m, axis=0)
+    turned_m = np.einsum("nji,nj->ni", poses[:-1, :3, :3], steps_m)
+    length_m = float(np.linalg.norm(steps_m, axis=1).sum())
+    share = float(np.linalg.norm(turned_m.sum(axis=0))) / length_m if length_m > 0 else 1.0
+    return float(np.sqrt(2.0 * max(0.0, 1.0 - share)))  # 1 - cos, for small angles
+
+
+def check_positions(xyz_m: Float64, lines: Sequence[int], path: StrPath) -> None:
     """Refuse positions (N, 3) that are nowhere on Earth; ``lines`` are theirs in the file."""
     far_m = np.abs(xyz_m).max(axis=1)
     worst = int(np.argmax(far_m))

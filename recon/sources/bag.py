@@ -15,14 +15,21 @@ from recon.core.errors import CalibrationError, SourceError
 from recon.core.values import (
     CameraIntrinsics,
     ImuRecord,
-    RectifiedCamera,
     Rig,
     StereoPair,
     check_size,
 )
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
-from recon.io.cameras.ros import NS, ROS_MODELS, check_shift, lens_of, rig_of_camera_infos
+from recon.io.cameras.kitti import projected_rig
+from recon.io.cameras.ros import (
+    NS,
+    ROS_MODELS,
+    are_rectified,
+    lens_of,
+    rig_of_camera_infos,
+    step_between,
+)
 from recon.io.files import reading, resolved
 from recon.sources.bag_prior import find_imu, read_imu_topic, read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
@@ -47,6 +54,10 @@ class BagSource(Recording):
     left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     stamped: bool = True
+    note: str = ""  # on the calibration
+
+    def warnings(self) -> list[str]:
+        return [*super().warnings(), *filter(None, [self.note])]
 
     @cached_property
     def files(self) -> Sequence[Path]:
@@ -98,12 +109,14 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     frames = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, path)
     pairs, listing = pair_frames(frames, settings, path)
     recorded_ns = (times[topics[0]][:, 0], times[topics[1]][:, 0])
+    first = next(bag.images(topics[0], [pairs[0][0]], recorded_ns[0]))
+    size, note = (first.shape[1], first.shape[0]), ""
     if settings.has_camera:
-        first = next(bag.images(topics[0], [pairs[0][0]], recorded_ns[0]))
-        rig, texts = read_rig(settings, path, (first.shape[1], first.shape[0]))
+        rig, texts = read_rig(settings, path, size)
         source = f"calibration {settings.calibration or 'in numbers'}"
     else:
-        rig, texts, source = _rig_of_infos(bag, topics, path), (), "its CameraInfo"
+        (rig, note), texts = _rig_of_infos(bag, topics, path, size), ()
+        source = "its CameraInfo" + (f" ({note})" if note else "")
     also += _list_others(bag, topics)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
@@ -119,6 +132,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         recorded_ns=recorded_ns,
         texts=texts,
         stamped=not clock,
+        note=note,
     )
 
 
@@ -156,14 +170,26 @@ def _stamps(
     return (left, right), "" if stamped else ", recording times as the headers have none"
 
 
-def _rig_of_infos(bag: Bag, topics: tuple[str, str], path: Path) -> Rig:
-    infos = [_info_topic(bag, topic) for topic in topics]
-    if None in infos:
+def _rig_of_infos(
+    bag: Bag, topics: tuple[str, str], path: Path, size: tuple[int, int]
+) -> tuple[Rig, str]:
+    """Return the rig of the CameraInfo of images (width, height), and a note on it or none."""
+    names = [name for name in (_info_topic(bag, topic) for topic in topics) if name is not None]
+    if len(names) < 2:
         what = "recording has no calibration of both cameras"
         got = bag.list_topics((CAMERA_INFO,)) or "no CameraInfo"
         raise SourceError(what, where=path, got=got, hint=CALIBRATE)
-    left, right = (bag.camera_info(topic) for topic in infos if topic is not None)
-    return as_rectified(rig_of_messages(left, right, path, all(map(_is_rectified, topics))))
+    left, right = (bag.camera_info(name) for name in names)
+    stated, rectified = (left.width_px, left.height_px), all(map(_is_rectified, topics))
+    other = are_rectified((left.K, right.K), (left.P, right.P), stated, size)
+    if other or 0 in stated:
+        left, right = (one._replace(width_px=size[0], height_px=size[1]) for one in (left, right))
+    note = (
+        f"K and D of the CameraInfo are not of these images of {size[0]}x{size[1]} pixels, "
+        "and P is: they are taken as rectified"
+    )
+    rig = as_rectified(rig_of_messages(left, right, path, rectified or other))
+    return rig, note if other and not rectified else ""
 
 
 def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
@@ -240,12 +266,11 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
             raise CalibrationError(what, where=where, got=got, hint=hint)
     if not rectified:
         cameras = [(_camera(info, where), info.R) for info in (left, right)]
-        return rig_of_camera_infos(cameras[0], cameras[1], right.P, where)
-    check_shift(right.P, float(left.P[0, 3]), where)
-    baseline_m = (left.P[0, 3] - right.P[0, 3]) / left.P[0, 0]
-    size = (left.width_px, left.height_px)
+        return rig_of_camera_infos(cameras[0], cameras[1], (left.P, right.P), where)
+    step_between((left.P, right.P), where)
+    named = {"P of the left": left.P, "P of the right": right.P}
     with reading(where):
-        return RectifiedCamera.from_matrices(left.P, right.P, baseline_m, *size)
+        return projected_rig(named, left.width_px, left.height_px)
 
 
 def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:

@@ -54,6 +54,13 @@ def test_a_good_drive_is_announced_measured_and_found_good(good, tmp_path):
     assert summary["verdict"] == "good"
 
 
+def test_what_is_to_be_known_of_the_source_is_printed_too(drive, tmp_path):
+    path = drives.write_kitti(*drive, tmp_path)
+    (path / "image_1" / "000002.png").unlink()
+    done = recon("audit", path)
+    assert "warning: 1 image without a partner: left out\n" in done.stdout
+
+
 def test_a_layout_that_is_named_and_not_there_is_refused(good):
     done = recon("audit", good, "--source", "euroc")
     assert done.exit_code == 1

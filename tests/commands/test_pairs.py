@@ -93,6 +93,30 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(images, tmp_pat
     assert [text for text in run.warnings if "in baselines, not in metres" in text]
 
 
+def test_pixels_without_a_match_are_in_every_file_what_the_pages_say(images, tmp_path):
+    settings = load_config(None, ["matching.sad.fill=false"], PAIR_DEFAULTS)
+    out = tmp_path / "out"
+    run_pair(read(images, SourceSettings(focal_px=300, baseline_m=0.2)), settings, out=out)
+
+    def stored(name: str) -> np.ndarray:
+        content = (out / "disparity" / name).read_bytes()
+        return np.frombuffer(content[-4 * 120 * 240 :], "<f4").reshape(120, 240)[::-1]
+
+    levels, reason = (
+        cv2.imread(str(out / "disparity" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        for name in ("disparity", "reason")
+    )
+    holes = reason != 0
+    assert 0.01 < holes.mean() < 0.5
+    for name in ("disparity.pfm", "depth.pfm"):
+        np.testing.assert_array_equal(stored(name) == np.inf, holes)
+        assert np.isfinite(stored(name)[~holes]).all()
+        read_back = recon.read_pfm(out / "disparity" / name)
+        np.testing.assert_array_equal(np.isnan(read_back), holes)
+    np.testing.assert_array_equal(stored("confidence.pfm") == 0, holes)
+    np.testing.assert_array_equal(levels == 0, holes)
+
+
 @pytest.mark.parametrize(
     ("known", "message"),
     [

@@ -156,6 +156,78 @@ def test_positions_of_another_day_or_at_one_place_or_none_are_refused(place, tmp
         georeference(mapped(), Survey(tmp_path / "gnss.txt"))
 
 
+def standing(sigma_m: float) -> Float64:
+    rows = positions(FROM_S + 0.02 * np.arange(10))
+    rows[:, 1:] = rows[0, 1:] + np.random.default_rng(2).normal(0.0, sigma_m, (10, 3))
+    return rows
+
+
+NO_DIRECTION = {
+    "two within a tenth of a second": positions(FROM_S + np.array([3.0, 3.1])),
+    "three within a fifth": positions(FROM_S + np.array([3.0, 3.1, 3.2])),
+    "standing with noise": standing(3.0),
+    "stated to be worse than their span": np.column_stack([
+        positions(FROM_S + np.arange(3, 6)), np.full(3, 4.0)
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("rows", NO_DIRECTION.values(), ids=NO_DIRECTION)
+def test_positions_that_fix_no_direction_are_refused(place, rows):
+    with pytest.raises(
+        EvaluationError, match=r"gnss\.txt: the positions do not say how the map is"
+    ):
+        place(rows)
+
+
+def test_how_well_positions_fix_the_rotation_is_stated(place):
+    """Two of 2 cm, 25 m apart, the line through which turns with the level of the map: 3 deg."""
+    rows = np.column_stack([positions(FROM_S + np.array([2.0, 7.0])), np.full(2, 0.02)])
+    figures = place(rows).figures()
+    apart_m = np.linalg.norm(rows[1, 1:3] - rows[0, 1:3])
+    climb = (rows[1, 3] - rows[0, 3]) / apart_m
+    expected_deg = np.hypot(np.degrees(0.02 * np.sqrt(2.0) / apart_m), 3.0 * climb)
+    assert figures["yaw_sigma_deg"] == pytest.approx(expected_deg, rel=0.01)
+    # About the line through both, nothing but the level of the map is known.
+    assert figures["rotation_sigma_deg"] == pytest.approx(3.0, rel=0.01)
+    # Frames of the bend are off that line by metres alone.
+    assert 0.1 < figures["edge_sigma_m"] < np.radians(3.0) * 45.0
+
+
+def test_a_roll_about_a_straight_path_moves_no_frame_of_it(place):
+    times_s = FROM_S + 0.1 * np.arange(50)
+    map_ = Map.temporary()
+    session = map_.begin(SessionInfo())
+    session.set_axes(T_MAP_WORLD, RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12))
+    for way_m, time_s in enumerate(times_s.tolist()):
+        T = make_transform(np.eye(3), np.array([0.0, 0.0, float(way_m)]))
+        session.add_frame(T, time_s, OdometryHealth())
+    there_m = np.column_stack([np.zeros(50), np.arange(50.0), np.full(50, 1000.0)])
+    rows = np.column_stack([times_s, there_m, np.full(50, 0.02)])
+    figures = place(rows, map_, antenna=(0.0, 0.0, 0.0)).figures()
+    assert figures["rotation_sigma_deg"] == pytest.approx(3.0, rel=0.01)
+    assert figures["edge_sigma_m"] < 0.02
+
+
+def test_a_direction_that_is_known_badly_is_warned_of(place):
+    rows = np.column_stack([each_second()[:3], np.full(3, 1.0)])
+    (said,) = [line for line in place(rows).warnings() if "known to" in line]
+    assert "turned by an angle known to 8." in said
+    assert "m at its farthest frame" in said
+
+
+def test_the_stated_yaw_is_what_noise_makes_of_it(place):
+    turned = []
+    for seed in range(60):
+        rows = each_second()[:8]
+        rows[:, 1:] += np.random.default_rng(seed).normal(0.0, 0.3, (8, 3))
+        placed = place(np.column_stack([rows, np.full(8, 0.3)]))
+        off = (invert(T_SURVEY_MAP) @ placed.T_survey_map)[:3, :3]
+        turned.append(np.degrees(np.arctan2(off[1, 0], off[0, 0])))
+    # Of 60 samples, a standard deviation is known to 9 %: three of those.
+    assert np.std(turned) == pytest.approx(placed.figures()["yaw_sigma_deg"], rel=0.3)
+
+
 @pytest.mark.parametrize("columns", [1, 3])
 def test_a_file_may_state_how_well_positions_were_measured(place, columns):
     def stated(sigma_m: float) -> Float64:

@@ -117,6 +117,36 @@ def test_a_typing_error_is_named_and_check_points_are_only_compared(rows, placed
     assert abs(honest["east_m"]) < 4 * honest["sigma_m"]
 
 
+def three(rows, apart):
+    """One sight three times, named a, b and c, and moved in the survey and in the image."""
+    *place, u, v, image, _ = rows[0].split()
+    lines = []
+    for name, (*moved, x, y) in zip("abc", apart, strict=True):
+        there = " ".join(str(float(one) + by) for one, by in zip(place, moved, strict=True))
+        lines.append(f"{there} {int(u) + x} {int(v) + y} {image} {name}")
+    return lines
+
+
+@pytest.mark.parametrize("apart", [
+    [(0, 0, 0, 0, 0)] * 3,
+    [(0, 0, 0, 0, 0), (0.01, 0, 0, 1, 0), (0, 0.01, 0, 0, 1)],
+    [(0, 0, 0, 0, 0), (0, 0, 0.5, 0, -3), (0, 0, 1.0, 0, -6)],
+])  # fmt: skip
+def test_points_that_fix_no_direction_are_refused(rows, placed, apart):
+    done, out = placed(three(rows, apart))
+    assert_refused(done, "the control points do not say how the map is turned")
+    assert not out.exists()
+
+
+def test_how_well_points_fix_the_rotation_is_stated_with_what_it_means_at_the_edge(rows, placed):
+    done, out = placed(rows)
+    summary = summary_of(out)
+    assert 0.0 < summary["yaw_sigma_deg"] < 3.0
+    assert summary["yaw_sigma_deg"] <= summary["rotation_sigma_deg"] < 3.0
+    assert 0.0 < summary["edge_sigma_m"] < 2.0
+    assert "edge_sigma_m" in done.out
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -170,6 +170,11 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
             row, column = rasterio.transform.rowcol(file.transform, *places[:, :2].T)
             return file.read(band)[row, column]
 
+    for name in ("dsm", "dtm", "slope", "occupancy"):
+        with rasterio.open(out / f"map/{name}.tif") as file:
+            assert np.isnan(file.nodata)
+            assert not np.isinf(file.read(1)).any()
+            assert np.isnan(file.read(1)).any() or name in ("dtm", "slope")  # ground goes on
     # A point in the survey may be rounded into the next cell.
     assert np.mean(at_points("dsm") >= xyz[:, 2] - 1e-3) > 0.98
     highest = np.abs(at_points("dsm") - xyz[:, 2]) < 1e-3

@@ -7,11 +7,14 @@ import pytest
 
 from recon.core.errors import ReconError, SourceError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.values import RectifiedCamera, StereoCalibration
+from recon.io.cameras.ros import are_rectified
 from recon.io.images.video import VideoFile
 from recon.sources.bag import rig_of_messages
 from recon.sources.registry import open_source
 from recon.sources.rosbags import BagCameraInfo
 from recon.sources.settings import SourceSettings
+from recon.sources.source import StereoSource
 from recon.sources.video import view_size
 from tests.sources import drives
 from tests.sources.drives import CAMERA
@@ -122,6 +125,82 @@ def test_messages_without_lengths_are_refused(rectified, focal_px, message):
     info = BagCameraInfo(64, 32, "plumb_bob", np.zeros(5), K, np.eye(3), P)
     with pytest.raises(ReconError, match=rf"drive\.bag: {message}.*--calib"):
         rig_of_messages(info, info, Path("drive.bag"), rectified)
+
+
+def info_of(P: np.ndarray) -> BagCameraInfo:
+    return BagCameraInfo(1242, 375, "plumb_bob", np.zeros(5), P[:, :3], np.eye(3), P)
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+@pytest.mark.parametrize("centre", [-0.06, 0.0, 0.27, 3.0])
+def test_the_baseline_is_between_the_cameras_wherever_both_measure_from(rectified, centre):
+    """KITTI's colour pair measures from the grey left camera, others from the middle."""
+    K = np.array([[721.5, 0, 609.6], [0, 721.5, 172.9], [0, 0, 1]])
+    infos = [info_of(K @ np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0.0027]]))
+             for x in (centre, centre - 0.5327)]  # fmt: skip
+    rig = rig_of_messages(*infos, Path("drive.bag"), rectified)
+    assert rig.baseline_m == pytest.approx(0.5327, rel=1e-9)
+    with pytest.raises(ReconError, match="to the left of the left camera"):
+        rig_of_messages(*infos[::-1], Path("drive.bag"), rectified)
+
+
+def test_rectified_messages_of_two_focal_lengths_are_refused():
+    left, right = (np.array([[f, 0, 31.5, x], [0, f, 15.5, 0], [0, 0, 1, 0]])
+                   for f, x in ((60.0, 0.0), (61.0, -30.0)))  # fmt: skip
+    with pytest.raises(ReconError, match=r"drive\.bag: P of the left and P of the right have diff"):
+        rig_of_messages(info_of(left), info_of(right), Path("drive.bag"), rectified=True)
+
+
+VIEW = RectifiedCamera(72.0, 61.0, 17.3, 61.0, 0.54, 124, 37)
+RAW = {"K": [98.4, 0, 69.0, 0, 98.4, 23.3, 0, 0, 1], "D": [-0.37, 0.2, 0.002, 0.001, -0.07]}
+RAW_TOPICS = ("/kitti/left/image_raw", "/kitti/right/image_raw")
+
+
+def recorded(
+    folder: Path, size: tuple[int, int], image: np.ndarray, **infos: object
+) -> StereoSource:
+    with recorder(folder, Recording("ros1")) as made:
+        made.camera_infos(START_NS, VIEW, RAW_TOPICS, size, **infos)
+        for topic in RAW_TOPICS:
+            made.write(topic, START_NS, made.image(START_NS, image))
+    return open_source(folder / "drive.bag")
+
+
+@pytest.mark.parametrize("size", [(124, 37), (139, 51), (0, 0)])
+def test_rectified_images_beside_the_lens_of_the_camera_are_read_by_their_projection(
+    tmp_path, size
+):
+    """As kitti2bag writes: images of 1242x375, and K and D of those of 1392x512."""
+    source = recorded(tmp_path, size, np.zeros((37, 124), np.uint8), **RAW)
+    assert source.calibration == VIEW
+    assert len(list(source)) == 1
+    (said,) = source.warnings()
+    assert "K and D of the CameraInfo are not of these images of 124x37" in said
+    assert said in source.description
+
+
+@pytest.mark.parametrize("size", [(139, 51), (0, 0)])
+def test_images_of_the_lens_are_raw_though_their_projection_fits_as_well(tmp_path, size):
+    source = recorded(tmp_path, size, np.zeros((51, 139), np.uint8), **RAW)
+    assert isinstance(source.calibration, StereoCalibration)
+    assert (len(list(source)), source.warnings()) == (1, [])
+
+
+def test_a_sensor_that_is_read_off_its_centre_stays_raw(tmp_path):
+    """The projection is off by as much, since it shows what the lens shows."""
+    K, P = ([f, 0, 61.0, *last, 0, f, 26.0, *last, 0, 0, 1, *last]
+            for f, last in ((98.4, []), (90.0, [0.0])))  # fmt: skip
+    right = [*P[:3], -49.0, *P[4:]]
+    assert not are_rectified(
+        (np.reshape(K, (3, 3)),) * 2, (np.reshape(P, (3, 4)), np.reshape(right, (3, 4))),
+        (124, 37), (124, 37),
+    )  # fmt: skip
+
+
+def test_images_of_half_the_size_of_their_calibration_are_still_refused(tmp_path):
+    source = recorded(tmp_path, (139, 51), np.zeros((25, 69), np.uint8), **RAW)
+    with pytest.raises(ReconError, match="another size than the calibration"):
+        list(source)
 
 
 # The camera sits 1 m ahead and 0.4 m up, looks ahead and is tilted; by way of a bracket.

@@ -92,6 +92,19 @@ def _distances_m(from_m: Float64, to_m: Float64, chosen: NDArray[Any]) -> Float6
     return np.asarray(np.linalg.norm(apply(T_to_from, from_m) - to_m, axis=1))
 
 
+def turn_covariance(points_m: Float64, sigma_m: Float64, level_rad: float) -> Float64:
+    """Return the covariance (3, 3), rad², of the rotation that points (N, 3) of a frame fix.
+
+    ``sigma_m`` (N,) are errors of their coordinates, ``level_rad`` that of the frame's z being up.
+    What they do not fix at all has a variance of 1e12.
+    """
+    weights = sigma_m**-2.0
+    arms_m = points_m - np.average(points_m, axis=0, weights=weights)
+    spread = np.einsum("n,ni,nj->ij", weights, arms_m, arms_m)
+    level = np.diag([1.0, 1.0, 0.0]) / level_rad**2
+    return np.linalg.inv(np.trace(spread) * np.eye(3) - spread + level + 1e-12 * np.eye(3))
+
+
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
     """Return the rigid transform between trajectories that fits centres and axes of their poses."""
     return fit_points(_axes_m(from_path), _axes_m(to_path))

@@ -28,7 +28,6 @@ _SIGNS: Final = {
 }
 _READERS: Final[dict[str, Callable[[StrPath], Rig]]] = {
     "recon": read_recon_calibration,
-    "ros": read_camera_info,
     "kalibr": read_kalibr,
     "middlebury": lambda path: read_middlebury_calib(path).camera,
 }
@@ -63,6 +62,8 @@ def read_calibration(
         rig: Rig = read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
     elif form == "kitti":
         rig = _read_kitti(path, size, cameras)
+    elif form == "ros":
+        rig = read_camera_info(path, size)
     elif form in _READERS:
         rig = _READERS[form](path)
     elif form == "homographies":

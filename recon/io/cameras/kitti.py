@@ -48,14 +48,14 @@ def projected_rig(
     projections: Mapping[str, Float64], width_px: int, height_px: int
 ) -> RectifiedCamera:
     """Return the rectified camera of two projection matrices (3, 4), left and right, by name."""
-    left, right = (_checked(*named) for named in projections.items())
+    left, right = projections.values()
+    offsets_m = [offset_m(projection, name) for name, projection in projections.items()]
     if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
         raise CalibrationError(
             f"{' and '.join(projections)} have different focal lengths or rows",
             hint="a rectified pair shares them; rectify the images first",
         )
-    # ``t`` is relative to camera 0, also of the colour pair of KITTI.
-    baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
+    baseline_m = float(offsets_m[0][0] - offsets_m[1][0])
     return RectifiedCamera.from_matrices(left, right, baseline_m, width_px, height_px)
 
 
@@ -63,7 +63,7 @@ def projected_rig(
 def read_kitti_offset(path: StrPath, camera: int) -> Float64:
     """Return ``T_camera_camera0`` (4, 4), a translation: KITTI's trajectories are of camera 0."""
     T = np.eye(4)
-    T[:3, 3] = _centre_m(_projection(path, camera))
+    T[:3, 3] = offset_m(_projection(path, camera))
     return T
 
 
@@ -89,20 +89,19 @@ def _projection(path: StrPath, camera: int) -> Float64:
         got = ", ".join(f"P{number}" for number in sorted(rows)) or "no projection matrix"
         hint = "a stereo pair needs P0 and P1, or P2 and P3"
         raise FormatError(f"calibration has no {name}", got=got, hint=hint)
-    return _checked(name, Fields({name: rows[camera]}).numbers(name, (3, 4)))
+    return Fields({name: rows[camera]}).numbers(name, (3, 4))
 
 
-def _checked(name: str, projection: Float64) -> Float64:
+def offset_m(projection: Float64, name: str = "P") -> Float64:
+    """Return ``t`` (3,) of ``P = K·[I | t]``: from the camera that all ``P`` of a rig measure from.
+
+    That need not be the left one: both of KITTI's colour pair measure from the grey left camera.
+    """
     if not np.allclose(projection[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise FormatError(f"{name} is not the projection matrix of a rectified camera")
     if min(projection[0, 0], projection[1, 1]) <= 0:
         got = f"{projection[0, 0]:g} px"
         raise CalibrationError(f"focal length of {name} is not positive", got=got)
-    return projection
-
-
-def _centre_m(projection: Float64) -> Float64:
-    """Return ``t`` of ``P = K·[I | t]``, float64 (3,)."""
     return np.asarray(np.linalg.solve(projection[:, :3], projection[:, 3]), dtype=np.float64)
 
 

@@ -25,6 +25,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
+from recon.io.cameras.kitti import offset_m
 from recon.io.fields import Fields, read_yaml
 from recon.io.files import StrPath, read_table, reader, reading
 
@@ -48,6 +49,7 @@ _EUROC_MODELS: Final[Models] = {
 }
 NS: Final = 1e-9
 _SIDES: Final = ("left", "right")
+_OFF_CENTRE: Final = 0.05  # of a principal point, in image sizes: hardly a lens is mounted worse
 
 
 def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
@@ -62,45 +64,84 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
 
 
 @reader
-def read_camera_info(path: StrPath) -> StereoCalibration:
-    """Read a rig from either of its two files; its pose follows from ``R`` and ``P[0, 3]``."""
+def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> StereoCalibration:
+    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both.
+
+    ``size`` is width and height of the images; rectified ones that ``K`` is not of are refused.
+    """
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
         hint = "give both files the same name but for 'left' and 'right'"
         raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
-    left, R_left, _ = _read_one(left_path)
-    right, R_right, P_right = _read_one(right_path)
-    return rig_of_camera_infos((left, R_left), (right, R_right), P_right, right_path)
+    (left, R_left, P_left), (right, R_right, P_right) = map(_read_one, (left_path, right_path))
+    projections = P_left, P_right
+    stated = left.width_px, left.height_px
+    if size and are_rectified((left.matrix, right.matrix), projections, stated, size):
+        focal, cx, cy = P_left[[0, 0, 1], [0, 2, 2]]
+        hint = f"--focal {focal:g} --baseline {-step_between(projections, path)[0]:g}"
+        raise CalibrationError(
+            "the images are rectified: K and D of the CameraInfo are of others, and P is of them",
+            got=f"images of {size[0]}x{size[1]} pixels",
+            hint=f"instead of the file give {hint} --cx {cx:g} --cy {cy:g}",
+        )
+    return rig_of_camera_infos((left, R_left), (right, R_right), projections, right_path)
 
 
 def rig_of_camera_infos(
     left: tuple[CameraIntrinsics, Float64],
     right: tuple[CameraIntrinsics, Float64],
-    P_right: Float64,
+    projections: tuple[Float64, Float64],
     where: StrPath,
 ) -> StereoCalibration:
-    """Return the rig of cameras and their rectifying rotations (3, 3); ``P_right`` is (3, 4)."""
-    check_shift(P_right, 0.0, where)
-    offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
+    """Return the rig of cameras, their rectifying rotations (3, 3) and both ``P`` (3, 4)."""
+    step_m = step_between(projections, where)
     with reading(where):
-        T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ offset))
+        T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ step_m))
         return StereoCalibration(left[0], right[0], T)
 
 
-def check_shift(P_right: Float64, left_shift: float, where: StrPath) -> None:
-    """Check that the right ``P`` (3, 4) has a baseline; ``left_shift`` is the left ``P[0, 3]``."""
-    shift = float(P_right[0, 3]) - left_shift
-    if shift < 0:
-        return
+def are_rectified(
+    matrices: tuple[Float64, Float64],
+    projections: tuple[Float64, Float64],
+    stated: tuple[int, int],
+    size: tuple[int, int],
+) -> bool:
+    """Return whether images of a size (width, height) are what both ``P`` are of, and no ``K``.
+
+    What writes rectified images may state ``K`` and ``D`` of the cameras, whose images were larger,
+    as kitti2bag does, under the ``stated`` size (0 = none) of either.
+    """
+
+    def off(both: tuple[Float64, Float64], of: tuple[int, int]) -> float:
+        # Of both cameras together: that turned ones see to the sides is no other size.
+        centres = [(matrix[:2, 2] + 0.5) / of - 0.5 for matrix in both]
+        return float(np.abs(np.mean(centres, axis=0)).max())
+
+    if 0 in stated or stated == size:
+        return off(matrices, size) > max(_OFF_CENTRE, 2 * off(projections, size))
+    return off(matrices, stated) < off(matrices, size) and (
+        off(projections, size) < off(projections, stated)
+    )
+
+
+def step_between(projections: tuple[Float64, Float64], where: StrPath) -> Float64:
+    """Return ``xyz_right - xyz_left`` (3,) of a point, rectified axes, by both ``P`` (3, 4)."""
+    with reading(where):
+        left_m, right_m = map(offset_m, projections, (f"P of the {side}" for side in _SIDES))
+    step_m: Float64 = right_m - left_m
+    if step_m[0] < 0:
+        return step_m
     what, hint = "right camera is to the left of the left camera", "swap left and right"
-    if shift == 0:
+    if step_m[0] == 0:
         what = "CameraInfo has no baseline"
         hint = (
             "the right camera was calibrated alone: calibrate both as a pair, or name a "
             "calibration file with --calib"
         )
-    got, expected = f"P[0, 3] = {P_right[0, 3]:g}", "-fx * baseline, below 0"
+    left, right = (P[0, 3] for P in projections)
+    got = f"P[0, 3] = {right:g}" + (f", {left:g} of the left" if left else "")
+    expected = "-fx * baseline, below that of the left"
     raise CalibrationError(what, where=where, got=got, expected=expected, hint=hint)
 
 

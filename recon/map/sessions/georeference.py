@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -9,11 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.alignment import fit_points
+from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Float64
 from recon.io.models.las import check_inside
 from recon.map.map import Map
 from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, span_m
 
+_LARGEST_YAW_RAD: Final = 0.1  # sigma that is said: places are off by a tenth of their distance
 _LARGEST_STRETCH: Final = 0.05  # by how much the path may be too long or short before it is said
 
 
@@ -28,6 +31,8 @@ class Georeference:
     scale: float  # how many times as far apart the positions are as those of the map
     left_out: int  # number of positions that contradict the others
     lines: tuple[str, ...]  # warnings that name them
+    turn: Float64  # (3, 3), rad², of `fixed_turn`
+    edge_m: float  # by which it moves the frame of the map that it moves most, sigma
     points: Mapping[str, Any] = field(default_factory=dict)  # figures of each control point
 
     @property
@@ -50,13 +55,21 @@ class Georeference:
             "span_m": self.span_m,
             "scale": self.scale,
             "tilt_deg": self.tilt_deg,
+            "yaw_sigma_deg": math.degrees(math.sqrt(self.turn[2, 2])),
+            "rotation_sigma_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(self.turn)[-1])),
+            "edge_sigma_m": self.edge_m,
             "T_survey_map": self.T_survey_map.tolist(),
             **({"control": dict(self.points)} if self.points else {}),
         }
 
     def warnings(self) -> list[str]:
         """Return lines of what is left out, and of map and positions that differ."""
-        lines = list(self.lines)
+        lines, yaw_rad = list(self.lines), math.sqrt(self.turn[2, 2])
+        if yaw_rad > _LARGEST_YAW_RAD:
+            far = f"{self.edge_m:.2g} m at its farthest frame"
+            lines.append(
+                f"the map is turned by an angle known to {math.degrees(yaw_rad):.1f} deg, {far}"
+            )
         if self.rms_m <= LARGEST_MISFIT * self.span_m:
             return lines
         if self.points:
@@ -76,7 +89,7 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
     measured = measure_along(map_.first, survey)
     if survey.system is not None:
         check_inside(survey.system, np.median(measured.position_m, axis=0), survey.positions)
-    agree = measured.agree
+    agree, turn = measured.agree, np.eye(3) if measured.turn is None else measured.turn
     ours_m, position_m = measured.ours_m[agree], measured.position_m[agree]
     return Georeference(
         measured.T_survey_map,
@@ -86,4 +99,14 @@ def georeference(map_: Map, survey: Survey) -> Georeference:
         fit_points(ours_m, position_m, scaled=True).scale,
         len(agree) - len(ours_m),
         (*survey.notes(), *measured.warnings()),
+        turn,
+        edge_m(map_, measured.T_survey_map, turn, position_m),
     )
+
+
+def edge_m(map_: Map, T_survey_map: Float64, turn: Float64, places_m: Float64) -> float:
+    """Return by how much a rotation (3, 3) about places (N, 3) moves a frame of a map at most."""
+    paths = [apply(one.T_map_world, one.trajectory.positions_m) for one in map_.linked]
+    arms_m = apply(T_survey_map, np.concatenate(paths)) - places_m.mean(axis=0)
+    across = np.sum(arms_m**2, axis=1) * np.trace(turn)
+    return float(np.sqrt(np.max(across - np.einsum("ni,ij,nj->n", arms_m, turn, arms_m))))

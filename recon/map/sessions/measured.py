@@ -16,6 +16,7 @@ from recon.core.geometry.alignment import (
     fit_upright,
     interpolate_poses,
     nearest_sorted,
+    turn_covariance,
 )
 from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
@@ -34,8 +35,12 @@ from recon.sources.bag_positions import read_measured
 LARGEST_MISFIT: Final = 0.01  # misfit, as a share of the extent of the path, that drift may explain
 _LONGEST_ARM_M: Final = 100.0
 """The axes of a vehicle are known to a degree or so: an antenna farther away is off by metres."""
-_LEAST_SPAN_M: Final = 1.0
-"""Positions closer together than this say nothing of the direction of the map."""
+LEVEL_RAD: Final = np.radians(3.0)
+"""Of the map's up, which is levelled where it is tilted more; standard deviation."""
+_MOST_YAW_RAD: Final = 0.5 * np.pi / SIGMAS
+"""A direction that is known worse may be any: its largest error is a right angle."""
+_UNSTATED_M: Final = 2.0
+"""What positions of unknown quality are off by together at least: two always fit a path."""
 _LONGEST_GAP_S: Final = 1.0
 """Between frames farther apart than this, nobody knows where the camera was."""
 _FEWEST_TO_BEND: Final = 5
@@ -134,6 +139,7 @@ class Measured:
     late_s: float = 0.0  # by how much their clock was late; times are those of the images
     late_sigma_s: float = 0.0
     degrees: bool = False  # whether the file has latitude and longitude
+    turn: Float64 | None = None  # of `fixed_turn`
 
     @cached_property
     def T_survey_map(self) -> Float64:
@@ -157,6 +163,15 @@ class Measured:
         worse = max(1.0, self.uneven_m / typical_m) if typical_m > 0.0 else 1.0
         least_m = self.uneven_m if typical_m == 0.0 else 0.0
         return np.maximum(max(_LEAST_SIGMA_M, least_m), worse * stated_m)
+
+    @property
+    def turn_sigma_m(self) -> Float64:
+        """float64 (N,), for those that agree: as stated, else what they differ from the path by."""
+        if self.stated_m is not None:
+            return self.sigma_m[self.agree]
+        off_m, many = self.misfit_m[self.agree], int(self.agree.sum())
+        sigma_m = math.sqrt((_UNSTATED_M**2 + np.sum(off_m**2)) / max(1, 3 * many - 4))
+        return np.full(many, min(RECEIVER_M, sigma_m))
 
     @property
     def uneven_m(self) -> float:
@@ -254,14 +269,6 @@ def measure_along(session: Session, survey: Survey) -> Measured:
             hint="both need one clock",
         )
     position_m, sigma_m = here[:, 1:4], np.sqrt(np.mean(here[:, 4:] ** 2, axis=1))
-    if span_m(position_m[:, :2]) < _LEAST_SPAN_M:
-        raise EvaluationError(
-            "the positions do not say how the map is turned",
-            where=survey.positions,
-            got=f"{counted(len(here), 'position')} within {span_m(position_m[:, :2]):.2f} m",
-            expected=f"{_LEAST_SPAN_M:g} m or more",
-            hint="eastings and northings are in metres, not degrees",
-        )
     ours_m = ours_at(here[:, 0])
     agree = find_agreeing(ours_m, position_m, LARGEST_MISFIT * span_m(ours_m))
     stated_m = None if np.isnan(sigma_m).any() else sigma_m
@@ -269,11 +276,41 @@ def measure_along(session: Session, survey: Survey) -> Measured:
         *(here[:, 0], position_m, ours_m, agree, stated_m, survey.swapped_m[during]),
         *(late_s, late_sigma_s, survey.found.degrees),
     )
+    places_m = apply(measured.T_survey_map, ours_m[agree]), position_m[agree]
+    turn = fixed_turn(*places_m, measured.turn_sigma_m, survey.positions, "positions")
+    measured = replace(measured, turn=turn)
     path = session.odometry
     stated = expected_drift(path, session.health, session.camera)
     drift_m = drift_at_end(path, session.trusted, None if stated is None else stated.percent)
     measured.check(drift_m, survey.positions)
     return measured
+
+
+def fixed_turn(
+    ours_m: Float64, there_m: Float64, sigma_m: Float64, where: Path, what: str
+) -> Float64:
+    """Return the covariance (3, 3), rad², of the rotation that points (N, 3) fix, survey axes.
+
+    By their standard deviations (N,) and their spread as the map or the survey has them, wherever
+    that says less of the yaw.
+
+    Raises:
+        EvaluationError: The yaw is not fixed.
+    """
+    found = [turn_covariance(points_m, sigma_m, LEVEL_RAD) for points_m in (ours_m, there_m)]
+    worse = max(found, key=lambda covariance: float(covariance[2, 2]))
+    yaw_rad = math.sqrt(worse[2, 2])
+    if yaw_rad > _MOST_YAW_RAD:
+        apart = f"{counted(len(there_m), 'place')} within {span_m(there_m[:, :2]):.2f} m"
+        yaw_deg = min(180.0, math.degrees(yaw_rad))
+        raise EvaluationError(
+            f"the {what} do not say how the map is turned",
+            where=where,
+            got=f"{apart}, known to {np.median(sigma_m):.2g} m: a direction to {yaw_deg:.0f} deg",
+            expected=f"{math.degrees(_MOST_YAW_RAD):.0f} deg or better",
+            hint="measure places farther apart; eastings and northings are in metres, not degrees",
+        )
+    return worse
 
 
 def hold(map_: MapFile, survey: Survey) -> list[str]:

@@ -159,6 +159,7 @@ def _figures(measured: Measured) -> dict[str, Any]:
         "description": source.description,
         "frames": len(source),
         "frames_left_out": source.left_out,
+        "warnings": source.warnings(),
         "frames_read": sample.frames,
         "repeated_frames": sample.repeats.both,
         "frozen_left_frames": sample.repeats.frozen[0],

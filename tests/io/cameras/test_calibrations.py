@@ -173,6 +173,29 @@ def test_camera_infos_that_are_no_rig_are_refused(tmp_path, spoil, message):
         read_calibration(left, 640, 480)
 
 
+def test_camera_infos_that_measure_from_another_camera_give_the_same_rig(tmp_path):
+    paths = write_ros(tmp_path / "rig.yaml", rig("brown"))
+    for path in paths:
+        content = yaml.safe_load(path.read_text())
+        P = content["projection_matrix"]["data"]
+        P[3] += 0.27 * P[0]
+        path.write_text(yaml.safe_dump(content))
+    have = read_calibration(paths[0], 640, 480)
+    np.testing.assert_allclose(have.T_right_left, T_RIGHT_LEFT, atol=1e-12)
+
+
+def test_camera_infos_of_a_lens_beside_rectified_images_are_refused_with_the_numbers(tmp_path):
+    paths = write_ros(tmp_path / "rig.yaml", rig("brown"))
+    for path in paths:
+        content = yaml.safe_load(path.read_text())
+        content["projection_matrix"]["data"][2::4] = 280.0, 190.0, 1.0
+        content |= {"image_width": 560, "image_height": 380}
+        path.write_text(yaml.safe_dump(content))
+    said = "images are rectified.*--focal .* --baseline 0.12.* --cx 280 --cy 190"
+    with pytest.raises(CalibrationError, match=rf"rig_left.yaml: .*{said}"):
+        read_calibration(paths[0], 560, 380)
+
+
 @pytest.mark.parametrize("write", [write_kalibr, write_ros])
 def test_a_header_of_opencv_does_not_hide_the_format(tmp_path, write):
     write(tmp_path / "rig.yaml", rig("radtan"))
