@@ -15,7 +15,7 @@ Ref: P. A. P. Moran, "The interpretation of statistical maps", J. R. Statist. So
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -28,6 +28,7 @@ from recon.core.values import PointCloud, RayCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int8, Int64
 from recon.map.builders import SPREAD_SIGMAS, OccupancySettings, frame_rays
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE, cast_rays, make_blocks
+from recon.map.occupancy.error import disagreement, frame_pairs
 
 _DISAGREEMENT: Final = 0.4
 """Largest disagreement within a body, root mean square of that of all and of upright pairs.
@@ -128,6 +129,11 @@ def _disagreement(seen: _Seen, pairs: Int64, upright: Bool, placed: Bool, piece:
     return np.where(np.isfinite(surely), surely, at_all)
 
 
+def pieces_of(keys: Int64) -> Int64:
+    """Return int64 (N,), number of the piece of each of some sorted packed cells."""
+    return _pieces(len(keys), _pairs(keys)[0])
+
+
 def _pieces(cells: int, pairs: Int64) -> Int64:
     """Return int64 (N,), number of the piece of each cell: cells that touch are of one."""
     label = np.arange(cells)
@@ -179,6 +185,10 @@ class Looks:
 
         1 where it hit something, -1 where it looked through, 0 where it saw neither.
         """
+        return (look for _, look in self.from_poses(keys))
+
+    def from_poses(self, keys: Int64) -> Iterator[tuple[Float64, Int8]]:
+        """Yield the same as `at`, after the ``T_map_camera`` of each frame."""
         cells = unpack_keys(keys).astype(np.int64)
         centres = (cells + 0.5) * self.settings.resolution_m
         reach_m = self.settings.max_range_m + self.settings.resolution_m
@@ -189,7 +199,17 @@ class Looks:
             if seen.any():
                 cloud = self._read(int(frame)).cloud()
                 chosen = _towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
-                yield self._cast(cloud.select(chosen), T, cells)
+                yield T, self._cast(cloud.select(chosen), T, cells)
+
+    @cached_property
+    def disagreement(self) -> float:
+        """By how much frames contradict each other: standard deviation of inverse depths, 1/m."""
+        T, range_m = self.T_map_camera, self.settings.max_range_m
+        clouds = (
+            (*(self._read(n).cloud() for n in pair), invert(T[pair[1]]) @ T[pair[0]])
+            for pair in frame_pairs(T, range_m)
+        )
+        return disagreement(clouds, self.settings)
 
     def near(self, low: Float64, high: Float64) -> Iterator[tuple[PointCloud, Float64]]:
         """Yield the rays of frames near a rectangle, camera axes, and ``T_map_camera`` of each."""
