@@ -13,8 +13,9 @@ of those beside them at the same height have moved: one of two along an upright 
 straight edge on the ground it is three of eight, and nothing grows.
 
 Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noise are looked
-through as well, but no frame sees a whole piece of them gone. A point that its frames could not
-place in a voxel stays if something occupied is in its reach.
+through as well, but no frame sees a whole piece of them gone. Nor did a piece move whose surface is
+still there, beside it by no more than the error of depths (`error.py`). A point that its frames
+could not place in a voxel stays if something occupied is in its reach.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def find_moved(
             rows = np.flatnonzero(moved)
             stays = _is_beside(keys[rows], sigmas * reach, occupied)
             moved[rows[stays]], reach = False, reach[~stays]
-            if moved[home[counted]].mean() <= _MUCH:
+            if moved[home[counted]].sum() <= _MUCH * counted.sum():
                 break
     moved = moved[home]
     occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed])])
