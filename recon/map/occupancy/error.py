@@ -33,7 +33,9 @@ def frame_pairs(T_map_camera: Float64, range_m: float) -> Iterator[tuple[int, in
     for frame in np.unique(np.linspace(0, len(places) - 1, _PAIRS).astype(int)).tolist():
         near = np.linalg.norm(places - places[frame], axis=1) <= _NEAR * range_m
         others = np.flatnonzero(near & (ahead @ ahead[frame] >= _SAME_WAY))
-        yield frame, int(others[np.abs(others - frame).argmax()])
+        other = int(others[np.abs(others - frame).argmax()])
+        if other != frame:
+            yield frame, other
 
 
 def disagreement(

@@ -91,11 +91,11 @@ def find_moved(
         reaches = Reaches(free, voxels.resolution_m, looks.disagreement)
         seen = reaches.noting(looks.from_poses(free))
         body = came_or_went(free, _among(home, counted & placed)[moved], seen)
-        moved[moved], reach = body, reaches.cells[body]
+        moved[moved], by_error = body, reaches.cells[body]
         for sigmas in _SIGMAS:
             rows = np.flatnonzero(moved)
-            stays = _is_beside(keys[rows], sigmas * reach, occupied)
-            moved[rows[stays]], reach = False, reach[~stays]
+            stays = _is_beside(keys[rows], sigmas * by_error, occupied)
+            moved[rows[stays]], by_error = False, by_error[~stays]
             if moved[home[counted]].sum() <= _MUCH * counted.sum():
                 break
     moved = moved[home]

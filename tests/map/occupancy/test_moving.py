@@ -242,7 +242,7 @@ def test_frames_are_compared_that_are_near_look_the_same_way_and_are_far_apart_i
     assert all(abs(there_and_back[one] - there_and_back[two]) <= 5.0 for one, two in pairs.items())
     poses[20:, :3, :3] = exp_so3(np.array([0.0, np.pi, 0.0]))
     assert dict(frame_pairs(poses, 20.0))[0] == 5
-    assert list(frame_pairs(poses[:1], 20.0)) == [(0, 0)]
+    assert not list(frame_pairs(poses[:1], 20.0))
 
 
 def test_a_frame_alone_or_that_sees_nothing_disagrees_with_none():
