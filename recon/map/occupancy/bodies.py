@@ -66,9 +66,9 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     those with points that their frames could place in one cell, the better evidence; ``looks`` what
     each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
     """
-    pairs, upright = _pairs(keys)
+    pairs, upright = pairs_of(keys)
     seen = _count(len(keys), pairs, looks)
-    piece = _pieces(len(keys), pairs)
+    piece = pieces_of(len(keys), pairs)
     ratio = _disagreement(seen, pairs, upright, placed, piece)[piece]
     known = np.isfinite(ratio)
     body = known & (ratio <= _DISAGREEMENT)
@@ -79,7 +79,7 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     return np.asarray(body | (~known & alone))
 
 
-def _pairs(keys: Int64) -> tuple[Int64, Bool]:
+def pairs_of(keys: Int64) -> tuple[Int64, Bool]:
     """Return int64 (P, 2), rows of cells that touch; and which pairs lie one above the other."""
     found, upright = [], []
     for step, stride in zip(_HALF, strides(_HALF), strict=True):
@@ -129,12 +129,7 @@ def _disagreement(seen: _Seen, pairs: Int64, upright: Bool, placed: Bool, piece:
     return np.where(np.isfinite(surely), surely, at_all)
 
 
-def pieces_of(keys: Int64) -> Int64:
-    """Return int64 (N,), number of the piece of each of some sorted packed cells."""
-    return _pieces(len(keys), _pairs(keys)[0])
-
-
-def _pieces(cells: int, pairs: Int64) -> Int64:
+def pieces_of(cells: int, pairs: Int64) -> Int64:
     """Return int64 (N,), number of the piece of each cell: cells that touch are of one."""
     label = np.arange(cells)
     while True:

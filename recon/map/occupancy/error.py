@@ -53,7 +53,11 @@ def disagreement(
 
 def _off(one: PointCloud, other: PointCloud, T_other_one: Float64, s: OccupancySettings) -> Float64:
     """Return by how much two frames disagree about rays that both have, as inverse depths, 1/m."""
-    there, seen = (_in_range(cloud, s.max_range_m) for cloud in (one, other))
+    hits = (np.linalg.norm(cloud.xyz, axis=1) <= s.max_range_m for cloud in (one, other))
+    there, seen = (
+        cloud.xyz[hit & (cloud.xyz[:, 2] > 0)].astype(np.float64)
+        for cloud, hit in zip((one, other), hits, strict=True)
+    )
     moved = apply(T_other_one, there)
     ahead = moved[:, 2] > s.resolution_m
     if not len(seen) or not ahead.any():
@@ -63,12 +67,6 @@ def _off(one: PointCloud, other: PointCloud, T_other_one: Float64, s: OccupancyS
     same = apart * moved[:, 2] < s.resolution_m / 2
     found = seen[at[same], 2]
     return np.asarray((found - moved[same, 2]) / np.hypot(own[same] ** 2, found**2))
-
-
-def _in_range(cloud: PointCloud, range_m: float) -> Float64:
-    """Return the points (N, 3) of rays that hit something."""
-    xyz = cloud.xyz.astype(np.float64)
-    return np.asarray(xyz[(xyz[:, 2] > 0) & (np.linalg.norm(xyz, axis=1) <= range_m)])
 
 
 class Reaches:

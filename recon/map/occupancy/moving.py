@@ -30,7 +30,7 @@ from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
 from recon.map.builders import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
-from recon.map.occupancy.bodies import Looks, came_or_went, pieces_of, strides
+from recon.map.occupancy.bodies import Looks, came_or_went, pairs_of, pieces_of, strides
 from recon.map.occupancy.error import Reaches, still_there
 from recon.map.occupancy.part import OccupancyPart
 
@@ -109,7 +109,7 @@ def find_moved(
 def _is_beside(keys: Int64, reach: Float64, occupied: Int64) -> Bool:
     """Return bool (N,), cells of bodies of which at least half has a surface in its reach."""
     beside = still_there(keys, reach, np.sort(occupied[~are_among(occupied, keys)]))
-    piece = pieces_of(keys)
+    piece = pieces_of(len(keys), pairs_of(keys)[0])
     return np.asarray((np.bincount(piece, beside - 0.5) >= 0)[piece])
 
 
