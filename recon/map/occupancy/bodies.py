@@ -15,7 +15,7 @@ Ref: P. A. P. Moran, "The interpretation of statistical maps", J. R. Statist. So
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -28,6 +28,7 @@ from recon.core.values import PointCloud, RayCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int8, Int64
 from recon.map.builders import SPREAD_SIGMAS, OccupancySettings, frame_rays
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE, cast_rays, make_blocks
+from recon.map.occupancy.error import disagreement, frame_pairs
 
 _DISAGREEMENT: Final = 0.4
 """Largest disagreement within a body, root mean square of that of all and of upright pairs.
@@ -65,9 +66,9 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     those with points that their frames could place in one cell, the better evidence; ``looks`` what
     each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
     """
-    pairs, upright = _pairs(keys)
+    pairs, upright = pairs_of(keys)
     seen = _count(len(keys), pairs, looks)
-    piece = _pieces(len(keys), pairs)
+    piece = pieces_of(len(keys), pairs)
     ratio = _disagreement(seen, pairs, upright, placed, piece)[piece]
     known = np.isfinite(ratio)
     body = known & (ratio <= _DISAGREEMENT)
@@ -78,7 +79,7 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     return np.asarray(body | (~known & alone))
 
 
-def _pairs(keys: Int64) -> tuple[Int64, Bool]:
+def pairs_of(keys: Int64) -> tuple[Int64, Bool]:
     """Return int64 (P, 2), rows of cells that touch; and which pairs lie one above the other."""
     found, upright = [], []
     for step, stride in zip(_HALF, strides(_HALF), strict=True):
@@ -128,7 +129,7 @@ def _disagreement(seen: _Seen, pairs: Int64, upright: Bool, placed: Bool, piece:
     return np.where(np.isfinite(surely), surely, at_all)
 
 
-def _pieces(cells: int, pairs: Int64) -> Int64:
+def pieces_of(cells: int, pairs: Int64) -> Int64:
     """Return int64 (N,), number of the piece of each cell: cells that touch are of one."""
     label = np.arange(cells)
     while True:
@@ -179,6 +180,10 @@ class Looks:
 
         1 where it hit something, -1 where it looked through, 0 where it saw neither.
         """
+        return (look for _, look in self.from_poses(keys))
+
+    def from_poses(self, keys: Int64) -> Iterator[tuple[Float64, Int8]]:
+        """Yield the same as `at`, after the ``T_map_camera`` of each frame."""
         cells = unpack_keys(keys).astype(np.int64)
         centres = (cells + 0.5) * self.settings.resolution_m
         reach_m = self.settings.max_range_m + self.settings.resolution_m
@@ -189,7 +194,17 @@ class Looks:
             if seen.any():
                 cloud = self._read(int(frame)).cloud()
                 chosen = _towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
-                yield self._cast(cloud.select(chosen), T, cells)
+                yield T, self._cast(cloud.select(chosen), T, cells)
+
+    @cached_property
+    def disagreement(self) -> float:
+        """By how much frames contradict each other: standard deviation of inverse depths, 1/m."""
+        T, range_m = self.T_map_camera, self.settings.max_range_m
+        clouds = (
+            (*(self._read(n).cloud() for n in pair), invert(T[pair[1]]) @ T[pair[0]])
+            for pair in frame_pairs(T, range_m)
+        )
+        return disagreement(clouds, self.settings)
 
     def near(self, low: Float64, high: Float64) -> Iterator[tuple[PointCloud, Float64]]:
         """Yield the rays of frames near a rectangle, camera axes, and ``T_map_camera`` of each."""

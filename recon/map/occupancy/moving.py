@@ -13,8 +13,9 @@ of those beside them at the same height have moved: one of two along an upright 
 straight edge on the ground it is three of eight, and nothing grows.
 
 Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noise are looked
-through as well, but no frame sees a whole piece of them gone. A point that its frames could not
-place in a voxel stays if something occupied is in its reach.
+through as well, but no frame sees a whole piece of them gone. Nor did a piece move whose surface is
+still there, beside it by no more than the error of depths (`error.py`). A point that its frames
+could not place in a voxel stays if something occupied is in its reach.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
 from recon.map.builders import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
-from recon.map.occupancy.bodies import Looks, came_or_went, strides
+from recon.map.occupancy.bodies import Looks, came_or_went, pairs_of, pieces_of, strides
+from recon.map.occupancy.error import Reaches, still_there
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))
@@ -40,6 +42,10 @@ _PLACED: Final = 0.45
 """Standard deviation of a frame, in voxels, up to which a point is in its voxel or beside it."""
 _UNSURE: Final = _MOST / 2
 """Largest mean evidence around a voxel that may be of what moved beside it."""
+_MUCH: Final = 0.02
+"""Share of the points of a tile from which error is likelier to be underrated than all to move."""
+_SIGMAS: Final = (FREE_MARGIN_SIGMAS, 2 * FREE_MARGIN_SIGMAS)
+"""Standard deviations that a body must have moved by; the second where so much would go."""
 _INSIDE: Final = 8  # voxels that touch one inside a surface
 GROWTH_CELLS: Final = 5  # voxels through which what moved grows
 _AROUND: Final = np.array(list(product((-1, 0, 1), repeat=3)))
@@ -79,16 +85,32 @@ def find_moved(
     placed = sigma_m <= _PLACED * voxels.resolution_m
     keys, home = np.unique(packed, return_inverse=True)
     moved = _mostly_free(keys, _among(home, counted), voxels, evidence)
+    occupied = pack_keys(voxels.keys[voxels.log_odds > 0])
     if moved.any():
         free = keys[moved]
-        moved[moved] = came_or_went(free, _among(home, counted & placed)[moved], looks.at(free))
+        reaches = Reaches(free, voxels.resolution_m, looks.disagreement)
+        seen = reaches.noting(looks.from_poses(free))
+        body = came_or_went(free, _among(home, counted & placed)[moved], seen)
+        moved[moved], by_error = body, reaches.cells[body]
+        for sigmas in _SIGMAS:
+            rows = np.flatnonzero(moved)
+            stays = _is_beside(keys[rows], sigmas * by_error, occupied)
+            moved[rows[stays]], by_error = False, by_error[~stays]
+            if moved[home[counted]].sum() <= _MUCH * counted.sum():
+                break
     moved = moved[home]
-    occupied = pack_keys(voxels.keys[voxels.log_odds > 0])
     occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed])])
     unsure = np.flatnonzero(moved & ~placed)
     reach = FREE_MARGIN_SIGMAS * sigma_m[unsure] / voxels.resolution_m
     moved[unsure] = ~_in_reach(places[unsure], reach, occupied)
     return moved
+
+
+def _is_beside(keys: Int64, reach: Float64, occupied: Int64) -> Bool:
+    """Return bool (N,), cells of bodies of which at least half has a surface in its reach."""
+    beside = still_there(keys, reach, np.sort(occupied[~are_among(occupied, keys)]))
+    piece = pieces_of(len(keys), pairs_of(keys)[0])
+    return np.asarray((np.bincount(piece, beside - 0.5) >= 0)[piece])
 
 
 def _among(home: Int64, points: Bool) -> Bool:

@@ -22,6 +22,7 @@ from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSurface
 from recon.map.occupancy.bodies import Looks, came_or_went
+from recon.map.occupancy.error import disagreement, frame_pairs, still_there
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
 from recon.sources.synthetic import SyntheticSource
@@ -65,19 +66,37 @@ class Drive(NamedTuple):
     rays: list[RayCloud]
 
 
-def _drive(scenes: Sequence[Sequence[Box]], step_m: float = 0.5, aside: float = 0.0) -> Drive:
-    """A drive through a scene that changes from frame to frame."""
+def _drive(
+    scenes: Sequence[Sequence[Box]],
+    step_m: float = 0.5,
+    aside: float = 0.0,
+    off_px: np.ndarray | None = None,
+    off_m: np.ndarray | None = None,
+) -> Drive:
+    """A drive through a scene that changes from frame to frame.
+
+    ``off_px`` is the error of all disparities of each frame, ``off_m`` (F, 3) that of its place.
+    """
+    off_px = np.zeros(len(scenes)) if off_px is None else off_px
+    off_m = np.zeros((len(scenes), 3)) if off_m is None else off_m
     poses, kept = [], []
     builder = SubmapBuilder(CONFIG.submaps, CONFIG.fusion, CONFIG.occupancy, T_MAP_WORLD)
     for frame, boxes in enumerate(scenes):
         T = make_transform(np.eye(3), np.array([aside, 0.0, step_m * frame]))
         shifted = [((x - aside, up, z), size) for (x, up, z), size in boxes]
-        cloud = look(shifted, step_m * frame, frame)
+        cloud = _off(look(shifted, step_m * frame, frame), off_px[frame])
+        T[:3, 3] += off_m[frame]
         kept.append(thin_rays(cloud, CONFIG.occupancy))
         near = cloud.select(cloud.xyz[:, 2] < RANGE_M)
         builder.integrate(transform_cloud(near, T, frame="world"), kept[-1].cloud(), T)
         poses.append(T)
     return Drive(builder.close(), poses, kept)
+
+
+def _off(cloud: PointCloud, off_px: float) -> PointCloud:
+    """What a rig sees whose disparities are too large by so much."""
+    share = FOCAL_BASELINE / (FOCAL_BASELINE + off_px * cloud.xyz[:, 2:])
+    return replace(cloud, xyz=(cloud.xyz * share).astype("f4"))
 
 
 def _tiles(*drives: Drive, remove: bool = True) -> Tiles:
@@ -165,6 +184,81 @@ def test_a_fence_that_is_looked_through_as_often_as_it_is_hit_stays():
     cells = np.floor(points.xyz[_near(points, whole, 0.1)] / CONFIG.occupancy.resolution_m)
     assert np.isin(pack_keys(cells.astype(np.int64)), free).mean() > 0.25
     assert _left(whole, drive, margin_m=0.1) >= 0.99
+
+
+STREET: list[Box] = [
+    ((5.0, 0.0, 20.0), (0.2, 4.0, 44.0)),
+    ((-3.5, 0.0, 16.0), (1.8, 1.6, 4.2)),
+    ((-3.5, 0.0, 24.0), (1.8, 1.6, 4.2)),
+]
+"""A façade along the street, and two parked cars."""
+LESS = 16  # frames, at 0.75 m
+WANDER = np.linspace(-2.0, 2.0, LESS)
+DRIFT = np.random.default_rng(3).normal(0.0, 0.07, (LESS, 3)).cumsum(axis=0) * [1, 0, 1]
+
+
+@pytest.mark.parametrize("errors", [{"off_px": WANDER}, {"off_m": DRIFT}], ids=["rig", "path"])
+def test_what_only_the_error_of_a_rig_or_of_a_path_moves_stays(errors):
+    before, after = _clouds(_drive([STREET] * LESS, step_m=0.75, **errors))
+    assert len(after) >= 0.995 * len(before)
+
+
+def test_a_car_that_moves_by_more_than_the_error_of_the_rig_is_gone():
+    scenes = ONCOMING[:LESS]
+    trail = [box for boxes in scenes for box in boxes]
+    drive = _drive([[*boxes, STREET[0]] for boxes in scenes], off_px=0.25 * WANDER)
+    before, after = _clouds(drive)
+    assert _near(before, trail).sum() > 100
+    assert _near(after, trail).sum() <= 0.05 * _near(before, trail).sum()
+    assert _near(after, STREET[:1]).sum() >= 0.995 * _near(before, STREET[:1]).sum()
+
+
+@pytest.mark.slow
+def test_two_rigs_that_disagree_take_nothing_out_but_what_left_between_their_drives():
+    off = np.full(FRAMES, 1.0)
+    rigs = _drive([STREET] * FRAMES, off_px=off), _drive([STREET] * FRAMES, off_px=-off)
+    before, after = _clouds(*rigs)
+    assert len(after) >= 0.995 * len(before)
+    older = _drive([[*STREET, *PARKED]] * FRAMES, off_px=0.25 * off)
+    later = _drive([STREET] * FRAMES, aside=0.5, off_px=-0.25 * off)
+    assert _left(PARKED, older, later, margin_m=0.0) <= 0.05
+
+
+@pytest.mark.parametrize("off_px", [0.0, 1.0, 3.0])
+def test_disagreement_is_the_error_of_an_inverse_depth(off_px):
+    # One frame is right, the other as far off as two that err apart by the root of two.
+    clouds = [thin_rays(_off(look(STREET, 0.0, n), n * off_px), CONFIG.occupancy) for n in (0, 1)]
+    poses = np.stack([T_MAP_WORLD @ np.eye(4)] * 2)
+    error_px = Looks(CONFIG.occupancy, poses, clouds.__getitem__).disagreement * FOCAL_BASELINE
+    # A median of sizes is that of the shift, as soon as it is larger than the noise.
+    assert np.hypot(0.5 * SIGMA_PX, off_px) <= error_px <= 1.2 * np.hypot(SIGMA_PX, 1.1 * off_px)
+
+
+def test_frames_are_compared_that_are_near_look_the_same_way_and_are_far_apart_in_time():
+    there_and_back = np.concatenate([np.arange(0.0, 20.0), np.arange(20.0, 0.0, -1.0)])
+    poses = np.stack([make_transform(np.eye(3), np.array([0.0, 0.0, z])) for z in there_and_back])
+    pairs = dict(frame_pairs(poses, 20.0))
+    assert pairs[0] == len(poses) - 1
+    assert all(abs(there_and_back[one] - there_and_back[two]) <= 5.0 for one, two in pairs.items())
+    poses[20:, :3, :3] = exp_so3(np.array([0.0, np.pi, 0.0]))
+    assert dict(frame_pairs(poses, 20.0))[0] == 5
+    assert not list(frame_pairs(poses[:1], 20.0))
+
+
+def test_a_frame_alone_or_that_sees_nothing_disagrees_with_none():
+    nothing = PointCloud(np.zeros((0, 3), "f4"))
+    assert disagreement([], CONFIG.occupancy) == 0.0
+    views = [(nothing, look([], 0.0, 0), np.eye(4)), (look([], 0.0, 0), nothing, np.eye(4))]
+    assert disagreement(views, CONFIG.occupancy) == 0.0
+
+
+def test_a_surface_is_still_there_up_to_its_reach_before_and_behind_a_cell():
+    cells = np.array([[0, 0, z] for z in (0, 3, 9)])
+    occupied = np.sort(pack_keys(np.array([[6, 0, 0], [-4, 0, 3], [0, 5, 9]])))
+    for length, found in ((3.0, [False] * 3), (4.0, [False, True, False]), (6.5, [True] * 2)):
+        reach = np.array([[length, 0.0, 0.0]] * 3)
+        assert still_there(pack_keys(cells), reach, occupied)[: len(found)].tolist() == found
+    assert still_there(pack_keys(cells[:0]), np.zeros((0, 3)), occupied).tolist() == []
 
 
 GROUND = GroundSurface(np.full((60, 60), -HEIGHT_M), 1.0, (-15.0, -30.0))
