@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from types import UnionType
-from typing import Any, ClassVar, Final, Union, get_args, get_origin
+from typing import Any, Final, Union, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -52,9 +52,6 @@ class Settings(BaseModel):
         use_attribute_docstrings=True,
     )
 
-    fixed: ClassVar[Mapping[str, Any]] = {}
-    """Settings of earlier versions that are constants now; files may have these values."""
-
     @model_validator(mode="before")
     @classmethod
     def _complete(cls, values: Any) -> Any:
@@ -62,12 +59,7 @@ class Settings(BaseModel):
         if not isinstance(values, Mapping):
             return values
         fields = cls.model_fields
-        fixed = {name: value for name, value in cls.fixed.items() if name not in fields}
-        for name in fixed.keys() & values.keys():
-            if values[name] != fixed[name]:
-                raise ValueError(f"{name} is fixed in this version, at {fixed[name]}")
-        given = {name: value for name, value in values.items() if name not in fixed}
-        return {k: _complete(fields[k], v) if k in fields else v for k, v in given.items()}
+        return {k: _complete(fields[k], v) if k in fields else v for k, v in values.items()}
 
     @field_validator("*", mode="before")
     @classmethod

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,6 @@ _PATCH_PX: Final = 11  # of the printed method; the paper does not give it
 
 class PaperSettings(Settings):
     """How the seed paper's experiments are repeated."""
-
-    fixed: ClassVar = {"patch_px": _PATCH_PX}
 
     as_printed: bool = False
     """Run the method as printed as well as the corrected one."""

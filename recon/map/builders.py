@@ -6,7 +6,7 @@ rounded, so that the same map can be built again, and others with other voxels, 
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,8 +134,6 @@ _MIN_POINTS: Final = 2  # voxels with fewer points in a frame start no ray
 
 class OccupancySettings(Settings):
     """How clouds become occupancy."""
-
-    fixed: ClassVar = {"rays_per_voxel": 2, "thin_surfaces": True}
 
     resolution_m: float = Length(0.2, ge=1e-06, le=1000.0)
     """Edge of a voxel, and of a cell of the grid. Half of it takes about six times the memory."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -14,8 +14,6 @@ Metres = Annotated[float, Field(ge=0, le=1e6)]
 
 class AuditSettings(Settings):
     """Whether and how thoroughly recordings are audited, and what is plausible."""
-
-    fixed: ClassVar = {"frames": 300}
 
     quick: bool = True
     """Whether `recon map`, `localize`, `pair` and `disparity` start with a quick audit. Off saves a
@@ -35,8 +33,6 @@ LensKind = Literal["radtan", "rational", "fisheye"]
 
 class CalibrationSettings(Settings):
     """Lens model, acceptance and uncertainty."""
-
-    fixed: ClassVar = {"bootstrap": 500, "depths_m": [2.0, 5.0, 10.0, 20.0]}
 
     model: LensKind = "radtan"
     """Lens model: radtan (radial and tangential, most lenses), rational (wide angle) or fisheye

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -187,8 +187,6 @@ _NORMALS_RADIUS_PX: Final = 3  # half width of the window that gives a point its
 
 class CloudSettings(Settings):
     """Which pixels become points."""
-
-    fixed: ClassVar = {"min_confidence": 0.0}
 
     remove_flying_edges: bool = True
     """Drop pixels that float between a foreground and its background. Turn it off to see what the

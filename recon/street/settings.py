@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
@@ -25,8 +25,6 @@ class StreetSettings(Settings):
     Equal settings give bit-identical images. A longer drive with the same seed continues along
     the same street.
     """
-
-    fixed: ClassVar = {"turn_deg_per_100m": 20.0}
 
     seed: int = Field(0, ge=0, lt=2**31)
     """Seed of the street: another one, another street."""

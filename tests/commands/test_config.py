@@ -157,12 +157,6 @@ def test_settings_must_be_those_of_the_run_but_for_the_memory(begin):
         MapOptions(mesh=False).resumed(run, None, [])
 
 
-def test_a_run_of_an_earlier_version_has_settings_that_are_fixed_now(begin):
-    run = begin({"grid": {"free_height_m": 0.8, "max_height_m": 3.0}, "audit": {"frames": 300}})
-    _, settings = MapOptions().resumed(run, None, [])
-    assert settings == load_config(None, ["grid.max_height_m=3"])
-
-
 @pytest.mark.parametrize("config", [{"grid": {"free_height_m": 0.5}}, {"no": 1}])
 def test_settings_that_there_are_not_are_refused_by_the_name_of_the_run(begin, config):
     run = begin(config)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import pytest
 from pydantic import Field, ValidationError, field_validator
@@ -169,7 +169,7 @@ def test_a_bad_setting_is_named_with_its_path(values, message):
         Outer.parse(values, where="config.yaml")
 
 
-def test_settings_cannot_be_changed_keep_their_bounds_and_may_come_back():
+def test_settings_cannot_be_changed_and_keep_their_bounds():
     class Wrong(Settings):
         window_px: int = Field(default=0, ge=1, description="Window.")
 
@@ -177,33 +177,6 @@ def test_settings_cannot_be_changed_keep_their_bounds_and_may_come_back():
         Outer().name = "b"
     with pytest.raises(ValidationError):
         Wrong()
-
-    class Old(Settings):
-        fixed = {"size": 1}  # noqa: RUF012
-
-    class New(Old):
-        size: int = 2
-
-    assert New.parse({"size": 3}) == New(size=3)
-
-
-#: What settings of before are fixed at.
-FIXED: dict[str, Any] = {
-    "matching.sad.speckle_size_px": 50, "matching.sad.min_texture": 0.1,
-    "matching.sad.half_size_first": True, "matching.sgm.speckle_size_px": 50,
-    "cloud.min_confidence": 0.0, "occupancy.rays_per_voxel": 2, "occupancy.thin_surfaces": True,
-    "grid.free_height_m": 0.8, "grid.occupied_probability": 0.55, "grid.free_probability": 0.35,
-    "audit.frames": 300, "calibration.bootstrap": 500, "paper.patch_px": 11,
-    "calibration.depths_m": [2.0, 5.0, 10.0, 20.0], "street.turn_deg_per_100m": 20.0,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", FIXED)
-def test_a_constant_of_now_is_read_from_files_of_before_with_its_value_alone(name):
-    assert load_config(None, [{name: FIXED[name]}]) == ReconConfig()
-    group, _, last = name.rpartition(".")
-    with pytest.raises(SettingsError, match=f"{group}.*{last} is fixed in this version"):
-        load_config(None, [{name: 7}])
 
 
 @pytest.mark.parametrize("settings", [ReconConfig, TrajectoryRules, RecordingSettings, StreetScene])

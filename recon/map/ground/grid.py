@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -31,8 +31,6 @@ FREE_PROBABILITY: Final = 0.35  # voxels at most this probable are free
 
 class GridSettings(Settings):
     """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
-
-    fixed: ClassVar = {"free_height_m": 0.8, "occupied_probability": 0.55, "free_probability": 0.35}
 
     min_height_m: float = Field(0.3, ge=0.0, le=10.0)
     """Lower end of the band in which obstacles are looked for: what the vehicle can drive over."""

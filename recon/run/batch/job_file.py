@@ -100,9 +100,6 @@ def read_plan(folder: Path) -> JobList:
         raise FormatError("folder holds no batch", where=folder, expected=f"a {PLAN}")
     with reading(path):
         content = json.loads(read_text(path, _PLAN_BYTES))
-        if isinstance(content, list):
-            hint = "start it again with another --out"
-            raise FormatError("batch of an earlier version", where=path, hint=hint)
         return _job_list(content, path)
 
 

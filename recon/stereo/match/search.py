@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import Annotated, ClassVar, Final, Generic, TypeVar
+from typing import Annotated, Final, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -89,8 +89,6 @@ class FillableSettings(SearchSettings):
 
 class MeasuredSettings(SearchSettings):
     """Settings of the matchers with sub-pixel disparities and uncertainties of their own."""
-
-    fixed: ClassVar = {"speckle_size_px": 50, "min_texture": 0.1, "half_size_first": True}
 
     uniqueness_percent: UniquenessPercent = 0
 

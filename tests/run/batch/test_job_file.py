@@ -66,14 +66,11 @@ def test_what_a_batch_was_begun_with_is_read_as_it_was_written(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
-    [*((text, r"jobs\.json") for text in
-       ("", "3", "[3]", '{"x": 1}', "{", '{"job": [{"name": "a"}]}')),
-     ('[{"name": "a", "words": ["map", "drive"]}]', r"earlier version.*another --out")],
-)  # fmt: skip
-def test_a_damaged_plan_is_one_line(tmp_path, content, words):
+    "content", ["", "3", "[3]", '{"x": 1}', "{", '{"job": [{"name": "a"}]}', '[{"name": "a"}]']
+)
+def test_a_damaged_plan_is_one_line(tmp_path, content):
     (tmp_path / "jobs.json").write_text(content)
-    with pytest.raises(ReconError, match=words):
+    with pytest.raises(ReconError, match=r"jobs\.json"):
         read_plan(tmp_path)
 
 
