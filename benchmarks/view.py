@@ -21,7 +21,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
-from urllib.request import urlopen
 
 import checkout  # noqa: F401 - what is measured
 import msgspec
@@ -73,9 +72,8 @@ def kept(drive: Path, folder: Path, number: int) -> dict[str, float]:
     return {way: fps[way] / fps["alone"] for way in ("unseen", "seen")}
 
 
-def look(door: str) -> None:
+def look(url: str) -> None:
     """Take what a page shows until it ends; it begins when a camera looks at the scene."""
-    url = urlopen(door).url  # noqa: S310 - its own
     turn, eye_m, ahead_m, up = (1.0, 0.0, 0.0, 0.0), (-9.0, 0.0, 9.0), (0.0,) * 3, (0.0, 0.0, 1.0)
     camera = ViewerCameraMessage(turn, eye_m, 1.0, 0.1, 1e3, 900, 1600, ahead_m, up)
     protocols = [Subprotocol(f"viser-v{viser.__version__}")]

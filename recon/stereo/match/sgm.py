@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
@@ -59,14 +59,6 @@ class SgmSettings(common.MeasuredSettings, common.FillableSettings):
     p2: float = Field(50.0, gt=0.0, le=1000.0)
     """Penalty of a larger step along a path, as a mean cost of one pixel. Larger is smoother, and
     fills more of what is plain; smaller keeps thin things."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _has_new_names(cls, values: Any) -> Any:
-        for old, new in (("small_penalty", "p1"), ("large_penalty", "p2")):
-            if isinstance(values, Mapping) and old in values:
-                raise ValueError(f"{old} is now called {new}")
-        return values
 
     @model_validator(mode="after")
     def _penalties_fit(self) -> Self:

@@ -260,7 +260,6 @@ def test_what_is_flat_is_filled_in_and_brightness_of_one_camera_matters_little()
         (SgmSettings, {"window_px": 10}, "odd"),
         (sad.SadSettings, {"window_px": 57}, "less than or equal to 55"),
         (SgmSettings, {"p1": 70.0}, "exceed"),
-        (SgmSettings, {"small_penalty": 1.0}, "now called p1"),
     ],
 )
 def test_windows_and_penalties_that_do_not_fit_are_refused(settings, wrong, words):
