@@ -300,11 +300,14 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: Rectifie
 
 
 def _best_fit(sample: Sample) -> tuple[int, float]:
-    """Return the lag that fits best, and how many times as well as none."""
+    """Return the lag that fits best, and how many times as well as none; 1 if few features do."""
     # Lags were tried on different numbers of pairs.
-    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in sample.lagged.items()}
+    total = {lag: sum(n.agreeing for n in at) for lag, at in sample.lagged.items()}
+    fit = {lag: number / len(sample.lagged[lag]) for lag, number in total.items()}
     best = max(fit, key=lambda lag: (fit[lag], -abs(lag)), default=0)
-    return best, fit.get(best, 0.0) / max(fit.get(0, 0.0), 1.0)
+    if total.get(best, 0) < MIN_FEATURES:
+        return best, 1.0
+    return best, fit[best] / max(fit.get(0, 0.0), 1.0)
 
 
 def _time_skew(
