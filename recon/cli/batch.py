@@ -59,7 +59,8 @@ def batch(
     Each job is a process of its own with a folder of its own below --out. One
     that fails leaves the others alone; one whose worker dies goes on elsewhere.
     The folder gets summary.json, tables and a report, what is wrong first. The
-    exit code is 1 if any job failed. It needs: pip install 'recon-stereo\[cluster]'
+    exit code is 1 if any job failed. It needs the extra cluster:
+    pip install 'recon-stereo\[cluster]'
 
     Examples:
       recon batch jobs.toml --out outputs/week

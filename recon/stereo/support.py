@@ -16,7 +16,8 @@ from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.stereo.match.sad import HalfSizeMatcher, estimate_ndisp
 from recon.stereo.match.search import SearchSettings
-from recon.stereo.rectify.features import PairFeatures, inspect_features
+from recon.stereo.rectify.features import PairFeatures
+from recon.stereo.rectify.row_alignment import count_aligned
 
 _LEAST_ROWS: Final = 64  # lower images are not judged: hardly a feature fits in
 _SHIFT_ROWS: Final = 16
@@ -30,6 +31,8 @@ _BY_PIXELS: Final = 2.2
 cameras have 0.7 to 2.0, if they are not symmetrical; good pairs 2.3 to 40."""
 _LEAST_SHARE: Final = 0.02
 """Of the pixels, beyond chance: fewer support nothing, as those that noise has in common."""
+_MOSTLY: Final = 0.4
+"""Of the pixels, which no unrelated pair matches: along upright edges shifted rows match, too."""
 _DOUBTED: Final = 1.5
 _LEAST_FEATURES: Final = 12
 """Features from which they support a pair, if most of those matched agree: by chance 10 did."""
@@ -42,7 +45,7 @@ class Support:
     measured: float  # mean confidence of a match at half size, over all pixels
     by_chance: float  # the same with rows of the right image that belong elsewhere
     matched: int  # number of matched features
-    agreeing: int  # of them, on one row error and at disparities that are searched
+    agreeing: int  # of them, on how rows meet, and at disparities that are searched
 
     @property
     def times_chance(self) -> float:
@@ -60,7 +63,8 @@ class Support:
     def by_pixels(self) -> bool:
         """Whether dense matches support the pair; they do where hardly a corner is."""
         beyond = self.measured - self.by_chance
-        return self.times_chance >= _BY_PIXELS and beyond >= _LEAST_SHARE
+        clearly = self.times_chance >= _BY_PIXELS and beyond >= _LEAST_SHARE
+        return clearly or self.measured >= _MOSTLY
 
     @property
     def shown(self) -> bool:
@@ -69,6 +73,7 @@ class Support:
 
     @property
     def doubtful(self) -> bool:
+        """Whether one of the two signs is missing."""
         return not self.by_features or self.times_chance < _DOUBTED
 
     def check(self, where: str | None, hint: str | None = None) -> None:
@@ -76,10 +81,11 @@ class Support:
         if self.shown:
             return
         advice = (
-            "give two images of one moment, neither mirrored nor upside down, with the "
-            "calibration of their cameras and a range (--ndisp) that reaches the nearest things"
+            "give rectified images of one moment, or raw ones with the calibration of their "
+            "cameras, neither mirrored nor upside down, and a range (--ndisp) that reaches the "
+            "nearest things"
         )
-        what = "left and right do not belong together"
+        what = "nothing shows that left and right belong together"
         raise MatchingError(what, where=where, got=self._found, hint=hint or advice)
 
     def warnings(self) -> tuple[str, ...]:
@@ -90,7 +96,8 @@ class Support:
     @property
     def _found(self) -> str:
         features, times = counted(self.matched, "matched feature"), f"{self.times_chance:.1f} times"
-        return f"{self.agreeing} of {features} agree, and {times} as many pixels match as by chance"
+        agree = f"{self.agreeing} of {features} agree within the range"
+        return f"{agree}, and {times} as many pixels match as by chance"
 
 
 def measure_support(
@@ -118,5 +125,6 @@ def measure_support(
         return None
     columns_px = features.left_uv[:, 0] - features.right_uv[:, 0] - searched.min_disparity_px
     within = (columns_px > -1) & (columns_px < searched.ndisp_for(pair.camera) + 1)
-    agreeing = inspect_features(features.select(within)).features
+    near = features.select(within)
+    agreeing = count_aligned(near.left_uv, near.right_uv, pair.camera)
     return Support(measured, max(by_chance), len(features), agreeing)

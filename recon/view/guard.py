@@ -130,7 +130,7 @@ class Guard:
             try:
                 self._check()
             except OutputError:
-                server.stop()
+                stop(server)
                 raise
         return server
 
@@ -221,6 +221,13 @@ class Guard:
     def _unsafe(self, why: str) -> OutputError:
         hint = "install the versions of constraints.txt"
         return OutputError(f"nothing is served, as {why}", got=self._protocol, hint=hint)
+
+
+def stop(server: Any) -> None:
+    """Stop viser's server without a word, which it has for the terminal when its thread ends."""
+    with redirect_stdout(io.StringIO()):
+        server.stop()
+        server._websock_server._server_thread.join(_PATIENCE_S)
 
 
 def _are_numbers(values: dict[object, object], shapes: dict[str, tuple[int, ...]]) -> bool:

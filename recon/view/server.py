@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Iterable
-from contextlib import redirect_stdout
 from html import escape
 from pathlib import Path
 from threading import Event
@@ -16,7 +14,7 @@ import numpy as np
 from recon.core.errors import require
 from recon.core.values import UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64
-from recon.view.guard import Guard
+from recon.view.guard import Guard, stop
 from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
 
 _LAYERS: Final = ("cloud", "grid", "mesh", "path")
@@ -81,8 +79,7 @@ class Viewer:
             self._draw()
 
     def close(self) -> None:
-        with redirect_stdout(io.StringIO()):
-            self._server.stop()
+        stop(self._server)
 
     def _note(self, **wanted: Any) -> None:
         # For `serve`, whose thread does all work; what we set comes from no client: None.

@@ -142,7 +142,7 @@ def test_live_drives_priors_and_a_missing_package_are_refused_at_once(street, mo
     with pytest.raises(SettingsError, match="--prior"):
         run_map(street, config, MapOptions(prior=street.trajectory))
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(MissingDependencyError, match=r"recon\[sfm\]"):
+    with pytest.raises(MissingDependencyError, match=r"recon-stereo\[sfm\]"):
         run_map(street, config)
 
 

@@ -47,8 +47,9 @@ class Rigidity:
         rows = zip(self.frames, self.rows_px, strict=True)
         found = ", ".join(f"{row:+.0f} px in frame {frame}" for frame, row in rows)
         return (
-            f"the cameras move against each other: the right image is too low by {found}; no "
-            "calibration holds for such a drive: fix both to one bar, and trigger them together"
+            "the cameras move against each other, or their images are of different moments: the "
+            f"right image is too low by {found}; no calibration holds for such a drive: fix both "
+            "to one bar, and trigger them together"
         )
 
 

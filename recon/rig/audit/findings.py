@@ -186,6 +186,8 @@ def _of_geometry(measured: Measured) -> Found:
     elif skew is not None and abs(skew[0]) > max(MOST_LATE, 4 * skew[1]):
         yield "skew", {"skew": skew[0]}
     rows = geometry.alignment
+    if lag:  # rows say nothing of the cameras then
+        return
     if measured.rig is not None and measured.rig.not_rigid:
         yield "nonrigid", {"found": measured.rig.not_rigid[0]}
     elif rows is None and geometry.pairs:

@@ -48,6 +48,7 @@ _MAX_LAG: Final = 4  # largest delay of one camera to look for, in frames
 _QUICK_LAG: Final = 3  # the same in a quick audit
 BLANK_DN: Final = 4.0  # an image counts as blank below this standard deviation, in grey levels
 _LAG_FACTOR: Final = 1.25  # agreement relative to lag 0 from which a delay is reported
+_ALIKE: Final = 1.5  # agreement of the best lag relative to another that fits about as well
 _LARGEST_SKEW: Final = 0.75  # a larger skew, in frames, is closer to a lag of one frame
 MIN_FEATURES: Final = 60  # minimum number of features, in all, to judge geometry
 
@@ -286,10 +287,8 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: Rectifie
     A delay of half a frame fits both neighbours badly; it is a skew, which moving features show.
     """
     best, times = _best_fit(sample)
+    best = _best_moving(sample, best, camera)
     if abs(best) == 1:
-        # Where little moves, neighbours fit as well; what moves most in rows still tells.
-        if skew is not None and abs(skew[0]) + 4 * skew[1] < 1 - _LARGEST_SKEW:
-            return 0
         found, flows, _ = zip(*sample.lagged[best], strict=True)
         left = _time_skew(found, flows, camera, _align(pool_features(found), camera))
         if left is not None:
@@ -297,6 +296,21 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: Rectifie
         if skew is not None and 4 * skew[1] < abs(skew[0]) < _LARGEST_SKEW:
             return 0
     return best if times > _LAG_FACTOR else 0
+
+
+def _best_moving(sample: Sample, best: int, camera: RectifiedCamera) -> int:
+    """Return of the lags that fit about as well as the best one that at which moving rows do best.
+
+    Where little moves, or what is ahead comes nearer, neighbouring frames match as well.
+    """
+    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in sample.lagged.items()}
+    sigmas = {}
+    for lag in (lag for lag in fit if _ALIKE * fit[lag] >= fit[best]):
+        found, flows, _ = zip(*sample.lagged[lag], strict=True)
+        skew = _time_skew(found, flows, camera, _align(pool_features(found), camera))
+        if skew is not None and abs(skew[0]) < 1 - _LARGEST_SKEW:
+            sigmas[lag] = skew[1]
+    return min(sigmas, key=lambda lag: sigmas[lag], default=best)
 
 
 def _best_fit(sample: Sample) -> tuple[int, float]:

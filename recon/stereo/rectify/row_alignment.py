@@ -61,6 +61,8 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
         turn = turn + _solve(basis[agree], rows[agree])
     left_over = left_uv[:, 1] - turn_features(right_uv, camera, turn)[:, 1]
     agree = np.abs(left_over) < _NEAR_PX
+    if agree.sum() < 12:
+        return None
     left_over = left_over[agree]
     error = (right_uv[:, 1] - left_uv[:, 1])[agree].astype(np.float64)
     noise = float(np.mean(left_over**2))

@@ -298,7 +298,7 @@ def test_positions_lie_in_the_area_of_their_system(name, east, north, inside):
 @pytest.mark.parametrize(("write", "library"), [(write_las, "laspy"), (write_e57, "pye57")])
 def test_without_its_library_the_extra_is_named(tmp_path, monkeypatch, write, library):
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(MissingDependencyError, match=r"recon\[survey\]"):
+    with pytest.raises(MissingDependencyError, match=r"recon-stereo\[survey\]"):
         write(tmp_path / "cloud", [], np.eye(4))
 
 

@@ -126,7 +126,9 @@ def test_a_drive_of_two_drives_is_refused_and_one_in_the_dark_is_not_for_that(st
     mixed = faults.Spoiled(
         street.camera, FRAMES, lambda k: replace(street.take(k), right=other.take(k).right)
     )
-    with pytest.raises(MatchingError, match=r"^spoiled, frame 15: left and right do not belong"):
+    with pytest.raises(
+        MatchingError, match=r"^spoiled, frame 15: nothing shows that left and right"
+    ):
         run_map(mixed, CONFIG, MapOptions(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
     black = faults.changed(street, lambda left, right: (0 * left, 0 * right))

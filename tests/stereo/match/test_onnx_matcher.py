@@ -126,7 +126,7 @@ def test_without_the_extra_pip_is_named(difference, monkeypatch):
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(errors, "import_module", absent)
-    with pytest.raises(MissingDependencyError, match=r"recon\[onnx\]"):
+    with pytest.raises(MissingDependencyError, match=r"recon-stereo\[onnx\]"):
         match(difference, pair_of(1, 2))
 
 
