@@ -71,20 +71,19 @@ def batch(
     """
     if [bool(what), resume is not None, watch is not None].count(True) != 1:
         raise typer.BadParameter("give JOBS, COMMAND and SOURCES, --resume or --watch FOLDER")
-    with one_line_errors(quiet=quiet):
+    with one_line_errors(quiet=quiet, verbose=verbose):
         if watch is not None:
             from recon.cli.watch import show_batch
 
             show_batch(watch)
             return
         from recon.cli.program import plan_jobs
-        from recon.cli.progress import choose_viewer
         from recon.commands.batch import run_batch
+        from recon.core.progress import stage
         from recon.run.batch.cluster import BatchOptions
         from recon.run.batch.job_file import SUFFIXES, jobs_of_sources, read_jobs, read_plan
 
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        options = BatchOptions(resume or out, scheduler, workers, fail_fast, viewer)
+        options = BatchOptions(resume or out, scheduler, workers, fail_fast)
         first, *sources = what or [""]
         if resume is not None:
             listed = read_plan(resume)
@@ -99,7 +98,7 @@ def batch(
                 timeout_s=timeout,
                 retries=retries,
             )
-        viewer.on_stage("check the jobs")
+        stage("check the jobs")
         jobs = plan_jobs(listed)
         summary = run_batch(jobs, options, listed if resume is None else None)
     print_json(summary) if json else print_batch(summary)

@@ -136,7 +136,7 @@ def open_workers(
         raise typer.BadParameter("--scheduler has workers of its own; drop --workers")
     if scheduler is None and (workers or 1) == 1:
         return None
-    return BatchOptions(None, scheduler, workers, progress=shared.viewer())
+    return BatchOptions(None, scheduler, workers)
 
 
 def read_start(text: str | None) -> tuple[StartPose | None, int | None]:

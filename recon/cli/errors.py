@@ -21,7 +21,6 @@ from typing import Final
 import typer
 
 from recon.core.errors import MissingDependencyError, ReconError, SettingsError
-from recon.core.kernels.cache import when_compiling
 
 INTERRUPTED = 130
 _BUG = 3
@@ -30,21 +29,22 @@ _ADDRESS_BYTES = 2_500_000_000
 
 
 @contextmanager
-def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
-    """Run a command's body; a `ReconError` becomes one line on standard error and exit code 1.
+def one_line_errors(*, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+    """Run a command's body, shown; a `ReconError` becomes one line on standard error and code 1.
 
     Any other exception is a bug: one line with the file that has its traceback, and exit code 3.
     Meanwhile file descriptor 1 is redirected to standard error, so that the output of native
-    libraries cannot get into that of ``--json``; with ``quiet`` that output is dropped, and it is
-    not shown that kernels are being compiled.
+    libraries cannot get into that of ``--json``; with ``quiet`` that output is dropped, and nothing
+    is shown of what is done.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # bytes of file names may not be UTF-8
             stream.reconfigure(errors="backslashreplace")
     try:
         _check_surroundings()
-        notice = _compiling_notice(quiet)
-        with _standard_output_kept_clean(quiet), when_compiling(notice):
+        from recon.cli.progress import watched
+
+        with _standard_output_kept_clean(quiet), watched(quiet=quiet, verbose=verbose):
             yield
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
@@ -106,22 +106,6 @@ def report_unforeseen(error: BaseException) -> int:
     what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
     typer.echo(f"error: internal error ({what}), please report: {where}", err=True)
     return _BUG
-
-
-def _compiling_notice(quiet: bool) -> Callable[[str], None]:
-    """Return what says on a terminal, once, why a command waits for the compiler."""
-    silent = quiet or not sys.stderr.isatty()
-
-    def show(kernel: str) -> None:
-        del kernel
-        nonlocal silent
-        if not silent:
-            silent = True
-            typer.echo(
-                "compiling kernels, once after an installation: about two minutes …", err=True
-            )
-
-    return show
 
 
 @contextmanager

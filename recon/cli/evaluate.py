@@ -85,7 +85,6 @@ def middlebury(
             threads=shared.threads,
             parallel=parallel,
             auto_range=range_ == "auto",
-            progress=shared.viewer(),
         )
         form = Table.latex if latex else Table.text
         tables = join(map(form, middlebury_tables(summary)))

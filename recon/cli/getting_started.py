@@ -38,8 +38,7 @@ def demo(
     with shared.one_line_errors():
         from recon.commands.demo import run_demo
 
-        settings, viewer = shared.settings(), shared.viewer()
-        run = run_demo(settings, out=out, mesh=mesh, threads=shared.threads, progress=viewer)
+        run = run_demo(shared.settings(), out=out, mesh=mesh, threads=shared.threads)
     shared.show(run.summary)
 
 
@@ -186,12 +185,10 @@ def fetch(
       recon datasets fetch kitti-raw/2011_09_26_drive_0013 tum-vi/room1
       recon datasets fetch euroc/vicon_room1 --address http://mirror.example/data
     """
-    with one_line_errors(quiet=quiet):
-        from recon.cli.progress import choose_viewer
+    with one_line_errors(quiet=quiet, verbose=verbose):
         from recon.commands.datasets import run_fetch
 
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        found = run_fetch(names, folder, address=address, progress=viewer)
+        found = run_fetch(names, folder, address=address)
     print_json(found) if json else print_datasets(found)
 
 

@@ -174,14 +174,12 @@ def piece(
     """
     if out is None and resume is None:
         raise typer.BadParameter("give --out FOLDER or --resume FOLDER")
-    with one_line_errors(quiet=quiet):
-        from recon.cli.progress import choose_viewer
+    with one_line_errors(quiet=quiet, verbose=verbose):
         from recon.commands.map_options import MapOptions
         from recon.commands.map_pieces import run_piece
 
-        viewer, going_on = choose_viewer(quiet=quiet, verbose=verbose), resume is not None
-        how: Any = {"progress": viewer, "resume": going_on}
-        summary = run_piece(plan, number, MapOptions("piece", resume or out, threads, **how))
+        options = MapOptions("piece", resume or out, threads, resume=resume is not None)
+        summary = run_piece(plan, number, options)
     print_json(summary) if json else print_run(summary, stages=verbose)
 
 

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from recon.commands.config import Changes, ReconConfig
     from recon.commands.map_options import MapOptions
     from recon.map.sessions.measured import Survey
-    from recon.run.work import Progress
 
 _KEYWORD: Final = inspect.Parameter.KEYWORD_ONLY
 Read = str | Callable[[Any], Mapping[str, Any]]
@@ -174,16 +173,14 @@ class Shared(Asked):
     verbose: Verbose = False
     threads: Threads = None
 
-    def viewer(self) -> Progress:
-        from recon.cli.progress import choose_viewer
-
-        return choose_viewer(quiet=self.quiet, verbose=self.verbose)
+    def one_line_errors(self) -> AbstractContextManager[None]:
+        return one_line_errors(quiet=self.quiet, verbose=self.verbose)
 
     def options(self, command: str = "map", out: Path | None = None, **more: Any) -> MapOptions:
-        """Return the options of a run that maps, which shows its progress."""
+        """Return the options of a run that maps."""
         from recon.commands.map_options import MapOptions
 
-        return MapOptions(command, out, self.threads, progress=self.viewer(), **more)
+        return MapOptions(command, out, self.threads, **more)
 
     def show(self, summary: Mapping[str, Any]) -> None:
         print_json(summary) if self.json else print_run(summary, stages=self.verbose)

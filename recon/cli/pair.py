@@ -109,7 +109,6 @@ def pair(
             out=out,
             formats=opt.names_in(formats),
             threads=shared.threads,
-            progress=shared.viewer(),
         )
     shared.show(run.summary)
 
@@ -145,6 +144,5 @@ def disparity(
             metres_per_unit=settings.source.metres_per_unit,
             max_megapixels=settings.readable_megapixels,
         )
-        viewer = shared.viewer()
-        run = run_disparity(given, settings, out=out, threads=shared.threads, progress=viewer)
+        run = run_disparity(given, settings, out=out, threads=shared.threads)
     shared.show(run.summary)

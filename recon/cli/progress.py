@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Final, TextIO
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.progress import (
@@ -16,18 +19,23 @@ from rich.progress import (
     ProgressColumn,
     Task,
     TextColumn,
+    TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.progress_bar import ProgressBar as Bar
 from rich.text import Text
 
+from recon.core.progress import LOGGER, Silent, Step, showing
+from recon.core.progress import Progress as Shown
 from recon.core.text import counted
-from recon.run.work import Progress as Shown
-from recon.run.work import Silent, Step
-from recon.sources.source import StereoSource
+
+if TYPE_CHECKING:
+    from recon.sources.source import StereoSource
 
 # Weight of the newest item in the displayed rate: steady enough to read, yet responsive.
 _RATE_WEIGHT: Final = 0.2
+_FIELDS: Final = ("rate", "state")
+_WAITED_S: Final = 2.0  # a stage that takes longer leaves a line
 _SLOW_S: Final = 10.0  # from which on an item has seconds, instead of a second items
 
 
@@ -42,6 +50,31 @@ def choose_viewer(
     if quiet or not (out.isatty() or verbose):
         return Silent()
     return ProgressBar(Console(file=out)) if out.isatty() else JsonLines(out)
+
+
+@contextmanager
+def watched(*, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
+    """Show what a command does until the body ends, from its first moment on."""
+    viewer = choose_viewer(quiet=quiet, verbose=verbose)
+    notes = _Notes() if isinstance(viewer, ProgressBar) else logging.NullHandler()
+    LOGGER.addHandler(notes)
+    try:
+        with showing(viewer):
+            if isinstance(viewer, ProgressBar):
+                viewer.on_stage("starting")
+            yield
+    finally:
+        LOGGER.removeHandler(notes)
+        if isinstance(viewer, ProgressBar):
+            viewer.close()
+
+
+class _Notes(logging.Handler):
+    """Writes what the library logs as a warning above the bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno >= logging.WARNING:
+            sys.stderr.write(f"{record.getMessage()}\n")
 
 
 class JsonLines:
@@ -68,45 +101,75 @@ class JsonLines:
 
 
 class ProgressBar:
-    """Shows a bar with the number of items, their rate, and the state of the last one."""
+    """Shows one line: the items of a series, their rate and the last one, or a stage and its time.
+
+    The line of a series stays when it ends, that of a stage only if somebody waited for it. What
+    begins within a series is the state of its line.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._progress: Progress | None = None
+        self._depth, self._stage, self._since_s = 0, "", 0.0
         self._seconds = math.nan
         self._unit = ""
         self._bad = 0
 
     def on_start(self, name: str, total: int, unit: str = "frames") -> None:
-        self.on_finish()
+        self._depth += 1
+        if self._depth > 1:
+            self._update(state=name)
+            return
+        self._end_stage()
         self._seconds, self._unit, self._bad = math.nan, unit, 0
-        self._progress = Progress(
-            FittingColumn(
-                [MofNCompleteColumn(), TextColumn("{task.fields[bad]}", style="bold red")],
-                [
-                    TextColumn("{task.fields[rate]}"),
-                    TimeRemainingColumn(),
-                    TextColumn("{task.fields[state]}", markup=False),
-                ],
-            ),
-            console=self._console,
-        )
-        self._progress.add_task(name, total=total or None, rate="", state="", bad="")
-        self._progress.start()
+        bad = TextColumn("{task.fields[bad]}", style="bold red")
+        rate, state = (TextColumn(f"{{task.fields[{one}]}}", markup=False) for one in _FIELDS)
+        column = FittingColumn([MofNCompleteColumn(), bad], [rate, TimeRemainingColumn(), state])
+        self._show(name, column, total=total or None)
 
     def on_step(self, step: Step) -> None:
-        if self._progress is None:
-            return
-        self._bad += not step.ok
-        word = "failed" if self._unit in ("jobs", "pieces") else "not trusted"
-        bad = f"{self._bad} {word}" if self._bad else ""
-        task = self._progress.task_ids[0]
-        self._progress.update(task, advance=1, rate=self._rate(step), state=step.state, bad=bad)
+        if self._depth == 1:
+            self._bad += not step.ok
+            word = "failed" if self._unit in ("jobs", "pieces") else "not trusted"
+            bad = f"{self._bad} {word}" if self._bad else ""
+            self._update(advance=1, rate=self._rate(step), state=step.state, bad=bad)
 
     def on_stage(self, name: str) -> None:
-        self._console.print(f"{name} …", style="dim", markup=False, highlight=False)
+        if self._depth:
+            self._update(state=name)
+            return
+        self._end_stage()
+        self._stage, self._since_s = name, time.monotonic()
+        if name:
+            self._show(name, FittingColumn([TimeElapsedColumn()]), total=None, transient=True)
 
     def on_finish(self) -> None:
+        self._depth = max(0, self._depth - 1)
+        if self._depth == 0:
+            self._stop()
+            self.on_stage(self._stage)  # what the series was part of goes on
+
+    def close(self) -> None:
+        """End what is shown, wherever the work ended."""
+        self._end_stage()
+
+    def _show(self, name: str, column: FittingColumn, *, total: int | None, **how: Any) -> None:
+        self._progress = Progress(column, console=self._console, refresh_per_second=4, **how)
+        self._progress.add_task(name, total=total, rate="", state="", bad="")
+        self._progress.start()
+
+    def _update(self, **fields: Any) -> None:
+        if self._progress is not None:
+            self._progress.update(self._progress.task_ids[0], **fields)
+
+    def _end_stage(self) -> None:
+        shown, took_s = self._progress is not None, time.monotonic() - self._since_s
+        self._stop()
+        if shown and self._depth == 0 and took_s > _WAITED_S:
+            line = f"{self._stage}: {took_s:.0f} s"
+            self._console.print(line, style="dim", markup=False, highlight=False)
+
+    def _stop(self) -> None:
         if self._progress is not None:
             self._progress.stop()
             self._progress = None

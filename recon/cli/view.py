@@ -41,14 +41,16 @@ def view(
       recon view outputs/map/latest
       recon view outputs/monday outputs/friday --port 8090
     """
-    with until_interrupted() as stopped, one_line_errors(quiet=quiet):
+    with until_interrupted() as stopped, one_line_errors(quiet=quiet or beside is not None):
         if beside is not None:
             os.nice(_LEAST_PRIORITY)
         from recon.commands.view import run_view
+        from recon.core.progress import stage
 
         ends = "Ctrl-C" if beside is None else "the run ends"
 
         def announce(url: str) -> None:  # also where it is quiet: nobody can guess the address
+            stage("")  # what follows is up to who looks
             typer.echo(f"{url} until {ends}", err=True)
 
         def over() -> bool:

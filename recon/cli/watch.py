@@ -13,6 +13,7 @@ from rich.live import Live
 
 from recon.cli.program import plan_jobs
 from recon.cli.tables import batch_table
+from recon.core.progress import stage
 from recon.run.batch.job import is_done
 from recon.run.batch.job_file import read_plan
 from recon.run.batch.results import JobResult, wrong_first
@@ -29,6 +30,7 @@ def show_batch(folder: Path) -> None:
 
 
 def _refresh(rounds: Iterator[list[JobResult]]) -> None:
+    stage("")  # the table says it
     with Live(console=Console(), auto_refresh=False) as live:
         for results in rounds:
             rows = [{**one.facts, "figures": one.figures} for one in wrong_first(results)]

@@ -32,7 +32,7 @@ def run_batch(
     if listed is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         begun = "--resume goes on with it" if (folder / PLAN).is_file() else "choose another --out"
         raise OutputError("output folder is not empty", where=folder, hint=begun)
-    with _hint(folder), Run("batch", folder, progress=options.progress, resume=True) as run:
+    with _hint(folder), Run("batch", folder, resume=True) as run:
         done = [job for job in jobs if is_done(folder / job.name)]
         ended = {job.name: result_of(job, last_outcome(folder, job.name), folder) for job in done}
         missing = [job for job in jobs if job.name not in ended]

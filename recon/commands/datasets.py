@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.core.errors import FormatError
-from recon.run.work import SILENT, Progress
 from recon.sources.datasets import (
     Part,
     datasets,
@@ -37,14 +36,13 @@ def run_fetch(
     folder: Path = FOLDER,
     *,
     address: str | None = None,
-    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Download, check and unpack data sets, or parts of them, that are not there yet.
 
     ``address`` is a mirror: a folder on a server that has the archives by their names.
     """
     parts = {part.name: part for name in names for part in find_parts(name)}
-    return {"datasets": [fetch_part(one, folder, address, progress) for one in parts.values()]}
+    return {"datasets": [fetch_part(one, folder, address) for one in parts.values()]}
 
 
 def run_verify(names: Sequence[str], folder: Path = FOLDER) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.fusion import fusion_range_m
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
-from recon.run.work import SILENT, Progress
 from recon.sources.one_pair import PairInput
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
@@ -38,10 +37,9 @@ def run_demo(
     out: Path | None = None,
     mesh: bool = True,
     threads: int | None = None,
-    progress: Progress = SILENT,
 ) -> MapRun:
     """Render the street of the configuration and map it: what `recon demo` does."""
-    options = MapOptions("demo", out, threads, mesh=mesh, progress=progress, audit=False)
+    options = MapOptions("demo", out, threads, mesh=mesh, audit=False)
     return run_map(demo_source(config), config, options)
 
 

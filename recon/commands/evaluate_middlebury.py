@@ -9,6 +9,7 @@ from pathlib import Path
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
+from recon.core.progress import Progress, series
 from recon.evaluation.middlebury.bench import (
     Bench,
     SceneDone,
@@ -26,7 +27,6 @@ from recon.io.files import StrPath
 from recon.io.images.disparity import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
 from recon.run.run import Run
-from recon.run.work import SILENT, Progress
 from recon.stereo.match.onnx import describe_network
 from recon.stereo.match.protocol import Matcher
 
@@ -42,7 +42,6 @@ def run_middlebury(
     threads: int | None = None,
     parallel: int = 1,
     auto_range: bool = False,
-    progress: Progress = SILENT,
 ) -> Figures:
     """Score matchers on Middlebury scenes: what `recon evaluate middlebury` does.
 
@@ -62,7 +61,6 @@ def run_middlebury(
         parallel: Scenes processed at once, sharing the threads. Above 1, timings are those of a
             busy machine.
         auto_range: Whether the disparity range is estimated from each pair.
-        progress: Shown each scene.
 
     Returns:
         The content of ``summary.json``.
@@ -85,7 +83,7 @@ def run_middlebury(
     names += [other.name for other in others]
     if not names:
         raise SettingsError("nothing to evaluate", hint="name a matcher, or a folder of results")
-    with Run("evaluate-middlebury", out, config, threads=threads, progress=progress) as run:
+    with Run("evaluate-middlebury", out, config, threads=threads) as run:
         bench = Bench(chosen, config, max(1, run.threads // parallel), auto_range=auto_range)
 
         def score(name: str, path: Path) -> SceneFigures | None:
@@ -103,11 +101,8 @@ def run_middlebury(
                     figures[other.name] = given.figures
             return figures
 
-        progress.on_start(str(folder), len(paths), "scenes")
-        try:
-            found = dict(_watched(score, paths, parallel, progress))
-        finally:
-            progress.on_finish()
+        with series(str(folder), len(paths), "scenes") as shown:
+            found = dict(_watched(score, paths, parallel, shown))
         summary = summarise_scenes(found, names, others, Path(folder))
         summary |= {"threads": run.threads, "parallel": parallel}
         if "onnx" in chosen:
@@ -126,7 +121,7 @@ def _watched(
     score: Callable[[str, Path], SceneFigures | None],
     paths: Mapping[str, Path],
     parallel: int,
-    progress: Progress,
+    shown: Progress,
 ) -> Iterator[tuple[str, SceneFigures | None]]:
     """Yield figures of each scene, in order, some scenes at once."""
     pool, last = ThreadPoolExecutor(parallel), time.perf_counter()
@@ -134,7 +129,7 @@ def _watched(
         scored = pool.map(score, paths.keys(), paths.values())
         for name, figures in zip(paths, scored, strict=True):
             now = time.perf_counter()
-            progress.on_step(SceneDone(name, figures, now - last))
+            shown.on_step(SceneDone(name, figures, now - last))
             last = now
             yield name, figures
     finally:

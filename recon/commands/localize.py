@@ -68,7 +68,7 @@ def run_localize(
         workspace = Workspace(map_, run.watch, run.threads)
         T_map_world = map_.first.T_map_world.tolist()
         where = {"map_run": str(map_path), "T_map_world": T_map_world}
-        how: Any = {"start": start, "progress": options.progress, "note": begin_states(where, run)}
+        how: Any = {"start": start, "note": begin_states(where, run)}
         options.begun(run.folder)
         drive = localize_sequence(source, workspace, config, **how)
         has_grid = folder is not None and (folder / GRID).is_file()

@@ -248,7 +248,6 @@ def map_drive(
         config,
         known_poses=options.known_poses,
         prior=options.prior,
-        progress=options.progress,
         workspace=Workspace(map_, run.watch, run.threads),
     )
 

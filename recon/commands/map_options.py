@@ -30,7 +30,6 @@ from recon.run.batch.cluster import BatchOptions
 from recon.run.directory import RECORD, STARTED, state_folder
 from recon.run.machine import versions
 from recon.run.run import Run
-from recon.run.work import SILENT, Progress
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource, mark_of
 from recon.stereo.rectify.rectifier import turns_of
@@ -53,7 +52,6 @@ class MapOptions:
         prior: Motion of the left camera from another sensor, in the time base of the source.
         prior_origin: Where it is from, for the summary.
         mesh: Whether to reconstruct a surface.
-        progress: Shown how far the run is.
         audit: Whether a quick audit of the recording comes first, unless the settings forbid it.
         warn: Given the findings of the audit, before the drive is mapped.
         begun: Given the folder of the run, once its map or what it has located can be read.
@@ -72,7 +70,6 @@ class MapOptions:
     prior: Trajectory | None = None
     prior_origin: str = ""
     mesh: bool = True
-    progress: Progress = SILENT
     audit: bool = True
     warn: Callable[[tuple[str, ...]], None] = lambda findings: None
     begun: Callable[[Path], None] = lambda folder: None
@@ -160,7 +157,7 @@ class MapOptions:
 
     def run(self, config: ReconConfig) -> Run:
         """Return the run, which begins when it is entered."""
-        how: Any = {"threads": self.threads, "progress": self.progress, "resume": self.resume}
+        how: Any = {"threads": self.threads, "resume": self.resume}
         return Run(self.command, self.out, config, **how)
 
     def begin(self, run: Run, source: StereoSource, config: ReconConfig) -> Map:

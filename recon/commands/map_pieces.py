@@ -75,7 +75,7 @@ def map_pieces(
     To close its loops is left to `map_sequence`, for which it is a drive resumed at its end.
     """
     plan, session = run.state(_PLAN), map_.session()
-    spread = options.workers or BatchOptions(progress=options.progress)
+    spread = options.workers or BatchOptions()
     if len(session) and not plan.is_file():
         raise SettingsError("the run was begun in one piece", hint="resume it without --workers")
     _refuse_what_does_not_combine(config, options)
@@ -126,7 +126,7 @@ def run_piece(plan: Path, number: int, options: MapOptions) -> dict[str, Any]:
     part = SourcePart(source, *pieces[number])
     with options.run(config) as run, options.begin(run, part, config) as map_:
         work = Workspace(map_, run.watch, run.threads)
-        map_sequence(part, config, progress=options.progress, workspace=work)
+        map_sequence(part, config, workspace=work)
         keep_map(map_, run.path(MAP_FILE))
         summary = {"frames": len(part), "warnings": []}
         run.finish(summary, source=part.name, inputs=())

@@ -60,7 +60,7 @@ def run_merge(
     Args:
         runs: Folders of finished runs; the world and the axes of the first are those of the map.
         config: Settings of the first run with changes; None = its own.
-        options: Folder, threads, mesh and progress of the run; None = the defaults.
+        options: Folder, threads and mesh of the run; None = the defaults.
         survey: Positions that were measured during drives, whose paths are bent to run through
             them; None = none.
 
@@ -152,9 +152,9 @@ def _make_joined(
     survey: Survey | None = None,
 ) -> dict[str, Any]:
     """Fill the map of a run, which may replace another, link and place its drives, and report."""
-    how: Any = {"threads": options.threads, "progress": options.progress}
+    out = replaced or options.out
     with (
-        WholeRun(options.command, replaced or options.out, settings, **how) as run,
+        WholeRun(options.command, out, settings, threads=options.threads) as run,
         Map.create(run.path(MAP_FILE), cache_bytes=settings.memory.cache_bytes) as map_,
         _damage_named(map_, inputs),
     ):

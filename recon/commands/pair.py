@@ -11,6 +11,7 @@ import numpy as np
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
 from recon.core.plugins import name_of
+from recon.core.progress import stage
 from recon.core.values import (
     Disparity,
     Reason,
@@ -30,7 +31,6 @@ from recon.map.drive.sequence import check_cloud
 from recon.report.pair_page import PairRun, write_disparity_images, write_pair_page
 from recon.rig.audit.audit import check_found, find_pair_faults
 from recon.run.run import Run, plain
-from recon.run.work import SILENT, Progress
 from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 from recon.stereo.match.onnx import describe_network
@@ -45,7 +45,6 @@ def run_pair(
     out: StrPath | None = None,
     formats: Sequence[str] = (),
     threads: int | None = None,
-    progress: Progress = SILENT,
 ) -> PairRun:
     """Reconstruct one pair: what `recon pair` does.
 
@@ -59,22 +58,20 @@ def run_pair(
         out: Result folder; None = a new one below ``outputs/``.
         formats: Suffixes of the mesh files besides PLY, without the dot.
         threads: Threads to use; None = all cores. Changes no result.
-        progress: Shown the name of each long stage when it begins.
 
     Raises:
         ReconError: The pair cannot be matched, or the folder not be written; nothing is left.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
     check_mesh_formats(formats)
-    with Run("pair", out, config, threads=threads, progress=progress) as run:
+    with Run("pair", out, config, threads=threads) as run:
         reconstructor = _reconstructor(given, config, run)
         with run.stage("audit"):
             faults = find_pair_faults(given, config, metric=not given.up_to_scale)
-        progress.on_stage("match")
+        stage("match")
         frame = reconstructor.reconstruct(given.pair)
         found = check_found(frame.disparity, given.pair.name, frame.support, faults)
         check_cloud(frame, config.cloud, given.pair.name)
-        progress.on_stage("mesh")
         with run.stage("mesh"):
             mesh, coverage, unmeshed = mesh_frame(frame, config.mesh)
         with run.stage("write"):
@@ -102,18 +99,17 @@ def run_disparity(
     *,
     out: StrPath | None = None,
     threads: int | None = None,
-    progress: Progress = SILENT,
 ) -> PairRun:
     """Match one pair, and write disparity and reasons alone: what `recon disparity` does.
 
     The arguments and errors are those of `run_pair`.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
-    with Run("disparity", out, config, threads=threads, progress=progress) as run:
+    with Run("disparity", out, config, threads=threads) as run:
         reconstructor = _reconstructor(given, config, run)
         with run.stage("audit"):
             faults = find_pair_faults(given, config, metric=False)
-        progress.on_stage("match")
+        stage("match")
         pair, disparity = reconstructor.match(given.pair)
         inspected, support = reconstructor.inspect(pair)
         found = check_found(disparity, given.pair.name, support, faults)

@@ -94,7 +94,6 @@ def make(order: Order, products: Sequence[str] = USUAL) -> Products:
         product, run, settings = PRODUCTS[name], order.run, order.placed.tiles.config
         if product.needs_occupancy and not has_occupancy(order.map):
             check_rays(order.map.first, settings)
-        run.progress.on_stage(name)
         try:
             with run.stage(name):
                 made[name] = product.write(order)

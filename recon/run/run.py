@@ -17,12 +17,13 @@ from typing import Any, Final
 
 from typing_extensions import Self
 
+from recon.core import progress
 from recon.core.settings import Settings
 from recon.io.fields import write_yaml
 from recon.io.files import StrPath, resolved
 from recon.run.directory import RECORD, RunDirectory, default_folder
 from recon.run.machine import peak_memory_mb, versions
-from recon.run.work import SILENT, Progress, Stopwatch, use_threads
+from recon.run.work import Stopwatch, use_threads
 
 CONFIG: Final = "config.yaml"
 SUMMARY: Final = "summary.json"
@@ -51,7 +52,6 @@ class Run(RunDirectory):
         config: Settings | None = None,
         *,
         threads: int | None = None,
-        progress: Progress = SILENT,
         resume: bool = False,
     ) -> None:
         standard = default_folder(command)
@@ -61,7 +61,6 @@ class Run(RunDirectory):
         super().__init__(folder, latest=out is None or (resume and stamped), resume=resume)
         self.command = command
         self.threads = use_threads(threads)
-        self.progress = progress
         self.watch = Stopwatch()
         self._config = config
         self._start = time.perf_counter()
@@ -81,13 +80,13 @@ class Run(RunDirectory):
         write_yaml(self.path(CONFIG), config.recorded(self.command))
 
     def stage(self, name: str) -> AbstractContextManager[None]:
-        """Time the body of a ``with`` statement as part of the stage ``name``."""
+        """Time the body of a ``with`` statement as part of the stage ``name``, and say it."""
+        progress.stage(name)
         return self.watch.stage(name)
 
     @contextmanager
     def report(self, summary: dict[str, Any]) -> Iterator[None]:
         """Time the writing of the report, which finds the cost of the run in the summary."""
-        self.progress.on_stage("report")
         summary |= self._cost
         with self.stage("report"):
             yield

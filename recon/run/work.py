@@ -1,4 +1,4 @@
-"""Work and its cost: what runs at the same time, in how much memory; seconds; who is shown it."""
+"""Work and its cost: what runs at the same time, in how much memory; seconds."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, Final, Protocol, TypeVar, runtime_checkable
+from typing import Final, TypeVar
 
 import cv2
 from pydantic import Field
@@ -187,54 +187,6 @@ def parse_size_mb(text: str) -> float:
     if found is None or unit is None or float(found[1]) == 0:
         raise SettingsError("cannot read this size", got=text, expected="such as 2G or 1500M")
     return float(found[1]) * unit
-
-
-class Step(Protocol):
-    """One item of a run that is done, such as a frame or a scene."""
-
-    @property
-    def seconds(self) -> float:
-        """Time since the previous item was done."""
-
-    @property
-    def ok(self) -> bool:
-        """Whether its result is to be trusted."""
-
-    @property
-    def event(self) -> Mapping[str, Any]:
-        """Its figures for programs, ready for JSON; ``event`` names the kind of item."""
-
-    @property
-    def state(self) -> str:
-        """Its result in a few words, for people; plain text."""
-
-
-@runtime_checkable
-class Progress(Protocol):
-    """Receives the progress of a run, in its thread; what is not overridden does nothing."""
-
-    def on_start(self, name: str, total: int, unit: str = "frames") -> None:
-        """Begin a series of ``total`` items."""
-        return
-
-    def on_step(self, step: Step) -> None:
-        """Count an item that is done."""
-        return
-
-    def on_stage(self, name: str) -> None:
-        """Begin a stage that is not per item, such as ``mesh``."""
-        return
-
-    def on_finish(self) -> None:
-        """End the series, successfully or not."""
-        return
-
-
-class Silent(Progress):
-    """Shows no progress."""
-
-
-SILENT = Silent()  # for runs that nobody watches
 
 
 class Stopwatch:

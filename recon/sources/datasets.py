@@ -13,7 +13,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cache
@@ -23,13 +23,13 @@ from typing import Any, Final
 from pydantic import Field
 
 from recon.core.errors import DownloadError, FormatError, OutputError, SettingsError
+from recon.core.progress import Counted, Progress, series, stage
 from recon.core.settings import Settings
 from recon.io.atomic import take_lock, write_text
 from recon.io.download import OnBytes, download, unpack
 from recon.io.fields import read_toml
 from recon.io.files import read_text, reading
 from recon.run.directory import refuse_links
-from recon.run.work import Progress
 
 _LIST: Final = Path(__file__).with_suffix(".toml")
 RECORD: Final = "dataset.json"  # what was fetched, and size and hash of each file
@@ -130,26 +130,12 @@ def find_parts(name: str) -> list[Part]:
     return found
 
 
-@dataclass(frozen=True)
-class _Megabyte:
-    """A megabyte that has arrived, in so many seconds; a `Step` of the progress."""
-
-    number: int
-    seconds: float
-    ok: bool = True
-    state: str = ""
-
-    @property
-    def event(self) -> dict[str, Any]:
-        return {"event": "megabyte", "number": self.number, "seconds": round(self.seconds, 3)}
-
-
 def is_fetched(place: Path) -> bool:
     """Return whether a folder holds a part of a data set that was fetched."""
     return (place / RECORD).is_file()
 
 
-def fetch_part(part: Part, folder: Path, mirror: str | None, progress: Progress) -> dict[str, Any]:
+def fetch_part(part: Part, folder: Path, mirror: str | None) -> dict[str, Any]:
     """Fetch one part into its folder, unless it is there."""
     place, work = folder / part.name, folder / _PARTIAL / part.name
     found = {"name": part.name, "out": str(place)}
@@ -165,8 +151,8 @@ def fetch_part(part: Part, folder: Path, mirror: str | None, progress: Progress)
     except OSError as error:
         raise OutputError("cannot be written", where=folder, got=error.strerror) from error
     try:
-        received = [_receive(one, part, work, mirror, progress) for one in part.archives]
-        progress.on_stage("unpack")
+        received = [_receive(one, part, work, mirror) for one in part.archives]
+        stage("unpack")
         count = _unpack(part, work, received)
         place.parent.mkdir(parents=True, exist_ok=True)
         (work / "files").replace(place)
@@ -180,16 +166,14 @@ def fetch_part(part: Part, folder: Path, mirror: str | None, progress: Progress)
     return {**found, "files": count, "fetched": True}
 
 
-def _receive(
-    one: Archive, part: Part, work: Path, mirror: str | None, progress: Progress
-) -> dict[str, Any]:
+def _receive(one: Archive, part: Part, work: Path, mirror: str | None) -> dict[str, Any]:
     """Download an archive that is not there yet, and check it; returns what is known of it."""
     address = one.path if mirror is None else f"{mirror.rstrip('/')}/{one.file}"
     path, promised = work / one.file, one.digest
     if kind := part.dataset.digest_beside:
         promised = _published(f"{address}.{kind}", kind, work)
     if not path.is_file():
-        with _shown(one, progress) as on_bytes:
+        with _shown(one) as on_bytes:
             download(address, path, one.bytes, on_bytes)
     found = _digest(path, promised.partition(":")[0]) if promised else None
     if found != promised:
@@ -213,26 +197,24 @@ def _published(address: str, kind: str, work: Path) -> str:
 
 
 @contextmanager
-def _shown(one: Archive, progress: Progress) -> Iterator[OnBytes]:
+def _shown(one: Archive) -> Iterator[OnBytes]:
     """Yield what shows the megabytes of a file, also of those that an earlier call received."""
-    shown, last = -1, time.perf_counter()
+    done, last = 0, time.perf_counter()
+    with ExitStack() as stack:
+        shown: list[Progress] = []
 
-    def on_bytes(done: int, total: int | None) -> None:
-        nonlocal shown, last
-        if shown < 0:
-            progress.on_start(one.file, math.ceil((total or 0) / _MEGABYTE), "MB")
-            shown = 0
-        now = time.perf_counter()
-        while shown < done // _MEGABYTE:
-            shown += 1
-            progress.on_step(_Megabyte(shown, now - last))
-            last = now
+        def on_bytes(received: int, total: int | None) -> None:
+            nonlocal done, last
+            if not shown:
+                count = math.ceil((total or 0) / _MEGABYTE)
+                shown.append(stack.enter_context(series(one.file, count, "MB")))
+            now = time.perf_counter()
+            while done < received // _MEGABYTE:
+                done += 1
+                shown[0].on_step(Counted(now - last))
+                last = now
 
-    try:
         yield on_bytes
-    finally:
-        if shown >= 0:
-            progress.on_finish()
 
 
 def _unpack(part: Part, work: Path, received: Sequence[Mapping[str, Any]]) -> int:

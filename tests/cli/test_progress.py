@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from recon.cli.progress import JsonLines, ProgressBar, announce, choose_viewer, warn
+from recon.core.progress import Counted, Progress, Silent
 from recon.evaluation.middlebury.bench import SceneDone
 from recon.map.drive.mapper import FrameResult
 from recon.map.localize.localizer import Located, State
@@ -17,8 +18,6 @@ from recon.map.localize.sequence import LocalizedFrame
 from recon.odometry.protocol import OdometryHealth
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult
-from recon.run.work import Progress, Silent
-from recon.sources.datasets import _Megabyte
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.run.batch.jobs import job
@@ -111,7 +110,7 @@ JOB = JobResult(job("night"), Outcome("failed", "no images", 0.25))
         pytest.param([frame(1), frame(2, ok=False)], "frames", "not trusted", id="map demo live"),
         pytest.param([located(State.TRACKING), located(State.LOST)], "frames", "", id="localize"),
         pytest.param([SceneDone("Motorcycle", None, 0.25)] * 2, "scenes", "", id="middlebury"),
-        pytest.param([_Megabyte(1, 0.25), _Megabyte(2, 0.25)], "MB", "", id="datasets"),
+        pytest.param([Counted(0.25), Counted(0.25)], "MB", "", id="datasets"),
         pytest.param([JOB, JOB], "jobs", "2 failed", id="batch"),
         pytest.param([JOB, JOB], "pieces", "2 failed", id="pieces"),
     ],

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from recon.core.errors import FormatError
+from recon.core.progress import Silent
 from recon.core.values import StereoCalibration
 from recon.map.drive.mapper import FrameResult
 from recon.map.map import Map
 from recon.odometry.rig.fault import NAMES
 from recon.odometry.rig.fit import FittedFault
 from recon.odometry.rig.refine import RefinedRig
-from recon.run.work import Silent
 from recon.stereo.rectify.row_alignment import correct_rig
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +31,7 @@ class Breaks(Silent):
         self.frame, self.error = frame, error or KeyboardInterrupt()
 
     def on_step(self, result: FrameResult) -> None:
-        if result.index == self.frame:
+        if getattr(result, "index", None) == self.frame:
             raise self.error
 
 

@@ -11,6 +11,7 @@ from recon.commands.config import load_config
 from recon.commands.localize import run_live
 from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
+from recon.core.progress import showing
 from recon.io.trajectory import read_tum
 from recon.street.settings import StreetScene
 from tests.flow.runs import Breaks, content, summary_of
@@ -30,8 +31,9 @@ def broken(street_film: Film) -> Film:
 
 
 def _map(drive: Film, out: Path, *, resume: bool = False, breaks: int = -1) -> MapRun:
-    options = MapOptions(audit=False, out=out, mesh=False, resume=resume, progress=Breaks(breaks))
-    return run_map(drive, load_config(None, ["checkpoints.every_frames=5"]), options)
+    options = MapOptions(audit=False, out=out, mesh=False, resume=resume)
+    with showing(Breaks(breaks)):
+        return run_map(drive, load_config(None, ["checkpoints.every_frames=5"]), options)
 
 
 @pytest.fixture(scope="module")

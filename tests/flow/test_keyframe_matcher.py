@@ -9,6 +9,7 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import ReconError
+from recon.core.progress import showing
 from recon.sources.registry import open_source
 from recon.stereo.match import registry
 from recon.stereo.match.sgm import SgmMatcher
@@ -40,8 +41,9 @@ def matched(monkeypatch):
 
 def _run(drive, out, *settings, progress=None, **more):
     usual = ("checkpoints.every_frames=4", "submaps.length_m=4", "submaps.tile_m=25.6")
-    options = MapOptions(audit=False, out=out, mesh=False, progress=progress or Breaks(), **more)
-    return run_map(open_source(drive), load_config(None, [*usual, *settings]), options)
+    options = MapOptions(audit=False, out=out, mesh=False, **more)
+    with showing(progress or Breaks()):
+        return run_map(open_source(drive), load_config(None, [*usual, *settings]), options)
 
 
 def test_views_that_show_something_new_are_matched_again(drive, matched, tmp_path):

@@ -14,6 +14,7 @@ from recon.commands.localize import run_live
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError, SettingsError, SourceError
+from recon.core.progress import Silent, showing
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.calibration import read_calibration
 from recon.io.trajectory import read_tum
@@ -22,7 +23,6 @@ from recon.map.drive.mapper import FrameResult
 from recon.map.map import Map
 from recon.rig.cameras import CameraSource, is_camera, open_camera_source
 from recon.rig.capture import CaptureSettings, RecordingSettings
-from recon.run.work import Silent
 from recon.sources import live
 from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings
@@ -66,15 +66,16 @@ class Watch(Silent):
 def watch():
     watch = Watch()
     watch.steps = []
-    watch.on_step = watch.steps.append
+    watch.on_step = lambda s: watch.steps.append(s) if isinstance(s, FrameResult) else None
     return watch
 
 
 @pytest.fixture
 def play(tmp_path, watch):
     def play_drive(source, config=None, rate=10.0, **options):
-        into = MapOptions("live", tmp_path / "live", mesh=False, progress=watch)
-        return run_live(source, config or load_config(), into, rate=rate, **options)
+        into = MapOptions("live", tmp_path / "live", mesh=False)
+        with showing(watch):
+            return run_live(source, config or load_config(), into, rate=rate, **options)
 
     return play_drive
 

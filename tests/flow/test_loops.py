@@ -11,6 +11,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.commands.map import MapRun, run_map
 from recon.commands.map_options import MapOptions
+from recon.core.progress import showing
 from recon.core.values import SequenceTruth
 from recon.io.trajectory import read_tum
 from recon.stereo.frame import FrameReconstructor
@@ -34,8 +35,9 @@ def _film(**street: object) -> Film:
 
 
 def _run(drive: Film, out: Path, *settings: str, resume: bool = False, breaks: int = -1) -> MapRun:
-    options = MapOptions(audit=False, out=out, mesh=False, resume=resume, progress=Breaks(breaks))
-    return run_map(drive, load_config(None, settings), options)
+    options = MapOptions(audit=False, out=out, mesh=False, resume=resume)
+    with showing(Breaks(breaks)):
+        return run_map(drive, load_config(None, settings), options)
 
 
 def _content(folder: Path) -> dict[str, bytes]:

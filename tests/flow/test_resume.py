@@ -8,6 +8,7 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, SettingsError
+from recon.core.progress import showing
 from recon.map.drive.mapper import FrameResult
 from recon.sources.registry import open_source
 from tests.flow.runs import STATE, Breaks, content
@@ -18,8 +19,9 @@ FRAMES = 15
 
 def _run(drive, out, progress=None, *settings, **more):
     usual = ("checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=25.6")
-    options = MapOptions(audit=False, out=out, mesh=False, progress=progress or Breaks(), **more)
-    return run_map(open_source(drive), load_config(None, [*usual, *settings]), options)
+    options = MapOptions(audit=False, out=out, mesh=False, **more)
+    with showing(progress or Breaks()):
+        return run_map(open_source(drive), load_config(None, [*usual, *settings]), options)
 
 
 @pytest.fixture(scope="module")

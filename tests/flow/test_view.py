@@ -22,10 +22,11 @@ from recon.commands.demo import demo_source
 from recon.commands.localize import run_localize
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.core.progress import Silent, showing
 from recon.core.values import UNKNOWN
 from recon.io.models.ply import read_ply
+from recon.map.drive.mapper import FrameResult
 from recon.run.directory import STARTED, state_folder
-from recon.run.work import Silent
 from recon.view.follow import add_located, finish, follow_located, grow
 from recon.view.scene import colours
 from tests.flow.conftest import SMALL_STREET
@@ -127,8 +128,9 @@ class Watching(Silent):
     def begin(self, folder: Path) -> None:
         self.coming = grow(folder, state_folder(folder) / STARTED)
 
-    def on_step(self, _: object) -> None:
-        self.seen.append(next(self.coming))
+    def on_step(self, step: object) -> None:
+        if isinstance(step, FrameResult):
+            self.seen.append(next(self.coming))
 
 
 def test_a_path_is_seen_to_grow_while_its_drive_is_located(small_demo, tmp_path):
@@ -146,8 +148,9 @@ def test_a_path_is_seen_to_grow_while_its_drive_is_located(small_demo, tmp_path)
         following.coming = follow_located([of_map], folder)
         assert len(next(following.coming).paths[1].cloud) == 0
 
-    options = MapOptions("localize", out, progress=following, begun=begin)
-    run_localize(demo_source(config), small_demo, config, options)
+    options = MapOptions("localize", out, begun=begin)
+    with showing(following):
+        run_localize(demo_source(config), small_demo, config, options)
     counts = [len(scene.paths[1].cloud) for scene in following.seen if scene is not None]
     assert counts == sorted(counts)
     assert len(set(counts)) > 3
@@ -165,7 +168,8 @@ def map_street(out: Path, **how: Any) -> None:
 
 def test_a_map_is_seen_to_grow_and_is_the_same_map_as_unseen(tmp_path):
     watching = Watching()
-    map_street(tmp_path / "seen", progress=watching, begun=watching.begin)
+    with showing(watching):
+        map_street(tmp_path / "seen", begun=watching.begin)
     grown = [scene for scene in watching.seen if scene is not None and scene.points]
     counts = [len(scene.points) for scene in grown]
     assert counts == sorted(counts)

@@ -11,6 +11,7 @@ from recon.commands.config import load_config
 from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.core.progress import showing
 from recon.io.images.image import write_image
 from tests.flow.runs import Breaks
 from tests.scenery.kitti import street_drive
@@ -66,8 +67,8 @@ def good_state(tmp_path_factory):
     street_drive(folder / "drive", **DRIVE)
     config = load_config(None, ["checkpoints.every_frames=1", "submaps.length_m=1"])
     source, options = MapOptions(source=folder / "drive", mesh=False).open(config)
-    options = replace(options, audit=False, out=folder / "run", progress=Breaks(3))
-    with pytest.raises(KeyboardInterrupt):
+    options = replace(options, audit=False, out=folder / "run")
+    with pytest.raises(KeyboardInterrupt), showing(Breaks(3)):
         run_map(source, config, options)
     return folder
 

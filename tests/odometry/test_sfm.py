@@ -12,12 +12,12 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import MissingDependencyError, RegistrationError, SettingsError
 from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import invert
+from recon.core.progress import showing
 from recon.map.store.records import Store
 from recon.odometry.protocol import Odometry, OdometryFrame
 from recon.odometry.sfm.colmap import find_features
 from recon.odometry.sfm.find import SfmOptions, find_poses
 from recon.odometry.sfm.found import FoundOdometry
-from recon.run.work import Silent
 from recon.sources.registry import open_source
 from recon.stereo.rectify.rectifier import RectificationSettings
 from recon.street.settings import StreetScene
@@ -102,12 +102,12 @@ def test_of_many_pairs_those_are_matched_that_look_alike(photos, found, monkeypa
 def test_a_run_that_is_resumed_does_not_look_for_poses_again(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
     drive, config = street_drive(tmp_path, 6, 320), load_config(None, ["odometry.method=sfm"])
-    options = MapOptions(out=tmp_path / "run", mesh=False, audit=False, progress=Breaks(0))
-    with pytest.raises(KeyboardInterrupt, match="--resume"):
+    options = MapOptions(out=tmp_path / "run", mesh=False, audit=False)
+    with pytest.raises(KeyboardInterrupt, match="--resume"), showing(Breaks(0)):
         run_map(open_source(drive), config, options)
     assert not [*(tmp_path / "run").rglob("sfm-*")]
     monkeypatch.setattr("recon.map.drive.sequence.find_poses", None)
-    run = run_map(open_source(drive), config, replace(options, resume=True, progress=Silent()))
+    run = run_map(open_source(drive), config, replace(options, resume=True))
     assert (run.summary["sfm"]["registered"], run.summary["frames_not_trusted"]) == (6, 0)
 
 

@@ -12,12 +12,12 @@ import pytest
 import yaml
 
 from recon.core.errors import FormatError, OutputError
+from recon.core.progress import Silent, showing
 from recon.core.settings import Settings
 from recon.io.atomic import exchange
 from recon.run import directory
 from recon.run.directory import RunDirectory, refuse_links, state_folder
 from recon.run.run import Run, WholeRun, fingerprint, plain
-from recon.run.work import Silent
 
 
 class _Size(Settings):
@@ -38,7 +38,7 @@ def test_a_run_writes_configuration_summary_and_record(tmp_path, monkeypatch):
     monkeypatch.setattr("recon.run.run.peak_memory_mb", lambda: next(peak_mb))
     notes = _Notes()
     summary: dict[str, Any] = {"points": 3, "warnings": ["few points"]}
-    with Run("pair", out, _Size(), threads=1, progress=notes) as run:
+    with showing(notes), Run("pair", out, _Size(), threads=1) as run:
         for _ in range(2):
             with run.stage("match"):
                 time.sleep(0.01)
@@ -50,7 +50,7 @@ def test_a_run_writes_configuration_summary_and_record(tmp_path, monkeypatch):
             run.write_json("figures.json", {"t_rel_percent": math.nan})
         run.finish(summary, source="im0", inputs=[photo], record={"mapped_by": "demo"})
 
-    assert notes.stages == ["report"]
+    assert notes.stages == ["match", "match", "report", "hash"]
     assert json.loads((out / "summary.json").read_text()) == summary
     assert summary["out"] == str(out)
     cost = ("seconds", "stages", "peak_memory_mb")

@@ -13,8 +13,11 @@ import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Final
+
+from recon.core.progress import LOGGER
 
 _PACKAGE: Final = Path(__file__).parents[2]
 _PREFIX: Final = "kernels-"
@@ -32,9 +35,15 @@ def when_compiling(notify: Callable[[str], None]) -> Iterator[None]:
 
 
 def announce(kernel: str) -> None:
-    """Notify all listeners that a kernel is about to be compiled."""
+    """Notify all listeners that a kernel is about to be compiled; the first time, log it."""
+    _log_compiling()
     for notify in tuple(_LISTENERS):
         notify(kernel)
+
+
+@cache
+def _log_compiling() -> None:
+    LOGGER.warning("compiling kernels, once after an installation: about two minutes …")
 
 
 def cache_parent() -> Path:

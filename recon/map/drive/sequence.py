@@ -14,6 +14,7 @@ import numpy as np
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert, transform_cloud
+from recon.core.progress import series, stage
 from recon.core.text import counted
 from recon.core.values import (
     Disparity,
@@ -45,7 +46,7 @@ from recon.odometry.sfm.find import SfmOptions, find_poses
 from recon.odometry.sfm.found import FoundOdometry, FoundPoses
 from recon.odometry.visual import VisualOdometry
 from recon.run.machine import available_cores
-from recon.run.work import SILENT, Progress, serial_algebra
+from recon.run.work import serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedFrame
 
@@ -190,7 +191,6 @@ def map_sequence(
     *,
     known_poses: Trajectory | None = None,
     prior: Trajectory | None = None,
-    progress: Progress = SILENT,
     workspace: Workspace | None = None,
 ) -> MappedSequence:
     """Register and fuse all frames of a source, and close loops in the path.
@@ -205,7 +205,6 @@ def map_sequence(
             unchanged, without loop closure.
         prior: Motion of the left camera from wheel odometry, an IMU or GNSS, in the time base of
             the source; only relative motions are used.
-        progress: Shown each frame.
         workspace: Map, threads and stopwatch of the run; None = a temporary map, all cores,
             not timed.
 
@@ -231,7 +230,7 @@ def map_sequence(
     session = work.session(source, config)
     odometry: Odometry
     if by_sfm:
-        progress.on_stage("sfm")
+        stage("register the photos")
         odometry = _photos(source, config, work, session)
     else:
         odometry = odometry_of(config, source, known_poses, prior, used, guide)
@@ -246,15 +245,13 @@ def map_sequence(
     if isinstance(odometry, FoundOdometry) and not len(mapper):
         drive.begin_at(int(odometry.found.models[0].frames[0]))
     steps = drive.frames(tracks)
-    progress.on_start(source.name, len(source))
     try:
-        with serial_algebra(), closing(steps):
+        with serial_algebra(), series(source.name, len(source)) as shown, closing(steps):
             for step in steps:
-                progress.on_step(step)
+                shown.on_step(step)
             drive.wait()
     finally:
         drive.stop()
-        progress.on_finish()
     drive.finish()
     return MappedSequence(
         map=work.map,

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
+from recon.core.progress import series
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
@@ -20,7 +21,7 @@ from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
-from recon.run.work import SILENT, Progress, look_ahead, serial_algebra
+from recon.run.work import look_ahead, serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
 
@@ -169,7 +170,6 @@ def localize_sequence(
     config: DriveSettings,
     *,
     start: StartPose | None = None,
-    progress: Progress = SILENT,
     note: Callable[[LocalizedFrame], object] = lambda frame: None,
 ) -> LocalizedDrive:
     """Find all frames of a source in a map, which is not changed.
@@ -191,25 +191,21 @@ def localize_sequence(
         return OdometryFrame(*reconstructor.match(pair))
 
     frames: list[LocalizedFrame] = []
-    progress.on_start(source.name, len(source))
     begun = time.perf_counter()
-    try:
-        with serial_algebra():
-            # What is matched ahead of its turn would be old when it is located.
-            pairs = source.frames()
-            matched = map(match, pairs) if source.live else look_ahead(match, pairs)
-            for index, frame in enumerate(matched):
-                with watch.stage("localize"):
-                    start_s = time.perf_counter()
-                    located = localizer.add(frame, hurried=source.hurried)
-                    seconds = time.perf_counter() - start_s
-                frames.append(LocalizedFrame(index, frame.pair.timestamp_s, seconds, located))
-                note(frames[-1])
-                source.note_located(index)
-                progress.on_step(frames[-1])
-                config.memory.check(f"frame {index}")
-    finally:
-        progress.on_finish()
+    with serial_algebra(), series(source.name, len(source)) as shown:
+        # What is matched ahead of its turn would be old when it is located.
+        pairs = source.frames()
+        matched = map(match, pairs) if source.live else look_ahead(match, pairs)
+        for index, frame in enumerate(matched):
+            with watch.stage("localize"):
+                start_s = time.perf_counter()
+                located = localizer.add(frame, hurried=source.hurried)
+                seconds = time.perf_counter() - start_s
+            frames.append(LocalizedFrame(index, frame.pair.timestamp_s, seconds, located))
+            note(frames[-1])
+            source.note_located(index)
+            shown.on_step(frames[-1])
+            config.memory.check(f"frame {index}")
     if not frames:
         raise RegistrationError("the source has no frame", where=source.name)
     T_map_world = map_.first.T_map_world

@@ -16,7 +16,6 @@ from uuid import uuid4
 from recon.core.errors import ClusterError, ReconError, SettingsError, require
 from recon.run.batch.job import Job, Outcome, last_outcome, run_job
 from recon.run.machine import available_cores
-from recon.run.work import SILENT, Progress
 
 EXTRA: Final = "cluster"
 _REACH_S: Final = 20.0
@@ -57,7 +56,6 @@ class BatchOptions:
     scheduler: str | None = None
     workers: int | None = None
     fail_fast: bool = False
-    progress: Progress = SILENT
 
     def connect(self) -> AbstractContextManager[Cluster]:
         """Return the workers, for ``with``."""

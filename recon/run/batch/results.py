@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from recon.core.progress import series, stage
 from recon.io.files import read_text, reading
 from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.run.batch.job import Job, Outcome, log_file
@@ -99,17 +100,13 @@ def work_off(
     jobs: Sequence[Job], folder: Path, cluster: Cluster, options: BatchOptions, unit: str = "jobs"
 ) -> Iterator[JobResult]:
     """Run jobs on workers and show how many are done; yields the result of each that ends."""
-    progress = options.progress
     log_file(folder, "").parent.mkdir(parents=True, exist_ok=True)
-    progress.on_stage(f"{len(cluster.workers)} workers, dashboard {cluster.dashboard}")
-    progress.on_start(folder.name, len(jobs), unit)
-    try:
+    stage(f"{len(cluster.workers)} workers, dashboard {cluster.dashboard}")
+    with series(folder.name, len(jobs), unit) as shown:
         for job, outcome in cluster.run(jobs, folder):
             result = result_of(job, outcome, folder)
-            progress.on_step(result)
+            shown.on_step(result)
             yield result
-    finally:
-        progress.on_finish()
 
 
 def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:

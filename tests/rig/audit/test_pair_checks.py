@@ -11,9 +11,9 @@ from recon.commands.export import run_mesh
 from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.core.geometry.se3 import make_transform
+from recon.core.progress import Silent, showing
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.export.mesh.grid import check_coverage
-from recon.run.work import Silent
 from recon.sources.one_pair import PairInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -42,7 +42,8 @@ def good_run(pair, tmp_path_factory):
     progress, out, told = Silent(), tmp_path_factory.mktemp("pair") / "run", []
     progress.on_stage = told.append
     given = PairInput(pair, CAMERA)
-    return run_pair(given, SETTINGS, out=out, formats=("glb",), progress=progress), out, told
+    with showing(progress):
+        return run_pair(given, SETTINGS, out=out, formats=("glb",)), out, told
 
 
 def test_images_that_show_nothing_no_point_or_two_things_are_told(pair, tmp_path):
