@@ -120,7 +120,9 @@ def open_drive(
 ) -> tuple[StereoSource, MapOptions]:
     """Open a drive, say how it is read, and return it with the options of its run."""
     from recon.cli.progress import announce
+    from recon.core.progress import stage
 
+    stage(f"open {options.source}")
     drive, options = options.open(settings)
     announce(drive, quiet=shared.quiet, verbose=shared.verbose)
     return drive, options

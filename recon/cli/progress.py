@@ -103,8 +103,7 @@ class JsonLines:
 class ProgressBar:
     """Shows one line: the items of a series, their rate and the last one, or a stage and its time.
 
-    The line of a series stays when it ends, that of a stage only if somebody waited for it. What
-    begins within a series is the state of its line.
+    Who waited for one keeps a line of it. What begins within a series is the state of its line.
     """
 
     def __init__(self, console: Console) -> None:
@@ -120,7 +119,7 @@ class ProgressBar:
         if self._depth > 1:
             self._update(state=name)
             return
-        self._end_stage()
+        self.close()
         self._seconds, self._unit, self._bad = math.nan, unit, 0
         bad = TextColumn("{task.fields[bad]}", style="bold red")
         rate, state = (TextColumn(f"{{task.fields[{one}]}}", markup=False) for one in _FIELDS)
@@ -138,23 +137,28 @@ class ProgressBar:
         if self._depth:
             self._update(state=name)
             return
-        self._end_stage()
-        self._stage, self._since_s = name, time.monotonic()
+        self.close()
+        self._stage = name
         if name:
-            self._show(name, FittingColumn([TimeElapsedColumn()]), total=None, transient=True)
+            self._show(name, FittingColumn([TimeElapsedColumn()]), total=None)
 
     def on_finish(self) -> None:
         self._depth = max(0, self._depth - 1)
         if self._depth == 0:
-            self._stop()
+            self._stop(leave=self._waited_s > _WAITED_S)
             self.on_stage(self._stage)  # what the series was part of goes on
 
     def close(self) -> None:
-        """End what is shown, wherever the work ended."""
-        self._end_stage()
+        """End the stage that is shown, if any."""
+        shown, waited_s = self._progress is not None, self._waited_s
+        self._stop(leave=False)
+        if shown and waited_s > _WAITED_S:
+            line = f"{self._stage}: {waited_s:.0f} s"
+            self._console.print(line, style="dim", markup=False, highlight=False)
 
-    def _show(self, name: str, column: FittingColumn, *, total: int | None, **how: Any) -> None:
-        self._progress = Progress(column, console=self._console, refresh_per_second=4, **how)
+    def _show(self, name: str, column: FittingColumn, *, total: int | None) -> None:
+        self._since_s = time.monotonic()
+        self._progress = Progress(column, console=self._console, refresh_per_second=4)
         self._progress.add_task(name, total=total, rate="", state="", bad="")
         self._progress.start()
 
@@ -162,15 +166,13 @@ class ProgressBar:
         if self._progress is not None:
             self._progress.update(self._progress.task_ids[0], **fields)
 
-    def _end_stage(self) -> None:
-        shown, took_s = self._progress is not None, time.monotonic() - self._since_s
-        self._stop()
-        if shown and self._depth == 0 and took_s > _WAITED_S:
-            line = f"{self._stage}: {took_s:.0f} s"
-            self._console.print(line, style="dim", markup=False, highlight=False)
+    @property
+    def _waited_s(self) -> float:
+        return time.monotonic() - self._since_s
 
-    def _stop(self) -> None:
+    def _stop(self, *, leave: bool) -> None:
         if self._progress is not None:
+            self._progress.live.transient = not leave
             self._progress.stop()
             self._progress = None
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig
 from recon.core.errors import FormatError, OutputError, SourceError
+from recon.core.progress import tracked
 from recon.core.values.board import CalibrationBoard
 from recon.io.atomic import check_targets, write_text
 from recon.io.files import StrPath
@@ -149,7 +150,8 @@ def run_rectify(
                 how: Any = {"metres_per_unit": metres_per_unit}
                 plan = plan_by_calibration(calibration, images, config.rectification, **how)
         with run.stage("rectify"):
-            for pair, (left_file, right_file) in read_pairs(images):
+            pairs = tracked(read_pairs(images), "pairs", total=len(images.pairs))
+            for pair, (left_file, right_file) in pairs:
                 left_image, right_image = plan.warp(pair)
                 write_image(run.path(f"left/{_rectified_name(left_file)}"), left_image)
                 write_image(run.path(f"right/{_rectified_name(right_file)}"), right_image)
@@ -225,7 +227,9 @@ def record(
             shutil.copyfile(calibration, folder / f"calibration{calibration.suffix}")
         locked = warm_up(cameras, settings)
         try:
-            write_pairs(capture_pairs(cameras, settings, stopped), target, settings.preview_every)
+            pairs = capture_pairs(cameras, settings, stopped)
+            shown = tracked(pairs, "pairs", "record", total=settings.frames)
+            write_pairs(shown, target, settings.preview_every)
         finally:
             summary = {
                 "started_utc": started,

@@ -21,6 +21,7 @@ from typing import Final
 
 from recon.core.errors import DISTRIBUTION
 from recon.core.kernels.cache import cache_parent
+from recon.core.progress import stage, tracked
 from recon.run.machine import available_cores
 
 _ROOMS: Final = Path(__file__).parents[1]
@@ -33,15 +34,17 @@ def examine(outputs: Path = Path("outputs")) -> list[Check]:
     Each package and kernel has a process of its own, so that a crash is reported as well. The
     folder that runs write to need not exist, and is not created.
     """
-    return [
-        *check_packages(),
-        *(check_library(*one) for one in SYSTEM_LIBRARIES.items() if sys.platform == "linux"),
-        *check_machine(),
-        *check_kernels(),
-        *check_environment(),
-        check_folder("results can be written", outputs, "use --out", needed=True),
-        check_size("free disk space", shutil.disk_usage(_nearest(outputs)).free, _DISK),
-    ]
+    return [*tracked(_examined(outputs), "checks", "examine")]
+
+
+def _examined(outputs: Path) -> Iterator[Check]:
+    yield from check_packages()
+    yield from (check_library(*one) for one in SYSTEM_LIBRARIES.items() if sys.platform == "linux")
+    yield from check_machine()
+    yield from check_kernels()
+    yield from check_environment()
+    yield check_folder("results can be written", outputs, "use --out", needed=True)
+    yield check_size("free disk space", shutil.disk_usage(_nearest(outputs)).free, _DISK)
 
 
 def check_kernels() -> Iterator[Check]:
@@ -54,6 +57,7 @@ def check_kernels() -> Iterator[Check]:
     yield check_folder("kernels can be cached", cache_parent(), hint, needed=False)
     for room in sorted(folder.parent.name for folder in _ROOMS.glob("*/kernels")):
         sample = f"from recon.commands.kernel_samples import SAMPLES; SAMPLES[{room!r}]()"
+        stage(f"run a kernel of {room}")
         ran, printed = run_python(sample, _COMPILE_TIMEOUT_S)
         hint = "install recon anew, with the versions of its constraints.txt"
         yield Check(f"kernels of {room}", ran, "run" if ran else printed, hint)

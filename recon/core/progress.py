@@ -94,6 +94,9 @@ class _Logged(threading.local):
 _SHOWN: Final[ContextVar[Progress]] = ContextVar("progress", default=_Logged())  # noqa: B039
 
 
+_STAGE: Final = ContextVar("stage", default="")
+
+
 @contextmanager
 def showing(progress: Progress) -> Iterator[None]:
     """Tell ``progress`` what is done in the body of a ``with`` statement, in this thread."""
@@ -106,14 +109,18 @@ def showing(progress: Progress) -> Iterator[None]:
 
 def stage(name: str) -> None:
     """Say that a stage begins, in words for people; it lasts until the next one, "" = no stage."""
+    _STAGE.set(name)
     _SHOWN.get().on_stage(name)
 
 
 @contextmanager
 def series(name: str, total: int, unit: str = "frames") -> Iterator[Progress]:
-    """Begin a series of ``total`` items (0 = nobody knows), and end it with the body."""
+    """Begin a series of ``total`` items (0 = nobody knows), and end it with the body.
+
+    Its name, if that is empty, is that of the stage.
+    """
     shown = _SHOWN.get()
-    shown.on_start(name, total, unit)
+    shown.on_start(name or _STAGE.get(), total, unit)
     try:
         yield shown
     finally:
@@ -134,7 +141,7 @@ class Counted:
 
 
 def tracked(
-    items: Iterable[Item], name: str, unit: str, *, total: int | None = None
+    items: Iterable[Item], unit: str, name: str = "", *, total: int | None = None
 ) -> Iterator[Item]:
     """Yield items, each counted when the next one is asked for.
 

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import find_agreeing, fit_points, fit_upright
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.core.progress import tracked
 from recon.core.values import Disparity, RectifiedCamera, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import project, unproject
@@ -64,7 +65,7 @@ def georeference_by_points(
     """
     images_of = _Images(open_images(map_, images), where, threads)
     lines, points, ours = [], [], []
-    for point in control.points:
+    for point in tracked(control.points, "points", "match control points"):
         found = _located([images_of.sighting(*seen) for seen in point.seen])
         if found is None:
             lines.append(f"control point {point.name} has no depth where it is seen: left out")

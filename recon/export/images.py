@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from recon.core.errors import ReconError, SourceError
+from recon.core.progress import tracked
 from recon.core.values import Rig, StereoPair
 from recon.core.values.arrays import Bool, Float64
 from recon.io.files import reading, resolved
@@ -51,7 +52,8 @@ class DriveImages:
         """Yield number and pair of the frames that have a place, one in memory at a time."""
         first = int(np.argmax(self.placed))
         frames = range(first, len(self.placed))
-        for frame, pair in zip(frames, self.source.frames(first), strict=False):
+        pairs = zip(frames, self.source.frames(first), strict=False)
+        for frame, pair in tracked(pairs, "images", total=len(frames)):
             if self.placed[frame]:
                 yield frame, pair
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
+from recon.core.progress import tracked
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
@@ -115,7 +116,8 @@ class Flattening:
             submap, step_m = self._tiles.submap_of_frame, self._resolution_m / 2
             path = DrivenPath.through(self._path_m, self._trusted, submap, step_m)
         keys = [tile.key for tile in self._tiles]
-        for key in dict.fromkeys((*keys, *self._crossed(self._margin_m))):
+        around = dict.fromkeys((*keys, *self._crossed(self._margin_m)))
+        for key in tracked(around, "tiles"):
             part = self._flat(key, settings, path)
             if part is not None:
                 _paste(cells, low, part, key, self._tiles.edge_cells)

@@ -16,6 +16,7 @@ from typing_extensions import Self
 
 from recon.core.geometry.se3 import apply
 from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
+from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64, Int64, tree_of
 from recon.map.fusion import KNOWABLE, FusedPart
@@ -143,7 +144,7 @@ class Cutter:
         of the first one in its map.
         """
         cut = Cut()
-        for place, submap in enumerate(submaps):
+        for place, submap in enumerate(tracked(submaps, "submaps", "cut into tiles")):
             T = None if T_corrected_world is None else T_corrected_world[place]
             moved = self._moved(submap, T)
             cut.add(moved)

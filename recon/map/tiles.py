@@ -20,6 +20,7 @@ from typing_extensions import Self
 
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
+from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
@@ -150,7 +151,7 @@ class Tiles:
         return len(self._parts.keys)
 
     def __iter__(self) -> Iterator[Tile]:
-        return (Tile(key, self) for key in self._parts.keys)
+        return tracked([Tile(key, self) for key in self._parts.keys], "tiles")
 
     def bounds(self, key: TileKey) -> Rectangle:
         return self._parts.bounds(key)

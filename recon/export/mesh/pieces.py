@@ -13,6 +13,7 @@ import numpy as np
 
 from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32
@@ -146,7 +147,7 @@ class _Mesher:
         failed: dict[PieceKey, MeshingError] = {}
         keys = sorted(self.points)
         surfaces = side_by_side(self._surface, keys, threads=self.threads)
-        for key, surface in zip(keys, surfaces, strict=True):
+        for key, surface in tracked(zip(keys, surfaces, strict=True), "pieces", total=len(keys)):
             if isinstance(surface, MeshingError):
                 failed[key] = surface
                 continue

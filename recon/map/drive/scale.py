@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import ReconError
+from recon.core.progress import tracked
 from recon.map.fusion import FusionSettings
 from recon.map.settings import SCALES
 from recon.sources.source import StereoSource
@@ -64,7 +65,8 @@ def _depths(source: StereoSource, settings: StereoSettings) -> Iterator[tuple[fl
     """
     reconstructor = FrameReconstructor(source.calibration, settings)
     camera = reconstructor.camera
-    for number in np.unique(np.linspace(0, len(source) - 1, _FRAMES).astype(int)).tolist():
+    numbers = np.unique(np.linspace(0, len(source) - 1, _FRAMES).astype(int)).tolist()
+    for number in tracked(numbers, "frames", "measure the scene"):
         with suppress(ReconError, StopIteration):
             _, disparity = reconstructor.match(next(source.frames(number)))
             found = disparity.values[disparity.valid] + camera.doffs_px

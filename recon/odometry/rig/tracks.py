@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from recon.core.progress import tracked
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.features import find_in_right, surface_slopes
@@ -55,7 +56,7 @@ def track_stretches(
 ) -> tuple[StereoTracks, ...]:
     """Return windows of tracks from all over a drive, stretches side by side in threads."""
 
-    def tracked(stretch: tuple[int, int]) -> list[StereoTracks]:
+    def tracks(stretch: tuple[int, int]) -> list[StereoTracks]:
         start, stop = stretch
         pairs = islice(source.frames(start), stop - start)
         odometry = VisualOdometry()
@@ -65,8 +66,10 @@ def track_stretches(
         return [window for window in found if window is not None]
 
     with serial_algebra():
-        found = side_by_side(tracked, plan_stretches(len(source)), threads=THREADS)
-        return tuple(window for stretch in found for window in stretch)
+        stretches = plan_stretches(len(source))
+        found = side_by_side(tracks, stretches, threads=THREADS)
+        counted = tracked(found, "windows", "track features", total=len(stretches))
+        return tuple(window for stretch in counted for window in stretch)
 
 
 class StereoTracker:

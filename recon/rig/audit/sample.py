@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.core.errors import ReconError
+from recon.core.progress import tracked
 from recon.core.values import RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64
 from recon.rig.audit.measures import (
@@ -104,7 +105,7 @@ def take_sample(source: StereoSource, rectifier: Rectifier, *, quick: bool) -> S
     centres = plan_centres(stretches, quick=quick)
     sampler = _Sampler(source, rectifier, centres, quick=quick)
     try:
-        for start, stop in stretches:
+        for start, stop in tracked(stretches, "windows", "check the recording"):
             sampler.look(start, stop)
     except ReconError as error:
         sampler.sample.broken = error

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError, SourceError
+from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.board import CalibrationBoard
@@ -94,11 +95,13 @@ def _look_at_all(
 ) -> tuple[CalibrationBoard, list[_Look]]:
     """Return detections in all images, and the board, which may have the legacy pattern."""
     with ThreadPoolExecutor(threads) as pool:
-        looks = list(pool.map(lambda path: _look(path, board), files))
+        seen = pool.map(lambda path: _look(path, board), files)
+        looks = list(tracked(seen, "images", "find the board", total=len(files)))
         if board.kind == "chess" or any(look.seen for look in looks):
             return board, looks
         other = replace(board, legacy=not board.legacy)
-        older = list(pool.map(lambda path: _look(path, other), files))
+        seen = pool.map(lambda path: _look(path, other), files)
+        older = list(tracked(seen, "images", "find the older board", total=len(files)))
         return (other, older) if any(look.seen for look in older) else (board, looks)
 
 
@@ -144,7 +147,8 @@ def pick_views(
         view_size(videos[0], settings)  # checks that the frames can be halved
     every = max(1, round(videos[0].rate_hz / _LOOKS_HZ))
     looks = range(0, min(video.frames for video in videos), every)
-    small = np.stack([_shrunk(both) for both in _frames(videos, looks, settings)])
+    seen = tracked(_frames(videos, looks, settings), "frames", "find still views", total=len(looks))
+    small = np.stack([_shrunk(both) for both in seen])
     chosen = [looks[number] for number in _choose(small)]
     if not chosen:
         raise SourceError(

@@ -14,6 +14,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, invert
+from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import StereoCalibration
 from recon.core.values.arrays import Float64
@@ -59,7 +60,7 @@ def _resample(fit: StereoFit) -> list[StereoCalibration]:
     count, info = len(fit.views), fit.information
     vectors = _jackknife_vectors(fit)
     rigs = []
-    for _ in range(_RESAMPLES):
+    for _ in tracked(range(_RESAMPLES), "samples"):
         drawn = rng.multinomial(count, np.full(count, 1 / count)).astype(np.float64)
         A = info.prior + np.tensordot(drawn, info.matrices, axes=1)
         # At the solution the vectors sum to zero, up to the prior of rational lenses.
