@@ -16,6 +16,8 @@ from recon.commands.pair import reconstruct as reconstruct
 from recon.commands.pair import run_disparity as run_disparity
 from recon.commands.pair import run_pair as run_pair
 from recon.core.errors import ReconError as ReconError
+from recon.core.progress import Progress as Progress
+from recon.core.progress import showing as showing
 from recon.core.values import CameraIntrinsics as CameraIntrinsics
 from recon.core.values import Disparity as Disparity
 from recon.core.values import DisparityMetrics as DisparityMetrics

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 # Weight of the newest item in the displayed rate: steady enough to read, yet responsive.
 _RATE_WEIGHT: Final = 0.2
 _FIELDS: Final = ("rate", "state")
+_STARTING: Final = "starting"  # while libraries are loaded
 _WAITED_S: Final = 2.0  # a stage that takes longer leaves a line
 _SLOW_S: Final = 10.0  # from which on an item has seconds, instead of a second items
 
@@ -61,7 +62,7 @@ def watched(*, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
     try:
         with showing(viewer):
             if isinstance(viewer, ProgressBar):
-                viewer.on_stage("starting")
+                viewer.on_stage(_STARTING)
             yield
     finally:
         LOGGER.removeHandler(notes)
@@ -152,7 +153,7 @@ class ProgressBar:
         """End the stage that is shown, if any."""
         shown, waited_s = self._progress is not None, self._waited_s
         self._stop(leave=False)
-        if shown and waited_s > _WAITED_S:
+        if shown and waited_s > _WAITED_S and self._stage != _STARTING:
             line = f"{self._stage}: {waited_s:.0f} s"
             self._console.print(line, style="dim", markup=False, highlight=False)
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar, runtime_checkable
 
 LOGGER: Final = logging.getLogger("recon")
-_COUNT_EVERY_S: Final = 2.0  # nobody waits longer for a word
+_COUNT_EVERY_S: Final = 1.0
 
 Item = TypeVar("Item")
 
@@ -68,7 +68,7 @@ class Silent(Progress):
 
 
 class _Logged(threading.local):
-    """Logs the progress of each thread: stages, and every two seconds how far a series is."""
+    """Logs the progress of each thread: stages, and every second how far a series is."""
 
     _name, _unit, _total, _done, _said_s = "", "", 0, 0, 0.0
 
@@ -79,7 +79,7 @@ class _Logged(threading.local):
 
     def on_step(self, step: Step) -> None:
         self._done += 1
-        if time.monotonic() - self._said_s > _COUNT_EVERY_S:
+        if time.monotonic() - self._said_s >= _COUNT_EVERY_S:
             of = f" of {self._total}" if self._total else ""
             LOGGER.info("%s: %d%s %s %s", self._name, self._done, of, self._unit, step.state)
             self._said_s = time.monotonic()
