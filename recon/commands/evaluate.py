@@ -12,6 +12,7 @@ import numpy as np
 from recon.commands.config import run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError, SettingsError
+from recon.core.progress import stage
 from recon.core.text import counted
 from recon.core.values import (
     Disparity,
@@ -81,6 +82,7 @@ def run_evaluate_trajectory(
     ``times`` has the timestamps of the poses of a KITTI file (s, one per line), ``tolerance_s`` is
     the largest time difference of two associated poses.
     """
+    stage("compare")
     ours, true, by_time = _read_paths(estimate, truth, times)
     poses = {"estimate_poses": len(ours), "true_poses": len(true)}
     fewer = min(poses.values())
@@ -156,6 +158,7 @@ def run_evaluate_map(
     """
     if not thresholds_m:
         raise SettingsError("there is no threshold", where="--threshold")
+    stage("compare")
     mapped, truth = read_mapped_cloud(run), read_ply(reference)
     with naming(f"{run}, {reference}"):
         if icp:
@@ -205,6 +208,7 @@ def run_evaluate_disparity(
         confidence: PFM of the map's confidence, in [0, 1]; a pixel is correct if its error is at
             most one pixel of the map.
     """
+    stage("compare")
     values, true = read_disparity(estimate), read_disparity(truth)
     counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == 255
     if counted.shape != true.shape:
@@ -268,6 +272,7 @@ def run_evaluate_occupancy(
         expected = "a run of recon demo, whose street can be rendered again"
         hint = "recon evaluate map compares a run with a reference cloud"
         raise EvaluationError(what, where=folder, got=got, expected=expected, hint=hint)
+    stage("compare")
     source, map_ = demo_source(config), map_of_run(folder)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
     truth = source.occupancy_truth(**occupancy_view(config, map_.T_map_world, least_frames))

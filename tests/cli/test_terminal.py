@@ -61,7 +61,7 @@ COMMANDS = [
         r"find the board .*\d+/16",
     ),
     ("evaluate middlebury scenes --out bench", r"scenes .*\d/1"),
-    ("evaluate map run later/map/cloud.ply --out compared", r"starting"),
+    ("evaluate map run later/map/cloud.ply --out compared", r"compare "),
     ("batch jobs.toml --workers 1 --out week", r"week .*1/1"),
     ("doctor", r"examine .*\d+/\?"),
 ]

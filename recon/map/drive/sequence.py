@@ -245,6 +245,7 @@ def map_sequence(
     if isinstance(odometry, FoundOdometry) and not len(mapper):
         drive.begin_at(int(odometry.found.models[0].frames[0]))
     steps = drive.frames(tracks)
+    stage("map")
     try:
         with serial_algebra(), series(source.name, len(source)) as shown, closing(steps):
             for step in steps:
@@ -252,6 +253,7 @@ def map_sequence(
             drive.wait()
     finally:
         drive.stop()
+    stage("close loops")
     drive.finish()
     return MappedSequence(
         map=work.map,

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
-from recon.core.progress import series
+from recon.core.progress import series, stage
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
@@ -192,6 +192,7 @@ def localize_sequence(
 
     frames: list[LocalizedFrame] = []
     begun = time.perf_counter()
+    stage("localize")
     with serial_algebra(), series(source.name, len(source)) as shown:
         # What is matched ahead of its turn would be old when it is located.
         pairs = source.frames()

@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.se3 import make_transform
+from recon.core.progress import stage
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
@@ -303,6 +304,7 @@ def refine_rig(
         if len(tracks) < MIN_WINDOWS:
             return found
         camera = reconstructor.camera
+        stage("fit the rig")
         fitted = fit_fault(tracks, RigFault(camera), active(refined), before, spread)
         values, spread = values + fitted.values, fitted.spread
         last, turns = refined, turns_of(refined, config.rectification)

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
+from recon.core.progress import stage
 from recon.core.values import Disparity, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
@@ -86,6 +87,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     check_source(source)
     rectifier = Rectifier(source.calibration, config.rectification)
     camera = rectifier.camera
+    stage("audit")
     sample = take_sample(source, rectifier, quick=quick)
     geometry = measure_geometry(sample, camera)
     if quick and geometry.out_of_step:  # which a few pairs do not tell from half a frame, or chance
