@@ -31,7 +31,7 @@ _PAUSE_S: Final = 1.0
 _TIMEOUT_S: Final = 60.0
 _PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})  # busy, or starting again
 
-OnBytes = Callable[[int, int | None], None]
+OnBytes = Callable[[int], None]
 """Receives the number of bytes that are there and, if it is known, of those to come in all."""
 
 
@@ -89,7 +89,7 @@ def _receive(address: str, part: Path, size: int | None, on_bytes: OnBytes) -> N
             if total is not None and done > total:
                 _forget(part)
                 raise DownloadError("the server sends more than it said", where=address)
-            on_bytes(done, total)
+            on_bytes(done)
     if total is not None and _size(part) < total:
         raise _BrokenOffError(f"{_size(part)} of {counted(total, 'byte')}")
 

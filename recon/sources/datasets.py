@@ -13,7 +13,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cache
@@ -23,7 +23,7 @@ from typing import Any, Final
 from pydantic import Field
 
 from recon.core.errors import DownloadError, FormatError, OutputError, SettingsError
-from recon.core.progress import Counted, Progress, series, stage
+from recon.core.progress import Counted, series, stage
 from recon.core.settings import Settings
 from recon.io.atomic import take_lock, write_text
 from recon.io.download import OnBytes, download, unpack
@@ -199,19 +199,15 @@ def _published(address: str, kind: str, work: Path) -> str:
 @contextmanager
 def _shown(one: Archive) -> Iterator[OnBytes]:
     """Yield what shows the megabytes of a file, also of those that an earlier call received."""
-    done, last = 0, time.perf_counter()
-    with ExitStack() as stack:
-        shown: list[Progress] = []
+    shown, last = 0, time.perf_counter()
+    with series(one.file, math.ceil((one.bytes or 0) / _MEGABYTE), "MB") as progress:
 
-        def on_bytes(received: int, total: int | None) -> None:
-            nonlocal done, last
-            if not shown:
-                count = math.ceil((total or 0) / _MEGABYTE)
-                shown.append(stack.enter_context(series(one.file, count, "MB")))
+        def on_bytes(received: int) -> None:
+            nonlocal shown, last
             now = time.perf_counter()
-            while done < received // _MEGABYTE:
-                done += 1
-                shown[0].on_step(Counted(now - last))
+            while shown < received // _MEGABYTE:
+                shown += 1
+                progress.on_step(Counted(now - last))
                 last = now
 
         yield on_bytes

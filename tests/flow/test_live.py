@@ -14,7 +14,7 @@ from recon.commands.localize import run_live
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError, SettingsError, SourceError
-from recon.core.progress import Silent, showing
+from recon.core.progress import Counted, Silent, showing
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.calibration import read_calibration
 from recon.io.trajectory import read_tum
@@ -66,7 +66,7 @@ class Watch(Silent):
 def watch():
     watch = Watch()
     watch.steps = []
-    watch.on_step = lambda s: watch.steps.append(s) if isinstance(s, FrameResult) else None
+    watch.on_step = lambda s: None if isinstance(s, Counted) else watch.steps.append(s)
     return watch
 
 

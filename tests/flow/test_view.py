@@ -22,10 +22,9 @@ from recon.commands.demo import demo_source
 from recon.commands.localize import run_localize
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.progress import Silent, showing
+from recon.core.progress import Counted, Silent, showing
 from recon.core.values import UNKNOWN
 from recon.io.models.ply import read_ply
-from recon.map.drive.mapper import FrameResult
 from recon.run.directory import STARTED, state_folder
 from recon.view.follow import add_located, finish, follow_located, grow
 from recon.view.scene import colours
@@ -129,7 +128,7 @@ class Watching(Silent):
         self.coming = grow(folder, state_folder(folder) / STARTED)
 
     def on_step(self, step: object) -> None:
-        if isinstance(step, FrameResult):
+        if not isinstance(step, Counted):
             self.seen.append(next(self.coming))
 
 
@@ -137,8 +136,9 @@ def test_a_path_is_seen_to_grow_while_its_drive_is_located(small_demo, tmp_path)
     class Following(Silent):
         coming, seen = None, []
 
-        def on_step(self, _: object) -> None:
-            self.seen.append(next(self.coming))
+        def on_step(self, step: object) -> None:
+            if not isinstance(step, Counted):
+                self.seen.append(next(self.coming))
 
     following, out, config = Following(), tmp_path / "there", run_settings(small_demo)
 

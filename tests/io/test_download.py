@@ -43,11 +43,11 @@ def names(folder: Path) -> set[str]:
 
 
 def test_a_download_is_what_the_server_has(mirror, fetch):
-    told: list[tuple[int, int | None]] = []
+    told: list[int] = []
     mirror.redirect, mirror.busy = f"{mirror.address}/moved", 3
-    path = fetch(None, lambda *now: told.append(now))
+    path = fetch(None, told.append)
     assert (path.read_bytes(), names(path.parent)) == (CONTENT, {"a.zip"})
-    assert told[-1] == (SIZE, SIZE)
+    assert told[-1] == SIZE
 
 
 def test_a_download_goes_on_where_a_connection_breaks_off(mirror, fetch, monkeypatch):
@@ -62,7 +62,7 @@ def test_a_download_goes_on_where_a_connection_breaks_off(mirror, fetch, monkeyp
 # A file that is complete is not received again.
 @pytest.mark.parametrize(("size", "asked"), [(1_500_000, 1_999_999), (SIZE, SIZE - 1)])
 def test_a_later_call_goes_on_where_an_earlier_one_broke_off(mirror, tmp_path, fetch, size, asked):
-    def interrupt(done: int, total: int | None) -> None:
+    def interrupt(done: int) -> None:
         if done >= size:
             raise KeyboardInterrupt
 
