@@ -12,6 +12,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import refine_drive, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
+from recon.core.progress import Silent, showing, stage
 from recon.core.values import StereoPair
 from recon.export.trajectories import begin_states, export_localized
 from recon.io.files import StrPath
@@ -133,7 +134,8 @@ def run_live(
         raise SettingsError(what, where="odometry.method", got="kiss", expected="visual")
     beginning = _Beginning(source)
     first = LiveSource(beginning, stopped=stopped)  # what comes is done once and forgotten
-    with Map.temporary() if map_path is None else Map.open(map_path) as map_:
+    stage("warm up")
+    with Map.temporary() if map_path is None else Map.open(map_path) as map_, showing(Silent()):
         if map_path is None:
             config = config.at_scale(look_at_scene(beginning, config).scale)
             map_sequence(first, config, workspace=Workspace(map_))
