@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,8 @@ _R = TypeVar("_R")
 SMALL_FILE_BYTES: Final = 1 << 22  # more than any calibration or configuration has
 _LONGEST_REASON: Final = 120
 _NO_DATA: Final = "begin lines that are no data with #"
+#: A number with a decimal comma beside another word; alone in its line, it may be two columns.
+_DECIMAL_COMMA: Final = re.compile(r"[\s;][-+]?\d+,\d+(?![^\s;])|^[-+]?\d+,\d+[\s;]", re.ASCII)
 FOLDER: Final = "a folder"
 _LOOP: Final = "a loop of symbolic links"
 _KINDS: Final = (
@@ -127,6 +130,16 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
         raise FormatError("not a text file", where=path, got=got) from error
 
 
+def read_lines(path: StrPath) -> list[str]:
+    """Read the lines of a text table; one whose numbers have decimal commas is refused."""
+    lines = read_text(path).splitlines()
+    for number, line in enumerate(lines, start=1):
+        if _DECIMAL_COMMA.search(line.partition("#")[0].strip()):
+            what, got = "decimals are written with a comma", line.strip()[:60]
+            raise FormatError(what, where=f"{path}:{number}", got=got, expected="a point, as 0.5")
+    return lines
+
+
 @reader
 def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[int]]:
     """Read rows of numbers separated by spaces or commas; ``#`` starts a comment.
@@ -135,7 +148,7 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
     """
     rows: list[list[float]] = []
     lines: list[int] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue
