@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import os
 import re
@@ -126,8 +127,9 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
     try:
         return read_bytes(path, at_most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        got = f"byte {error.start} is not UTF-8"
-        raise FormatError("not a text file", where=path, got=got) from error
+        utf_16 = error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        got, hint = f"byte {error.start} is not UTF-8", "save it as UTF-8" if utf_16 else None
+        raise FormatError("not a text file", where=path, got=got, hint=hint) from error
 
 
 def read_lines(path: StrPath) -> list[str]:

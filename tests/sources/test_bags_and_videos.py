@@ -127,6 +127,25 @@ def test_messages_without_lengths_are_refused(rectified, focal_px, message):
         rig_of_messages(info, info, Path("drive.bag"), rectified)
 
 
+@pytest.mark.parametrize("rectified", [True, False])
+def test_a_vertical_rig_in_a_bag_is_called_so(rectified):
+    left = np.hstack([np.diag([700.0, 700.0, 1.0]), np.zeros((3, 1))])
+    right = left.copy()
+    right[1, 3] = -70.0
+    with pytest.raises(ReconError, match=r"a\.bag: cameras are not side by side .*vertical rig"):
+        rig_of_messages(info_of(left), info_of(right), Path("a.bag"), rectified)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_message_whose_rotation_is_empty_is_refused_by_its_side(side):
+    infos = [
+        info_of(np.array([[700.0, 0, 600, x], [0, 700, 180, 0], [0, 0, 1, 0]])) for x in (0, -70)
+    ]
+    infos[side] = infos[side]._replace(R=np.zeros((3, 3)))
+    with pytest.raises(ReconError, match=f"R of the {('left', 'right')[side]} CameraInfo is not a"):
+        rig_of_messages(infos[0], infos[1], Path("a.bag"), rectified=False)
+
+
 def info_of(P: np.ndarray) -> BagCameraInfo:
     return BagCameraInfo(1242, 375, "plumb_bob", np.zeros(5), P[:, :3], np.eye(3), P)
 
