@@ -18,10 +18,8 @@ from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury import read_middlebury_calib
 
 _COMMA, _POINT = re.compile(r"\d,\d"), re.compile(r"^[^%<\n]*\d\.", re.MULTILINE)
-#: Numbers of rectified cameras: in the settings of ORB-SLAM, and below one another.
+#: Numbers of rectified cameras in the settings of ORB-SLAM.
 _ORB_SLAM: Final = re.compile(r"^(?:Camera1?|Stereo)\.(fx|cx|cy|bf|b):\s*(\S+)", re.MULTILINE)
-_N: Final = r"([-+.\deE]+)"
-_K_BASELINE: Final = re.compile(rf"\s*{_N} 0\S* {_N} 0\S* \S+ {_N} 0\S* 0\S* 1\S*\s*\n{_N}\s*\Z")
 #: What a file of each format contains. OpenCV's comes after the others that may have its header,
 #: and before KITTI's: it may contain a ``P1:``.
 _SIGNS: Final = {
@@ -97,10 +95,8 @@ def read_calibration(
 
 
 def _refuse_numbers(text: str) -> None:
-    """Refuse the cameras of programs for rectified images: numbers that options take."""
+    """Refuse settings of ORB-SLAM, whose cameras are numbers that options take."""
     found = dict(_ORB_SLAM.findall(text))
-    if below := _K_BASELINE.match(text):
-        found = dict(zip(("fx", "cx", "cy", "b"), below.groups(), strict=True))
     if {"fx", "cx", "cy"} < found.keys() and found.keys() & {"b", "bf"}:
         fx, cx, cy = (parse_number(found[name]) for name in ("fx", "cx", "cy"))
         baseline_m = parse_number(found["b"]) if "b" in found else parse_number(found["bf"]) / fx

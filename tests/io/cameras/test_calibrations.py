@@ -235,7 +235,6 @@ ORB_SLAM = "%YAML:1.0\nCamera.fx: 700.0\nCamera.cx: 600.5\nCamera.cy: 180.0\nCam
 OTHERS = {
     "settings.yaml": ORB_SLAM + "Viewer.PointSize:2\n",
     "settings_3.yaml": ORB_SLAM.replace("Camera.", "Camera1.") + "Stereo.b: 0.5\n",
-    "K.txt": "700.0 0.0 600.5 0.0 700.0 180.0 0.0 0.0 1.0\n0.5\n",
 }
 
 
