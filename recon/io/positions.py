@@ -218,7 +218,7 @@ def _seconds(text: str, path: Path) -> float:
 
 def _read_rtklib(path: Path) -> Positions:
     """Read a solution of RTKLIB: its last line of ``%`` names the columns."""
-    lines = read_text(path).splitlines()
+    lines = read_lines(path)
     heads = [line.lstrip("% ") for line in lines if line.startswith("%")]
     names = heads[-1].split() if heads else []
     kind = next((kind for kind in _RTKLIB if {*kind} <= {*names}), None)
