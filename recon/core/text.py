@@ -20,10 +20,10 @@ def counted(number: int, one: str, many: str = "", *, form: str = "") -> str:
     return f"{number:{form}} {one if abs(number) == 1 else many or one + 's'}"
 
 
-def metres(length_m: float) -> str:
-    """Return a length with its unit: to three significant digits, and without an exponent."""
+def metres(length_m: float, sign: str = "") -> str:
+    """Return a length with its unit: three significant digits, no exponent; ``+`` shows a sign."""
     size = math.floor(math.log10(abs(length_m))) if length_m and math.isfinite(length_m) else 2
-    return f"{length_m:.{min(max(2 - size, 0), _MOST_DECIMALS)}f} m"
+    return f"{length_m:{sign}.{min(max(2 - size, 0), _MOST_DECIMALS)}f} m"
 
 
 def parse_number(text: str | bytes) -> float:

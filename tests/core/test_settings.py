@@ -91,6 +91,7 @@ def test_a_setting_with_a_decimal_comma_is_refused_for_it(setting):
 def test_a_length_has_three_digits_that_count_and_no_exponent():
     lengths = {0: "0 m", 0.0019: "0.00190 m", -0.25: "-0.250 m", 12.345: "12.3 m", 1234.5: "1234 m"}
     assert [metres(length) for length in lengths] == [*lengths.values()]
+    assert (metres(0.25, "+"), metres(-0.25, "+")) == ("+0.250 m", "-0.250 m")
     assert (metres(1e-15), metres(float("nan"))) == ("0.000000 m", "nan m")
 
 
