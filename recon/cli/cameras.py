@@ -153,8 +153,9 @@ def rectify(
         ),
     ] = None,
     unit_m: Annotated[
-        float, opt.option("Metres per unit in an OpenCV file, e.g. 0.001 for mm.", min=1e-6)
-    ] = 1.0,
+        float | None,
+        opt.option("Metres per unit in an OpenCV file, e.g. 0.001 for mm. [1]", min=1e-6),
+    ] = None,
     out: opt.Out = None,
     *,
     shared: opt.Shared,
@@ -171,8 +172,10 @@ def rectify(
     with shared.one_line_errors():
         from recon.commands.cameras import run_rectify
 
+        settings = shared.settings()
+        unit_m = unit_m or settings.source.metres_per_unit
         how: Any = {"calibration": calib, "metres_per_unit": unit_m, "out": out}
-        run = run_rectify(left, right, shared.settings(), threads=shared.threads, **how)
+        run = run_rectify(left, right, settings, threads=shared.threads, **how)
     shared.show(run.summary)
 
 

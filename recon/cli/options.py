@@ -56,7 +56,7 @@ Config = Annotated[
 Set = Annotated[
     list[str] | None,
     option(
-        "Change one setting, e.g. matching.sad.window_px=9. Several with commas.", "--set", "-s"
+        "Change a setting, as scene.scale=0.1. Several with commas: a.b=1,c.d=2.", "--set", "-s"
     ),
 ]
 Matcher = Annotated[

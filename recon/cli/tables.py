@@ -13,7 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from recon.core.text import counted, with_unit
+from recon.core.text import counted, metres, with_unit
 
 if TYPE_CHECKING:
     from recon.commands.config import SettingGroup
@@ -75,9 +75,9 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
             f"{drive['name']}: {counted(drive['frames'], 'frame')}{place}"
         )
     for name, point in summary.get("control", {}).items():
-        off = ", ".join(f"{point[key]:+.3f}" for key in ("east_m", "north_m", "up_m"))
+        off = ", ".join(metres(point[key], "+") for key in ("east_m", "north_m", "up_m"))
         kind = "check point" if point["check"] else "used" if point["used"] else "left out"
-        shown[f"control {name}"] = f"{off} m ± {point['sigma_m']:.3f} m, {kind}"
+        shown[f"control {name}"] = f"{off} ± {metres(point['sigma_m'])}, {kind}"
     if stages:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
     print_figures("", shown)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +40,7 @@ from recon.street.settings import StreetSettings
 Changes = Sequence[str | Mapping[str, Any]]
 """Changed settings: ``key=value`` texts with dotted keys, or values by such keys."""
 _MOST_DOTS: Final = 10
+_NEXT: Final = re.compile(r",\s*(?=[a-z]\w*(?:\.\w+)+\s*=)")  # no comma of a list, or of a name
 _BYTES_PER_PIXEL: Final = 18
 """Two colour images, and the disparity with its confidence and deviation: the least of a pair."""
 
@@ -119,8 +121,8 @@ def load_config(
 
     Args:
         path: A YAML file with any part of the configuration, such as a run's ``config.yaml``.
-        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``; or
-            values by such keys.
+        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``,
+            also several with commas; or values by such keys.
         defaults: Defaults of a command that differ from those of the stages.
 
     Raises:
@@ -129,7 +131,7 @@ def load_config(
     given = merge(defaults or {}, {} if path is None else _read_yaml(Path(path)))
     values = given
     for one in overrides:
-        for key, value in [_parse_override(one)] if isinstance(one, str) else one.items():
+        for key, value in _parse_overrides(one) if isinstance(one, str) else one.items():
             values = merge(values, _nested(key, value))
     try:
         return ReconConfig.parse(values)
@@ -198,6 +200,11 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
         got = type(content).__name__
         raise SettingsError("configuration is not a mapping", where=path, got=got)
     return content
+
+
+def _parse_overrides(text: str) -> list[tuple[str, Any]]:
+    """Return the settings of a text; those of several stand with commas between."""
+    return [_parse_override(one) for one in _NEXT.split(text)]
 
 
 def _parse_override(text: str) -> tuple[str, Any]:

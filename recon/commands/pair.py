@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +25,7 @@ from recon.core.values.arrays import UInt8
 from recon.evaluation.disparity import evaluate_disparity
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.cameras.calibration import read_calibration
-from recon.io.files import StrPath
+from recon.io.files import StrPath, naming
 from recon.io.middlebury import stand_in_camera
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.sequence import check_cloud
@@ -146,7 +147,9 @@ def _compared(
 
 
 def _reconstructor(given: PairInput, config: ReconConfig, run: Run) -> FrameReconstructor:
-    return FrameReconstructor(given.calibration, config, threads=run.threads, stopwatch=run.watch)
+    rig, watch = given.calibration, run.watch
+    with naming(given.files[2]) if len(given.files) > 2 else nullcontext():  # the calibration
+        return FrameReconstructor(rig, config, threads=run.threads, stopwatch=watch)
 
 
 _Rig = RectifiedCamera | StereoCalibration

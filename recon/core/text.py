@@ -6,14 +6,24 @@ a file has those, something else is meant, or it is damaged.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from typing import Final
+
+_DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+", re.ASCII)
+_MOST_DECIMALS: Final = 6  # of a length: micrometres are beyond every measurement here
 
 
 def counted(number: int, one: str, many: str = "", *, form: str = "") -> str:
     """Return a number, written in a ``form``, of things: ``1 frame``, ``2 frames``."""
     return f"{number:{form}} {one if abs(number) == 1 else many or one + 's'}"
+
+
+def metres(length_m: float, sign: str = "") -> str:
+    """Return a length with its unit: three significant digits, no exponent; ``+`` shows a sign."""
+    size = math.floor(math.log10(abs(length_m))) if length_m and math.isfinite(length_m) else 2
+    return f"{length_m:{sign}.{min(max(2 - size, 0), _MOST_DECIMALS)}f} m"
 
 
 def parse_number(text: str | bytes) -> float:
@@ -39,11 +49,12 @@ def is_count(text: str) -> bool:
 
 
 def refuse_other_numbers(text: str) -> None:
-    """Refuse what is a number for Python alone; text that is none at all is not looked at."""
+    """Refuse a number for Python alone, or with a comma; text that is none is not looked at."""
     try:
         float(text)
     except ValueError:
-        return
+        if not _DECIMAL_COMMA.fullmatch(text):
+            return
     parse_number(text)
 
 
@@ -51,6 +62,8 @@ def _check(text: str | bytes) -> None:
     plain = text.decode("latin-1") if isinstance(text, bytes) else text
     if not plain.isascii() or "_" in plain:
         raise ValueError(f"not a decimal number: {plain!r}")
+    if _DECIMAL_COMMA.fullmatch(plain):
+        raise ValueError(f"decimals need a point, not a comma: {plain.replace(',', '.')}")
 
 
 _UNITS: Final = {  # by what the names of figures end in

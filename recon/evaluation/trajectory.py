@@ -14,7 +14,7 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import Similarity, fit_points, fit_upright, nearest_sorted
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, quaternion_from_rotation
 from recon.core.settings import Settings
-from recon.core.text import counted
+from recon.core.text import counted, metres
 from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Bool, Float64, Int32
 from recon.io.files import StrPath
@@ -226,7 +226,7 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
         raise EvaluationError("too few poses to compare", got=got, expected=expected)
     if truth.path_length_m < MIN_PATH_M:
         what = "true path is too short for errors relative to its length"
-        got, expected = f"{truth.path_length_m:.2f} m", f"{MIN_PATH_M:g} m or more"
+        got, expected = metres(truth.path_length_m), f"{MIN_PATH_M:g} m or more"
         raise EvaluationError(what, got=got, expected=expected)
     drift_m = min(drift_at_end(estimate), drift_at_end(truth))
     fit = fit_to_path(estimate.positions_m, truth.positions_m, drift_m)
@@ -281,7 +281,7 @@ def choose_segments(
     segments = segments_of(distances_m, lengths, step_frames or KITTI_STEP_FRAMES)
     if lengths_m is not None and not len(segments.first):
         what = "true path has no room for a segment of the requested lengths"
-        got, expected = f"a path of {distances_m[-1]:.1f} m", f"more than {min(lengths_m):g} m"
+        got, expected = f"a path of {metres(distances_m[-1])}", f"more than {min(lengths_m):g} m"
         raise EvaluationError(what, got=got, expected=expected)
     if lengths_m is not None or len(np.unique(segments.length_m)) >= 2:
         return segments

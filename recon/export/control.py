@@ -13,6 +13,7 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import find_agreeing, fit_points, fit_upright
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.progress import tracked
+from recon.core.text import metres
 from recon.core.values import Disparity, RectifiedCamera, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import project, unproject
@@ -91,7 +92,7 @@ def georeference_by_points(
     there_m = apply(T, ours_m[agree])
     turn = fixed_turn(there_m, place_m[agree], known_m, where, "control points")
     for n in np.flatnonzero(used & ~agree):
-        apart = f"{np.linalg.norm(off_m[n]):.2f} m off"
+        apart = f"{metres(float(np.linalg.norm(off_m[n])))} off"
         lines.append(f"control point {points[n].name} contradicts the others: {apart}, left out")
     columns = [*off_m.T.tolist(), sigma_m.tolist(), agree.tolist(), (~used).tolist()]
     names = ("east_m", "north_m", "up_m", "sigma_m", "used", "check")

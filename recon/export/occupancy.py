@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
 from recon.core.progress import tracked
+from recon.core.text import metres
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
@@ -148,7 +149,7 @@ class Flattening:
                 enough_m = math.ceil(20 * thick_m) / 20
                 yield (
                     f"grid.min_height_m={settings.min_height_m:g} is too low to tell obstacles "
-                    f"from the ground, which is {thick_m:.2f} m thick in cells of {cell_m:g} m: "
+                    f"from the ground, which is {metres(thick_m)} thick in cells of {cell_m:g} m: "
                     f"parts of it are drawn as obstacles; take {enough_m:g}, or smaller cells"
                 )
         if settings.max_height_m - settings.min_height_m < cell_m:

@@ -12,7 +12,7 @@ import numpy as np
 from recon.core.errors import FormatError, require
 from recon.core.text import parse_numbers
 from recon.core.values.arrays import Float64
-from recon.io.files import StrPath, read_text, reader
+from recon.io.files import StrPath, read_lines, reader
 from recon.io.models.las import check_crs
 from recon.io.positions import Positions
 
@@ -61,7 +61,7 @@ def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
 
     Ref: https://docs.opendronemap.org/gcp/
     """
-    lines = [line.split() for line in read_text(path).splitlines()]
+    lines = [line.split() for line in read_lines(path)]
     rows = [(n, words) for n, words in enumerate(lines, 1) if words and words[0][0] != "#"]
     system = _system_of(" ".join(rows[0][1]))
     named: dict[str, list[_Row]] = {}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import os
+import re
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +27,8 @@ _R = TypeVar("_R")
 SMALL_FILE_BYTES: Final = 1 << 22  # more than any calibration or configuration has
 _LONGEST_REASON: Final = 120
 _NO_DATA: Final = "begin lines that are no data with #"
+#: A number with a decimal comma beside another word; alone in its line, it may be two columns.
+_DECIMAL_COMMA: Final = re.compile(r"[\s;][-+]?\d+,\d+(?![^\s;])|^[-+]?\d+,\d+[\s;]", re.ASCII)
 FOLDER: Final = "a folder"
 _LOOP: Final = "a loop of symbolic links"
 _KINDS: Final = (
@@ -123,8 +127,19 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
     try:
         return read_bytes(path, at_most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        got = f"byte {error.start} is not UTF-8"
-        raise FormatError("not a text file", where=path, got=got) from error
+        utf_16 = error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        got, hint = f"byte {error.start} is not UTF-8", "save it as UTF-8" if utf_16 else None
+        raise FormatError("not a text file", where=path, got=got, hint=hint) from error
+
+
+def read_lines(path: StrPath) -> list[str]:
+    """Read the lines of a text table; one whose numbers have decimal commas is refused."""
+    lines = read_text(path).splitlines()
+    for number, line in enumerate(lines, start=1):
+        if _DECIMAL_COMMA.search(line.partition("#")[0].strip()):
+            what, got = "decimals are written with a comma", line.strip()[:60]
+            raise FormatError(what, where=f"{path}:{number}", got=got, expected="a point, as 0.5")
+    return lines
 
 
 @reader
@@ -135,7 +150,7 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
     """
     rows: list[list[float]] = []
     lines: list[int] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue

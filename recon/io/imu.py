@@ -18,7 +18,7 @@ from recon.core.values import ImuRecord
 from recon.core.values.arrays import Bool, Float64
 from recon.io.cameras.ros import NS
 from recon.io.fields import Fields, read_yaml
-from recon.io.files import read_text, reader
+from recon.io.files import read_lines, reader
 
 _COLUMNS: Final = 7  # time, three rates of turn, three forces
 _LEAST: Final = 2  # rows
@@ -31,7 +31,7 @@ def read_imu(path: Path) -> ImuRecord:
 
     Rows that are no measurement, or not later than those before, are left out, and noted.
     """
-    lines = enumerate(read_text(path).splitlines(), start=1)
+    lines = enumerate(read_lines(path), start=1)
     rows = [(n, _row(line)) for n, line in lines if line.partition("#")[0].strip()]
     table = np.array([row for _, row in rows]).reshape(-1, _COLUMNS)
     return imu_of(table, [f"{path.name}:{n}" for n, _ in rows], str(path))

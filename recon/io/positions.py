@@ -16,7 +16,7 @@ import numpy as np
 from recon.core.errors import EvaluationError, FormatError, require
 from recon.core.text import counted, parse_numbers
 from recon.core.values.arrays import Float64
-from recon.io.files import StrPath, read_table, read_text, reader
+from recon.io.files import StrPath, read_lines, read_table, read_text, reader
 from recon.io.models.las import check_crs
 from recon.io.trajectory import check_positions
 
@@ -162,7 +162,7 @@ def _read_named(path: Path, columns: dict[str, int]) -> Positions:
         raise FormatError(what, where=path, got=f"no {missing[0]}", expected=expected)
     rows = [
         line.replace(",", " ").split()
-        for line in read_text(path).splitlines()[1:]
+        for line in read_lines(path)[1:]
         if line.strip() and not line.lstrip().startswith("#")
     ]
     used = [columns[name] for name in ("time", "lat", "lon", "height", "sigma")]
@@ -218,7 +218,7 @@ def _seconds(text: str, path: Path) -> float:
 
 def _read_rtklib(path: Path) -> Positions:
     """Read a solution of RTKLIB: its last line of ``%`` names the columns."""
-    lines = read_text(path).splitlines()
+    lines = read_lines(path)
     heads = [line.lstrip("% ") for line in lines if line.startswith("%")]
     names = heads[-1].split() if heads else []
     kind = next((kind for kind in _RTKLIB if {*kind} <= {*names}), None)

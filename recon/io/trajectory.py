@@ -21,7 +21,7 @@ from recon.core.text import counted, parse_number
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
-from recon.io.files import StrPath, parse_row, read_table, read_text, reader
+from recon.io.files import StrPath, parse_row, read_lines, read_table, read_text, reader
 
 # Files print rotations with four to seven digits; a larger deviation means it is not a rotation.
 _RIGID_TOLERANCE = 1e-3
@@ -116,7 +116,7 @@ class Rows(NamedTuple):
 
 def _read_rows(path: StrPath, counts: tuple[int, ...]) -> Rows:
     """Read what a header names, else rows of as many columns as permitted; times in seconds."""
-    texts = [text.partition("#") for text in read_text(path).splitlines()]
+    texts = [text.partition("#") for text in read_lines(path)]
     first = next((n for n, (text, *_) in enumerate(texts) if _DATA.match(text)), len(texts))
     heads = (_columns_of(text or comment) for text, _, comment in texts[:first])
     head = next(filter(None, heads), None)

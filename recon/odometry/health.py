@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.text import counted
+from recon.core.text import counted, metres
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.checked import StretchCounter
@@ -119,7 +119,7 @@ class ExpectedDrift:
         half_width = _SIGMAS * self.rig_percent
         if half_width <= _MOST_PERCENT:
             return []
-        where = f"scale rests on points about {self.rests_on_m:.0f} m away"
+        where = f"scale rests on points about {metres(self.rests_on_m)} away"
         return [f"{where}: the length of the path is certain to ± {half_width:.0f} % only"]
 
 

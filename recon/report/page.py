@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from recon.core.text import counted, with_unit
+from recon.core.text import counted, metres, with_unit
 from recon.io.atomic import write_text
 from recon.report import style
 from recon.report.table import NOT_KNOWN
@@ -75,7 +75,7 @@ def page_environment() -> Environment:
     # Sections add their titles to the contents.
     environment.globals.update(
         warnings=(), verdict="", sound=False, command="", config="", versions={}, contents=[],
-        plotly=_packed_plotly,
+        plotly=_packed_plotly, metres=metres,
     )  # fmt: skip
     return environment
 

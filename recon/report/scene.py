@@ -96,7 +96,7 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS) -> Json | None:
         return None
     for (name, path), colour in zip(scene.paths, itertools.cycle(_PATH_COLOURS), strict=False):
         look: Json = {"mode": "lines", "line": {"color": colour, "width": 6}}
-        look["hovertemplate"] = "frame %{pointNumber}<br>x %{x:.2f} y %{y:.2f} z %{z:.2f} m"
+        look["hovertemplate"] = "frame %{pointNumber}<br>x %{x:.5r} y %{y:.5r} z %{z:.5r} m"
         figure.add_trace(go.Scatter3d(name=name, **look, **_xyz(apply(T, path))))
     _set_view(figure, scene, _visible_points(cloud, scene))
     return dict(json.loads(figure.to_json()))

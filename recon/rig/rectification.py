@@ -17,6 +17,7 @@ from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.fields import write_yaml
+from recon.io.files import naming
 from recon.rig.uncalibrated import rectify_images
 from recon.run.directory import RunDirectory
 from recon.run.run import plain
@@ -73,7 +74,8 @@ def plan_by_calibration(
             where=path,
             hint="use them directly with recon pair or recon map",
         )
-    rectifier = Rectifier(rig, settings)
+    with naming(path):
+        rectifier = Rectifier(rig, settings)
     turns, camera = plan_turns(rig, settings), rectifier.camera
     return RectifyPlan(
         warp=rectifier.warp,

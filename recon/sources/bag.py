@@ -217,7 +217,7 @@ def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str],
 
 
 def _list_others(bag: Bag, used: Sequence[str]) -> str:
-    """Return a note on unused topics, but for those of images, and on which `--prior` takes."""
+    """Return a note on other topics than those of images, and on which `--prior` takes."""
     images = [name for name, topic in bag.topics.items() if topic.kind in _IMAGES]
     named = {*used, find_imu(bag), *(name for pair in find_partners(images) for name in pair)}
     unused = {name for name, topic in bag.topics.items() if topic.kind != CAMERA_INFO} - named
@@ -226,7 +226,7 @@ def _list_others(bag: Bag, used: Sequence[str]) -> str:
         return ""
     poses = [name for name in others if bag.topics[name].kind in POSES and "static" not in name]
     listed = ", ".join(others[:_LISTED]) + (" …" if len(others) > _LISTED else "")
-    return f", not used: {listed}" + (f" (for --prior: {', '.join(poses)})" if poses else "")
+    return f", other topics: {listed}" + (f" (for --prior: {', '.join(poses)})" if poses else "")
 
 
 def _info_topic(bag: Bag, image_topic: str) -> str | None:

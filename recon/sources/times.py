@@ -16,7 +16,7 @@ from recon.core.geometry.se3 import invert
 from recon.core.text import counted, parse_integer, parse_number
 from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
-from recon.io.files import read_table, read_text, reader
+from recon.io.files import read_lines, read_table, read_text, reader
 from recon.io.trajectory import read_tum
 from recon.sources.source import FrameList, check_most
 
@@ -70,7 +70,7 @@ def _parse_date(text: str, where: str) -> float:
 def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, str]]:
     """Read time [s] and file of each line of TUM's ``rgb.txt`` or EuRoC's ``data.csv`` (1e-9 s)."""
     entries = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
         if words:
             entries.append(_parse_entry(words, unit_s, f"{path}:{number}"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
@@ -11,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.errors import FormatError, SourceError
+from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.core.values import StereoPair, check_size
 from recon.core.values.arrays import UInt8
 from recon.io.files import resolved
@@ -89,7 +90,11 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
     numbers, listing = pair_frames(list(frames), settings, path)
     size = view_size(videos[0], settings) if len(videos) == 1 else videos[0].size_px
     home = path if path.is_dir() else resolved(path).parent
-    rig, texts = read_rig(settings, home, size)
+    try:
+        rig, texts = read_rig(settings, home, size)
+    except CalibrationError as error:
+        hint = _how_to_cut(videos[0], settings, home) if len(videos) == 1 else None
+        raise error.but(hint=hint or error.hint) from error
     rate_hz = settings.rate_hz or videos[0].rate_hz
     layout = "two videos" if len(videos) == 2 else f"{settings.side_by_side} in one video"
     return VideoSource(
@@ -138,10 +143,27 @@ def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
     whole = video.height_px if stacked else video.width_px
     if whole % 2:
         what, got = "frames of the video cannot be halved", f"{video.width_px}x{video.height_px}"
-        hint = "for two videos: recon map LEFT --right RIGHT"
+        hint = (
+            "for two videos: recon map LEFT --right RIGHT; source.side_by_side tells how views lie"
+        )
         raise SourceError(what, where=video.path, got=got, hint=hint)
     width_px, height_px = video.size_px
     return (width_px, height_px // 2) if stacked else (width_px // 2, height_px)
+
+
+def _how_to_cut(video: VideoFile, settings: SourceSettings, home: Path) -> str | None:
+    """Return what to do with a video whose views, cut in another way, have the calibrated size."""
+    width_px, height_px = video.size_px
+    fits = "the calibration fits it cut so: --set source.side_by_side="
+    for size, hint in (
+        ((width_px, height_px), "it shows one camera: name the video of the other with --right"),
+        ((width_px, height_px // 2), f"{fits}top-bottom"),
+        ((width_px // 2, height_px), f"{fits}left-right"),
+    ):
+        with suppress(ReconError):
+            read_rig(settings, home, size)
+            return hint
+    return None
 
 
 def split_views(image: UInt8, settings: SourceSettings) -> tuple[UInt8, UInt8]:

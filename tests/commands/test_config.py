@@ -87,6 +87,21 @@ def test_a_wrong_file_is_refused_by_name(tmp_path, text, message):
         load_config(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "changes"),
+    [
+        ("fusion.min_count=2,fusion.voxel_m=0.2", {"fusion.min_count": 2, "fusion.voxel_m": 0.2}),
+        (
+            "audit.baseline_m=[0.1,2], matching.matcher=sgm",
+            {"audit.baseline_m": (0.1, 2), "matching.matcher": "sgm"},
+        ),
+        ("source.left=a,b=c.png", {"source.left": "a,b=c.png"}),
+    ],
+)
+def test_several_settings_stand_in_one_text_with_commas(text, changes):
+    assert load_config(overrides=[text]) == load_config(overrides=[changes])
+
+
 @pytest.mark.parametrize("text", ["fusion.voxel_m", "=3", "fusion.voxel_m=[1"])
 def test_an_override_that_cannot_be_read_is_refused(text):
     with pytest.raises(SettingsError, match="--set"):

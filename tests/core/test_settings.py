@@ -11,7 +11,15 @@ from recon.cli.options import parse_numbers as parse_option
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import MissingDependencyError, ReconError, SettingsError, require
 from recon.core.settings import Settings
-from recon.core.text import counted, is_count, parse_integer, parse_number, unit_of, with_unit
+from recon.core.text import (
+    counted,
+    is_count,
+    metres,
+    parse_integer,
+    parse_number,
+    unit_of,
+    with_unit,
+)
 from recon.evaluation.trajectory import TrajectoryRules
 from recon.io.cameras.opencv_yaml import read_file_storage
 from recon.io.fields import parse_yaml
@@ -70,6 +78,21 @@ def test_numbers_of_old_yaml_are_text(tmp_path, text):
     assert read_file_storage(tmp_path / "rig.yml") == {"fx": text}
     decimals = "[10, 010, -2, 0.5, 1.5e+3, -.inf, true]"
     assert parse_yaml(decimals, "x.yaml") == [10, 10, -2, 0.5, 1500.0, -float("inf"), True]
+
+
+@pytest.mark.parametrize(
+    "setting", ["fusion.voxel_m=0,2", "fusion.voxel_m=-0,2", "audit.baseline_m=['0,1', 2]"]
+)
+def test_a_setting_with_a_decimal_comma_is_refused_for_it(setting):
+    with pytest.raises(ReconError, match=r"decimals need a point.*: -?0\.[12]"):
+        load_config(None, [setting])
+
+
+def test_a_length_has_three_digits_that_count_and_no_exponent():
+    lengths = {0: "0 m", 0.0019: "0.00190 m", -0.25: "-0.250 m", 12.345: "12.3 m", 1234.5: "1234 m"}
+    assert [metres(length) for length in lengths] == [*lengths.values()]
+    assert (metres(0.25, "+"), metres(-0.25, "+")) == ("+0.250 m", "-0.250 m")
+    assert (metres(1e-15), metres(float("nan"))) == ("0.000000 m", "nan m")
 
 
 def test_things_are_counted_with_their_plural():

@@ -96,7 +96,7 @@ def test_freezing_copies_nothing_and_leaves_the_callers_array_writeable():
         (LENS, {"distortion": np.full(5, 2e6)}, "distortion is implausible"),
         (LENS, {"model": "fisheye"}, "four distortion .*got 5"),
         (RIG, {"T_right_left": np.eye(4)}, "baseline is zero"),
-        (RIG, {"T_right_left": np.diag([2.0, 1, 1, 1])}, "not orthonormal"),
+        (RIG, {"T_right_left": np.diag([2.0, 1, 1, 1])}, "R of the right camera is not a rotation"),
         (RIG, {"T_right_left": np.full((4, 4), NAN)}, "not finite"),
         (CAMERA, {"focal_px": 0.0}, "focal length is not positive"),
         (CAMERA, {"focal_px": 0.03}, "focal length is implausible"),

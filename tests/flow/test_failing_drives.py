@@ -7,6 +7,7 @@ rail, grey asphalt, sky. kiss-icp stands still on it and is sure of that.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -22,8 +23,9 @@ from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_merge, run_remove
 from recon.core.errors import CalibrationError, MappingError, RegistrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
-from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
+from recon.core.values import PointCloud, RectifiedCamera, RectifiedPair, Trajectory
 from recon.evaluation.trajectory import TrajectoryRules
+from recon.map.drive.sequence import check_map
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source
@@ -146,13 +148,23 @@ def dimmed(pair: RectifiedPair, factor: float) -> RectifiedPair:
 
 def test_a_drive_without_a_map_says_why(seen, tmp_path):
     swapped = [replace(pair, left=pair.right, right=pair.left) for pair in seen[:3]]
-    with pytest.raises(MappingError, match=r"the map is empty \(got 8 of 8 poses are not to be"):
+    with pytest.raises(MappingError, match=r"the map is empty: 8 of 8 poses are not to be"):
         map_drive(BARE.pairs(range(8)), tmp_path / "bare")
     with pytest.raises(MappingError, match=r"no point in the middle of the drive: .* at .* m"):
         map_drive(seen[:4], tmp_path / "near", "cloud.max_range_m=0.5")
     with pytest.raises(CalibrationError, match="left and right images are swapped"):
         map_drive(swapped, tmp_path / "swapped")
     assert [path.name for path in tmp_path.glob("*/*")] == ["drive"] * 3
+
+
+def test_an_empty_map_of_frames_that_share_no_place_is_told_in_one_sentence(seen):
+    sample = SimpleNamespace(cloud=PointCloud(np.full((3, 3), 2.0, np.float32)))
+    mapped: Any = SimpleNamespace(tiles=[], health=[], config=load_config(), sample=sample)
+    mapped.camera, mapped.trajectory = seen[0].camera, range(6)
+    with pytest.raises(
+        MappingError, match=r"^a: the map is empty: of 6 frames, too few saw .*; use"
+    ):
+        check_map(mapped, "a")
 
 
 def test_a_baseline_in_another_unit_is_warned_of_and_throws_nothing_away(seen, tmp_path):

@@ -8,8 +8,11 @@ from hypothesis import strategies as st
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
+from recon.io.control_points import read_control
 from recon.io.fields import read_yaml, write_yaml
 from recon.io.files import read_table, read_text
+from recon.io.imu import read_imu
+from recon.io.positions import read_positions
 from recon.io.trajectory import (
     holds_times,
     read_kitti_poses,
@@ -18,6 +21,7 @@ from recon.io.trajectory import (
     write_kitti_poses,
     write_tum,
 )
+from recon.sources.times import read_stamped_names
 
 
 def test_tables_and_yaml_are_read_as_they_are_meant(tmp_path):
@@ -31,6 +35,30 @@ def test_tables_and_yaml_are_read_as_they_are_meant(tmp_path):
     write_yaml(tmp_path / "c.yaml", values)
     assert read_yaml(tmp_path / "c.yaml") == values
     assert list(read_yaml(tmp_path / "c.yaml")) == ["b", "a"]
+
+
+IMU, GCP = "#t\n" + 9 * "1 0 0 0 0 0 9.8\n", "EPSG:32632\n"
+COMMAS = {
+    "KITTI": (read_trajectory, "1,0 0,0 0,0 5,5 0,0 1,0 0,0 0,0 0,0 0,0 1,0 0,0\n"),
+    "TUM": (read_trajectory, "0.0 0 0 0 0 0 0 1\n1,5 2,0 0,5 0,0 0,0 0,0 0,0 1,0\n"),
+    "a quaternion": (read_trajectory, "0,1 1,5 2,0 3,0\n"),
+    "a header": (read_tum, "t;x;y;z;qx;qy;qz;qw\n0,1;1,5;2,0;3,0;0,0;0,0;0,0;1,0\n"),
+    "positions": (read_positions, "0 1 2 3\n1 1 2 3,5\n"),
+    "a spreadsheet": (read_positions, "time;lat;lon;height\n0,5;48,1;11,2;500,1\n"),
+    "RTKLIB": (read_positions, "% GPST latitude(deg)\n2020/01/01 00:00:00.000 35,1 139,7 50,1\n"),
+    "images": (read_stamped_names, "0.1 a.png\n0,2 b.png\n"),
+    "control points": (read_control, GCP + "500000 5000000 400,25 100 200 a.png p1\n"),
+    "an inertial unit": (read_imu, IMU + "2 0,1 0,0 0,0 0,0 0,0 9,8\n"),
+}
+
+
+@pytest.mark.parametrize("kind", COMMAS)
+def test_a_table_with_decimal_commas_is_refused_for_them(tmp_path, kind):
+    read, text = COMMAS[kind]
+    (tmp_path / "t.txt").write_text(text)
+    line = text.count("\n")
+    with pytest.raises(FormatError, match=rf"t\.txt:{line}: decimals are written with a comma"):
+        read(tmp_path / "t.txt")
 
 
 def random_trajectory(seed: int, length: int) -> Trajectory:

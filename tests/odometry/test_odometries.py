@@ -80,7 +80,7 @@ def test_an_error_of_all_disparities_is_as_much_of_the_length_and_warned_of_if_l
     assert far.rests_on_m == pytest.approx(260.0 * 0.5 / 3.0)
     assert near.warnings() == []
     assert far.warnings() == [
-        "scale rests on points about 43 m away: the length of the path is certain to ± 9 % only"
+        "scale rests on points about 43.3 m away: the length of the path is certain to ± 9 % only"
     ]
 
 

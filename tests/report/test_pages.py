@@ -234,7 +234,7 @@ def test_page_of_a_drive_shows_all_that_the_run_has(drive):
         "Time by stage", "What the calibration does to disparities",
     }  # fmt: skip
     assert key_figures(page) == {
-        "Path": "10.0 m", "Drift (t_rel)": "0.62 %", "Position error (ATE)": "0.41 m",
+        "Path": "10.0 m", "Drift (t_rel)": "0.62 %", "Position error (ATE)": "0.410 m",
         "Frames not trusted": "1 of 11", "Mapping rate": "4.2 fps", "Points in the map": "2,000",
     }  # fmt: skip
     shown = blocks(page)
@@ -279,6 +279,14 @@ def test_the_rig_is_tabulated_where_it_was_fitted(drive):
     assert "Right camera" not in map_html(drive)
 
 
+@pytest.mark.parametrize(("ate_m", "text"), [(0.0019, "0.00190 m"), (1234.5, "1234 m")])
+def test_a_position_error_is_shown_in_digits_that_fit_it(drive, ate_m, text):
+    drive.errors = replace(drive.errors, path=replace(drive.errors.path, ate_m=ate_m))
+    page = map_html(drive)
+    assert key_figures(page)["Position error (ATE)"] == text
+    assert ("absolute trajectory error (ATE)", text) in rows(blocks(page)["Path against truth"])
+
+
 def test_loops_that_were_closed_and_that_were_not_are_in_the_report(drive):
     session, figures = drive.map_.first, {"found": 3, "keyframes": 11, "largest_correction_m": 2.5}
     session.loops = {"closed": [{"first": 0, "last": 9}]}
@@ -289,7 +297,7 @@ def test_loops_that_were_closed_and_that_were_not_are_in_the_report(drive):
     session.loops = {"closed": []}
     drive.summary["loops"] = {**figures, "closed": 0, "largest_correction_m": 0.0}
     page = map_html(drive)
-    assert key_figures(page)["Loops closed, path moved by"] == "0 of 3, 0.00 m"
+    assert key_figures(page)["Loops closed, path moved by"] == "0 of 3, 0 m"
     assert "Loops" not in blocks(page)
 
 

@@ -101,7 +101,7 @@ def test_rectified_topics_are_taken_and_a_few_others_named(tmp_path, others):
     description = open_source(tmp_path / "drive.bag").description
     assert f"{TOPICS[0]} and {TOPICS[1]}" in description
     assert f"also there: {raw[0]}" in description
-    listed = description.partition("not used: ")[2]
+    listed = description.partition("other topics: ")[2]
     assert ("/wheel19 …" in listed) == (others > 20)
     assert "/wheel19" in listed.partition(" (for --prior")[0]
 
@@ -125,6 +125,25 @@ def test_messages_without_lengths_are_refused(rectified, focal_px, message):
     info = BagCameraInfo(64, 32, "plumb_bob", np.zeros(5), K, np.eye(3), P)
     with pytest.raises(ReconError, match=rf"drive\.bag: {message}.*--calib"):
         rig_of_messages(info, info, Path("drive.bag"), rectified)
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+def test_a_vertical_rig_in_a_bag_is_called_so(rectified):
+    left = np.hstack([np.diag([700.0, 700.0, 1.0]), np.zeros((3, 1))])
+    right = left.copy()
+    right[1, 3] = -70.0
+    with pytest.raises(ReconError, match=r"a\.bag: cameras are not side by side .*vertical rig"):
+        rig_of_messages(info_of(left), info_of(right), Path("a.bag"), rectified)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_message_whose_rotation_is_empty_is_refused_by_its_side(side):
+    infos = [
+        info_of(np.array([[700.0, 0, 600, x], [0, 700, 180, 0], [0, 0, 1, 0]])) for x in (0, -70)
+    ]
+    infos[side] = infos[side]._replace(R=np.zeros((3, 3)))
+    with pytest.raises(ReconError, match=f"R of the {('left', 'right')[side]} CameraInfo is not a"):
+        rig_of_messages(infos[0], infos[1], Path("a.bag"), rectified=False)
 
 
 def info_of(P: np.ndarray) -> BagCameraInfo:
@@ -242,7 +261,7 @@ def write_moving(folder: Path, kind: str, *, static: bool = True) -> Path:
 @pytest.mark.parametrize("kind", KINDS)
 def test_odometry_of_a_bag_becomes_the_path_of_its_camera(tmp_path, kind):
     source = open_source(write_moving(tmp_path, kind))
-    assert "not used: /odom, /tf, /tf_static (for --prior: /odom, /tf)" in source.description
+    assert "other topics: /odom, /tf, /tf_static (for --prior: /odom, /tf)" in source.description
     T_base_camera = T_BASE_BRACKET @ T_BRACKET_CAM
     expected = np.stack([base(index) @ T_base_camera for index in range(3)])
     for topic in ("/odom", "/tf"):
@@ -309,6 +328,23 @@ def test_a_video_that_cannot_be_halved_is_reported():
     with pytest.raises(ReconError, match=r"both.avi: .*cannot be halved \(got 127x32\)"):
         view_size(video, SourceSettings())
     assert view_size(video, SourceSettings(side_by_side="top-bottom")) == (127, 16)
+
+
+@pytest.mark.parametrize(
+    ("layout", "stack", "hint"),
+    [("left-right", np.vstack, "fits it cut so: --set source.side_by_side=top-bottom"),
+     ("top-bottom", np.hstack, "fits it cut so: --set source.side_by_side=left-right"),
+     ("left-right", lambda views: views[0], "it shows one camera: name .* --right"),
+     ("left-right", lambda views: np.tile(views[0], (3, 3)), "use images as they were calibrated")],
+)  # fmt: skip
+def test_views_that_are_cut_wrongly_are_refused_with_the_cut_that_fits(
+    noise, tmp_path, layout, stack, hint
+):
+    drives.write_calib(tmp_path, CAMERA)
+    images = [stack((pair.left, pair.right)) for pair in noise]
+    path = drives.write_video(tmp_path / "both.avi", images)
+    with pytest.raises(ReconError, match=f"another size .*{hint}"):
+        open_source(path, settings=SourceSettings(side_by_side=layout))
 
 
 @pytest.mark.parametrize(

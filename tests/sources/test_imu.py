@@ -128,7 +128,7 @@ def test_a_unit_of_a_bag_is_read_and_placed_by_static_transforms(noise, tmp_path
                 message.header.stamp.nanosec += 5_000_000 * k
                 bag.write("/imu/data", stamp + 5_000_000 * k, message)
     source = open_source(how.path(tmp_path))
-    assert "not used: /tf_static" in source.description
+    assert "other topics: /tf_static" in source.description
     record = source.read_imu()
     assert (len(record), record.notes) == (240, ())
     np.testing.assert_allclose(record.T_camera_imu, T_BODY_IMU, atol=1e-12)

@@ -9,6 +9,8 @@ from recon.core.values.camera import LensModel as LensModel
 from recon.core.values.camera import RectifiedCamera as RectifiedCamera
 from recon.core.values.camera import Rig as Rig
 from recon.core.values.camera import StereoCalibration as StereoCalibration
+from recon.core.values.camera import check_rotation as check_rotation
+from recon.core.values.camera import check_side_by_side as check_side_by_side
 from recon.core.values.camera import check_size as check_size
 from recon.core.values.camera import check_unsized as check_unsized
 from recon.core.values.camera import other_size as other_size

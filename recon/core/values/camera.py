@@ -88,9 +88,7 @@ class StereoCalibration:
         rotation = self.T_right_left[:3, :3]
         if not np.isfinite(self.T_right_left).all():
             raise CalibrationError("pose of the right camera is not finite")
-        # 1e-3: calibration files often print no more than six digits.
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-            raise CalibrationError("rotation of the right camera is not orthonormal")
+        check_rotation(rotation, "R of the right camera")
         _check_baseline(self.baseline_m)
 
     def __repr__(self) -> str:
@@ -199,14 +197,40 @@ def _check_view(
             raise CalibrationError("principal point is far outside of the image", got=got)
 
 
+def check_rotation(rotation: Float64, name: str) -> None:
+    """Check that a matrix (3, 3) of a calibration is a rotation."""
+    # 1e-3: calibration files often print no more than six digits.
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not orthonormal or np.linalg.det(rotation) < 0:
+        raise CalibrationError(
+            f"{name} is not a rotation",
+            got=rotation.round(4).tolist() if rotation.any() else "zeros",
+            hint="take it from a calibration of both cameras as a pair",
+        )
+
+
+def check_side_by_side(step_m: Float64, where: str | PathLike[str] | None = None) -> None:
+    """Check that the right camera is to the right; ``step_m`` (3,) is its ``T``."""
+    x, y, z = step_m.tolist()
+    if -x > max(abs(y), abs(z)) or not step_m.any():  # a baseline of zero has an error of its own
+        return
+    what = "cameras are not side by side"
+    hint = "rotate the images of a vertical rig by 90 degrees and calibrate again"
+    if x > max(abs(y), abs(z)):
+        what = "right camera is to the left of the left camera"
+        hint = "swap left and right, of images and calibration"
+    elif abs(z) > abs(y):
+        hint = "one is behind the other: check T, whose axes are x right, y down, z forward"
+    got, expected = f"right camera at ({0.0 - x:g}, {0.0 - y:g}, {0.0 - z:g}) m", "mostly along x"
+    raise CalibrationError(what, where=where, got=got, expected=expected, hint=hint)
+
+
 def _check_baseline(baseline_m: float) -> None:
     if baseline_m <= 0:
-        raise CalibrationError(
-            "baseline is zero" if baseline_m == 0 else "baseline is negative",
-            got=f"{baseline_m:g} m",
-            expected="> 0 m",
-            hint="check that left and right are not swapped",
-        )
+        what, hint = "baseline is negative", "check that left and right are not swapped"
+        if baseline_m == 0:
+            what, hint = "baseline is zero", "calibrate both cameras as a pair"
+        raise CalibrationError(what, got=f"{baseline_m:g} m", expected="> 0 m", hint=hint)
     if not _BASELINE_M[0] <= baseline_m <= _BASELINE_M[1]:
         raise CalibrationError("baseline is implausible", got=f"{baseline_m:g} m")
 

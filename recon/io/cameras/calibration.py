@@ -5,16 +5,21 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from typing import Final
+from zipfile import is_zipfile
 
 from recon.core.errors import CalibrationError, FormatError
+from recon.core.text import parse_number
 from recon.core.values import Rig, check_size
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
-from recon.io.cameras.opencv_yaml import read_opencv_calibration
+from recon.io.cameras.opencv_yaml import INSTEAD, read_opencv_calibration
 from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
-from recon.io.cameras.ros import read_camera_info, read_kalibr
+from recon.io.cameras.ros import in_options, read_camera_info, read_kalibr
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury import read_middlebury_calib
 
+_COMMA, _POINT = re.compile(r"\d,\d"), re.compile(r"^[^%<\n]*\d\.", re.MULTILINE)
+#: Numbers of rectified cameras in the settings of ORB-SLAM.
+_ORB_SLAM: Final = re.compile(r"^(?:Camera1?|Stereo)\.(fx|cx|cy|bf|b):\s*(\S+)", re.MULTILINE)
 #: What a file of each format contains. OpenCV's comes after the others that may have its header,
 #: and before KITTI's: it may contain a ``P1:``.
 _SIGNS: Final = {
@@ -56,7 +61,12 @@ def read_calibration(
         CalibrationError: The calibration cannot give depth, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)
+    if is_zipfile(path):
+        raise FormatError("arrays of NumPy are not a calibration file", hint=INSTEAD)
     text = read_text(path, SMALL_FILE_BYTES)
+    if _COMMA.search(text) and not _POINT.search(text):
+        raise FormatError("decimals are written with a comma", expected="a point, as 0.5")
+    _refuse_numbers(text)
     form = next((form for form, sign in _SIGNS.items() if sign.search(text)), "")
     if form == "opencv":
         rig: Rig = read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
@@ -74,13 +84,25 @@ def read_calibration(
         )
     else:
         raise FormatError(
-            "not a calibration file",
+            "not a calibration file of a known kind",
             expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
             "OpenCV YAML/XML/JSON (M1 …, or P1 P2), ROS CameraInfo or a kalibr camchain (cam0: …)",
+            hint=INSTEAD,
         )
     if size is not None:
         check_size(rig, *size, path)
     return rig
+
+
+def _refuse_numbers(text: str) -> None:
+    """Refuse settings of ORB-SLAM, whose cameras are numbers that options take."""
+    found = dict(_ORB_SLAM.findall(text))
+    if {"fx", "cx", "cy"} < found.keys() and found.keys() & {"b", "bf"}:
+        fx, cx, cy = (parse_number(found[name]) for name in ("fx", "cx", "cy"))
+        baseline_m = parse_number(found["b"]) if "b" in found else parse_number(found["bf"]) / fx
+        what = "not a calibration of raw cameras, but numbers of rectified ones"
+        given = f"if the images are rectified give {in_options(fx, baseline_m, cx, cy)}"
+        raise FormatError(what, hint=f"{given}; else calibrate both cameras as a pair")
 
 
 def _read_kitti(

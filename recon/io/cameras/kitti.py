@@ -19,6 +19,8 @@ from recon.core.values import (
     RectifiedCamera,
     Rig,
     StereoCalibration,
+    check_rotation,
+    check_side_by_side,
     check_unsized,
     other_size,
 )
@@ -55,6 +57,7 @@ def projected_rig(
             f"{' and '.join(projections)} have different focal lengths or rows",
             hint="a rectified pair shares them; rectify the images first",
         )
+    check_side_by_side(offsets_m[1] - offsets_m[0])
     baseline_m = float(offsets_m[0][0] - offsets_m[1][0])
     return RectifiedCamera.from_matrices(left, right, baseline_m, width_px, height_px)
 
@@ -135,4 +138,5 @@ def _camera(fields: Fields, camera: int, size: tuple[int, ...]) -> CameraIntrins
 
 def _pose(fields: Fields, camera: int) -> Float64:
     rotation = fields.numbers(f"R_{camera:02d}", (3, 3))
+    check_rotation(rotation, f"R_{camera:02d}")
     return make_transform(rotation, fields.numbers(f"T_{camera:02d}", (3,)))

@@ -51,6 +51,11 @@ _FISHEYE_NAMES: Final = frozenset({"fisheye", "equidistant", "kannala-brandt", "
 _FISHEYE_LIKE: Final = 0.1
 _DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})  # coefficients that OpenCV supports
 _LONGEST_BASELINE_M: Final = 20.0  # longer than any rig: millimetres read as metres
+INSTEAD: Final = (
+    "write M1, D1, M2, D2, R, T, image_width and image_height into one file with OpenCV's "
+    "FileStorage; of rectified images --focal PX and --baseline M are enough"
+)
+"""What to do with a calibration that is not read."""
 _NOT_FINITE: Final = re.compile(r"\.(?:Nan|Inf)\b")
 _XML_ROOT: Final = "opencv_storage"
 Nodes = dict[str, Float64 | str]
@@ -118,7 +123,7 @@ def _check_unit(baseline_m: float) -> None:
     if baseline_m > _LONGEST_BASELINE_M:
         what = "baseline is implausibly long"
         got, expected = f"{baseline_m:g} m", f"at most {_LONGEST_BASELINE_M:g} m"
-        hint = "if the file is in millimetres, pass 0.001 metres per unit"
+        hint = "in millimetres? --set source.metres_per_unit=0.001, in Python metres_per_unit=0.001"
         raise CalibrationError(what, got=got, expected=expected, hint=hint)
 
 
@@ -173,7 +178,7 @@ def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...]) -> Float
     value, what = _find(nodes, names), repr(names[0])
     if value is None:
         got, expected = ", ".join(nodes) or "nothing", " or ".join(names)
-        raise FormatError(f"calibration has no {what}", got=got, expected=expected)
+        raise FormatError(f"calibration has no {what}", got=got, expected=expected, hint=INSTEAD)
     if value.size != np.prod(shape):
         raise FormatError(f"{what} has the wrong size", got=value.shape, expected=shape)
     return value.reshape(shape)

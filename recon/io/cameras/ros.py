@@ -22,6 +22,8 @@ from recon.core.values import (
     RectifiedCamera,
     StereoCalibration,
     Trajectory,
+    check_rotation,
+    check_side_by_side,
 )
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
@@ -48,6 +50,7 @@ _EUROC_MODELS: Final[Models] = {
     "equidistant": ("fisheye", (4,)),
 }
 NS: Final = 1e-9
+_AGAIN: Final = "calibrate again with one of these; equidistant is for wide lenses"
 _SIDES: Final = ("left", "right")
 _OFF_CENTRE: Final = 0.05  # of a principal point, in image sizes: hardly a lens is mounted worse
 
@@ -79,11 +82,11 @@ def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> Ster
     stated = left.width_px, left.height_px
     if size and are_rectified((left.matrix, right.matrix), projections, stated, size):
         focal, cx, cy = P_left[[0, 0, 1], [0, 2, 2]]
-        hint = f"--focal {focal:g} --baseline {-step_between(projections, path)[0]:g}"
+        options = in_options(focal, -step_between(projections, path)[0], cx, cy)
         raise CalibrationError(
             "the images are rectified: K and D of the CameraInfo are of others, and P is of them",
             got=f"images of {size[0]}x{size[1]} pixels",
-            hint=f"instead of the file give {hint} --cx {cx:g} --cy {cy:g}",
+            hint=f"instead of the file give {options}",
         )
     return rig_of_camera_infos((left, R_left), (right, R_right), projections, right_path)
 
@@ -97,6 +100,8 @@ def rig_of_camera_infos(
     """Return the rig of cameras, their rectifying rotations (3, 3) and both ``P`` (3, 4)."""
     step_m = step_between(projections, where)
     with reading(where):
+        for side, (_, rotation) in zip(_SIDES, (left, right), strict=True):
+            check_rotation(rotation, f"rectification matrix R of the {side} CameraInfo")
         T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ step_m))
         return StereoCalibration(left[0], right[0], T)
 
@@ -130,19 +135,18 @@ def step_between(projections: tuple[Float64, Float64], where: StrPath) -> Float6
     with reading(where):
         left_m, right_m = map(offset_m, projections, (f"P of the {side}" for side in _SIDES))
     step_m: Float64 = right_m - left_m
-    if step_m[0] < 0:
+    if step_m.any():
+        check_side_by_side(step_m, where)
         return step_m
-    what, hint = "right camera is to the left of the left camera", "swap left and right"
-    if step_m[0] == 0:
-        what = "CameraInfo has no baseline"
-        hint = (
-            "the right camera was calibrated alone: calibrate both as a pair, or name a "
-            "calibration file with --calib"
-        )
     left, right = (P[0, 3] for P in projections)
-    got = f"P[0, 3] = {right:g}" + (f", {left:g} of the left" if left else "")
-    expected = "-fx * baseline, below that of the left"
-    raise CalibrationError(what, where=where, got=got, expected=expected, hint=hint)
+    raise CalibrationError(
+        "CameraInfo has no baseline",
+        where=where,
+        got=f"P[0, 3] = {right:g}" + (f", {left:g} of the left" if left else ""),
+        expected="-fx * baseline, below that of the left",
+        hint="the right camera was calibrated alone: calibrate both as a pair, or name a "
+        "calibration file with --calib",
+    )
 
 
 @reader
@@ -204,14 +208,16 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
 def read_kalibr(path: StrPath) -> StereoCalibration:
     """Read kalibr's camera chain; ``T_cn_cnm1`` maps points of camera n-1 to camera n."""
     fields, cameras = Fields(read_yaml(path)), []
-    T_right_left = orthonormalise(fields.below("cam1").numbers("T_cn_cnm1", (4, 4)))
+    T_right_left = fields.below("cam1").numbers("T_cn_cnm1", (4, 4))
+    check_rotation(T_right_left[:3, :3], "T_cn_cnm1")
     for part in (fields.below("cam0"), fields.below("cam1")):
         if (kind := part.text("camera_model")) != "pinhole":
             expected = "pinhole (with radtan or equidistant distortion)"
-            raise FormatError("camera model is not supported", got=kind, expected=expected)
+            what = "camera model is not supported"
+            raise FormatError(what, got=kind, expected=expected, hint=_AGAIN)
         name = part.text("distortion_model")
         cameras.append(_camera(part, _KALIBR_MODELS, name, "distortion_coeffs", path))
-    return StereoCalibration(cameras[0], cameras[1], T_right_left)
+    return StereoCalibration(cameras[0], cameras[1], orthonormalise(T_right_left))
 
 
 def _camera(
@@ -250,6 +256,7 @@ def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
     name = fields.text(key) if key in fields else "radial-tangential"
     camera = _camera(fields, _EUROC_MODELS, name, "distortion_coefficients", path)
     T = fields.below("T_BS").numbers("data", (4, 4))
+    check_rotation(T[:3, :3], "T_BS")
     return camera, make_transform(T[:3, :3], T[:3, 3])
 
 
@@ -260,6 +267,11 @@ def read_euroc_truth(path: StrPath) -> Trajectory:
     table, _ = read_table(path, (17, 8))
     poses = [make_transform(rotation_from_quaternion(row[[5, 6, 7, 4]]), row[1:4]) for row in table]
     return Trajectory(np.stack(poses), table[:, 0] * NS)
+
+
+def in_options(focal_px: float, baseline_m: float, cx_px: float, cy_px: float) -> str:
+    """Return the options that give the camera of rectified images without a file."""
+    return f"--focal {focal_px:g} --baseline {baseline_m:g} --cx {cx_px:g} --cy {cy_px:g}"
 
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
@@ -273,7 +285,8 @@ def lens_of(
     """Return our lens model for a format's name, and its coefficients."""
     if name not in models:
         expected = ", ".join(models)
-        raise FormatError("lens model is not supported", where=where, got=name, expected=expected)
+        what = "lens model is not supported"
+        raise FormatError(what, where=where, got=name, expected=expected, hint=_AGAIN)
     model, counts = models[name]
     if coefficients.size not in counts:
         what = f"lens model {name!r} has the wrong number of coefficients"

@@ -15,7 +15,7 @@ import numpy as np
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert, transform_cloud
 from recon.core.progress import series, stage
-from recon.core.text import counted
+from recon.core.text import counted, metres
 from recon.core.values import (
     Disparity,
     OccupancyVoxels,
@@ -314,7 +314,7 @@ def check_map(mapped: MappedSequence, where: str, findings: Sequence[str] = ()) 
         return
     why, hint = _explain_poses(mapped.health) or _explain_sample(mapped)
     hint = "; ".join((*findings[:1], hint))
-    raise MappingError("the map is empty", where=where, got=why, hint=hint)
+    raise MappingError(f"the map is empty: {why}", where=where, hint=hint)
 
 
 def _explain_poses(health: Sequence[OdometryHealth]) -> tuple[str, str] | None:
@@ -340,7 +340,7 @@ def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
     nearest_m = float(frame.cloud.xyz[:, 2].min())
     reach_m = fusion_range_m(mapped.camera, config.fusion)
     if nearest_m > reach_m:
-        got = f"the nearest point is {nearest_m:.1f} m away, the map ends at {reach_m:.1f} m"
+        got = f"the nearest point is {metres(nearest_m)} away, the map ends at {metres(reach_m)}"
         return got, "allow larger errors with --set fusion.max_depth_error_m="
     got = f"of {counted(len(mapped.trajectory), 'frame')}, too few saw the same place"
     return got, "use recon pair for a single pair, or lower fusion.min_count"

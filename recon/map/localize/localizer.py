@@ -77,7 +77,7 @@ class Located:
     def __repr__(self) -> str:
         parts = [self.state.value, *([self.note] if self.note else [])]
         if self.T_world_camera is not None:
-            at = " ".join(f"{metres:.2f}" for metres in self.T_world_camera[:3, 3])
+            at = " ".join(f"{metres:.5g}" for metres in self.T_world_camera[:3, 3])
             parts += [f"at {at} m, sigma {self.sigma_m:.2g} m, {counted(self.inliers, 'inlier')}"]
         return f"Located({', '.join(parts)})"
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import apply
+from recon.core.text import metres
 from recon.core.values.arrays import Float64
 from recon.io.models.las import check_inside
 from recon.map.map import Map
@@ -73,8 +74,8 @@ class Georeference:
         if self.rms_m <= LARGEST_MISFIT * self.span_m:
             return lines
         if self.points:
-            return [*lines, f"the control points are {self.rms_m:.2f} m from the map (RMS)"]
-        apart = f"the positions are {self.rms_m:.2f} m from the path of the map (RMS)"
+            return [*lines, f"the control points are {metres(self.rms_m)} from the map (RMS)"]
+        apart = f"the positions are {metres(self.rms_m)} from the path of the map (RMS)"
         if abs(self.scale - 1.0) > _LARGEST_STRETCH:
             return [*lines, f"{apart}, {self.scale:.2f} times as far apart: not in metres?"]
         return [*lines, f"{apart}: another clock, another antenna offset, or drift"]

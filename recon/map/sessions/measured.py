@@ -19,7 +19,7 @@ from recon.core.geometry.alignment import (
     turn_covariance,
 )
 from recon.core.geometry.se3 import apply, invert
-from recon.core.text import counted
+from recon.core.text import counted, metres
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.control_points import ControlPoints, is_control, read_control
@@ -222,7 +222,7 @@ class Measured:
         )
         if swapped > 0.5 * as_given or as_given < _LEAST_BEND_M:
             return []
-        better = f"{swapped:.2f} m instead of {as_given:.2f} m (RMS)"
+        better = f"{metres(swapped)} instead of {metres(as_given)} (RMS)"
         if self.degrees:
             return [better]
         ask = "columns are time, easting, northing, height"
@@ -233,7 +233,7 @@ class Measured:
         worst = [n for n in np.argsort(-off_m) if not self.agree[n]]
         if not worst:
             return []
-        named = [f"at {self.times_s[n]:.3f} s ({off_m[n]:.1f} m off)" for n in worst[:_NAMED]]
+        named = [f"at {self.times_s[n]:.3f} s ({metres(off_m[n])} off)" for n in worst[:_NAMED]]
         more = ", …" if len(worst) > _NAMED else ""
         of_all = f"{len(worst)} of {counted(len(off_m), 'position')}"
         return [f"{of_all} contradict the others and are left out: {', '.join(named)}{more}"]
@@ -301,7 +301,7 @@ def fixed_turn(
     worse = max(found, key=lambda covariance: float(covariance[2, 2]))
     yaw_rad = math.sqrt(worse[2, 2])
     if yaw_rad > _MOST_YAW_RAD:
-        apart = f"{counted(len(there_m), 'place')} within {span_m(there_m[:, :2]):.2f} m"
+        apart = f"{counted(len(there_m), 'place')} within {metres(span_m(there_m[:, :2]))}"
         yaw_deg = min(180.0, math.degrees(yaw_rad))
         raise EvaluationError(
             f"the {what} do not say how the map is turned",
@@ -346,7 +346,7 @@ def doubts_of_positions(map_: MapFile) -> list[str]:
     if off_m is None or off_m <= LARGEST_MISFIT * extent_m:
         return []
     why = "another clock, another antenna offset, other units, or positions that are no better"
-    return [f"the paths are {off_m:.2f} m from the measured positions (RMS): {why}"]
+    return [f"the paths are {metres(off_m)} from the measured positions (RMS): {why}"]
 
 
 def _fixes(session: Session, measured: Measured, survey: Survey) -> Fixes:

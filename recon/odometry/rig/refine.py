@@ -18,6 +18,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import make_transform
 from recon.core.progress import stage
+from recon.core.text import metres
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
@@ -48,6 +49,7 @@ _LEAST_PX: Final = 0.05  # no matcher sees less; images are not warped for it
 _FIELD: Final = (16, 8)  # places across and down the image at which rigs are compared
 MOST_DEPTH_PERCENT: Final = 2.0
 """Error of the depth from which the rig given is called wrong."""
+LEAST_FRAMES: Final = MIN_WINDOWS * FRAMES  # of a drive whose rig is refined
 MOST_LATE: Final = 0.1  # frames from which right images are said to be late
 LATER: Final = "after the left ones"  # in what is said of them
 
@@ -225,7 +227,7 @@ class RefinedRig:
         """Return in words what the drive shows of the rig given, and what it does to a depth."""
         near = self.changes[0]
         off = f"{near.mean_px:+.2f} ± {1.96 * self.sigma_px:.2f} px"
-        depth = f"by {self.rms_percent(depth_m):.0f} % at {depth_m:.0f} m"
+        depth = f"by {self.rms_percent(depth_m):.0f} % at {metres(depth_m)}"
         return f"disparities are {off} off, {near.rms_px:.2f} px rms over the image, depth {depth}"
 
     def warnings(self, known: Sequence[str] = ()) -> list[str]:
@@ -290,7 +292,7 @@ def refine_rig(
     if source.live:
         return found
     found = replace(found, rigidity=measure_rigidity(source, begun))
-    if found.not_rigid or len(source) < MIN_WINDOWS * FRAMES:
+    if found.not_rigid or len(source) < LEAST_FRAMES:
         return found
     values = np.zeros(len(NAMES)) if known is None else known.fitted.values.copy()
     refined, turn = _with_rows_aligned(source, found.calibration, begun)

@@ -8,10 +8,10 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from recon.core.text import counted
+from recon.core.text import counted, metres
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
-from recon.odometry.rig.refine import LATER, MOST_LATE, RefinedRig
+from recon.odometry.rig.refine import LATER, LEAST_FRAMES, MOST_LATE, RefinedRig
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample
 from recon.rig.settings import AuditedSettings
@@ -24,7 +24,7 @@ _FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "nonrigid", 
 _SIDES = ("left", "right")
 _SWAPPED_SHARE: Final = 0.8  # share of negative disparities from which the cameras count as swapped
 _ROW_PX: Final = 0.75  # rms row error above which it is reported
-_BAD_ROW_PX: Final = 1.5  # rms row error above which that finding is fatal
+_BAD_ROW_PX: Final = 1.5  # rms row error above which it is fatal, unless recon map corrects it
 _GAIN: Final = 1.2  # brightness ratio above which a finding is reported
 _SHARPNESS_RATIO: Final = 0.65  # one camera counts as blurred below, relative to the other
 _SHARPNESS: Final = 0.14  # both cameras count as blurred below this sharpness
@@ -60,13 +60,13 @@ _TEXTS: Final = {
     "geometry: the images show too little texture, or different scenes",
     "rows": "rows of left and right are not aligned: {rows.rms_px:.2f} px rms, mean "
     "{rows.mean_px:+.2f} px, spread {rows.spread_px:.2f} px; rotating the right camera by "
-    "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: recon map does so (from 36 "
-    "frames on), and recon audit --mend FILE writes it",
+    "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: {who}recon audit --mend FILE "
+    "writes it",
     "rig": "the rig is not as calibrated: {shown}; recon map uses the rig that the motion shows, "
     "and recon audit --mend FILE writes it",
     "near": "{percent:.0f} % of the features are nearer than the disparity range covers "
-    "({reach_px} px, {reach_m:.1f} m); give the matcher an ndisp of {most}",
-    "far": "half of the features are farther away than {depth_m:.0f} m, at less than "
+    "({reach_px} px, {reach}); give the matcher an ndisp of {most}",
+    "far": "half of the features are farther away than {depth}, at less than "
     "{middle:.1f} px of disparity: the baseline of {baseline_m:.3g} m is too short for this scene",
     "size": "the calibration is of another size: principal point of the {side} camera at "
     "({x:.0f}, {y:.0f}) of {width}x{height} pixels; scale it, or use images of the calibrated size",
@@ -194,8 +194,12 @@ def _of_geometry(measured: Measured) -> Found:
         yield "features", {"matched": geometry.matched}
     elif rows is not None and rows.rms_px > _ROW_PX:
         pitch, _, roll, _ = np.degrees(rows.turn)
-        fatal = rows.rms_px > _BAD_ROW_PX
-        yield "rows", {"fatal": fatal, "rows": rows, "pitch": pitch, "roll": roll}
+        corrected = len(measured.source) >= LEAST_FRAMES
+        if measured.rig is not None:
+            corrected = measured.rig.fitted is not None
+        fatal = rows.rms_px > _BAD_ROW_PX and not corrected
+        who = "recon map does so, and " if corrected else ""
+        yield "rows", {"fatal": fatal, "rows": rows, "pitch": pitch, "roll": roll, "who": who}
 
 
 def _of_rig(rig: RefinedRig | None, disparity_px: Float64) -> Found:
@@ -217,13 +221,13 @@ def _of_range(disparity_px: Float64, reach_px: int | None, camera: RectifiedCame
     columns_px = disparity_px - camera.doffs_px
     near = float(np.mean(columns_px > reach_px)) if reach_px else 0.0
     if reach_px and near > _NEAR_SHARE:
-        reach = {"reach_px": reach_px, "reach_m": scale / (reach_px + camera.doffs_px)}
+        reach = {"reach_px": reach_px, "reach": metres(scale / (reach_px + camera.doffs_px))}
         most = int(np.ceil(np.quantile(columns_px, 0.98) / 16) * 16)
         yield "near", {"percent": 100 * near, **reach, "most": most}
     middle = float(np.median(disparity_px))
     if 0 < middle < _FAR_PX:
         baseline = {"baseline_m": camera.baseline_m}
-        yield "far", {"depth_m": scale / middle, "middle": middle, **baseline}
+        yield "far", {"depth": metres(scale / middle), "middle": middle, **baseline}
 
 
 def _of_calibration(

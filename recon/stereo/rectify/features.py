@@ -249,8 +249,8 @@ def check_inspection(inspection: PairInspection, where: str | None = None) -> tu
         line = (
             "rows of left and right are not aligned: the right image is "
             f"{abs(inspection.row_error_px):.0f} px too {side} (expected "
-            f"under {_WARN_ROW_PX:g} px); depth will be poor or wrong: rectify the "
-            "images, or recalibrate the cameras"
+            f"under {_WARN_ROW_PX:g} px); depth will be poor or wrong: recon audit --mend FILE "
+            "writes a calibration of the pairs that aligns them"
         )
         return (line,)
     return ()

@@ -21,6 +21,7 @@ from recon.core.values import (
     Rig,
     StereoCalibration,
     StereoPair,
+    check_side_by_side,
     check_size,
 )
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8, frozen_array
@@ -218,27 +219,13 @@ def _check_rig(calibration: StereoCalibration) -> None:
             "left and right camera differ in image size",
             got=f"left {left.width_px}x{left.height_px}, right {right.width_px}x{right.height_px}",
         )
-    x, y, z = calibration.T_right_left[:3, 3]
-    if abs(y) >= abs(x) or abs(z) >= abs(x):
-        raise CalibrationError(
-            "cameras are not side by side",
-            got=f"right camera at ({-x:g}, {-y:g}, {-z:g}) m",
-            expected="mostly along x",
-            hint="rotate the images of a vertical rig by 90 degrees and calibrate again",
-        )
+    check_side_by_side(calibration.T_right_left[:3, 3])
     apart_rad = float(angle_rad(calibration.T_right_left))
     if apart_rad > _LARGEST_ANGLE_RAD:
         raise CalibrationError(
             "cameras look in different directions",
             got=f"{math.degrees(apart_rad):.0f} deg",
             expected=f"at most {math.degrees(_LARGEST_ANGLE_RAD):.0f} deg",
-        )
-    if x > 0:
-        raise CalibrationError(
-            "right camera is to the left of the left camera",
-            got=f"T[0] = {x:g} m",
-            expected="< 0 m",
-            hint="swap left and right",
         )
 
 

@@ -4,6 +4,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -158,12 +159,37 @@ def swap(left: Path, right: Path) -> None:
     right.write_text(right.read_text().replace(repr(P[3]), repr(-P[3])))
 
 
+def spoil_matrix(side: str, *paths: Path) -> None:
+    """Leave the rectification matrix of a camera empty, as drivers do."""
+    path = paths[side == "right"]
+    content = yaml.safe_load(path.read_text())
+    content["rectification_matrix"]["data"] = [0.0] * 9
+    path.write_text(yaml.safe_dump(content))
+
+
+def move(place: int, _: Path, right: Path) -> None:
+    """Put the baseline of the right camera at another place of its P."""
+    content = yaml.safe_load(right.read_text())
+    P = content["projection_matrix"]["data"]
+    P[3], P[place] = P[place], P[3]
+    right.write_text(yaml.safe_dump(content))
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda left, right: right.unlink(), "CameraInfo of the other camera"),
         (shutil.copy, r"CameraInfo has no baseline \(got P\[0, 3\] = 0.*alone.*--calib$"),
         (swap, "to the left of the left.*swap left and right"),
+        (
+            partial(spoil_matrix, "left"),
+            r"R of the left CameraInfo is not a rot.*\(got zeros\); take",
+        ),
+        (partial(spoil_matrix, "right"), "R of the right CameraInfo is not a rotation"),
+        (
+            partial(move, 7),
+            r"not side by side \(got right camera at \(0, 0.12\d*, 0\) m.*90 degrees",
+        ),
     ],
 )
 def test_camera_infos_that_are_no_rig_are_refused(tmp_path, spoil, message):
@@ -194,6 +220,51 @@ def test_camera_infos_of_a_lens_beside_rectified_images_are_refused_with_the_num
     said = "images are rectified.*--focal .* --baseline 0.12.* --cx 280 --cy 190"
     with pytest.raises(CalibrationError, match=rf"rig_left.yaml: .*{said}"):
         read_calibration(paths[0], 560, 380)
+
+
+def test_a_chain_of_kalibr_that_turns_nothing_is_refused(tmp_path):
+    write_kalibr(tmp_path / "rig.yaml", rig("radtan"))
+    content = yaml.safe_load((tmp_path / "rig.yaml").read_text())
+    content["cam1"]["T_cn_cnm1"] = np.diag([0.0, 0, 0, 1]).tolist()
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(CalibrationError, match="T_cn_cnm1 is not a rotation"):
+        read_calibration(tmp_path / "rig.yaml")
+
+
+ORB_SLAM = "%YAML:1.0\nCamera.fx: 700.0\nCamera.cx: 600.5\nCamera.cy: 180.0\nCamera.bf: 350.0\n"
+OTHERS = {
+    "settings.yaml": ORB_SLAM + "Viewer.PointSize:2\n",
+    "settings_3.yaml": ORB_SLAM.replace("Camera.", "Camera1.") + "Stereo.b: 0.5\n",
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_files_of_rectified_cameras_are_refused_with_the_options_that_take_them(tmp_path, name):
+    (tmp_path / name).write_text(OTHERS[name])
+    said = "rectified.* --focal 700 --baseline 0.5 --cx 600.5 --cy 180;"
+    with pytest.raises(FormatError, match=rf"{name}: .*{said}"):
+        read_calibration(tmp_path / name, 1242, 375)
+
+
+def test_arrays_of_numpy_are_refused_as_such_and_it_is_said_what_to_write(tmp_path):
+    np.savez(tmp_path / "stereo.npz", mtxL=LEFT, maps=np.zeros((1000, 1000)))
+    with pytest.raises(FormatError, match=r"arrays of NumPy.*M1, D1, M2, D2, R, T.*FileStorage"):
+        read_calibration(tmp_path / "stereo.npz", 640, 480)
+
+
+@pytest.mark.parametrize("form", ["kalibr", "ros", "yml", "xml", "kitti", "middlebury"])
+def test_decimal_commas_in_a_calibration_are_refused_for_what_they_are(tmp_path, form):
+    path = tmp_path / f"rig.{form}"
+    if form in ("yml", "xml"):
+        write_opencv_calibration(path, rig("brown"))
+    elif form in ("kitti", "middlebury"):
+        path.write_text({"kitti": KITTI, "middlebury": MIDDLEBURY}[form].replace("700", "700.5"))
+    else:
+        (write_kalibr if form == "kalibr" else write_ros)(path, rig("radtan"))
+        path = min(tmp_path.iterdir())
+    path.write_text(re.sub(r"(\d)\.(?!0\"?[?\n])", r"\1,", path.read_text()))
+    with pytest.raises(FormatError, match="decimals are written with a comma"):
+        read_calibration(path, 640, 480)
 
 
 @pytest.mark.parametrize("write", [write_kalibr, write_ros])
@@ -323,7 +394,8 @@ def test_opencv_files_in_millimetres_and_with_extrinsics_beside_them_are_read(tm
     path = write_nodes(tmp_path / "stereo.yml", **NODES, **{**POSE, "T": T_MM})
     read = read_opencv_calibration(path, size_px=(640, 480), metres_per_unit=0.001)
     np.testing.assert_allclose(read.T_right_left, T_RIGHT_LEFT, rtol=1e-14)
-    with pytest.raises(CalibrationError, match=r"stereo\.yml: baseline is impl.*got 120\.\d+ m"):
+    said = r"got 120\.\d+ m.*--set source.metres_per_unit=0.001"
+    with pytest.raises(CalibrationError, match=rf"stereo\.yml: baseline is impl.*{said}"):
         read_opencv_calibration(path, size_px=(640, 480))
     path = write_nodes(tmp_path / "intrinsics.yml", **NODES)
     beside = tmp_path / "extrinsics.yml"
@@ -360,7 +432,9 @@ def test_a_file_of_projection_matrices_alone_is_of_rectified_images(tmp_path, su
         ({"M1": LEFT * np.nan}, CalibrationError, "not finite"),
         ({"M1": -LEFT}, CalibrationError, "focal length is not positive"),
         ({"T": np.zeros((3, 1))}, CalibrationError, "baseline is zero"),
-        ({"R": 2 * np.eye(3)}, CalibrationError, "rotation of the right camera is not orthonormal"),
+        ({"R": 2 * np.eye(3)}, CalibrationError, "R of the right camera is not a rotation"),
+        ({"R": np.zeros((3, 3))}, CalibrationError, "R of the right .*not a rotation .got zeros"),
+        ({"R": np.diag([1.0, 1, -1])}, CalibrationError, "R of the right .*not a rotation"),
         ({"image_width": None}, FormatError, "does not contain the image size"),
     ],
 )

@@ -64,6 +64,26 @@ def test_each_planted_fault_is_found_and_no_other(street, fault):
     assert code in codes(plant(street), quick=True)
 
 
+@pytest.mark.parametrize("frames", [35, 36])
+def test_rows_that_recon_map_corrects_leave_a_drive_usable_and_the_text_says_who_does(
+    street, frames
+):
+    there_and_back = [*range(FRAMES), *range(FRAMES - 2, 0, -1)]
+    spoiled = faults.turned(street, roll_deg=1.0)
+    longer = replace(
+        spoiled,
+        count=frames,
+        take=lambda index: replace(
+            spoiled.take(there_and_back[index % len(there_and_back)]), timestamp_s=0.1 * index
+        ),
+    )
+    audit = audit_source(longer, CONFIG, quick=True)
+    (rows,) = (finding for finding in audit.findings if finding.code == "rows")
+    assert (audit.verdict, rows.fatal) == (("not usable", True), ("usable", False))[frames == 36]
+    assert ("recon map does so" in rows.text) == (frames == 36)
+    assert "recon audit --mend FILE writes it" in rows.text
+
+
 @pytest.mark.parametrize("pitch_deg", [0.3, -0.3])
 def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(street, tmp_path, pitch_deg):
     assert_aligned(faults.turned(street, pitch_deg=pitch_deg, roll_deg=0.2), tmp_path)
