@@ -101,12 +101,14 @@ class MapOptions:
             "mesh": self.mesh,
         }
 
-    def images_of(self, source: StereoSource) -> dict[str, Any]:
+    def images_of(
+        self, source: StereoSource, mark: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """Return where the images of a drive are, for its map; empty where no file is mapped."""
         if source.live or self.source is None:
             return {}
         found = {"source": _absolute(self.source), "kind": self.kind}
-        return {IMAGES: {**found, "mark": mark_of(source)}}
+        return {IMAGES: {**found, "mark": mark or mark_of(source)}}
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> Self:
@@ -168,20 +170,25 @@ class MapOptions:
         named = (name for name in (self.poses_file, self.prior_from) if name is not None)
         run.check_targets([*source.files, *map(Path, named)])
         path, memory = run.state(STARTED), config.memory.cache_bytes
+        mark = mark_of(source)
         identity = {
             "config": config.model_dump(mode="json"),
-            "source": mark_of(source),
+            "source": mark,
             "poses": _digest(self.known_poses),
             "prior": _digest(self.prior),
             "versions": versions(),
         }
         if run.resumes:
-            _refuse_others(identity, _read_started(run.folder)["identity"], run.folder)
+            then = _read_started(run.folder)["identity"]
+            # What earlier versions did not note down is not compared.
+            then["source"] = {**mark, **then["source"]}
+            _refuse_others(identity, then, run.folder)
             with resuming(path):
                 return Map.open(path, read_only=False, cache_bytes=memory)
         map_ = Map.create(path, cache_bytes=memory)
         # What arrives in its own time will not arrive again.
-        start = {"identity": identity, "arguments": self.arguments, **self.images_of(source)}
+        images = self.images_of(source, mark)
+        start = {"identity": identity, "arguments": self.arguments, **images}
         map_.begin(session_info(source, config, {} if source.live else start))
         map_.commit()
         run.begun = run.command != "demo"  # whose street no command line names
@@ -209,7 +216,8 @@ def _read_started(folder: Path) -> dict[str, Any]:
 
 
 def _checked(started: Any) -> dict[str, Any]:
-    parts = (started["identity"], started["identity"]["config"], started["arguments"])
+    identity = started["identity"]
+    parts = (identity, identity["config"], identity["source"], started["arguments"])
     plain = all(isinstance(part, dict) for part in parts)
     if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
         raise TypeError("not what a run is started with")
