@@ -30,7 +30,7 @@ from recon.io.cameras.ros import (
     rig_of_camera_infos,
     step_between,
 )
-from recon.io.files import reading, resolved
+from recon.io.files import reading, refuse_special, resolved
 from recon.sources.bag_prior import find_imu, read_imu_topic, read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.image_names import find_partners, partner_names
@@ -153,6 +153,9 @@ def recording_files(path: Path) -> list[Path]:
     if not found or (path.is_file() and path.suffix not in BAGS):
         expected = "a .bag, .mcap or .db3 file, or a ROS 2 folder with metadata.yaml"
         raise SourceError("not a recording", where=path, expected=expected)
+    for each in found:
+        for file in each.iterdir() if each.is_dir() else [each]:
+            refuse_special(file)
     return found
 
 

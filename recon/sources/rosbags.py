@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -182,12 +182,14 @@ class Bag:
         self, topics: Sequence[str], start_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
         """Yield topic, time of recording and content of each message, in that order."""
-        with self._our_errors(), self._opened() as readers:
+        with self._our_errors(), self._opened() as readers, ExitStack() as open_streams:
             streams = []
             for reader in readers:
                 wanted = [c for c in reader.connections if c.topic in topics]
                 if wanted:
-                    streams.append(reader.messages(wanted, start=start_ns))
+                    # A database does not close while rows of it are being read.
+                    stream = closing(reader.messages(wanted, start=start_ns))
+                    streams.append(open_streams.enter_context(stream))
             for connection, recorded_ns, content in heapq.merge(*streams, key=lambda m: m[1]):
                 yield connection.topic, recorded_ns, content
 
