@@ -76,21 +76,25 @@ def las_header(laspy: Any, T_to_from: Float64, crs: str | None, step_m: float) -
     return header
 
 
-def check_crs(crs: str) -> Any:
-    """Return the coordinate system of a name such as ``EPSG:25832``."""
-    pyproj = require("pyproj", extra=_EXTRA)
+def check_crs(crs: str, where: StrPath = "--crs") -> Any:
+    """Return the coordinate system of a name such as ``EPSG:25832``; ``where`` it is given."""
+    pyproj, expected = require("pyproj", extra=_EXTRA), "a projected system, such as EPSG:25832"
     try:
         found = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
-        raise SettingsError(
-            "unknown coordinate system", where="--crs", got=crs, expected="such as EPSG:25832"
-        ) from error
+        what = "unknown coordinate system"
+        raise SettingsError(what, where=where, got=crs, expected="such as EPSG:25832") from error
+    got = f"{crs} ({found.name})"
     units = {axis.unit_name for axis in found.axis_info}
     if not found.is_projected or units != {"metre"}:
         what = "the coordinates of this system are not metres to the east and north"
         got = f"{crs} ({found.name}; {', '.join(sorted(units))})"
-        expected = "a projected system, such as EPSG:25832"
-        raise SettingsError(what, where="--crs", got=got, expected=expected)
+        raise SettingsError(what, where=where, got=got, expected=expected)
+    try:
+        pyproj.Transformer.from_crs(found, found.geodetic_crs)
+    except pyproj.exceptions.ProjError as error:  # UTM without a zone: EPSG:32600
+        what = "positions cannot be converted to this coordinate system"
+        raise SettingsError(what, where=where, got=got, expected=expected) from error
     return found
 
 

@@ -262,6 +262,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, suffix):
         ("EPSG:4326", "not metres"),  # degrees
         ("EPSG:4978", "not metres"),  # metres, but from the centre of the earth
         ("EPSG:2263", "not metres"),  # feet
+        ("EPSG:32600", "cannot be converted.*such as EPSG:25832"),  # UTM without a zone
+        ("EPSG:32700", "cannot be converted"),
     ],
 )
 def test_other_coordinates_are_refused(tmp_path, name, why):
