@@ -54,10 +54,6 @@ class BagSource(Recording):
     left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     stamped: bool = True
-    note: str = ""  # on the calibration
-
-    def warnings(self) -> list[str]:
-        return [*super().warnings(), *filter(None, [self.note])]
 
     @cached_property
     def files(self) -> Sequence[Path]:
@@ -132,7 +128,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         recorded_ns=recorded_ns,
         texts=texts,
         stamped=not clock,
-        note=note,
+        notes=(note,) if note else (),
     )
 
 

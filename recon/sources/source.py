@@ -203,6 +203,7 @@ class Recording(StereoSource):
     calibration: Rig
     listing: FrameList  # which frames of the recording are pairs
     texts: tuple[Path, ...]  # calibration and other text files that were read
+    notes: tuple[str, ...] = ()  # on the calibration, for the user
     truth: SequenceTruth | None = None
 
     @cached_property
@@ -226,7 +227,8 @@ class Recording(StereoSource):
 
     def warnings(self) -> list[str]:
         out = self.left_out
-        return [f"{counted(out, 'image')} without a partner: left out"] if out else []
+        left_out = [f"{counted(out, 'image')} without a partner: left out"] if out else []
+        return [*left_out, *self.notes]
 
     def figures(self) -> dict[str, Any]:
         return {"frames_left_out": self.left_out}
