@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, get_args, get_origin
 
@@ -113,30 +114,45 @@ PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
 
 
 def load_config(
-    path: StrPath | None = None, overrides: Changes = (), defaults: Mapping[str, Any] | None = None
+    path: StrPath | Mapping[str, Any] | ReconConfig | None = None,
+    overrides: Changes | Mapping[str, Any] = (),
+    defaults: Mapping[str, Any] | None = None,
 ) -> ReconConfig:
     """Build the configuration; what comes later wins: defaults, file, overrides.
 
+    Keys of all mappings may be dotted or nested.
+
     Args:
-        path: A YAML file with any part of the configuration, such as a run's ``config.yaml``.
+        path: A YAML file with any part of the configuration, such as a run's ``config.yaml``; or
+            its content as a mapping; or a configuration that is to be changed.
         overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``; or
-            values by such keys.
+            mappings; or one of them.
         defaults: Defaults of a command that differ from those of the stages.
 
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
-    given = merge(defaults or {}, {} if path is None else _read_yaml(Path(path)))
+    given = merge(_nested(defaults or {}), _nested(_values_of(path)))
     values = given
-    for one in overrides:
-        for key, value in [_parse_override(one)] if isinstance(one, str) else one.items():
-            values = merge(values, _nested(key, value))
+    for one in [overrides] if isinstance(overrides, str | Mapping) else overrides:
+        values = merge(values, _nested(_parse_override(one) if isinstance(one, str) else one))
     try:
         return ReconConfig.parse(values)
     except SettingsError:
-        if path is not None:
+        if isinstance(path, str | PathLike):
             ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself
         raise
+
+
+def _values_of(path: object) -> Mapping[str, Any]:
+    if path is None or isinstance(path, Mapping):
+        return path or {}
+    if isinstance(path, ReconConfig):
+        return path.model_dump(exclude_unset=True)
+    if isinstance(path, str | PathLike):
+        return _read_yaml(Path(path))
+    got, expected = type(path).__name__, "a file, a mapping or a ReconConfig"
+    raise SettingsError("not settings", got=got, expected=expected)
 
 
 def run_settings(
@@ -200,21 +216,28 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     return content
 
 
-def _parse_override(text: str) -> tuple[str, Any]:
+def _parse_override(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
-    if not equals or not key.strip() or key.count(".") > _MOST_DOTS:
+    if not equals or not key.strip():
         what, expected = "cannot read this setting", "key=value"
         raise SettingsError(what, where="--set", got=repr(text), expected=expected)
     try:
-        return key.strip(), parse_yaml(value, "--set")
+        return {key.strip(): parse_yaml(value, "--set")}
     except FormatError as error:
         raise SettingsError(f"value of {key!r} is not YAML", where="--set", got=value) from error
 
 
-def _nested(key: str, value: Any) -> dict[str, Any]:
-    for part in reversed(key.split(".")):
-        value = {part: value}
-    return dict(value)
+def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by dotted or nested keys as nested mappings."""
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        inner = _nested(value) if isinstance(value, Mapping) else value
+        if str(key).count(".") > _MOST_DOTS:
+            raise SettingsError("cannot read this setting", got=repr(key), expected="fewer dots")
+        for part in reversed(str(key).split(".")):
+            inner = {part: inner}
+        nested = merge(nested, inner)
+    return nested
 
 
 #: Units by the end of a setting's name, longer endings first.

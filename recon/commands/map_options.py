@@ -180,8 +180,9 @@ class MapOptions:
         }
         if run.resumes:
             then = _read_started(run.folder)["identity"]
-            # What earlier versions did not note down is not compared.
-            then["source"] = {**mark, **then["source"]}
+            if isinstance(then.get("source"), dict):
+                # What earlier versions did not note down is not compared.
+                then["source"] = {**mark, **then["source"]}
             _refuse_others(identity, then, run.folder)
             with resuming(path):
                 return Map.open(path, read_only=False, cache_bytes=memory)
@@ -216,8 +217,7 @@ def _read_started(folder: Path) -> dict[str, Any]:
 
 
 def _checked(started: Any) -> dict[str, Any]:
-    identity = started["identity"]
-    parts = (identity, identity["config"], identity["source"], started["arguments"])
+    parts = (started["identity"], started["identity"]["config"], started["arguments"])
     plain = all(isinstance(part, dict) for part in parts)
     if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
         raise TypeError("not what a run is started with")

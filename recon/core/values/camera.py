@@ -199,6 +199,14 @@ def _check_view(
             raise CalibrationError("principal point is far outside of the image", got=got)
 
 
+def check_order(rig: StereoCalibration) -> None:
+    """Refuse a rig whose right camera is to the left of the left one."""
+    x, y, z = rig.T_right_left[:3, 3].tolist()
+    if x > max(abs(y), abs(z)):
+        what, hint = "right camera is to the left of the left camera", "swap left and right"
+        raise CalibrationError(what, got=f"T[0] = {x:g} m", expected="< 0 m", hint=hint)
+
+
 def _check_baseline(baseline_m: float) -> None:
     if baseline_m <= 0:
         raise CalibrationError(

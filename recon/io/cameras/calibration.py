@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Final
 
 from recon.core.errors import CalibrationError, FormatError
-from recon.core.values import Rig, check_size
+from recon.core.values import Rig, StereoCalibration, check_size
+from recon.core.values.camera import check_order
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import read_opencv_calibration
 from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
@@ -53,7 +54,8 @@ def read_calibration(
     Raises:
         FormatError: The file is missing, damaged or of an unknown format, or it does not contain
             the image size (KITTI's and some of OpenCV's do not) and none is given.
-        CalibrationError: The calibration cannot give depth, or is of another image size.
+        CalibrationError: The calibration cannot give depth, such as one with left and right
+            swapped, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)
     text = read_text(path, SMALL_FILE_BYTES)
@@ -78,6 +80,8 @@ def read_calibration(
             expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
             "OpenCV YAML/XML/JSON (M1 …, or P1 P2), ROS CameraInfo or a kalibr camchain (cam0: …)",
         )
+    if isinstance(rig, StereoCalibration):
+        check_order(rig)
     if size is not None:
         check_size(rig, *size, path)
     return rig

@@ -24,6 +24,7 @@ from recon.core.values import (
     check_size,
 )
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8, frozen_array
+from recon.core.values.camera import check_order
 from recon.stereo.rectify.lens import border_of, rays_of, rectifying_maps, sees_all
 
 # Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
@@ -233,13 +234,7 @@ def _check_rig(calibration: StereoCalibration) -> None:
             got=f"{math.degrees(apart_rad):.0f} deg",
             expected=f"at most {math.degrees(_LARGEST_ANGLE_RAD):.0f} deg",
         )
-    if x > 0:
-        raise CalibrationError(
-            "right camera is to the left of the left camera",
-            got=f"T[0] = {x:g} m",
-            expected="< 0 m",
-            hint="swap left and right",
-        )
+    check_order(calibration)
 
 
 # A planar image stretches by 1 / cos²: fourfold at 60 degrees from the optical axis.
