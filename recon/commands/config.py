@@ -168,12 +168,9 @@ def run_settings(
     try:
         own = load_config(folder / CONFIG)
     except SettingsError as error:
-        raise SettingsError(
-            f"the settings of this run are not valid in this version: {error.what}",
-            where=error.where,
-            got=error.got,
-            hint="map the drive again",
-        ) from error
+        what = f"the settings of this run are not valid in this version: {error.what}"
+        how = {"where": error.where, "got": error.got, "hint": "map the drive again"}
+        raise SettingsError(what, **how) from error
     return load_config(file, overrides, own.model_dump(mode="json", exclude=set(without)))
 
 
@@ -181,12 +178,9 @@ def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[st
     """Refuse settings that differ from those that a run had, but for those of some sections."""
     for name in type(config).model_fields:
         if name not in sections and getattr(config, name) != getattr(ran, name):
-            raise SettingsError(
-                "this setting has no effect here: the drive is not mapped again",
-                got=name,
-                expected=f"settings of {', '.join(sections)}",
-                hint="recon map takes it",
-            )
+            what = "this setting has no effect here: the drive is not mapped again"
+            expected = f"settings of {', '.join(sections)}"
+            raise SettingsError(what, got=name, expected=expected, hint="recon map takes it")
 
 
 def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:

@@ -101,14 +101,12 @@ class MapOptions:
             "mesh": self.mesh,
         }
 
-    def images_of(
-        self, source: StereoSource, mark: Mapping[str, Any] | None = None
-    ) -> dict[str, Any]:
+    def images_of(self, source: StereoSource) -> dict[str, Any]:
         """Return where the images of a drive are, for its map; empty where no file is mapped."""
         if source.live or self.source is None:
             return {}
         found = {"source": _absolute(self.source), "kind": self.kind}
-        return {IMAGES: {**found, "mark": mark or mark_of(source)}}
+        return {IMAGES: {**found, "mark": mark_of(source)}}
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> Self:
@@ -170,7 +168,8 @@ class MapOptions:
         named = (name for name in (self.poses_file, self.prior_from) if name is not None)
         run.check_targets([*source.files, *map(Path, named)])
         path, memory = run.state(STARTED), config.memory.cache_bytes
-        mark = mark_of(source)
+        images = self.images_of(source)
+        mark = images[IMAGES]["mark"] if images else mark_of(source)
         identity = {
             "config": config.model_dump(mode="json"),
             "source": mark,
@@ -188,7 +187,6 @@ class MapOptions:
                 return Map.open(path, read_only=False, cache_bytes=memory)
         map_ = Map.create(path, cache_bytes=memory)
         # What arrives in its own time will not arrive again.
-        images = self.images_of(source, mark)
         start = {"identity": identity, "arguments": self.arguments, **images}
         map_.begin(session_info(source, config, {} if source.live else start))
         map_.commit()
@@ -230,13 +228,10 @@ def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path
     found = next(_differences(plain, {part: then.get(part) for part in now}), None)
     if found is not None:
         key, got, expected = found
-        raise SettingsError(
-            f"the run was started with {_OTHER[key.partition('.')[0]]}",
-            where=folder,
-            got=f"{key} = {got}",
-            expected=expected,
-            hint="resume with what it was started with, or start anew without --resume",
-        )
+        what = f"the run was started with {_OTHER[key.partition('.')[0]]}"
+        hint = "resume with what it was started with, or start anew without --resume"
+        got = f"{key} = {got}"
+        raise SettingsError(what, where=folder, got=got, expected=expected, hint=hint)
 
 
 def _differences(now: Any, then: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:

@@ -164,23 +164,20 @@ def fingerprint(files: Iterable[Path], *, samples: int | None = None) -> dict[st
         length = path.stat().st_size
         digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
         with path.open("rb", buffering=0) as content:
-            for start, end in _pieces(length, samples):
+            for start, many in _pieces(length, samples):
                 content.seek(start)
-                digest.update(content.read(end - start))
+                digest.update(content.read(many))
         count, size = count + 1, size + length
     return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
 
 
-def _pieces(length: int, samples: int | None) -> Iterator[tuple[int, int]]:
-    """Yield first byte and end of what is hashed of a file: all in large pieces, or samples."""
+def _pieces(length: int, samples: int | None) -> list[tuple[int, int]]:
+    """Return first byte and number of bytes of what is hashed of a file: all of it, or samples."""
     if samples is None or length <= samples * _SAMPLE_BYTES:
         # In pieces: a recording may be larger than memory.
-        for start in range(0, length, _PIECE_BYTES):
-            yield start, min(start + _PIECE_BYTES, length)
-        return
-    for number in range(samples):
-        start = number * (length - _SAMPLE_BYTES) // max(1, samples - 1)
-        yield start, start + _SAMPLE_BYTES
+        return [(start, _PIECE_BYTES) for start in range(0, length, _PIECE_BYTES)]
+    last, steps = length - _SAMPLE_BYTES, max(1, samples - 1)
+    return [(number * last // steps, _SAMPLE_BYTES) for number in range(samples)]
 
 
 def plain(value: Any) -> Any:

@@ -227,13 +227,10 @@ class Bag:
         except (ReconError, MemoryError):
             raise
         except Exception as error:
-            raise FormatError(
-                "recording cannot be read",
-                where=self.paths[0],
-                got=str(error) or type(error).__name__,
-                hint="it may be truncated; copy it again, or repair it with rosbag reindex, "
-                "ros2 bag reindex or mcap recover",
-            ) from error
+            what, got = "recording cannot be read", str(error) or type(error).__name__
+            repair = "repair it with rosbag reindex, ros2 bag reindex or mcap recover"
+            hint = f"it may be truncated; copy it again, or {repair}"
+            raise FormatError(what, where=self.paths[0], got=got, hint=hint) from error
 
 
 def _decode(message: Any, where: str) -> UInt8:

@@ -69,11 +69,10 @@ def read_calibration(
     elif form in _READERS:
         rig = _READERS[form](path)
     elif form == "homographies":
-        raise CalibrationError(
-            "homographies know no focal length and no baseline: there is no depth in them",
-            hint="recon disparity takes the rectified images as they are; for depth use a "
-            "calibration of the cameras (recon calibrate)",
-        )
+        what = "homographies know no focal length and no baseline: there is no depth in them"
+        use = "for depth use a calibration of the cameras (recon calibrate)"
+        hint = f"recon disparity takes the rectified images as they are; {use}"
+        raise CalibrationError(what, hint=hint)
     else:
         raise FormatError(
             "not a calibration file",
@@ -91,11 +90,9 @@ def _read_kitti(
     path: StrPath, size: tuple[int, int] | None, cameras: tuple[int, int] | None
 ) -> Rig:
     if size is None:
-        raise FormatError(
-            "a KITTI calibration does not say which images it is of",
-            hint="pass width_px and height_px, or give the file itself to recon.reconstruct or "
-            "recon.match, which take the size from the images",
-        )
+        what = "a KITTI calibration does not say which images it is of"
+        those = "recon.reconstruct or recon.match, which take the size from the images"
+        raise FormatError(what, hint=f"pass width_px and height_px, or give the file to {those}")
     known = list_kitti_cameras(path)
     grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
     return read_kitti_rig(path, *size, cameras or (GREY_CAMERAS if grey else COLOUR_CAMERAS))

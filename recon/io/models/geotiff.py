@@ -100,6 +100,4 @@ def write_geotiff(
 
 
 def _checksums(dataset: Any) -> list[int]:
-    return [
-        zlib.crc32(dataset.read(window=window).tobytes()) for _, window in dataset.block_windows(1)
-    ]
+    return [zlib.crc32(dataset.read(window=at).tobytes()) for _, at in dataset.block_windows(1)]

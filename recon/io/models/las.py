@@ -117,14 +117,11 @@ def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
         and area.south - _MARGIN_DEG <= lat <= area.north + _MARGIN_DEG
     ):
         return
-    raise EvaluationError(
-        "the positions lie outside the area of their coordinate system",
-        where=where,
-        got=f"easting {position_m[0]:.0f}, northing {position_m[1]:.0f} in {crs}",
-        expected=f"longitude {area.west:g} to {area.east:g}, latitude {area.south:g} to "
-        f"{area.north:g}",
-        hint="columns are time, easting, northing, height in metres; without --crs any are taken",
-    )
+    what = "the positions lie outside the area of their coordinate system"
+    got = f"easting {position_m[0]:.0f}, northing {position_m[1]:.0f} in {crs}"
+    lon_lat = f"longitude {area.west:g} to {area.east:g}, latitude {area.south:g} to {area.north:g}"
+    hint = "columns are time, easting, northing, height in metres; without --crs any are taken"
+    raise EvaluationError(what, where=where, got=got, expected=lon_lat, hint=hint)
 
 
 def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> None:

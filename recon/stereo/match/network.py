@@ -49,9 +49,8 @@ class OnnxNetwork:
                 str(path), options, providers=["CPUExecutionProvider"]
             )
         except self._errors as error:
-            raise FormatError(
-                "onnxruntime cannot load the network", where=path, got=_first_line(error)
-            ) from error
+            what = "onnxruntime cannot load the network"
+            raise FormatError(what, where=path, got=_first_line(error)) from error
         self._read_inputs()
 
     def _read_inputs(self) -> None:
@@ -74,22 +73,16 @@ class OnnxNetwork:
         """Run the network once, from float32 arrays in the order of its inputs."""
         wanted = self._session.get_inputs()
         if len(wanted) != len(inputs):
-            raise MatchingError(
-                "the network has a different number of inputs",
-                where=self._path,
-                got=f"{len(wanted)}: {', '.join(one.name for one in wanted)}",
-                expected=str(len(inputs)),
-            )
+            what, names = "the network has a different number of inputs", [w.name for w in wanted]
+            got = f"{len(wanted)}: {', '.join(names)}"
+            raise MatchingError(what, where=self._path, got=got, expected=str(len(inputs)))
         feed = {one.name: np.ascontiguousarray(x) for one, x in zip(wanted, inputs, strict=True)}
         try:
             return [np.asarray(output, dtype=np.float32) for output in self._outputs(feed)]
         except self._errors as error:
-            raise MatchingError(
-                "the network cannot process these images",
-                where=self._path,
-                got=_first_line(error),
-                hint="check the size that it expects: matching.onnx.width_px and height_px",
-            ) from error
+            what, got = "the network cannot process these images", _first_line(error)
+            hint = "check the size that it expects: matching.onnx.width_px and height_px"
+            raise MatchingError(what, where=self._path, got=got, hint=hint) from error
 
     def _outputs(self, feed: dict[str, Float32]) -> list[Any]:
         """Run the network in a thread, so that Ctrl-C and the limit end it."""
@@ -113,9 +106,8 @@ def _refuse_mistaken(path: Path) -> None:
         start = file.read(64).lstrip(b"\xef\xbb\xbf \r\n\t")
     for beginning, (what, hint) in _MISTAKEN.items():
         if start.startswith(beginning):
-            raise FormatError(
-                "not a network", where=path, got=what, expected="an ONNX network", hint=hint
-            )
+            how = {"got": what, "expected": "an ONNX network", "hint": hint}
+            raise FormatError("not a network", where=path, **how)
 
 
 def _errors_of(runtime: Any) -> tuple[type[Exception], ...]:

@@ -135,20 +135,13 @@ class OnnxMatcher:
             path, s = self._settings.model, self._settings
             if path is None:
                 get = f": {self._use.get}" if self._use.get else ""
-                raise SettingsError(
-                    "the matcher 'onnx' needs a network",
-                    expected=f"a file{get}",
-                    hint="--set matching.onnx.model=network.onnx",
-                )
+                what, hint = "the matcher 'onnx' needs a network", "--set matching.onnx.model=FILE"
+                raise SettingsError(what, expected=f"a file{get}", hint=hint)
             network = OnnxNetwork(path, self._threads, s.time_limit_s)
             if self._use.layout not in {"", network.layout}:
-                raise SettingsError(
-                    f"not the network of the preset {s.preset!r}",
-                    where=path,
-                    got=network.layout,
-                    expected=self._use.layout,
-                    hint=f"get {self._use.get}",
-                )
+                what, hint = f"not the network of the preset {s.preset!r}", f"get {self._use.get}"
+                how = {"got": network.layout, "expected": self._use.layout, "hint": hint}
+                raise SettingsError(what, where=path, **how)
             if s.self_test:
 
                 def match(left: UInt8, right: UInt8) -> Float32:
@@ -185,11 +178,9 @@ class OnnxMatcher:
         output = outputs[number]
         values = output.squeeze()
         if values.ndim != 2 or not values.size:
-            raise MatchingError(
-                "the network's output is not a disparity map",
-                got=output.shape,
-                expected="(1, 1, H, W), (1, H, W, 1) or with fewer ones",
-            )
+            what = "the network's output is not a disparity map"
+            expected = "(1, 1, H, W), (1, H, W, 1) or with fewer ones"
+            raise MatchingError(what, got=output.shape, expected=expected)
         values = values * np.float32(self._use.output_scale)
         return np.asarray(np.where(np.isfinite(values), values, np.nan), dtype=np.float32)
 
@@ -214,11 +205,9 @@ def _resized(values: Float32, shape: tuple[int, ...]) -> Float32:
 def _tensor(image: UInt8, channels: int, use: Preset) -> Float32:
     """Return one image as (1, C, H, W)."""
     if max(len(use.mean), len(use.std)) > channels:
-        raise SettingsError(
-            "mean and std have more numbers than the network has channels",
-            got=max(len(use.mean), len(use.std)),
-            expected=f"1 or {channels}",
-        )
+        what = "mean and std have more numbers than the network has channels"
+        got = max(len(use.mean), len(use.std))
+        raise SettingsError(what, got=got, expected=f"1 or {channels}")
     mean, std = (
         np.array(numbers, dtype=np.float32).reshape(-1, 1, 1) for numbers in (use.mean, use.std)
     )
