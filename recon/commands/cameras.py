@@ -99,11 +99,13 @@ def run_calibrate(
         summary["warnings"] = [finding.text for finding in findings]
         write_calibration(run.path("calibration.yaml"), result, "recon")
         if file is not None:
-            summary["files"] = [str(path) for path in write_calibration(file, result, form)]
+            summary["files"] = [str(path) for path in targets_of(file, form)]
         with run.report(summary):
             write_calibration_page(result, run)
         source, record = " ".join(filter(None, (left, right))), {"board": str(seen.board)}
         run.finish(summary, source=source, inputs=inputs, record=record)
+        if file is not None:  # last: an interrupted run leaves nothing
+            write_calibration(file, result, form)
     return result
 
 

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, get_args, get_origin
 
@@ -115,30 +116,47 @@ PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
 
 
 def load_config(
-    path: StrPath | None = None, overrides: Changes = (), defaults: Mapping[str, Any] | None = None
+    path: StrPath | Mapping[str, Any] | ReconConfig | None = None,
+    overrides: Changes | Mapping[str, Any] = (),
+    defaults: Mapping[str, Any] | None = None,
 ) -> ReconConfig:
     """Build the configuration; what comes later wins: defaults, file, overrides.
 
+    Keys of all mappings may be dotted or nested.
+
     Args:
-        path: A YAML file with any part of the configuration, such as a run's ``config.yaml``.
+        path: A YAML file with any part of the configuration, such as a run's ``config.yaml``; or
+            its content as a mapping; or a configuration that is to be changed.
         overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``,
-            also several with commas; or values by such keys.
+            also several with commas; or mappings; or one of them.
         defaults: Defaults of a command that differ from those of the stages.
 
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
-    given = merge(defaults or {}, {} if path is None else _read_yaml(Path(path)))
+    given = merge(_nested(defaults or {}), _nested(_values_of(path)))
     values = given
-    for one in overrides:
-        for key, value in _parse_overrides(one) if isinstance(one, str) else one.items():
-            values = merge(values, _nested(key, value))
+    for one in [overrides] if isinstance(overrides, str | Mapping) else overrides:
+        # Several settings stand in one text with commas between.
+        for part in map(_parse_override, _NEXT.split(one)) if isinstance(one, str) else [one]:
+            values = merge(values, _nested(part))
     try:
         return ReconConfig.parse(values)
     except SettingsError:
-        if path is not None:
+        if isinstance(path, str | PathLike):
             ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself
         raise
+
+
+def _values_of(path: object) -> Mapping[str, Any]:
+    if path is None or isinstance(path, Mapping):
+        return path or {}
+    if isinstance(path, ReconConfig):
+        return path.model_dump(exclude_unset=True)
+    if isinstance(path, str | PathLike):
+        return _read_yaml(Path(path))
+    got, expected = type(path).__name__, "a file, a mapping or a ReconConfig"
+    raise SettingsError("not settings", got=got, expected=expected)
 
 
 def run_settings(
@@ -154,12 +172,9 @@ def run_settings(
     try:
         own = load_config(folder / CONFIG)
     except SettingsError as error:
-        raise SettingsError(
-            f"the settings of this run are not valid in this version: {error.what}",
-            where=error.where,
-            got=error.got,
-            hint="map the drive again",
-        ) from error
+        what = f"the settings of this run are not valid in this version: {error.what}"
+        how = {"where": error.where, "got": error.got, "hint": "map the drive again"}
+        raise SettingsError(what, **how) from error
     return load_config(file, overrides, own.model_dump(mode="json", exclude=set(without)))
 
 
@@ -167,12 +182,9 @@ def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[st
     """Refuse settings that differ from those that a run had, but for those of some sections."""
     for name in type(config).model_fields:
         if name not in sections and getattr(config, name) != getattr(ran, name):
-            raise SettingsError(
-                "this setting has no effect here: the drive is not mapped again",
-                got=name,
-                expected=f"settings of {', '.join(sections)}",
-                hint="recon map takes it",
-            )
+            what = "this setting has no effect here: the drive is not mapped again"
+            expected = f"settings of {', '.join(sections)}"
+            raise SettingsError(what, got=name, expected=expected, hint="recon map takes it")
 
 
 def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:
@@ -202,26 +214,28 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     return content
 
 
-def _parse_overrides(text: str) -> list[tuple[str, Any]]:
-    """Return the settings of a text; those of several stand with commas between."""
-    return [_parse_override(one) for one in _NEXT.split(text)]
-
-
-def _parse_override(text: str) -> tuple[str, Any]:
+def _parse_override(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
-    if not equals or not key.strip() or key.count(".") > _MOST_DOTS:
+    if not equals or not key.strip():
         what, expected = "cannot read this setting", "key=value"
         raise SettingsError(what, where="--set", got=repr(text), expected=expected)
     try:
-        return key.strip(), parse_yaml(value, "--set")
+        return {key.strip(): parse_yaml(value, "--set")}
     except FormatError as error:
         raise SettingsError(f"value of {key!r} is not YAML", where="--set", got=value) from error
 
 
-def _nested(key: str, value: Any) -> dict[str, Any]:
-    for part in reversed(key.split(".")):
-        value = {part: value}
-    return dict(value)
+def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by dotted or nested keys as nested mappings."""
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        inner = _nested(value) if isinstance(value, Mapping) else value
+        if str(key).count(".") > _MOST_DOTS:
+            raise SettingsError("cannot read this setting", got=repr(key), expected="fewer dots")
+        for part in reversed(str(key).split(".")):
+            inner = {part: inner}
+        nested = merge(nested, inner)
+    return nested
 
 
 #: Units by the end of a setting's name, longer endings first.

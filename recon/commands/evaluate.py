@@ -276,7 +276,7 @@ def run_evaluate_occupancy(
     source, map_ = demo_source(config), map_of_run(folder)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
     truth = source.occupancy_truth(**occupancy_view(config, map_.T_map_world, least_frames))
+    metrics = evaluate_occupancy(voxels, grid, truth)
     if image is not None:
         write_image(image, colour_grid_errors(grid, truth))
-    metrics = evaluate_occupancy(voxels, grid, truth)
     return OccupancyComparison(metrics, grid, truth, list(map_.doubts))

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions
@@ -51,6 +51,7 @@ from recon.report.page import write_page
 from recon.rig.audit.audit import check_related, quick_warnings
 from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.run import Run, plain
+from recon.sources.calibration import RIG_FILE
 from recon.sources.source import StereoSource, check_source
 
 
@@ -190,9 +191,6 @@ def _begun(
         with options.begin(run, source, fitted) as map_:
             options.begun(run.folder)
             yield run, map_, rig, scene, fitted
-
-
-RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of the run
 
 
 def refine_drive(

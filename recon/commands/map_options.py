@@ -165,20 +165,26 @@ class MapOptions:
         named = (name for name in (self.poses_file, self.prior_from) if name is not None)
         run.check_targets([*source.files, *map(Path, named)])
         path, memory = run.state(STARTED), config.memory.cache_bytes
+        images = self.images_of(source)
+        mark = images[IMAGES]["mark"] if images else mark_of(source)
         identity = {
             "config": config.model_dump(mode="json"),
-            "source": mark_of(source),
+            "source": mark,
             "poses": _digest(self.known_poses),
             "prior": _digest(self.prior),
             "versions": versions(),
         }
         if run.resumes:
-            _refuse_others(identity, _read_started(run.folder)["identity"], run.folder)
+            then = _read_started(run.folder)["identity"]
+            if isinstance(then.get("source"), dict):
+                # What earlier versions did not note down is not compared.
+                then["source"] = {**mark, **then["source"]}
+            _refuse_others(identity, then, run.folder)
             with resuming(path):
                 return Map.open(path, read_only=False, cache_bytes=memory)
         map_ = Map.create(path, cache_bytes=memory)
         # What arrives in its own time will not arrive again.
-        start = {"identity": identity, "arguments": self.arguments, **self.images_of(source)}
+        start = {"identity": identity, "arguments": self.arguments, **images}
         map_.begin(session_info(source, config, {} if source.live else start))
         map_.commit()
         run.begun = run.command != "demo"  # whose street no command line names
@@ -219,13 +225,10 @@ def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path
     found = next(_differences(plain, {part: then.get(part) for part in now}), None)
     if found is not None:
         key, got, expected = found
-        raise SettingsError(
-            f"the run was started with {_OTHER[key.partition('.')[0]]}",
-            where=folder,
-            got=f"{key} = {got}",
-            expected=expected,
-            hint="resume with what it was started with, or start anew without --resume",
-        )
+        what = f"the run was started with {_OTHER[key.partition('.')[0]]}"
+        hint = "resume with what it was started with, or start anew without --resume"
+        got = f"{key} = {got}"
+        raise SettingsError(what, where=folder, got=got, expected=expected, hint=hint)
 
 
 def _differences(now: Any, then: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:

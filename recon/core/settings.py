@@ -70,6 +70,10 @@ class Settings(BaseModel):
                     refuse_other_numbers(part)
         return value
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        hint = f"recon.load_config(config, {{'GROUP.{name}': VALUE}}) returns a changed copy"
+        raise SettingsError("settings do not change", where=name, hint=hint)
+
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Show only what differs from its default."""
         for name, value in super().__repr_args__():

@@ -18,7 +18,7 @@ from recon.core.text import counted, metres
 from recon.core.values import LengthErrors, SequenceTruth, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Bool, Float64, Int32
 from recon.io.files import StrPath
-from recon.io.trajectory import ORDER_HINT, read_trajectory, reordered
+from recon.io.trajectory import ORDER_HINT, holds_times, read_trajectory, reordered
 from recon.places.places import drift_at_end, fit_to_path
 
 # A camera that moved less stood still, be it an endoscope: errors relative to it say nothing.
@@ -27,6 +27,7 @@ _STRAIGHT: Final = 0.05  # largest width of a straight path, as share of its len
 # The positions fix the roll to about their error over the width of the path, in radians.
 _NONSENSE: Final = 0.5  # of the length of a motion, by which it is off: of one turned by 29 degrees
 _FIXED_RAD: Final = float(np.radians(0.5))
+TOLERANCE_S: Final = 0.01  # largest time difference of two associated poses
 
 
 class TrajectoryRules(Settings):
@@ -90,19 +91,28 @@ def evaluate_trajectory(
     estimate: Trajectory | StrPath,
     truth: Trajectory | SequenceTruth | StrPath,
     rules: TrajectoryRules | None = None,
+    *,
+    tolerance_s: float = TOLERANCE_S,
 ) -> TrajectoryMetrics:
     """Return the errors of an estimated trajectory, see `compare_paths`.
+
+    Poses of two files with times (TUM) are associated by time, as `recon evaluate trajectory` does;
+    all others are compared in order. `Trajectory` values are, too: their times may be mere numbers.
 
     Args:
         estimate: The estimate, or its KITTI or TUM file.
         truth: The true path, its file, or what a source knows of the truth.
         rules: Alignment and segments; None = the defaults.
+        tolerance_s: Largest time difference of two associated poses, seconds.
 
     Raises:
         EvaluationError: The two cannot be compared, or one is no trajectory.
         FormatError: A file is missing or damaged.
     """
-    return compare_paths(_path("estimate", estimate), _path("truth", truth), rules).metrics
+    ours, true = _path("estimate", estimate), _path("truth", truth)
+    if all(isinstance(one, str | PathLike) and holds_times(one) for one in (estimate, truth)):
+        ours, true = associate(ours, true, tolerance_s)
+    return compare_paths(ours, true, rules).metrics
 
 
 def _path(name: str, given: object) -> Trajectory:
@@ -303,7 +313,6 @@ def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -
 
 _UNITS: Final = {1: "milliseconds", 2: "microseconds", 3: "nanoseconds"}
 _SAME_UNIT: Final = 0.1  # a third of a decade: of one drive, paths that last twice as long do not
-TOLERANCE_S: Final = 0.01  # largest time difference of two associated poses
 
 
 def associate(

@@ -30,18 +30,26 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     check_targets([target])
     temporary = target.with_name(f".{secrets.token_hex(6)}-{target.name}")
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        _sync(temporary)
-        temporary.replace(target)
-        _sync(target.parent)
-    except OSError as error:
-        got = error.strerror or type(error).__name__
-        hint = "check that the folder is writable and the disk is not full"
-        raise OutputError("cannot write the file", where=target, got=got, hint=hint) from error
+        with writing_to(target):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            _sync(temporary)
+            temporary.replace(target)
+            _sync(target.parent)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing_to(target: Path) -> Iterator[None]:
+    """Name a file, and what to do, where the system cannot write it."""
+    try:
+        yield
+    except OSError as error:
+        got = error.strerror or str(error) or type(error).__name__
+        hint = "check that the folder is writable and the disk is not full"
+        raise OutputError("cannot write the file", where=target, got=got, hint=hint) from error
 
 
 def check_targets(targets: Iterable[Path], inputs: Iterable[Path] = ()) -> None:

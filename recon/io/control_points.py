@@ -16,7 +16,7 @@ from recon.io.files import StrPath, read_lines, reader
 from recon.io.models.las import check_crs
 from recon.io.positions import Positions
 
-_UTM: Final = re.compile(r"WGS84 UTM (\d{1,2})([NS])$", re.IGNORECASE)
+_UTM: Final = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])$", re.IGNORECASE)
 _SYSTEM: Final = re.compile(r"(EPSG:\d+|\+proj|WGS84 UTM )", re.IGNORECASE)
 _CHECK: Final = "check"
 
@@ -121,7 +121,7 @@ def _in_metres(places: Float64, system: str, crs: str | None, path: StrPath) -> 
     except pyproj.exceptions.CRSError as error:
         raise FormatError("unknown coordinate system", where=path, got=system) from error
     if not geographic:
-        check_crs(system)
+        check_crs(system, path)
         return places, crs or system
     degrees = Positions(np.zeros(len(places)), places[:, [1, 0, 2]], np.zeros((0, 3)), degrees=True)
     metres, chosen = degrees.projected(crs, path)

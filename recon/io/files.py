@@ -60,8 +60,7 @@ def reading(path: StrPath) -> Iterator[None]:
     Pipes and devices, whose reading may never end, are refused.
     """
     try:
-        if (kind := special_kind(path)) not in (None, FOLDER):
-            raise FormatError("not a regular file", where=path, got=kind)  # noqa: TRY301
+        refuse_special(path)
         with naming(path), np.errstate(all="ignore"):
             yield
     except (ReconError, ImportError):  # a package that is missing is no fault of the file
@@ -107,6 +106,12 @@ def special_kind(path: StrPath) -> str | None:
         # what is missing, or no path, is found when it is opened
         return _LOOP if getattr(error, "errno", None) == errno.ELOOP else None
     return next((name for test, name in _KINDS if test(mode)), None)
+
+
+def refuse_special(path: StrPath) -> None:
+    """Refuse a pipe or device, which may never end, or wait for ever to be opened."""
+    if (kind := special_kind(path)) not in (None, FOLDER):
+        raise FormatError("not a regular file", where=path, got=kind)
 
 
 @reader

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from functools import reduce
@@ -76,8 +77,10 @@ class Positions:
         pyproj = require("pyproj", extra="survey")
         flat = check_crs(system)
         flat = flat.sub_crs_list[0] if flat.sub_crs_list else flat
-        convert = pyproj.Transformer.from_crs("EPSG:4326", flat, always_xy=True)
-        east, north = convert.transform(self.places[:, 1], self.places[:, 0])
+        east = north = np.array([np.nan])
+        with suppress(pyproj.exceptions.ProjError):  # such as a system of the Moon
+            convert = pyproj.Transformer.from_crs("EPSG:4326", flat, always_xy=True)
+            east, north = convert.transform(self.places[:, 1], self.places[:, 0])
         if not (np.isfinite(east).all() and np.isfinite(north).all()):
             what, expected = "positions cannot be converted", "latitude and longitude in its area"
             got = f"latitude {lat:g}, longitude {lon:g} in {system}"

@@ -20,7 +20,7 @@ from typing_extensions import Self
 from recon.core import progress
 from recon.core.settings import Settings
 from recon.io.fields import write_yaml
-from recon.io.files import StrPath, resolved
+from recon.io.files import StrPath, refuse_special, resolved
 from recon.run.directory import RECORD, RunDirectory, default_folder
 from recon.run.machine import peak_memory_mb, versions
 from recon.run.work import Stopwatch, use_threads
@@ -147,25 +147,36 @@ class WholeRun(Run):
 
 
 _PIECE_BYTES: Final = 1 << 20
+_SAMPLE_BYTES: Final = 1 << 12
 
 
-def fingerprint(files: Iterable[Path], *, head_bytes: int | None = None) -> dict[str, Any]:
+def fingerprint(files: Iterable[Path], *, samples: int | None = None) -> dict[str, Any]:
     """Return the number, size and one SHA-256 of a list of files, in that order.
 
-    The hash covers each file's name and bytes, so a renamed frame changes it too; or only the first
-    bytes of each, to tell sources apart without reading a large drive.
+    The hash covers each file's name and bytes, so a renamed frame changes it too. To tell sources
+    apart without reading a large drive, it covers of each larger file ``samples`` pieces of 4 KiB,
+    evenly spread from its first byte to its last. A pipe or device is a `FormatError`.
     """
     digest, count, size = hashlib.sha256(), 0, 0
     for path in files:
+        refuse_special(path)
         length = path.stat().st_size
         digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
-        # In pieces: a recording may be larger than memory.
-        with path.open("rb") as content:
-            while head_bytes is None and (piece := content.read(_PIECE_BYTES)):
-                digest.update(piece)
-            digest.update(content.read(head_bytes or 0))
+        with path.open("rb", buffering=0) as content:
+            for start, many in _pieces(length, samples):
+                content.seek(start)
+                digest.update(content.read(many))
         count, size = count + 1, size + length
     return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
+
+
+def _pieces(length: int, samples: int | None) -> list[tuple[int, int]]:
+    """Return first byte and number of bytes of what is hashed of a file: all of it, or samples."""
+    if samples is None or length <= samples * _SAMPLE_BYTES:
+        # In pieces: a recording may be larger than memory.
+        return [(start, _PIECE_BYTES) for start in range(0, length, _PIECE_BYTES)]
+    last, steps = length - _SAMPLE_BYTES, max(1, samples - 1)
+    return [(number * last // steps, _SAMPLE_BYTES) for number in range(samples)]
 
 
 def plain(value: Any) -> Any:

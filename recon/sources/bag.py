@@ -30,7 +30,7 @@ from recon.io.cameras.ros import (
     rig_of_camera_infos,
     step_between,
 )
-from recon.io.files import reading, resolved
+from recon.io.files import reading, refuse_special, resolved
 from recon.sources.bag_prior import find_imu, read_imu_topic, read_topic
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.image_names import find_partners, partner_names
@@ -54,10 +54,6 @@ class BagSource(Recording):
     left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     stamped: bool = True
-    note: str = ""  # on the calibration
-
-    def warnings(self) -> list[str]:
-        return [*super().warnings(), *filter(None, [self.note])]
 
     @cached_property
     def files(self) -> Sequence[Path]:
@@ -132,7 +128,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         recorded_ns=recorded_ns,
         texts=texts,
         stamped=not clock,
-        note=note,
+        notes=(note,) if note else (),
     )
 
 
@@ -153,6 +149,9 @@ def recording_files(path: Path) -> list[Path]:
     if not found or (path.is_file() and path.suffix not in BAGS):
         expected = "a .bag, .mcap or .db3 file, or a ROS 2 folder with metadata.yaml"
         raise SourceError("not a recording", where=path, expected=expected)
+    for each in found:
+        for file in each.iterdir() if each.is_dir() else [each]:
+            refuse_special(file)
     return found
 
 

@@ -16,6 +16,7 @@ from recon.sources.settings import SourceSettings
 _NAME: Final = re.compile(
     r"(calib|calibration|rig|stereo|cam_?chain|intrinsics|cameras?)([._-].*)?\.(txt|ya?ml|xml|json)"
 )
+RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of a run
 # Focal lengths, skew and principal row: all of a camera matrix but the principal column.
 _ROWS: Final = ([0, 0, 1, 1], [0, 1, 1, 2])
 _DIGITS_TOLERANCE: Final = 1e-9  # deviation from a rectified pair, given the digits of files

@@ -67,7 +67,11 @@ def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
 
 def list_files(folder: Path) -> list[tuple[str, str]]:
     """Return names (left, right) of the text files in a folder that list images."""
-    names = [path.name for path in folder.iterdir() if path.suffix == ".txt" and _lists(path)]
+    names = [
+        path.name
+        for path in folder.iterdir()
+        if path.suffix == ".txt" and path.is_file() and _lists(path)
+    ]
     return find_partners(names)
 
 

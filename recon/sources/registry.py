@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -12,12 +13,13 @@ from recon.io.images.video import VIDEOS
 from recon.io.middlebury import find_layout
 from recon.io.trajectory import FRAMES
 from recon.sources.bag import BAGS, find_bags, open_bag
+from recon.sources.calibration import RIG_FILE
 from recon.sources.folders import find_views, open_folders
 from recon.sources.kitti import open_kitti, open_kitti_raw
 from recon.sources.listed import is_euroc, list_files, open_euroc, open_tum
 from recon.sources.one_pair import open_middlebury
 from recon.sources.settings import SourceSettings
-from recon.sources.source import StereoSource
+from recon.sources.source import Recording, StereoSource
 from recon.sources.video import list_videos, open_video_source
 
 
@@ -69,7 +71,12 @@ def open_source(
         if kind in _NAMELESS:
             hint = "leave it out; --source folders takes image folders of any name"
             settings.refuse_names(("left", "right"), path, hint)
-        return opening[kind](Path(path), settings)
+        source = opening[kind](Path(path), settings)
+    rig = Path(path) / RIG_FILE
+    if not isinstance(source, Recording) or settings.has_camera or not rig.is_file():
+        return source
+    note = f"{rig} is not used: the drive has a calibration of its own; --calib takes it instead"
+    return source if rig in source.texts else replace(source, notes=(*source.notes, note))
 
 
 def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -182,12 +182,14 @@ class Bag:
         self, topics: Sequence[str], start_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
         """Yield topic, time of recording and content of each message, in that order."""
-        with self._our_errors(), self._opened() as readers:
+        with self._our_errors(), self._opened() as readers, ExitStack() as open_streams:
             streams = []
             for reader in readers:
                 wanted = [c for c in reader.connections if c.topic in topics]
                 if wanted:
-                    streams.append(reader.messages(wanted, start=start_ns))
+                    # A database does not close while rows of it are being read.
+                    stream = closing(reader.messages(wanted, start=start_ns))
+                    streams.append(open_streams.enter_context(stream))
             for connection, recorded_ns, content in heapq.merge(*streams, key=lambda m: m[1]):
                 yield connection.topic, recorded_ns, content
 
@@ -225,13 +227,10 @@ class Bag:
         except (ReconError, MemoryError):
             raise
         except Exception as error:
-            raise FormatError(
-                "recording cannot be read",
-                where=self.paths[0],
-                got=str(error) or type(error).__name__,
-                hint="it may be truncated; copy it again, or repair it with rosbag reindex, "
-                "ros2 bag reindex or mcap recover",
-            ) from error
+            what, got = "recording cannot be read", str(error) or type(error).__name__
+            repair = "repair it with rosbag reindex, ros2 bag reindex or mcap recover"
+            hint = f"it may be truncated; copy it again, or {repair}"
+            raise FormatError(what, where=self.paths[0], got=got, hint=hint) from error
 
 
 def _decode(message: Any, where: str) -> UInt8:

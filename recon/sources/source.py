@@ -181,12 +181,17 @@ def check_source(source: object) -> None:
         raise SourceError(what, got=type(source).__name__, expected=expected)
 
 
-_HEAD_BYTES: Final = 4096
+_SAMPLES: Final = 32  # of a file: a change over a 31st of it is seen, and all of up to 128 KiB
 
 
 def mark_of(source: StereoSource) -> dict[str, Any]:
-    """Return what a source is known again by: its number of pairs, names and heads of its files."""
-    return {"frames": len(source), **fingerprint(source.files, head_bytes=_HEAD_BYTES)}
+    """Return what a source is known again by: its number of pairs, names and samples of its files.
+
+    ``sha256`` is of their heads alone, by which maps know it that were made before there were
+    ``samples_sha256``.
+    """
+    heads, samples = (fingerprint(source.files, samples=count) for count in (1, _SAMPLES))
+    return {"frames": len(source), **heads, "samples_sha256": samples["sha256"]}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -198,6 +203,7 @@ class Recording(StereoSource):
     calibration: Rig
     listing: FrameList  # which frames of the recording are pairs
     texts: tuple[Path, ...]  # calibration and other text files that were read
+    notes: tuple[str, ...] = ()  # on the calibration, for the user
     truth: SequenceTruth | None = None
 
     @cached_property
@@ -221,7 +227,8 @@ class Recording(StereoSource):
 
     def warnings(self) -> list[str]:
         out = self.left_out
-        return [f"{counted(out, 'image')} without a partner: left out"] if out else []
+        left_out = [f"{counted(out, 'image')} without a partner: left out"] if out else []
+        return [*left_out, *self.notes]
 
     def figures(self) -> dict[str, Any]:
         return {"frames_left_out": self.left_out}

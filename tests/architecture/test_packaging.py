@@ -129,6 +129,24 @@ def test_public_names_are_exactly_the_documented_ones_and_explain_themselves(roo
     assert [each for each in named if not inspect.getdoc(each)] == []
 
 
+def test_documented_arguments_are_those_of_the_functions(root):
+    wrong = []
+    for line in (root / "docs" / "api.md").read_text().splitlines():
+        if (call := re.match(r"- `(\w+)\((.*?)\)`", line)) is None:
+            continue
+        # Names and defaults may hide commas: `stopped=…`, `formats=("ply",)`.
+        text = re.sub(r"\(.*?\)", "x", call[2])
+        given, _, named = text.partition("*, ")
+        parameters = inspect.signature(getattr(recon, call[1])).parameters
+        at_places = [n for n, one in parameters.items() if one.kind is not one.KEYWORD_ONLY]
+        positional = [part.partition("=")[0] for part in given.split(", ") if part.strip()]
+        by_name = {part.partition("=")[0] for part in named.split(", ")} - {"", "…"}
+        by_name = {name for name in by_name if not name.startswith("**")}
+        if positional != at_places[: len(positional)] or not by_name <= {*parameters}:
+            wrong.append(line)
+    assert wrong == []
+
+
 HEAVY = {
     "cv2", "kiss_icp", "matplotlib", "numba", "open3d", "plotly", "pymeshlab", "pyoctomap",
 }  # fmt: skip

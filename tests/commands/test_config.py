@@ -33,6 +33,55 @@ def test_a_dumped_configuration_loads_back_equal(tmp_path, command, defaults, ov
     assert load_config(tmp_path / "config.yaml", defaults=defaults) == config
 
 
+SETTINGS = ["matching.matcher=sgm", "matching.sgm.p1=20", "fusion.voxel_m=0.2"]
+
+
+@pytest.mark.parametrize("given", [
+    {"matching.matcher": "sgm", "matching.sgm.p1": 20, "fusion.voxel_m": 0.2},
+    {"matching": {"matcher": "sgm", "sgm": {"p1": 20}}, "fusion": {"voxel_m": 0.2}},
+    {"matching": {"matcher": "sgm", "sgm.p1": 20}, "fusion.voxel_m": 0.2},
+    {"matching": {"matcher": "sgm"}, "matching.sgm": {"p1": 20}, "fusion": {"voxel_m": 0.2}},
+])  # fmt: skip
+def test_settings_are_dicts_with_dotted_or_nested_keys(tmp_path, given):
+    expected = load_config(None, SETTINGS)
+    for overrides in (given, [given], [SETTINGS[0], given]):
+        assert load_config(None, overrides) == expected
+    assert load_config(given) == load_config(defaults=given) == expected
+    assert load_config(given, {"fusion.voxel_m": 0.3}) == load_config(
+        expected, "fusion.voxel_m=0.3"
+    )
+    write_yaml(tmp_path / "config.yaml", given)
+    assert load_config(tmp_path / "config.yaml") == expected
+
+
+@pytest.mark.parametrize(("given", "why"), [
+    ((None, {"matching.sad.window": 9}), "unknown setting 'matching.sad.window'.*window_px"),
+    (({"matching": {"sad": {"window": 9}}},), "unknown setting 'matching.sad.window'"),
+    ((None, "window"), r"cannot read this setting \(got 'window', expected key=value\)"),
+    ((None, {".".join("a" * 20): 1}), "cannot read this setting"),
+    ((9,), r"not settings \(got int, expected a file, a mapping or a ReconConfig\)"),
+])  # fmt: skip
+def test_what_are_no_settings_is_one_line(given, why):
+    with pytest.raises(SettingsError, match=why):
+        load_config(*given)
+
+
+def test_assigning_to_a_setting_says_what_to_use_and_that_works():
+    config = load_config(None, PAIR_DEFAULTS)
+    for group, name in ((config, "scene"), (config.matching.sad, "window_px"), (config.mesh, "x")):
+        with pytest.raises(
+            SettingsError, match=rf"{name}: settings do not .*load_config\(config, "
+        ):
+            setattr(group, name, 9)
+    changed = load_config(config, {"matching.sad.window_px": 9})
+    assert (changed.matching.sad.window_px, changed.cloud) == (9, config.cloud)
+    assert config.matching.sad.window_px != 9
+    # What follows from the size of the scene is not fixed by a change of something else.
+    assert changed.at_scale(0.2) == load_config(
+        None, ["matching.sad.window_px=9"], PAIR_DEFAULTS
+    ).at_scale(0.2)
+
+
 def test_a_command_writes_only_what_determines_its_result(tmp_path):
     write_yaml(tmp_path / "config.yaml", load_config().recorded("map"))
     drive = (tmp_path / "config.yaml").read_text()

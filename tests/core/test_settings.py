@@ -196,7 +196,7 @@ def test_settings_cannot_be_changed_and_keep_their_bounds():
     class Wrong(Settings):
         window_px: int = Field(default=0, ge=1, description="Window.")
 
-    with pytest.raises(ValidationError, match="frozen"):
+    with pytest.raises(SettingsError, match=r"name: settings do not change; recon.load_config"):
         Outer().name = "b"
     with pytest.raises(ValidationError):
         Wrong()

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from recon.core.errors import ReconError
-from recon.io.positions import read_positions
+from recon.io.control_points import is_control, read_control
+from recon.io.positions import Positions, read_positions
 from tests.scenery import receivers
 
 pytest.importorskip("pyproj")
@@ -48,6 +49,36 @@ def test_in_the_south_and_the_west(tmp_path):
     metres, crs = found.projected(None, "gnss")
     assert crs == "EPSG:32722"
     assert np.abs(metres[:, :2] - SOUTH_M[:, :2]).max() < 0.001
+
+
+@pytest.mark.parametrize(
+    ("crs", "why"),
+    [
+        ("EPSG:32600", r"--crs: positions cannot be converted.*UTM grid system \(northern"),
+        ("IAU_2015:30120", r"gnss: positions cannot be converted.*IAU_2015:30120"),  # of the Moon
+    ],
+)
+def test_a_system_that_positions_on_earth_have_not_is_refused(degrees, crs, why):
+    found = Positions(TIMES_S, degrees, np.full_like(degrees, np.nan), degrees=True)
+    with pytest.raises(ReconError, match=why):
+        found.projected(crs, "gnss")
+
+
+@pytest.mark.parametrize(
+    ("head", "why"),
+    [
+        ("WGS84 UTM 0S", "unknown coordinate system"),
+        ("WGS84 UTM 61N", "unknown coordinate system"),  # with the number of a polar system
+        ("EPSG:32700", "cannot be converted"),
+        ("EPSG:2263", "not metres"),
+    ],
+)
+def test_a_system_of_control_points_that_there_is_not_is_refused_by_their_file(tmp_path, head, why):
+    path = tmp_path / "gcp.txt"
+    path.write_text(f"{head}\n500000 5400000 100 10 10 left.png a\n")
+    assert is_control(path)
+    with pytest.raises(ReconError, match=rf"gcp\.txt: .*{why}"):
+        read_control(path)
 
 
 def test_nmea_over_midnight_and_damaged_sentences(tmp_path, degrees):

@@ -1,8 +1,10 @@
 """A run's folder appears complete, or not at all, with configuration, summary and record."""
 
+import hashlib
 import itertools
 import json
 import math
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,13 +95,51 @@ def test_a_hash_of_inputs_knows_their_names_bytes_and_order(tmp_path):
     found = fingerprint([one, other])
     assert (found["files"], found["bytes"]) == (2, 3_000_001)
     hashes = {found["sha256"], fingerprint([other, one])["sha256"]}
-    heads = fingerprint([one, other], head_bytes=4)
     one.write_bytes(b"a" * 2_999_999 + b"b")
-    assert fingerprint([one, other], head_bytes=4) == heads
     hashes.add(fingerprint([one, other])["sha256"])
     one.rename(tmp_path / "renamed")
     hashes.add(fingerprint([tmp_path / "renamed", other])["sha256"])
     assert len(hashes) == 4
+
+
+def test_a_hash_of_samples_knows_small_files_and_what_changes_over_a_part_of_larger_ones(tmp_path):
+    file, samples, length = tmp_path / "image.pgm", 32, 1_000_003
+
+    def hashed(content: bytearray) -> str:
+        file.write_bytes(content)
+        return fingerprint([file], samples=samples)["sha256"]
+
+    plain_image = hashed(bytearray(length))
+    part = -(-length // (samples - 1))
+    for start in (0, 4096, 500_000, length - part):
+        content = bytearray(length)
+        content[start : start + part] = b"x" * part
+        assert hashed(content) != plain_image
+    for length in (1, 4096, samples * 4096):  # small ones count to the last byte
+        content = bytearray(length)
+        before = hashed(content)
+        content[-1] = 1
+        assert hashed(content) != before
+    assert hashed(bytearray()) != plain_image
+
+
+def test_one_sample_is_what_earlier_versions_hashed(tmp_path):
+    """Their maps know drives by the first 4,096 bytes of each file."""
+    digest = hashlib.sha256()
+    files = [tmp_path / name for name in ("small", "large")]
+    for file, length in zip(files, (4096, 5000), strict=True):
+        file.write_bytes(bytes(range(250)) * 20)
+        os.truncate(file, length)
+        digest.update(file.name.encode() + b"\0" + length.to_bytes(8, "little"))
+        digest.update(file.read_bytes()[:4096])
+    assert fingerprint(files, samples=1)["sha256"] == digest.hexdigest()
+
+
+@pytest.mark.parametrize("samples", [None, 32])
+def test_a_pipe_is_not_hashed(tmp_path, samples):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FormatError, match=r"pipe: not a regular file \(got a named pipe\)"):
+        fingerprint([tmp_path / "pipe"], samples=samples)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Recordings and videos: what is chosen of them, motion beside the images, faults in one line."""
 
+import gc
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +47,21 @@ def test_a_cut_recording_is_one_line(noise, tmp_path, kind, share):
     path = bag(kind=kind)(noise, CAMERA, tmp_path)
     halve(next(path.glob("*.db3")) if kind == "ros2" else path, share)
     fails(path, "recording cannot be read.*reindex")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_drive_that_is_given_up_closes_its_recording(noise, tmp_path, kind, monkeypatch):
+    """As where an image has another size than the CameraInfo; SQLite is locked while it is read."""
+    lost: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda one: lost.append(one.exc_value))
+    source = open_source(bag(kind=kind)(noise, CAMERA, tmp_path))
+    for _ in range(3):
+        frames = source.frames()
+        loop = [frames, next(frames)]  # only the collector of garbage finds it
+        loop.append(loop)
+        del frames, loop
+        gc.collect()
+    assert lost == []
 
 
 def test_a_recording_without_an_index_is_one_line(noise, tmp_path):

@@ -3,6 +3,8 @@
 Times, truth and known poses stay those of the left images.
 """
 
+import os
+import shutil
 import tracemalloc
 from dataclasses import replace
 from functools import partial
@@ -24,6 +26,8 @@ from recon.rig.cameras import open_camera_source
 from recon.rig.capture import CaptureSettings
 from recon.sources.registry import open_source, recognise_source
 from recon.sources.settings import SourceSettings
+from recon.sources.source import mark_of
+from tests.hostile.refusals import refusal
 from tests.sources import drives
 from tests.sources.drives import CAMERA, FRAMES, Pairs, Writer
 
@@ -132,6 +136,29 @@ def test_each_layout_gives_every_pixel_and_time(written, drive, layout):
                 np.testing.assert_array_equal(
                     channels, np.broadcast_to(true[:, :, None], channels.shape)
                 )
+
+
+@pytest.mark.parametrize("layout", MORE)
+def test_a_pipe_in_place_of_a_file_is_refused_or_left_out(noise, tmp_path, layout):
+    """Opening one would wait for ever for what nobody writes."""
+    path, good = MORE[layout](noise, CAMERA, tmp_path / "good"), tmp_path / "good"
+    files = sorted(file for file in good.rglob("*") if file.is_file())
+    seen = [file for file in files if file.suffix == ".png"]
+    for file in [*(one for one in files if one not in seen), *seen[:1], *seen[-1:]]:
+        drive = tmp_path / "bad"
+        shutil.copytree(good, drive)
+        pipe = drive / file.relative_to(good)
+        pipe.unlink()
+        os.mkfifo(pipe)
+
+        def read(drive: Path = drive, pipe: Path = pipe) -> None:
+            source = open_source(drive / path.relative_to(good))
+            mark_of(source)
+            list(source)
+            assert pipe not in source.files
+
+        refusal(read)
+        shutil.rmtree(drive)
 
 
 SHORT, LONG, WIDTH_PX, HEIGHT_PX = 50, 100, 320, 240

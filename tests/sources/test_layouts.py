@@ -1,6 +1,7 @@
 """Layouts and names of image files: how they are recognised, paired, timed, and refused."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -394,6 +395,33 @@ def test_folders_without_pairs_or_calibration_are_refused(noise, tmp_path):
     (folder / "right" / "right0.png").unlink()
     with pytest.raises(SourceError, match=r"numbers of left .* differ \(got 12 left and 11 right"):
         open_source(folder)
+
+
+@pytest.mark.parametrize("layout", ["kitti", "kitti_raw", "tum", "folders"])
+@pytest.mark.parametrize("mended", [True, False])
+def test_a_rig_beside_the_calibration_of_a_drive_is_not_used_and_that_is_said(
+    noise, tmp_path, layout, mended
+):
+    folder = getattr(drives, f"write_{layout}")(noise, CAMERA, tmp_path)
+    before = open_source(folder)
+    assert before.warnings() == []
+    rig = folder / "rig.yaml"
+    if mended:
+        write_recon_calibration(rig, replace(CAMERA, baseline_m=0.25))
+    else:
+        rig.write_text("format: recon\nbaseline_m: [")
+    source = open_source(folder)
+    assert source.calibration == before.calibration
+    (line,) = source.warnings()
+    assert line.startswith(f"{rig} is not used")
+    assert source.with_calibration(CAMERA).warnings() == [line]
+    chosen = SourceSettings(calibration=str(rig))
+    if mended:
+        assert open_source(folder, settings=chosen).calibration.baseline_m == 0.25
+        assert open_source(folder, settings=chosen).warnings() == []
+    else:
+        with pytest.raises(FormatError, match=r"rig\.yaml"):
+            open_source(folder, settings=chosen)
 
 
 @pytest.mark.parametrize(

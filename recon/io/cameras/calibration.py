@@ -9,7 +9,7 @@ from zipfile import is_zipfile
 
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.text import parse_number
-from recon.core.values import Rig, check_size
+from recon.core.values import Rig, StereoCalibration, check_side_by_side, check_size
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import INSTEAD, read_opencv_calibration
 from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
@@ -58,7 +58,8 @@ def read_calibration(
     Raises:
         FormatError: The file is missing, damaged or of an unknown format, or it does not contain
             the image size (KITTI's and some of OpenCV's do not) and none is given.
-        CalibrationError: The calibration cannot give depth, or is of another image size.
+        CalibrationError: The calibration cannot give depth, such as one with left and right
+            swapped, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)
     if is_zipfile(path):
@@ -77,11 +78,10 @@ def read_calibration(
     elif form in _READERS:
         rig = _READERS[form](path)
     elif form == "homographies":
-        raise CalibrationError(
-            "homographies know no focal length and no baseline: there is no depth in them",
-            hint="recon disparity takes the rectified images as they are; for depth use a "
-            "calibration of the cameras (recon calibrate)",
-        )
+        what = "homographies know no focal length and no baseline: there is no depth in them"
+        use = "for depth use a calibration of the cameras (recon calibrate)"
+        hint = f"recon disparity takes the rectified images as they are; {use}"
+        raise CalibrationError(what, hint=hint)
     else:
         raise FormatError(
             "not a calibration file of a known kind",
@@ -89,6 +89,8 @@ def read_calibration(
             "OpenCV YAML/XML/JSON (M1 …, or P1 P2), ROS CameraInfo or a kalibr camchain (cam0: …)",
             hint=INSTEAD,
         )
+    if isinstance(rig, StereoCalibration):
+        check_side_by_side(rig.T_right_left[:3, 3])
     if size is not None:
         check_size(rig, *size, path)
     return rig
@@ -109,11 +111,9 @@ def _read_kitti(
     path: StrPath, size: tuple[int, int] | None, cameras: tuple[int, int] | None
 ) -> Rig:
     if size is None:
-        raise FormatError(
-            "a KITTI calibration does not say which images it is of",
-            hint="pass width_px and height_px, or give the file itself to recon.reconstruct or "
-            "recon.match, which take the size from the images",
-        )
+        what = "a KITTI calibration does not say which images it is of"
+        those = "recon.reconstruct or recon.match, which take the size from the images"
+        raise FormatError(what, hint=f"pass width_px and height_px, or give the file to {those}")
     known = list_kitti_cameras(path)
     grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
     return read_kitti_rig(path, *size, cameras or (GREY_CAMERAS if grey else COLOUR_CAMERAS))

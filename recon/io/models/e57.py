@@ -8,7 +8,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from recon.core.errors import OutputError, require
+from recon.core.errors import require
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
@@ -46,9 +46,7 @@ def write_e57(
                     file.write_scan_raw(data, name=name, translation=offset_m)
                     points += len(cloud)
         except pye57.libe57.E57Exception as error:
-            what, got = "cannot write the file", str(error).split(" **** ", maxsplit=1)[0]
-            hint = "check that the disk is not full"
-            raise OutputError(what, where=path, got=got, hint=hint) from error
+            raise OSError(str(error).partition("****")[0].strip()) from error
     return points
 
 
@@ -70,6 +68,9 @@ def _opened(pye57: Any, path: str, wkt: str) -> Any:
             }
             for name, value in nodes.items():
                 self.root.set(name, value)
+
+        def __del__(self) -> None:
+            """Do not close again what a full disk kept from being closed: Python would print it."""
 
     return File(path, mode="w")
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -81,13 +82,22 @@ def write_geotiff(
     if colours:
         kind = {"count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "yes"}
     west_m, north_m = place.west * place.cell_m, place.north * place.cell_m
-    with (
-        atomic_path(path) as temporary,
-        rasterio.open(
+    with atomic_path(path) as temporary:
+        with rasterio.open(
             temporary, "w+", driver="GTiff", width=place.columns, height=place.rows,
             transform=rasterio.Affine(place.cell_m, 0, west_m, 0, -place.cell_m, north_m),
             crs=None if crs is None else check_crs(crs).to_wkt(), tiled=True, blockxsize=_BLOCK_PX,
             blockysize=_BLOCK_PX, compress="deflate", bigtiff="if_safer", sparse_ok=True, **kind,
-        ) as dataset,
-    ):  # fmt: skip
-        yield RasterFile(dataset, rasterio.windows.Window, place)
+        ) as dataset:  # fmt: skip
+            yield RasterFile(dataset, rasterio.windows.Window, place)
+            written = _checksums(dataset)
+        # What is left is written when the file is closed, without an error if there is no room.
+        whole = False
+        with suppress(rasterio.errors.RasterioIOError), rasterio.open(temporary) as dataset:
+            whole = _checksums(dataset) == written
+        if not whole:
+            raise OSError("parts of it are missing")
+
+
+def _checksums(dataset: Any) -> list[int]:
+    return [zlib.crc32(dataset.read(window=at).tobytes()) for _, at in dataset.block_windows(1)]

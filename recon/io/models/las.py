@@ -76,21 +76,25 @@ def las_header(laspy: Any, T_to_from: Float64, crs: str | None, step_m: float) -
     return header
 
 
-def check_crs(crs: str) -> Any:
-    """Return the coordinate system of a name such as ``EPSG:25832``."""
-    pyproj = require("pyproj", extra=_EXTRA)
+def check_crs(crs: str, where: StrPath = "--crs") -> Any:
+    """Return the coordinate system of a name such as ``EPSG:25832``; ``where`` it is given."""
+    pyproj, expected = require("pyproj", extra=_EXTRA), "a projected system, such as EPSG:25832"
     try:
         found = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
-        raise SettingsError(
-            "unknown coordinate system", where="--crs", got=crs, expected="such as EPSG:25832"
-        ) from error
+        what = "unknown coordinate system"
+        raise SettingsError(what, where=where, got=crs, expected="such as EPSG:25832") from error
+    got = f"{crs} ({found.name})"
     units = {axis.unit_name for axis in found.axis_info}
     if not found.is_projected or units != {"metre"}:
         what = "the coordinates of this system are not metres to the east and north"
         got = f"{crs} ({found.name}; {', '.join(sorted(units))})"
-        expected = "a projected system, such as EPSG:25832"
-        raise SettingsError(what, where="--crs", got=got, expected=expected)
+        raise SettingsError(what, where=where, got=got, expected=expected)
+    try:
+        pyproj.Transformer.from_crs(found, found.geodetic_crs)
+    except pyproj.exceptions.ProjError as error:  # UTM without a zone: EPSG:32600
+        what = "positions cannot be converted to this coordinate system"
+        raise SettingsError(what, where=where, got=got, expected=expected) from error
     return found
 
 
@@ -113,14 +117,11 @@ def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
         and area.south - _MARGIN_DEG <= lat <= area.north + _MARGIN_DEG
     ):
         return
-    raise EvaluationError(
-        "the positions lie outside the area of their coordinate system",
-        where=where,
-        got=f"easting {position_m[0]:.0f}, northing {position_m[1]:.0f} in {crs}",
-        expected=f"longitude {area.west:g} to {area.east:g}, latitude {area.south:g} to "
-        f"{area.north:g}",
-        hint="columns are time, easting, northing, height in metres; without --crs any are taken",
-    )
+    what = "the positions lie outside the area of their coordinate system"
+    got = f"easting {position_m[0]:.0f}, northing {position_m[1]:.0f} in {crs}"
+    lon_lat = f"longitude {area.west:g} to {area.east:g}, latitude {area.south:g} to {area.north:g}"
+    hint = "columns are time, easting, northing, height in metres; without --crs any are taken"
+    raise EvaluationError(what, where=where, got=got, expected=lon_lat, hint=hint)
 
 
 def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> None:

@@ -13,6 +13,7 @@ from recon.core.errors import require
 from recon.core.geometry.se3 import quaternion_from_rotation
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
+from recon.io.atomic import writing_to
 
 _EXTRA: Final = "ros"
 _FLOAT32: Final = 7  # number of the type in a PointField
@@ -104,5 +105,6 @@ def write_bag(folder: Path) -> Iterator[RosBag]:
     for name, text in _GRID_MAP.items():
         store.register(typesys.get_types_from_msg(text, f"grid_map_msgs/msg/{name}"))
     # What is beside the file is of version 9, which ROS 2 reads since Iron.
-    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+    how = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
+    with writing_to(folder / f"{folder.name}.mcap"), rosbag2.Writer(folder, **how) as writer:
         yield RosBag(writer, store, interfaces)

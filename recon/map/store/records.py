@@ -19,7 +19,7 @@ from typing_extensions import Self
 
 from recon.core.errors import FormatError, OutputError
 from recon.io.atomic import check_targets
-from recon.io.files import reading
+from recon.io.files import reading, refuse_special
 from recon.map.store.database import (
     Content,
     begin_to_read,
@@ -65,6 +65,11 @@ def writing(path: Path | None) -> Iterator[None]:
         ) from error
 
 
+def _files_of(path: Path) -> list[Path]:
+    """Return a database, and what SQLite keeps beside it."""
+    return [path.with_name(path.name + end) for end in ("", "-wal", "-shm", "-journal")]
+
+
 class Store:
     """Records under a kind and a key, in one SQLite file.
 
@@ -87,8 +92,8 @@ class Store:
         """Begin a store; a file at ``path`` is replaced."""
         check_targets([path])
         with writing(path):
-            for end in ("", "-wal", "-shm", "-journal"):  # what SQLite keeps beside a file
-                path.with_name(path.name + end).unlink(missing_ok=True)
+            for file in _files_of(path):
+                file.unlink(missing_ok=True)
             path.parent.mkdir(parents=True, exist_ok=True)
             with closed_on_error(connect(path)) as database:
                 make_tables(database)
@@ -101,6 +106,8 @@ class Store:
         with reading(path):
             with path.open("rb"):  # a missing file, a folder, no permission
                 pass
+            for file in _files_of(path):
+                refuse_special(file)
             database = connect(path, read_only=read_only)
         with closed_on_error(database):
             with reading(path):

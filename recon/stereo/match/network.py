@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,6 +12,7 @@ import numpy as np
 from recon.core.errors import FormatError, MatchingError, require
 from recon.core.values.arrays import Float32
 
+LARGEST_PX: Final = 10_000  # length of an image that is matched
 #: What files begin with that people save instead of a network.
 _MISTAKEN: Final = {
     b"version https://git-lfs": ("a pointer of git-lfs", "fetch the file itself: git lfs pull"),
@@ -23,6 +25,8 @@ _MISTAKEN: Final = {
 class OnnxNetwork:
     """A loaded network, run on the CPU; ``threads`` per operator, None = onnxruntime's default.
 
+    It is ended after ``limit_s`` seconds: a file from elsewhere may have a loop without an end.
+
     Attributes:
         stacked: Whether one input takes both images, one behind the other: (1, 2·C, H, W).
         channels: Those of one image; 3 where the network leaves them free.
@@ -30,12 +34,12 @@ class OnnxNetwork:
         layout: The number of inputs and their channels, in words.
     """
 
-    def __init__(self, path: Path, threads: int | None = None) -> None:
+    def __init__(self, path: Path, threads: int | None = None, limit_s: float = 600.0) -> None:
         runtime = require("onnxruntime", extra="onnx")
         if not path.is_file():
             raise FormatError("file does not exist", where=path, expected="an ONNX network")
         _refuse_mistaken(path)
-        self._path = path
+        self._path, self._limit_s, self._how = path, limit_s, runtime.RunOptions
         self._errors = _errors_of(runtime)
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads or 0
@@ -45,9 +49,8 @@ class OnnxNetwork:
                 str(path), options, providers=["CPUExecutionProvider"]
             )
         except self._errors as error:
-            raise FormatError(
-                "onnxruntime cannot load the network", where=path, got=_first_line(error)
-            ) from error
+            what = "onnxruntime cannot load the network"
+            raise FormatError(what, where=path, got=_first_line(error)) from error
         self._read_inputs()
 
     def _read_inputs(self) -> None:
@@ -55,6 +58,10 @@ class OnnxNetwork:
         if not inputs:
             raise FormatError("the network has no input", where=self._path, expected="two images")
         shape = [length if isinstance(length, int) else None for length in inputs[0].shape]
+        if not all(1 <= length <= LARGEST_PX for length in shape if length is not None):
+            got, expected = "x".join(map(str, inputs[0].shape)), f"lengths of 1 to {LARGEST_PX}"
+            what = "the network does not take images"
+            raise FormatError(what, where=self._path, got=got, expected=expected)
         channels, height, width = shape[1:] if len(shape) == 4 else (None, None, None)
         self.stacked = len(inputs) == 1
         self.channels: int = max(1, channels // (1 + self.stacked)) if channels else 3
@@ -66,23 +73,32 @@ class OnnxNetwork:
         """Run the network once, from float32 arrays in the order of its inputs."""
         wanted = self._session.get_inputs()
         if len(wanted) != len(inputs):
-            raise MatchingError(
-                "the network has a different number of inputs",
-                where=self._path,
-                got=f"{len(wanted)}: {', '.join(one.name for one in wanted)}",
-                expected=str(len(inputs)),
-            )
+            what, names = "the network has a different number of inputs", [w.name for w in wanted]
+            got = f"{len(wanted)}: {', '.join(names)}"
+            raise MatchingError(what, where=self._path, got=got, expected=str(len(inputs)))
         feed = {one.name: np.ascontiguousarray(x) for one, x in zip(wanted, inputs, strict=True)}
         try:
-            outputs = self._session.run(None, feed)
+            return [np.asarray(output, dtype=np.float32) for output in self._outputs(feed)]
         except self._errors as error:
-            raise MatchingError(
-                "the network cannot process these images",
-                where=self._path,
-                got=_first_line(error),
-                hint="check the size that it expects: matching.onnx.width_px and height_px",
-            ) from error
-        return [np.asarray(output, dtype=np.float32) for output in outputs]
+            what, got = "the network cannot process these images", _first_line(error)
+            hint = "check the size that it expects: matching.onnx.width_px and height_px"
+            raise MatchingError(what, where=self._path, got=got, hint=hint) from error
+
+    def _outputs(self, feed: dict[str, Float32]) -> list[Any]:
+        """Run the network in a thread, so that Ctrl-C and the limit end it."""
+        options = self._how()
+        with ThreadPoolExecutor(1) as pool:
+            running = pool.submit(self._session.run, None, feed, options)
+            try:
+                wait([running], self._limit_s)
+                late = not running.done()
+            finally:
+                options.terminate = True
+        if late:
+            what, got = "the network does not come to an end", f"{self._limit_s:g} s"
+            hint = "--set matching.onnx.time_limit_s= allows more"
+            raise MatchingError(what, where=self._path, got=got, hint=hint)
+        return list(running.result())
 
 
 def _refuse_mistaken(path: Path) -> None:
@@ -90,9 +106,8 @@ def _refuse_mistaken(path: Path) -> None:
         start = file.read(64).lstrip(b"\xef\xbb\xbf \r\n\t")
     for beginning, (what, hint) in _MISTAKEN.items():
         if start.startswith(beginning):
-            raise FormatError(
-                "not a network", where=path, got=what, expected="an ONNX network", hint=hint
-            )
+            how = {"got": what, "expected": "an ONNX network", "hint": hint}
+            raise FormatError("not a network", where=path, **how)
 
 
 def _errors_of(runtime: Any) -> tuple[type[Exception], ...]:

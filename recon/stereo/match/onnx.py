@@ -17,7 +17,7 @@ from recon.core.settings import Settings
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.match.agreement import rate_by_agreement
-from recon.stereo.match.network import OnnxNetwork
+from recon.stereo.match.network import LARGEST_PX, OnnxNetwork
 from recon.stereo.match.presets import OWN, PRESETS, Preset
 from recon.stereo.match.protocol import unrated_disparity
 from recon.stereo.match.search import LEFT_RIGHT_PX, usual_ndisp
@@ -40,10 +40,10 @@ class OnnxSettings(Settings):
     preset: Literal["hitnet", "lite-any-stereo"] | None = None
     """Which published network it is: sets mean, std, output and output_scale, unless they are set,
     and names licence and training sets in the results."""
-    width_px: int | None = Field(None, ge=1, le=10000)
+    width_px: int | None = Field(None, ge=1, le=LARGEST_PX)
     """Width at which the network matches; images are resized. none = its own, or that of the
     images, widened to a multiple of 32. Smaller is faster."""
-    height_px: int | None = Field(None, ge=1, le=10000)
+    height_px: int | None = Field(None, ge=1, le=LARGEST_PX)
     """Height at which it matches; with width_px or not at all."""
     mean: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] | None = None
     """Taken from levels in [0, 1]; one number, or per channel (red, green, blue). none = 0, or as
@@ -62,6 +62,8 @@ class OnnxSettings(Settings):
     tile_megapixels: float = Field(1.0, ge=0.1, le=1000)
     """Larger images are matched in tiles of this size, which overlap; memory grows with it, by 1 to
     2 GB per megapixel of a small network. Not where the network or width_px gives the size."""
+    time_limit_s: float = Field(600.0, ge=0.1, le=1e6)
+    """The longest that the network may take of an image or tile: one that never ends is refused."""
     self_test: bool = True
     """Let the network match a rendered plane first, and refuse it if it does not find the
     disparity."""
@@ -133,20 +135,13 @@ class OnnxMatcher:
             path, s = self._settings.model, self._settings
             if path is None:
                 get = f": {self._use.get}" if self._use.get else ""
-                raise SettingsError(
-                    "the matcher 'onnx' needs a network",
-                    expected=f"a file{get}",
-                    hint="--set matching.onnx.model=network.onnx",
-                )
-            network = OnnxNetwork(path, self._threads)
+                what, hint = "the matcher 'onnx' needs a network", "--set matching.onnx.model=FILE"
+                raise SettingsError(what, expected=f"a file{get}", hint=hint)
+            network = OnnxNetwork(path, self._threads, s.time_limit_s)
             if self._use.layout not in {"", network.layout}:
-                raise SettingsError(
-                    f"not the network of the preset {s.preset!r}",
-                    where=path,
-                    got=network.layout,
-                    expected=self._use.layout,
-                    hint=f"get {self._use.get}",
-                )
+                what, hint = f"not the network of the preset {s.preset!r}", f"get {self._use.get}"
+                how = {"got": network.layout, "expected": self._use.layout, "hint": hint}
+                raise SettingsError(what, where=path, **how)
             if s.self_test:
 
                 def match(left: UInt8, right: UInt8) -> Float32:
@@ -182,12 +177,10 @@ class OnnxMatcher:
             raise MatchingError("the network has no such output", got=number, expected=len(outputs))
         output = outputs[number]
         values = output.squeeze()
-        if values.ndim != 2:
-            raise MatchingError(
-                "the network's output is not a disparity map",
-                got=output.shape,
-                expected="(1, 1, H, W), (1, H, W, 1) or with fewer ones",
-            )
+        if values.ndim != 2 or not values.size:
+            what = "the network's output is not a disparity map"
+            expected = "(1, 1, H, W), (1, H, W, 1) or with fewer ones"
+            raise MatchingError(what, got=output.shape, expected=expected)
         values = values * np.float32(self._use.output_scale)
         return np.asarray(np.where(np.isfinite(values), values, np.nan), dtype=np.float32)
 
@@ -212,11 +205,9 @@ def _resized(values: Float32, shape: tuple[int, ...]) -> Float32:
 def _tensor(image: UInt8, channels: int, use: Preset) -> Float32:
     """Return one image as (1, C, H, W)."""
     if max(len(use.mean), len(use.std)) > channels:
-        raise SettingsError(
-            "mean and std have more numbers than the network has channels",
-            got=max(len(use.mean), len(use.std)),
-            expected=f"1 or {channels}",
-        )
+        what = "mean and std have more numbers than the network has channels"
+        got = max(len(use.mean), len(use.std))
+        raise SettingsError(what, got=got, expected=f"1 or {channels}")
     mean, std = (
         np.array(numbers, dtype=np.float32).reshape(-1, 1, 1) for numbers in (use.mean, use.std)
     )

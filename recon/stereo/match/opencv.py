@@ -100,10 +100,9 @@ def _match(
         )
         raw = engine.compute(*wide)
     except cv2.error as error:
-        raise MatchingError(
-            "OpenCV cannot match this pair with these settings",
-            got=f"{pair.camera.width_px}x{pair.camera.height_px}: {error.err[:200]}",
-        ) from error
+        got = f"{pair.camera.width_px}x{pair.camera.height_px}: {error.err[:200]}"
+        what = "OpenCV cannot match this pair with these settings"
+        raise MatchingError(what, got=got) from error
     (top, _, left, _), (height, width) = sides, pair.left.shape
     fixed = np.ascontiguousarray(raw[top : top + height, left : left + width])
     unknown = (s.min_disparity_px - 1) * _STEPS
@@ -119,10 +118,8 @@ def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
     ndisp = _STEPS * -(-settings.ndisp_for(camera) // _STEPS)
     first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
     if first <= -_LIMIT_PX or last >= _LIMIT_PX:
-        raise MatchingError(
-            "disparities exceed the range of OpenCV",
-            got=f"disparities from {first} to {last} px",
-            expected=f"between {-_LIMIT_PX} and {_LIMIT_PX} px",
-            hint="check min_disparity_px and ndisp, or match smaller images",
-        )
+        what, got = "disparities exceed the range of OpenCV", f"from {first} to {last} px"
+        expected = f"between {-_LIMIT_PX} and {_LIMIT_PX} px"
+        hint = "check min_disparity_px and ndisp, or match smaller images"
+        raise MatchingError(what, got=got, expected=expected, hint=hint)
     return ndisp

@@ -1,5 +1,6 @@
 """Clouds, OctoMaps and Nav2 grids as files: round trips, other programs, and damage."""
 
+import gc
 import resource
 import shutil
 import subprocess
@@ -40,12 +41,14 @@ from recon.core.values import (
 )
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
+from recon.io.models.geotiff import RasterPlace, write_geotiff
 from recon.io.models.las import check_crs, check_inside, write_las
 from recon.io.models.nav2 import read_nav2, write_nav2, write_nav2_costs
 from recon.io.models.npz import write_npz
 from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
 from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import read_ply, write_ply
+from recon.io.models.ros_bag import header, points, write_bag
 from tests.scenery.octomaps import write_octomap
 
 FIELDS = ("rgb", "normals", "confidence", "sigma_m", "weight", "count")
@@ -240,18 +243,50 @@ def test_a_copc_is_read_as_far_as_a_view_needs(tmp_path, points):
     assert len(laspy.read(path).points) == points  # a program that knows LAZ reads it, too
 
 
-@pytest.mark.parametrize("suffix", ["las", "laz", "copc.laz"])
-def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, suffix):
+@pytest.mark.parametrize("suffix", ["las", "laz", "copc.laz", "e57"])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, suffix, monkeypatch):
     pytest.importorskip("laspy")
-    write = write_copc if suffix.startswith("copc") else write_las
+    lost: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda one: lost.append(one.exc_value))
+    how = {"step_m": 0.001} if suffix != "e57" else {}
+    write = {"copc.laz": write_copc, "e57": write_e57}.get(suffix, write_las)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
     try:
         with pytest.raises(OutputError, match=f"cloud.{suffix}: cannot write the file"):
-            write(tmp_path / f"cloud.{suffix}", [example_cloud(20_000)], np.eye(4), step_m=0.001)
+            write(tmp_path / f"cloud.{suffix}", [example_cloud(20_000)], np.eye(4), **how)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    gc.collect()
+    assert lost == []
     assert not list(tmp_path.iterdir())
+
+
+def test_a_raster_and_a_bag_on_a_full_disk_are_named(tmp_path):
+    """GDAL writes the end of a raster when it is closed, and says nothing where that fails."""
+    pytest.importorskip("rasterio")
+    pytest.importorskip("rosbags")
+    noise = np.random.default_rng(0).normal(size=(1, 256, 256)).astype(np.float32)
+
+    def write_raster() -> None:
+        place = RasterPlace(0.1, 0, 256, 256, 256)
+        with write_geotiff(tmp_path / "dsm.tif", place, colours=False, crs=None) as file:
+            file.write(0, 0, noise)
+
+    def write_messages() -> None:
+        with write_bag(tmp_path / "bag") as bag:
+            bag.write("/cloud", 1, points(header("map", 1), example_cloud(20_000)))
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for name, write in (("dsm.tif", write_raster), ("bag/bag.mcap", write_messages)):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+        try:
+            with pytest.raises(OutputError, match=rf"{name}: cannot write .*disk is not full"):
+                write()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    write_raster()
+    assert [path.name for path in tmp_path.glob("*.tif")] == ["dsm.tif"]
 
 
 @pytest.mark.parametrize(
@@ -262,6 +297,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, suffix):
         ("EPSG:4326", "not metres"),  # degrees
         ("EPSG:4978", "not metres"),  # metres, but from the centre of the earth
         ("EPSG:2263", "not metres"),  # feet
+        ("EPSG:32600", "cannot be converted.*such as EPSG:25832"),  # UTM without a zone
+        ("EPSG:32700", "cannot be converted"),
     ],
 )
 def test_other_coordinates_are_refused(tmp_path, name, why):

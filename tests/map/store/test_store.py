@@ -257,6 +257,16 @@ def test_files_of_others_are_refused(tmp_path, kind, read_only):
     assert ("got format 99" in str(caught.value)) == (kind == "format 99")
 
 
+@pytest.mark.parametrize("end", ["-wal", "-shm", "-journal"])
+@pytest.mark.parametrize("read_only", [False, True])
+def test_a_pipe_beside_a_map_is_not_waited_for(tmp_path, end, read_only):
+    path = tmp_path / "map.recon"
+    Store.create(path).close()
+    os.mkfifo(path.with_name(path.name + end))
+    with pytest.raises(FormatError, match=f"map.recon{end}: not a regular file.*pipe"):
+        Store.open(path, read_only=read_only)
+
+
 @settings(max_examples=60)
 @given(place=st.floats(0, 1), bit=st.integers(0, 7), cut=st.booleans())
 def test_a_damaged_file_is_refused_or_gives_what_was_put(place, bit, cut, tmp_path_factory):

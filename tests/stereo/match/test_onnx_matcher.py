@@ -1,5 +1,7 @@
 """The ONNX matcher with a tiny network built in the test."""
 
+import signal
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -287,3 +289,59 @@ def test_what_is_saved_instead_of_a_network_is_named(tmp_path, content, words):
     (tmp_path / "n.onnx").write_bytes(content)
     with pytest.raises(FormatError, match=words):
         match(tmp_path / "n.onnx", pair_of(1, 2))
+
+
+@pytest.mark.parametrize("shape", [
+    (1, 1, 100_000, 100_000), (1, 3, 0, 0), (1, 1, None, 1 << 40), (1, 1 << 30, None, None),
+])  # fmt: skip
+@pytest.mark.parametrize("self_test", [True, False])
+def test_a_network_of_images_that_there_are_not_is_refused(tmp_path, shape, self_test):
+    sides = ["left", "right"]
+    path = write_network(tmp_path / "odd.onnx", sides, [(sides, "d", "Sub")], shape)
+    with pytest.raises(FormatError, match=r"odd.onnx: the network does not take images \(got 1x"):
+        match(path, pair_of(1, 2), self_test=self_test)
+
+
+def test_an_output_without_a_pixel_is_refused(tmp_path):
+    graph = Graph()
+    shapes = dict.fromkeys(("left", "right"), (1, 1, None, None))
+    path = graph.write(tmp_path / "none.onnx", shapes, graph.cut("left", 2, 0, 0))
+    with pytest.raises(MatchingError, match="not a disparity map"):
+        match(path, pair_of(1, 2))
+
+
+def write_loop(path):
+    """A network that adds one to the left image for ever."""
+    helper, types = onnx.helper, onnx.TensorProto
+    value = helper.make_tensor_value_info
+    node = helper.make_node
+    body = helper.make_graph(
+        [node("Identity", ["on"], ["still"]), node("Add", ["x", "one"], ["y"])],
+        "body",
+        [value("n", types.INT64, []), value("on", types.BOOL, []), value("x", types.FLOAT, None)],
+        [value("still", types.BOOL, []), value("y", types.FLOAT, None)],
+    )  # fmt: skip
+    graph = Graph()
+    graph.constants.append(onnx.numpy_helper.from_array(np.float32(1), "one"))
+    on = graph.constant(True, np.bool_)
+    looped = graph.add("Loop", "", on, "left", body=body)
+    return graph.write(path, dict.fromkeys(("left", "right"), (1, 1, None, None)), looped)
+
+
+@pytest.mark.parametrize("self_test", [True, False])
+def test_a_network_without_an_end_is_ended(tmp_path, self_test):
+    path = write_loop(tmp_path / "loop.onnx")
+    with pytest.raises(MatchingError, match=r"does not come to an end.*0.3 s.*time_limit_s"):
+        match(path, pair_of(1, 2), self_test=self_test, time_limit_s=0.3)
+
+
+def test_ctrl_c_ends_a_network(tmp_path):
+    path = write_loop(tmp_path / "loop.onnx")
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # perhaps ignored
+    main = threading.main_thread().ident
+    threading.Timer(0.5, signal.pthread_kill, (main, signal.SIGINT)).start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            match(path, pair_of(1, 2))
+    finally:
+        signal.signal(signal.SIGINT, before)
