@@ -151,7 +151,8 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
     known_m = np.where(depth_m > 0, depth_m, np.nan)
     low, high = style.value_range(known_m)
     low = max(low, 1e-3)
-    limits = (math.log(low), math.log(max(high, low * 1.01)))
+    high = max(high, low * 1.01)
+    limits = (math.log(low), math.log(high))
     # Reversed, so that near has the same colour as in the disparity map.
     scale = f"{style.DISPARITY_SCALE}_r"
     figure = _image(style.colour_values(np.log(known_m), scale, limits))
@@ -197,6 +198,11 @@ def depth_marks(
     """Return depths > 0 to mark on a scale with these ends, as many as its labels have room for."""
     powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
     choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
+    if high_m < 2.0 * low_m:  # hardly any of these lies in between
+        whole_m = 10.0 ** math.floor(math.log10(high_m - low_m))
+        for step_m in (whole_m, 0.5 * whole_m, 0.2 * whole_m):
+            steps = range(math.ceil(low_m / step_m), int(high_m / step_m) + 1)
+            choices += [step_m * n for n in steps]
     room = _LABEL_ROOM * (limits[1] - limits[0])
     marks: dict[float, float] = {}
     for depth in choices:

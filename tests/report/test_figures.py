@@ -124,6 +124,17 @@ def test_a_figure_shows_its_picture(pair, disparity):
     assert [*disparity.reason_shares.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
 
 
+# The second is what Teddy has; the last, a wall.
+@pytest.mark.parametrize("ends", [(4.1, 65.0), (1.25, 1.72), (0.31, 0.62), (50.1, 51.0)])
+def test_every_depth_scale_has_several_round_marks_that_do_not_touch(ends):
+    limits = math.log(ends[0]), math.log(ends[1])
+    marks = pair_page.depth_marks(*ends, math.log, limits)
+    assert 4 <= len(marks) <= 11
+    assert ends[0] <= marks[0] < marks[-1] <= ends[1]
+    assert np.diff(np.log(marks)).min() >= 0.0999 * (limits[1] - limits[0])
+    assert max(len(f"{mark:g}") for mark in marks) <= 4
+
+
 @pytest.mark.parametrize("frames", [0, 1, 3])
 def test_path_of_any_length_is_drawn(frames, T_map_world):
     path, longer = (
