@@ -132,7 +132,9 @@ def pair_figure(pair: RectifiedPair) -> bytes:
     right = pair.right if pair.right_rgb is None else pair.right_rgb
     for axes, side, image in zip(both, ("Left", "Right"), (pair.colours, right), strict=True):
         style.show_image(axes, image, f"{side}, rectified")
-    return style.to_png(figure)
+    grey = " and ".join(f"{image.mean():.0f}" for image in (pair.left, pair.right))
+    size = f"{width} by {height} pixels, with mean grey levels of {grey}"
+    return style.to_png(figure, f"Left and right image, {size}")
 
 
 @style.styled
@@ -142,7 +144,10 @@ def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
     figure = _image(style.colour_disparity(disparity.values, limits))
     bar = _colour_bar(figure, style.DISPARITY_SCALE, limits, "disparity in pixels")
     _mark_depths(bar, limits, camera)
-    return style.to_png(figure)
+    share = 100 * disparity.valid.mean()
+    return style.to_png(
+        figure, f"Disparities: {style.spread(disparity.values, ' px')}; {share:.1f} % have one"
+    )
 
 
 @style.styled
@@ -159,7 +164,7 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
     bar = _colour_bar(figure, scale, limits, "depth in metres (logarithmic)")
     depths = depth_marks(low, high, math.log, limits)
     bar.set_xticks(np.log(depths).tolist(), [f"{depth:g}" for depth in depths])
-    return style.to_png(figure)
+    return style.to_png(figure, f"Depths: {style.spread(known_m, ' m')}")
 
 
 @style.styled
@@ -167,7 +172,8 @@ def confidence_figure(disparity: Disparity) -> bytes:
     """Draw the confidence of each match, from 0 to 1."""
     figure = _image(style.colour_confidence(disparity.confidence))
     _colour_bar(figure, style.CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: no match)")
-    return style.to_png(figure)
+    matched = disparity.confidence[disparity.confidence > 0]
+    return style.to_png(figure, f"Confidence of the matches: {style.spread(matched)}")
 
 
 @style.styled
@@ -176,7 +182,7 @@ def error_figure(error_px: NDArray[Any]) -> bytes:
     figure = _image(style.colour_error(error_px, ERROR_LIMIT_PX))
     label = "absolute disparity error in pixels (dark: not compared)"
     _colour_bar(figure, style.ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
-    return style.to_png(figure)
+    return style.to_png(figure, f"Disparity errors: {style.spread(error_px, ' px')}")
 
 
 @style.styled
@@ -189,7 +195,7 @@ def reasons_figure(disparity: Disparity) -> bytes:
     columns = 4 if is_wide(disparity.reason.shape) else 3
     middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
     figure.legend(handles=handles, loc="center", ncols=columns, bbox_to_anchor=(0.5, middle))
-    return style.to_png(figure)
+    return style.to_png(figure, f"Of all pixels: {', '.join(labels)}")
 
 
 def depth_marks(
