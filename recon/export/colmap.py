@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from recon.core.geometry.se3 import apply, invert
-from recon.core.values.arrays import UInt8
+from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.camera import project
 from recon.export.images import DriveImages, open_images
 from recon.export.product import Made, Order
 from recon.io.images.image import write_image
@@ -50,25 +51,28 @@ class _Written:
 
     def __init__(self, drive: DriveImages, model: ColmapModel, first: int) -> None:
         self._drive, self._model, self._first = drive, model, first
-        self._points = _points(drive)
-        self._rgb = np.zeros((len(self._points.xyz), 3), np.uint8)
+        self._points, self._camera = _points(drive), drive.session.camera
+        self._xyz = apply(drive.session.T_map_world, self._points.xyz)
+        self._rgb = np.zeros((len(self._xyz), 3), np.uint8)
+        self._off_px = np.zeros(len(self._xyz))  # summed over the images of a point
         self._tracks: list[list[tuple[int, int]]] = [[] for _ in self._rgb]
 
     def frames(self) -> Iterator[tuple[list[str], tuple[UInt8, UInt8]]]:
         """Add all frames, one after the other; yield the names of their images, and these."""
-        drive, rig = self._drive, self._model.add_rig(self._drive.session.camera)
+        drive, rig = self._drive, self._model.add_rig(self._camera)
         for frame, pair in drive.pairs():
             images = drive.rectifier.warp(pair)
             names = [drive.file(side, frame) for side in ("left", "right")]
-            seen, T_camera_map = self._seen(frame, images[0]), invert(drive.T_map_camera[frame])
+            T_camera_map = invert(drive.T_map_camera[frame])
+            seen = self._seen(frame, images[0], T_camera_map)
             numbers = self._model.add_frame(rig, T_camera_map, names, seen)
             for number, (_, points) in zip(numbers, seen, strict=True):
                 for place, point in enumerate((points - self._first).tolist()):
                     self._tracks[point].append((number, place))
             yield names, images
 
-    def _seen(self, frame: int, left: UInt8) -> list[Seen]:
-        """Return what the left and the right image see, and note its colours."""
+    def _seen(self, frame: int, left: UInt8, T_camera_map: Float64) -> list[Seen]:
+        """Return what the left and the right image see; note its colours, and how far it is off."""
         seen, node = self._points.seen, np.flatnonzero(self._points.frames == frame)
         rows = np.isin(seen.node, node)
         (u, v, d), points = seen.uvd[rows].T, seen.point[rows]
@@ -77,13 +81,16 @@ class _Written:
         column, row = np.clip(column, 0, width_px - 1), np.clip(row, 0, height_px - 1)
         self._rgb[points] = left.reshape(height_px, width_px, -1)[row, column]
         inside = (u - d >= 0) & (u - d <= width_px - 1)
-        views = (u, np.full(len(u), True)), (u - d, inside)
-        return [(np.column_stack([x, v])[k], points[k] + self._first) for x, k in views]
+        at_u, at_v, at_d = project(apply(T_camera_map, self._xyz[points]), self._camera)
+        views = (u, at_u, np.full(len(u), True)), (u - d, at_u - at_d, inside)
+        for x, at_x, k in views:
+            self._off_px[points[k]] += np.hypot(at_x - x, at_v - v)[k]
+        return [(np.column_stack([x, v])[k], points[k] + self._first) for x, _, k in views]
 
     def add_points(self) -> int:
         """Add the points; their number."""
-        places = apply(self._drive.session.T_map_world, self._points.xyz)
-        each = zip(places, self._rgb.tolist(), self._tracks, strict=True)
-        for number, (xyz, rgb, track) in enumerate(each, start=self._first):
-            self._model.add_point(number, xyz, rgb, track)
-        return len(places)
+        off_px = self._off_px / np.maximum(1, [*map(len, self._tracks)])
+        each = zip(self._xyz, self._rgb.tolist(), off_px.tolist(), self._tracks, strict=True)
+        for number, point in enumerate(each, start=self._first):
+            self._model.add_point(number, *point)
+        return len(self._xyz)

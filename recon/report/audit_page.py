@@ -70,7 +70,7 @@ def rows_figure(look: Look, pair: RectifiedPair) -> bytes:
         headwidth=2, headlength=2, headaxislength=2,
     )  # fmt: skip
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    return style.to_png(figure)
+    return style.to_png(figure, f"Row errors: {style.spread(apart, ' px')}")
 
 
 @style.styled

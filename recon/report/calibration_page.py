@@ -69,7 +69,8 @@ def coverage_figure(result: CalibrationRun) -> bytes:
         axes.set_xticks(np.linspace(0, width, _CELLS[0] + 1)[1:-1], [])
         axes.set_yticks(np.linspace(0, height, _CELLS[1] + 1)[1:-1], [])
         axes.spines[:].set(visible=True, color=style.FAINT)
-    return style.to_png(figure)
+    covered = "; ".join(axes.get_title() for axes in both)
+    return style.to_png(figure, f"Corners that were found. {covered}")
 
 
 @style.styled
@@ -89,7 +90,8 @@ def errors_figure(result: CalibrationRun) -> bytes:
     axes.set_ylabel("rms error, px")
     axes.set_xticks(np.arange(len(names)), names, rotation=60, ha="right", fontsize=7)
     axes.legend(ncols=3)
-    return style.to_png(figure)
+    each = f"Rms of a view: {style.spread(fit.errors_px, ' px')}"
+    return style.to_png(figure, f"{each}; {fit.rms_px:.3f} px of all")
 
 
 @style.styled
@@ -100,7 +102,7 @@ def rows_figure(result: CalibrationRun) -> bytes:
     axes.hist(result.rows_px, bins=list(np.linspace(-reach, reach, 61)))
     axes.axvline(0, color=style.INK, linewidth=1)
     axes.set(xlabel="row left − row right, px", ylabel="corners")
-    return style.to_png(figure)
+    return style.to_png(figure, f"Row differences: {style.spread(result.rows_px, ' px')}")
 
 
 @style.styled
@@ -180,4 +182,4 @@ def _side_by_side(images: Sides, pixels: Sides, lines: Sides, titles: Sides) -> 
             axes.plot(*pixel, "o", markersize=5, color=colour, markeredgecolor="white")
         height, width = images[n].shape[:2]
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    return style.to_png(figure)
+    return style.to_png(figure, f"{'; '.join(titles)}; with the lines of some points")

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.text import counted
-from recon.core.values import UNKNOWN, OccupancyGrid, Trajectory
+from recon.core.values import FREE, UNKNOWN, OccupancyGrid, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.protocol import OdometryHealth
 from recon.report import style
@@ -153,7 +153,10 @@ def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
     keys = map(style.colour_key, ("free", "occupied", "unknown"), colours)
     named = lines if len(lines) > 1 else []
     figure.legend(handles=[*keys, *named], loc="outside lower center", ncols=3)
-    return style.to_png(figure)
+    (width_m, height_m), known = far - near, grid.cells != UNKNOWN
+    free = f"{100 * (grid.cells[known] == FREE).mean():.0f} % of them free" if known.any() else ""
+    size = f"{width_m:.3g} by {height_m:.3g} m, {100 * known.mean():.0f} % of the cells known"
+    return style.to_png(figure, ", ".join(filter(None, [f"Grid of {size}", free])))
 
 
 @style.styled

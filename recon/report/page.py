@@ -6,6 +6,7 @@ import base64
 import functools
 import gzip
 import io
+import json
 import math
 import re
 import shlex
@@ -22,6 +23,7 @@ from plotly.offline import get_plotlyjs
 from recon.core.text import counted, metres, with_unit
 from recon.io.atomic import write_text
 from recon.report import style
+from recon.report.still import draw_still
 from recon.report.table import NOT_KNOWN
 from recon.run.directory import RunDirectory
 from recon.run.machine import versions
@@ -68,7 +70,7 @@ def page_environment() -> Environment:
     environment.filters.update(
         counted=counted, embedded=_embedded, leaves=summary_rows, timing=_timing,
         known=lambda value, form: NOT_KNOWN if value is None else form % value,
-        last_part=lambda name: Path(name).name or name, shortest="{:.3g}".format,
+        last_part=lambda name: Path(name).name or name, shortest="{:.3g}".format, still=draw_still,
         # A line may break between the words of the name of a figure.
         words=re.compile(r"(?<=[._])(?=[a-z])").split,
     )  # fmt: skip
@@ -130,13 +132,28 @@ def _packed_plotly() -> str:
     return base64.b64encode(gzip.compress(get_plotlyjs().encode("utf-8"), mtime=0)).decode("ascii")
 
 
-def _embedded(png: bytes) -> str:
-    """Return the URL of an image, as WebP if that is smaller, else as PNG."""
-    buffer = io.BytesIO()
+def _embedded(png: bytes) -> dict[str, Any]:
+    """Return what is seen in an image, and kinds and URLs of its layers, one upon the other.
+
+    Of a figure that is ``ink``, which a dark page makes light, and its ``picture``, if it has one.
+    """
     with Image.open(io.BytesIO(png)) as image:
-        image.convert("RGB").save(buffer, "WEBP", quality=_WEBP_QUALITY)
-    kind, smaller = min(("webp", buffer.getvalue()), ("png", png), key=lambda one: len(one[1]))
-    return f"data:image/{kind};base64,{base64.b64encode(smaller).decode('ascii')}"
+        layers, boxes = {"picture": image}, json.loads(image.info.get(style.PICTURES, "null"))
+        if boxes is not None:
+            mask = Image.new("L", image.size)
+            for box in boxes:
+                mask.paste(255, tuple(box))
+            layers["picture"].putalpha(mask)
+            ink = Image.composite(Image.new("RGB", image.size, "white"), image.convert("RGB"), mask)
+            layers = {"ink": ink} | (layers if boxes else {})
+        shown = [(kind, _url(one)) for kind, one in layers.items()]
+        return {"seen": image.info.get(style.SEEN, ""), "layers": shown}
+
+
+def _url(image: Image.Image) -> str:
+    buffer = io.BytesIO()
+    image.save(buffer, "WEBP", quality=_WEBP_QUALITY)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
 @style.styled
@@ -150,4 +167,6 @@ def timing_figure(stages: Mapping[str, float]) -> bytes:
     axes.invert_yaxis()
     axes.set(xlabel="time (s)", xlim=(0, max(float(seconds.max(initial=0.0)), 1e-12) * 1.28))
     axes.grid(visible=False, axis="y")
-    return style.to_png(figure)
+    longest = sorted(stages.items(), key=lambda stage: -stage[1])[:3]
+    named = ", ".join(f"{name} {spent:.2f} s" for name, spent in longest)
+    return style.to_png(figure, f"Of {total:.2f} s, most in {named}" if named else "")

@@ -132,7 +132,9 @@ def pair_figure(pair: RectifiedPair) -> bytes:
     right = pair.right if pair.right_rgb is None else pair.right_rgb
     for axes, side, image in zip(both, ("Left", "Right"), (pair.colours, right), strict=True):
         style.show_image(axes, image, f"{side}, rectified")
-    return style.to_png(figure)
+    grey = " and ".join(f"{image.mean():.0f}" for image in (pair.left, pair.right))
+    size = f"{width} by {height} pixels, with mean grey levels of {grey}"
+    return style.to_png(figure, f"Left and right image, {size}")
 
 
 @style.styled
@@ -142,7 +144,10 @@ def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
     figure = _image(style.colour_disparity(disparity.values, limits))
     bar = _colour_bar(figure, style.DISPARITY_SCALE, limits, "disparity in pixels")
     _mark_depths(bar, limits, camera)
-    return style.to_png(figure)
+    share = 100 * disparity.valid.mean()
+    return style.to_png(
+        figure, f"Disparities: {style.spread(disparity.values, ' px')}; {share:.1f} % have one"
+    )
 
 
 @style.styled
@@ -151,14 +156,15 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
     known_m = np.where(depth_m > 0, depth_m, np.nan)
     low, high = style.value_range(known_m)
     low = max(low, 1e-3)
-    limits = (math.log(low), math.log(max(high, low * 1.01)))
+    high = max(high, low * 1.01)
+    limits = (math.log(low), math.log(high))
     # Reversed, so that near has the same colour as in the disparity map.
     scale = f"{style.DISPARITY_SCALE}_r"
     figure = _image(style.colour_values(np.log(known_m), scale, limits))
     bar = _colour_bar(figure, scale, limits, "depth in metres (logarithmic)")
     depths = depth_marks(low, high, math.log, limits)
     bar.set_xticks(np.log(depths).tolist(), [f"{depth:g}" for depth in depths])
-    return style.to_png(figure)
+    return style.to_png(figure, f"Depths: {style.spread(known_m, ' m')}")
 
 
 @style.styled
@@ -166,7 +172,8 @@ def confidence_figure(disparity: Disparity) -> bytes:
     """Draw the confidence of each match, from 0 to 1."""
     figure = _image(style.colour_confidence(disparity.confidence))
     _colour_bar(figure, style.CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: no match)")
-    return style.to_png(figure)
+    matched = disparity.confidence[disparity.confidence > 0]
+    return style.to_png(figure, f"Confidence of the matches: {style.spread(matched)}")
 
 
 @style.styled
@@ -175,7 +182,7 @@ def error_figure(error_px: NDArray[Any]) -> bytes:
     figure = _image(style.colour_error(error_px, ERROR_LIMIT_PX))
     label = "absolute disparity error in pixels (dark: not compared)"
     _colour_bar(figure, style.ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
-    return style.to_png(figure)
+    return style.to_png(figure, f"Disparity errors: {style.spread(error_px, ' px')}")
 
 
 @style.styled
@@ -188,7 +195,7 @@ def reasons_figure(disparity: Disparity) -> bytes:
     columns = 4 if is_wide(disparity.reason.shape) else 3
     middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
     figure.legend(handles=handles, loc="center", ncols=columns, bbox_to_anchor=(0.5, middle))
-    return style.to_png(figure)
+    return style.to_png(figure, f"Of all pixels: {', '.join(labels)}")
 
 
 def depth_marks(
@@ -197,6 +204,11 @@ def depth_marks(
     """Return depths > 0 to mark on a scale with these ends, as many as its labels have room for."""
     powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
     choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
+    if high_m < 2.0 * low_m:  # hardly any of these lies in between
+        whole_m = 10.0 ** math.floor(math.log10(high_m - low_m))
+        for step_m in (whole_m, 0.5 * whole_m, 0.2 * whole_m):
+            steps = range(math.ceil(low_m / step_m), int(high_m / step_m) + 1)
+            choices += [step_m * n for n in steps]
     room = _LABEL_ROOM * (limits[1] - limits[0])
     marks: dict[float, float] = {}
     for depth in choices:

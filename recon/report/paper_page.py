@@ -103,7 +103,7 @@ def surface_figure(disparity: Disparity) -> bytes:
     axes.set(xlabel="column (px)", ylabel="row (px)", zlabel="disparity (px)", ylim=(height, 0))
     axes.set_box_aspect((1.0, height / width, 0.45), zoom=1.0)
     axes.view_init(elev=55.0, azim=-72.0)
-    return style.to_png(figure)
+    return style.to_png(figure, f"A surface of heights {style.spread(values, ' px')}")
 
 
 @style.styled

@@ -57,7 +57,7 @@ def field_figure(change: RigChange, size_px: tuple[int, int]) -> bytes:
     label = "disparity as given minus as refined (px)"
     ticks = MaxNLocator(7, symmetric=True)
     figure.colorbar(drawn, location="bottom", format="%+g", ticks=ticks, label=label, aspect=40)
-    return style.to_png(figure)
+    return style.to_png(figure, f"Disparities are off by {style.spread(change.off_px, ' px')}")
 
 
 def _off_rows(found: Json) -> list[tuple[str, str, str]]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -11,10 +13,14 @@ import matplotlib.style
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from recon.core.errors import ShapeError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyTruth, Reason
@@ -40,12 +46,67 @@ def bare_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def to_png(figure: Figure) -> bytes:
-    """Render a figure as a PNG file."""
-    buffer = io.BytesIO()
+PICTURES: Final = "Pictures"  # in a PNG: JSON, rectangles [left, top, right, bottom] in pixels
+SEEN: Final = "Description"  # in a PNG: what is to be seen in it
+
+
+def to_png(figure: Figure, seen: str = "") -> bytes:
+    """Render a figure as a PNG file, which says in words what is seen in it.
+
+    To ``seen`` is added where lines go. Noted are also the rectangles whose colours are values: a
+    dark page must not change these.
+    """
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba()))
+    said = ". ".join(filter(None, [seen, *map(_lines_seen, figure.axes)]))
+    return pack_png(image, {SEEN: said, PICTURES: json.dumps(_pictures(figure))})
+
+
+def pack_png(image: Image.Image, notes: Mapping[str, str]) -> bytes:
+    """Return an image as a PNG file with notes."""
+    buffer, info = io.BytesIO(), PngInfo()
+    for name, text in notes.items():
+        info.add_text(name, text)
     # Pages embed WebP; to pack these bytes well would take longer than to draw the figure.
-    figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 1})
+    image.save(buffer, "PNG", compress_level=1, pnginfo=info)
     return buffer.getvalue()
+
+
+def spread(values: ArrayLike, unit: str = "") -> str:
+    """Return between what and around what values are, in words; NaN is left out."""
+    known = np.asarray(values, np.float64)
+    known = known[np.isfinite(known)]
+    if not known.size:
+        return "nothing known"
+    low, middle, high = (f"{x:.4g}" for x in np.quantile(known, (0.0, 0.5, 1.0)))
+    return (low if low == high else f"{low} to {high}{unit}, median {middle}") + unit
+
+
+def _lines_seen(axes: Axes) -> str:
+    """Say where the lines of axes go: those with a name, or else the first."""
+    named = {str(line.get_label()): line for line in axes.lines}
+    shown = {name: line for name, line in named.items() if not name.startswith("_")}
+    lines = shown or {"": axes.lines[0]} if axes.lines else {}
+    found = [f"{name} {spread(line.get_ydata(orig=False))}" for name, line in lines.items()]
+    label = " ".join(axes.get_ylabel().split())
+    return f"{label}: {'; '.join(map(str.strip, found))}" if label and found else ""
+
+
+def _pictures(figure: Figure) -> list[list[int]]:
+    """Return the rectangles where colours are values, with what explains them in a legend."""
+    boxes = [axes.bbox for axes in figure.axes if any(map(_has_values, axes.get_children()))]
+    if boxes:  # the ends of a colour bar, and the keys of its figure
+        ends = [end for axes in figure.axes for end in axes.patches if not end.get_clip_on()]
+        keys = [key for legend in figure.legends for key in legend.legend_handles if key]
+        boxes += [one.get_window_extent() for one in (*ends, *keys)]
+    top = figure.bbox.height
+    corners = [(box.x0, top - box.y1, box.x1, top - box.y0) for box in boxes]
+    return [[*map(math.floor, each[:2]), *map(math.ceil, each[2:])] for each in corners]
+
+
+def _has_values(drawn: object) -> bool:
+    return isinstance(drawn, ScalarMappable) and drawn.get_array() is not None
 
 
 def show_image(axes: Axes, image: object, title: str = "") -> None:

@@ -17,7 +17,8 @@ from recon.core.values.arrays import Float64
 from recon.view.guard import Guard, stop
 from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
 
-_LAYERS: Final = ("cloud", "grid", "mesh", "path")
+# Shown at first. A grid is flat, and the ground is not: behind a bend it would hide the road.
+_LAYERS: Final = {"cloud": True, "grid": False, "mesh": False, "path": True}
 _COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
 FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
@@ -101,8 +102,8 @@ class Viewer:
         self._by = gui.add_dropdown("Colours", _COLOURINGS[:1])
         self._legend = gui.add_html("")
         self._layers = [
-            (gui.add_checkbox(f"Show {name}", name != "mesh"), scene.add_frame(f"/{name}", False))
-            for name in _LAYERS
+            (gui.add_checkbox(f"Show {name}", shown), scene.add_frame(f"/{name}", False))
+            for name, shown in _LAYERS.items()
         ]
         self._slider = gui.add_slider("Keyframe", 0, 1, 1, 0, disabled=True)
         self._said = gui.add_html(_html(["Move the slider, or click into the scene."]))

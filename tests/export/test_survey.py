@@ -8,9 +8,11 @@ import pytest
 
 from recon.core.errors import EvaluationError, FormatError, ReconError, SettingsError
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
-from recon.core.values import RectifiedCamera
+from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Float64
+from recon.export.survey import ground_points
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.ground.surface import GroundSurface
 from recon.map.map import Map
 from recon.map.sessions.georeference import georeference
 from recon.map.sessions.measured import Survey
@@ -325,3 +327,21 @@ def test_swapped_latitude_and_longitude_are_refused(winding_map, tmp_path):
     survey = Survey(receivers.write_degrees(tmp_path / "swapped.csv", rows[:, 0], swapped))
     with pytest.raises(EvaluationError, match="latitude and longitude are swapped"):
         georeference(winding_map, survey)
+
+
+def test_ground_is_as_thick_as_it_is_seen_too_low_and_what_stands_on_it_is_none():
+    rng = np.random.default_rng(2)
+    surface = GroundSurface(np.tile(0.1 * np.arange(8.0), (8, 1)), 1.0, (0.0, 0.0))
+    xy = rng.uniform(0.5, 7.5, (4000, 2))
+    z = surface.height_at(xy) + rng.normal(0.0, 0.02, 4000)
+    z[3000:] += rng.uniform(0.2, 2.0, 1000)  # a hedge
+    normals = np.tile(np.float32((0, 0, 1)), (4000, 1))
+    normals[:100] = 0, 1, 0  # the foot of a wall
+    cloud = PointCloud(np.column_stack([xy, z]).astype(np.float32), normals=normals, frame="map")
+    ground = ground_points(cloud, surface)
+    assert not ground[:100].any()
+    assert ground[100:3000].mean() > 0.9
+    assert not ground[3000:].any()
+    far = replace(cloud, xyz=cloud.xyz + np.float32((100, 0, 0)))  # where no ground is known
+    assert not ground_points(far, surface).any()
+    assert not ground_points(cloud.select(np.zeros(4000, np.bool_)), surface).size

@@ -92,6 +92,14 @@ def test_the_cloud_comes_as_laz_and_e57_in_survey_coordinates_and_as_arrays(smal
     assert np.abs(found.xyz - expected).max() < 0.002
     assert found.header.parse_crs().to_epsg() == 25832
     assert summary_of(out)["misfit_rms_m"] < 0.001
+    # 2 is ground, which is a plane here but for kerbs, and all else is not classified, 1.
+    assert set(found.classification) == {1, 2}
+    ground = np.asarray(found.classification) == 2
+    level = np.column_stack([cloud.xyz[:, :2], np.ones(len(cloud))]).astype(np.float64)
+    plane = np.linalg.lstsq(level[ground], cloud.xyz[ground, 2], rcond=None)[0]
+    above_m = cloud.xyz[:, 2] - level @ plane
+    assert np.abs(above_m[ground]).max() < 0.3
+    assert ground[np.abs(above_m) < 0.02].mean() > 0.8
     with pytest.importorskip("pye57").E57(str(out / "map/cloud.e57")) as file:
         scans = [file.read_scan(n, colors=True) for n in range(file.scan_count)]
         heights = np.concatenate([scan["cartesianZ"] for scan in scans])

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from recon.commands.config import load_config
 from recon.commands.paper import headline, run_paper
 from recon.io.images.disparity import read_pfm
 from recon.io.models.ply import read_ply
-from recon.report import paper_page
+from recon.report import paper_page, style
 from tests.flow.runs import summary_of
 from tests.hostile import refusals
 from tests.scenery.middlebury import CAMERA, write_scene
@@ -26,10 +25,10 @@ PER_METHOD = ("disparity.pfm", "depth.pfm", "disparity_colour.png", "cloud.ply",
 @pytest.fixture(scope="module", autouse=True)
 def coarse_figures():
     """Draw few facets and few pixels: matplotlib takes most of the time of these tests for them."""
-    draw = Figure.savefig
+    draw = style.to_png
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_page, "_SURFACE_COLUMNS", 30)
-        patch.setattr(Figure, "savefig", lambda *to, **options: draw(*to, **options, dpi=30))
+        patch.setattr(style, "to_png", lambda one, *seen: one.set_dpi(30) or draw(one, *seen))
         yield
 
 

@@ -1,5 +1,8 @@
 """What figures show: their colours, lines, bars, limits and words."""
 
+import base64
+import io
+import json
 import math
 import re
 from dataclasses import replace
@@ -11,6 +14,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from PIL import Image
 
 from recon.core.errors import ShapeError
 from recon.core.values import (
@@ -37,7 +41,7 @@ from recon.report import (
     style,
 )
 from recon.report import drive_figures as figures
-from recon.report.page import timing_figure
+from recon.report.page import page_environment, timing_figure
 
 
 def picture(png: bytes) -> UInt8:
@@ -102,6 +106,50 @@ def test_a_grid_is_drawn_with_its_largest_y_on_top_in_cells_large_enough_to_be_s
     np.testing.assert_array_equal(image[::side, ::side], expected)
 
 
+def notes(png: bytes) -> tuple[str, list[list[int]]]:
+    """What a PNG says is seen in it, and which rectangles of it are pictures."""
+    with Image.open(io.BytesIO(png)) as image:
+        return image.info[style.SEEN], json.loads(image.info[style.PICTURES])
+
+
+def test_figures_say_in_words_what_is_seen_in_this_run(
+    pair, disparity, health, grid, nothing_found
+):
+    seen, boxes = notes(pair_page.disparity_figure(disparity, pair.camera))
+    assert seen == "Disparities: 3.288 to 10 px, median 6.644 px; 75.0 % have one"
+    assert "Disparities: nothing known; 0.0 % have one" in notes(
+        pair_page.disparity_figure(nothing_found, pair.camera)
+    )
+    assert len(boxes) == 2  # the map, and the bar with its colours
+    seen, boxes = notes(figures.health_figure(health))
+    assert "inlier tracks: 0 to 150, median 150. reprojection error (px): 0.2." in seen
+    assert boxes == []
+    seen, boxes = notes(figures.grid_figure(grid, {"path": np.array([[0.0, 1.0], [5.0, 2.5]])}))
+    assert "Grid of 15 by 10 m, 33 % of the cells known, 90 % of them free" in seen
+    assert "path 1 to 2.5, median 1.75" in seen
+    assert len(boxes) == 4  # the grid, and the keys of its legend
+    assert (
+        "most in mesh 3.20 s, match 1.10 s" in notes(timing_figure({"match": 1.1, "mesh": 3.2}))[0]
+    )
+    assert "valid 75.0 %, border 25.0 %" in notes(pair_page.reasons_figure(disparity))[0]
+
+
+def test_a_dark_page_changes_paper_and_ink_but_no_colours_of_values(pair, disparity):
+    shown = page_environment().filters["embedded"](
+        pair_page.disparity_figure(disparity, pair.camera)
+    )
+    ink, picture = (
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))))
+        for _, url in shown["layers"]
+    )
+    assert [kind for kind, _ in shown["layers"]] == ["ink", "picture"]
+    values, below = np.s_[5:-140, 5:-5], np.s_[-15:]  # the label of the bar is at the bottom
+    assert ink[values].min() > 250
+    assert (picture[values][..., 3] == 255).all()
+    assert ink[below].min() < 120
+    assert (picture[below][..., 3] == 0).all()
+
+
 @pytest.mark.parametrize("which", ["disparity", "nothing_found", "below zero"])
 def test_every_figure_of_a_pair_is_a_png(which, pair, disparity, nothing_found):
     """With doffs, disparities may be negative; they have no depth here, where doffs is 0."""
@@ -122,6 +170,17 @@ def test_a_figure_shows_its_picture(pair, disparity):
     assert right[2] > right[0] + 60  # near: red (OpenCV decodes to BGR)
     assert [pair_page.is_wide((10, width, 3)) for width in (19, 20)] == [False, True]
     assert [*disparity.reason_shares.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
+
+
+# The second is what Teddy has; the last, a wall.
+@pytest.mark.parametrize("ends", [(4.1, 65.0), (1.25, 1.72), (0.31, 0.62), (50.1, 51.0)])
+def test_every_depth_scale_has_several_round_marks_that_do_not_touch(ends):
+    limits = math.log(ends[0]), math.log(ends[1])
+    marks = pair_page.depth_marks(*ends, math.log, limits)
+    assert 4 <= len(marks) <= 11
+    assert ends[0] <= marks[0] < marks[-1] <= ends[1]
+    assert np.diff(np.log(marks)).min() >= 0.0999 * (limits[1] - limits[0])
+    assert max(len(f"{mark:g}") for mark in marks) <= 4
 
 
 @pytest.mark.parametrize("frames", [0, 1, 3])
@@ -170,7 +229,7 @@ def test_a_thinned_grid_keeps_its_obstacles_and_its_place():
 def drawn(monkeypatch):
     """The figures that are drawn; none becomes a PNG."""
     found: list[Figure] = []
-    monkeypatch.setattr(style, "to_png", lambda figure: found.append(figure) or b"")
+    monkeypatch.setattr(style, "to_png", lambda figure, _="": found.append(figure) or b"")
     return found
 
 

@@ -40,6 +40,10 @@ class Page:
     def _send(self, method: str, about: dict[str, Any], **to: Any) -> None:
         self._tools.send(json.dumps({"id": 1, "method": method, "params": about} | to))
 
+    def emulate(self, what: str, **how: Any) -> None:
+        """Give the page another screen, or paper: a command of the domain ``Emulation``."""
+        self._send(f"Emulation.{what}", how)
+
     def run(self, script: str) -> Any:
         """Return the value of an expression, of a promise that which it comes to."""
         how = {"awaitPromise": True, "returnByValue": True, "allowUnsafeEvalBlockedByCSP": False}

@@ -256,7 +256,8 @@ def test_no_message_changes_what_it_may_not_or_ends_the_viewer(served, protocol,
         assert served.ended is None
         assert viewer._by.value == "height"
         assert viewer._slider.value == 0
-        assert viewer._layers[0][0].value
+        # As at first: the grid would hide the ground where that is not flat.
+        assert [box.value for box, _ in viewer._layers] == [True, False, False, True]
         assert viewer._eye_m.tolist() == [1.0, 2.5, 3.0]
         assert "keyframe" not in viewer._said.content
     assert capfd.readouterr() == ("", "")

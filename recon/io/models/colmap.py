@@ -74,11 +74,19 @@ class ColmapModel:
         return images
 
     def add_point(
-        self, number: int, xyz: Float64, rgb: Sequence[int], track: Sequence[tuple[int, int]]
+        self,
+        number: int,
+        xyz: Float64,
+        rgb: Sequence[int],
+        error_px: float,
+        track: Sequence[tuple[int, int]],
     ) -> None:
-        """Add a point; ``track`` has image and place in what it sees, of all that see it."""
+        """Add a point; ``track`` has image and place in what it sees, of all that see it.
+
+        ``error_px`` is the mean distance, over its images, from where it is seen to where it is.
+        """
         words = [word for sighting in track for word in sighting]
-        point = number, *xyz.tolist(), *rgb, -1  # the error is not computed
+        point = number, *xyz.tolist(), *rgb, error_px
         self._line("points3D", *point, *words)
         self._record("points3D", "Q3d3BdQ" + "2I" * len(track), *point, len(track), *words)
 

@@ -17,7 +17,7 @@ from recon.core.kernels.voxels import KEY_BITS, pack_keys
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, Int64
 from recon.io.files import StrPath
-from recon.io.models.las import COLOURED, las_header, las_record, packing
+from recon.io.models.las import COLOURED, AreGround, las_header, las_record, packing
 
 _EXTRA: Final = "survey"
 _CELL_BITS: Final = 7  # a node has 128 cells along each side, with a point for each
@@ -36,6 +36,7 @@ def write_copc(
     crs: str | None = None,
     *,
     step_m: float,
+    ground: AreGround | None = None,
 ) -> int:
     """Write clouds into one COPC file, atomically, as `write_las` does; returns their points.
 
@@ -43,7 +44,7 @@ def write_copc(
     """
     laspy, lazrs = require("laspy", extra=_EXTRA), require("lazrs", extra=_EXTRA)
     header = las_header(laspy, T_to_from, crs, step_m)
-    records = [las_record(laspy, header, cloud, T_to_from) for cloud in clouds]
+    records = [las_record(laspy, header, cloud, T_to_from, ground) for cloud in clouds]
     points = laspy.ScaleAwarePointRecord.empty(header=header)
     points.array = np.concatenate([points.array, *(one.array for one in records)])
     steps = np.stack([points.array[axis] for axis in "XYZ"], axis=1).astype(np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +12,7 @@ import numpy as np
 from recon.core.errors import EvaluationError, SettingsError, require
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
 
@@ -22,6 +22,7 @@ _STEP_M: Final = 0.001
 _MARGIN_DEG: Final = 6.0  # systems are used as far outside their area as a zone of UTM is wide
 _LARGEST_STRETCH: Final = 2.0  # of a metre on the ground: Mercator's at 60 degrees north
 _FULL_COLOUR: Final = 257  # colours have 16 bits: 255 becomes 65535
+AreGround = Callable[[PointCloud], Bool]  # which points of a cloud are ground, (N,)
 
 
 def write_las(
@@ -30,13 +31,14 @@ def write_las(
     T_to_from: Float64,
     crs: str | None = None,
     step_m: float = _STEP_M,
+    ground: AreGround | None = None,
 ) -> int:
     """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
 
     Positions are rounded to multiples of ``step_m``; colours, and the standard deviation of the
     depth as the extra dimension ``sigma``, are written where the clouds have them. ``T_to_from``
-    (4, 4) leads to the coordinates of the file, in the system ``crs``. The number of points is
-    returned.
+    (4, 4) leads to the coordinates of the file, in the system ``crs``. Points that ``ground`` says
+    are ground have class 2, all others 1, unclassified. The number of points is returned.
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
@@ -47,7 +49,7 @@ def write_las(
         laspy.open(temporary, mode="w", header=header, do_compress=packed) as file,
     ):
         for cloud in clouds:
-            file.write_points(las_record(laspy, header, cloud, T_to_from))
+            file.write_points(las_record(laspy, header, cloud, T_to_from, ground))
             points += len(cloud)
     return points
 
@@ -136,10 +138,13 @@ def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> 
     raise EvaluationError(what, where=where, got=got, expected=expected)
 
 
-def las_record(laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64) -> Any:
+def las_record(
+    laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64, ground: AreGround | None
+) -> Any:
     """Return the points of a cloud as they are in a file with this header."""
     record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
     record.return_number[:] = record.number_of_returns[:] = 1  # 0 is not permitted
+    record.classification[:] = 1 if ground is None else np.where(ground(cloud), 2, 1)
     record.x, record.y, record.z = apply(T_to_from, cloud.xyz.astype(np.float64)).T
     if cloud.rgb is not None:
         record.red, record.green, record.blue = cloud.rgb.T.astype(np.uint16) * _FULL_COLOUR

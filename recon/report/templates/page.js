@@ -1,13 +1,20 @@
 // A click on an image shows it alone, as large as the window; another click goes back.
 const dialog = document.body.appendChild(document.createElement("dialog"));
-const large = dialog.appendChild(document.createElement("img"));
-for (const image of document.querySelectorAll(".block img")) {
+for (const image of document.querySelectorAll(".layers")) {
   image.addEventListener("click", () => {
-    large.src = image.src;
+    dialog.replaceChildren(image.cloneNode(true));
     dialog.showModal();
   });
 }
 dialog.addEventListener("click", () => dialog.close());
+
+// What goes on beyond the right edge says so.
+for (const box of document.querySelectorAll(".scroll")) {
+  const look = () =>
+    box.classList.toggle("cut", box.scrollLeft + box.clientWidth < box.scrollWidth - 1);
+  new ResizeObserver(look).observe(box);
+  box.addEventListener("scroll", look);
+}
 
 const PLOTLY_CONFIG = { displaylogo: false, responsive: true, scrollZoom: true };
 const views = document.querySelectorAll(".view");
@@ -26,6 +33,7 @@ async function drawView(view) {
   const scene = JSON.parse(view.querySelector("script").textContent);
   const buttons = view.querySelectorAll("button");
   element.textContent = "";
+  view.classList.add("drawn");
   await Plotly.newPlot(element, scene.data, scene.layout, PLOTLY_CONFIG);
   buttons.forEach((button, chosen) => button.addEventListener("click", () => {
     const [cloud, ...others] = scene.data;
@@ -41,6 +49,9 @@ async function drawView(view) {
 
 if (views.length) {
   loadPlotly().then(() => Promise.all([...views].map(drawView))).catch((error) => {
-    for (const view of views) view.textContent = "No view in 3-D here: " + error;
+    for (const view of views) {
+      view.classList.remove("drawn");
+      view.querySelector(".scene").textContent = "No view in 3-D to turn here: " + error;
+    }
   });
 }

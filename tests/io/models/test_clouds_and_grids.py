@@ -201,6 +201,9 @@ def test_points_of_a_survey_come_back_turned_and_moved(tmp_path, suffix):
     # Each point is the only return of its ray; the specification permits no 0.
     assert set(found.return_number) == set(found.number_of_returns) == {1}
     assert found.header.number_of_points_by_return[0] == 1010
+    assert set(found.classification) == {1}  # unclassified; 0 would be: never looked at
+    write_las(path, parts, T_SURVEY_MAP, ground=lambda cloud: cloud.xyz[:, 2] < 0)
+    np.testing.assert_array_equal(laspy.read(path).classification, np.where(z < 0, 2, 1))
     write_las(path, [PointCloud(np.ones((1, 3), np.float32))], np.eye(4))
     found = laspy.read(path)
     np.testing.assert_allclose(found.xyz, 1.0)
