@@ -122,9 +122,9 @@ def _values(cloud: PointCloud) -> Float32:
 _FIRST_POINTS: Final = 1 << 12
 _LEAST_SIGMA_CELLS: Final = 0.1
 """Least standard deviation of a point, so that none outweighs all others in a mean."""
-_HIT_PROBABILITY: Final = 0.7
+HIT_PROBABILITY: Final = 0.7
 """Occupancy of a voxel after one certain hit; OctoMap's, as the next three."""
-_MISS_PROBABILITY: Final = 0.4  # occupancy of a voxel after one ray went through it
+MISS_PROBABILITY: Final = 0.4  # occupancy of a voxel after one ray went through it
 MIN_PROBABILITY: Final = 0.12  # lower clamp: keeps the map able to change
 MAX_PROBABILITY: Final = 0.97  # upper clamp
 FREE_MARGIN_SIGMAS: Final = 2.0  # free space ends this many standard deviations before the point
@@ -218,8 +218,8 @@ def frame_rays(cloud: PointCloud, T_map_camera: Float64, s: OccupancySettings) -
         ends=means,
         free=free.astype(np.float64),
         sigma=sigma.astype(np.float64),
-        hit=np.float32(log_odds(_HIT_PROBABILITY)) * confidence * hit,
-        miss=np.float32(log_odds(_MISS_PROBABILITY)) * confidence,
+        hit=np.float32(log_odds(HIT_PROBABILITY)) * confidence * hit,
+        miss=np.float32(log_odds(MISS_PROBABILITY)) * confidence,
     )
 
 
@@ -278,7 +278,7 @@ def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
 
 
 _UNITS_PER_CELL: Final = 64
-_RAYS_PER_VOXEL: Final = 2
+RAYS_PER_VOXEL: Final = 2
 """Points of a frame are averaged in cubes so many times finer than a voxel."""
 _LARGEST: Final = np.iinfo(np.int16).max - 1
 _FIRST_ROWS: Final = 1 << 15
@@ -286,7 +286,7 @@ _FIRST_ROWS: Final = 1 << 15
 
 def ray_grain(settings: OccupancySettings) -> RayGrain:
     """Return the resolution of the rays that are kept for a map."""
-    cell_m = settings.resolution_m / _RAYS_PER_VOXEL
+    cell_m = settings.resolution_m / RAYS_PER_VOXEL
     # The farthest places must fit into 16 bits.
     unit_m = max(cell_m / _UNITS_PER_CELL, (_beyond_m(settings) + cell_m) / _LARGEST)
     return RayGrain(cell_m, unit_m, settings.max_range_m)
@@ -323,4 +323,4 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
 
 def _beyond_m(settings: OccupancySettings) -> float:
     """Return where points out of range are moved to: never into a cube with one in range."""
-    return settings.max_range_m + 2 * settings.resolution_m / _RAYS_PER_VOXEL
+    return settings.max_range_m + 2 * settings.resolution_m / RAYS_PER_VOXEL

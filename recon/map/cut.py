@@ -112,8 +112,9 @@ class Cutter:
         margin_m = max(2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
         margin_m = max(config.scale * _FILTER_MARGIN_M, margin_m)
         # A voxel more, since a point may lie anywhere in its voxel; and whether a point moved
-        # depends on the points in the voxels that touch those through which it may have grown.
-        beyond = 3 + GROWTH_CELLS
+        # depends on the points in the voxels that touch those through which it may have grown, at
+        # the sides and then twice below.
+        beyond = 5 + GROWTH_CELLS
         self._filter_margin_m = margin_m + config.fusion.voxel_m + beyond * resolution_m
         # A cell of a grid depends on the cells joined to it, on their blob, on as many around them,
         # and on adjacent cells; and a surface in a block on the blocks that touch it.

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from recon.commands.config import load_config
 from recon.core.errors import MeshingError, OutputError
@@ -239,6 +241,43 @@ def test_what_hangs_where_cameras_looked_is_cut_off(store, tmp_path):
     whole = written(store, tmp_path / "cut")[0]
     above = whole.vertices[(whole.vertices[:, 2] > 1.0) & (whole.vertices[:, 1] < 2.5)]
     assert len(above) == 0
+
+
+def flat(low: tuple[float, float], high: tuple[float, float], z_m: float) -> PointCloud:
+    """A level rectangle of points, above the street."""
+    x, y = (a.ravel() for a in np.mgrid[low[0] : high[0] : STEP_M, low[1] : high[1] : STEP_M])
+    xyz = np.stack([x, y, np.full_like(x, z_m)], axis=1).astype(np.float32) + np.float32(0.02)
+    normals = np.tile(np.float32([0, 0, 1]), (len(xyz), 1))
+    return PointCloud(xyz, np.full((len(xyz), 3), 50, np.uint8), normals, frame="map")
+
+
+def components(mesh: TriangleMesh) -> list[list[float]]:
+    """Corners of the box around each component of a mesh whose tiles are welded, 0.1 m."""
+    places = np.unique(np.rint(mesh.vertices * 1e3), axis=0, return_inverse=True)[1].ravel()
+    faces = places[mesh.faces]
+    links = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    size = places.max() + 1
+    ones = coo_matrix((np.ones(len(links)), links.T), shape=(size, size))
+    label = connected_components(ones, directed=False)[1][places]
+    boxes = [mesh.vertices[label == one] for one in np.unique(label)]
+    return sorted(np.rint(10 * np.concatenate([b.min(0), b.max(0)])).tolist() for b in boxes)
+
+
+def test_components_are_counted_over_all_tiles(store, tmp_path):
+    # A ribbon of which a tile and its margin have only the tip; and a crumb over the seam.
+    store.put_cloud(flat((-1.5, 0.0), (4.6, 0.15), 2.0))
+    store.put_cloud(flat((3.8, -1.5), (4.2, -1.2), 2.0))
+    large = SETTINGS.model_copy(update={"min_component_faces": 180})
+    found = [written(store, tmp_path / "tiled", large)[0]]
+    found.append(written(store, tmp_path / "whole", large.model_copy(update={"tile_m": 50.0}))[0])
+    assert components(found[0]) == components(found[1])
+    assert len(components(found[0])) == 2
+    every = written(store, tmp_path / "all", SETTINGS.model_copy(update={"min_component_faces": 1}))
+    assert len(components(every[0])) == 3
+    with pytest.raises(MeshingError, match="no component of 1000000 faces"):
+        written(
+            store, tmp_path / "none", SETTINGS.model_copy(update={"min_component_faces": 10**6})
+        )
 
 
 def test_tiles_with_too_few_points_are_reported_and_none_is_an_error(store, tmp_path):

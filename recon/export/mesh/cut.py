@@ -50,7 +50,7 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
     a, b, c, d = np.split(new, np.cumsum([len(one), len(one), len(two)]))
     split = ((one[:, 0], a, b), (two[:, 0], two[:, 1], c), (two[:, 0], c, d))
     faces = np.concatenate([whole, *(np.stack(corners, axis=1) for corners in split)])
-    return _compact(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
+    return with_faces(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
 
 
 def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64) -> TriangleMesh:
@@ -92,7 +92,7 @@ def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) ->
     return with_vertices(mesh, new, edges, share)
 
 
-def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
+def with_faces(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
     """Return the faces with the vertices that they use; degenerate faces of a cut are dropped."""
     a, b, c = faces.T
     used, faces = renumbered(faces[(a != b) & (b != c) & (c != a)])
@@ -113,6 +113,11 @@ class OnEdges(NamedTuple):
 def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
     """Return boundary edges of a mesh that lie in a plane: float32 (E, 2, 3)."""
     return np.asarray(mesh.vertices[_open_corners(mesh, plane)[:, :2]])
+
+
+def open_faces(mesh: TriangleMesh, plane: Plane) -> Int32:
+    """Return int32 (E,), the face that each of the `open_edges` is of."""
+    return np.asarray(_open_corners(mesh, plane)[:, 3])
 
 
 def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:

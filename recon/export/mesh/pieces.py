@@ -10,20 +10,31 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
-from recon.core.values.arrays import Float32
+from recon.core.values.arrays import Bool, Float32, Int32, Int64
 from recon.core.values.cloud import Frame
 from recon.export.cloud import export_cloud
-from recon.export.mesh.cut import Plane, close_seam, cut_mesh, open_edges
+from recon.export.mesh.cut import (
+    Plane,
+    close_seam,
+    cut_mesh,
+    nearest_on_edges,
+    open_edges,
+    open_faces,
+    with_faces,
+)
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.voxels import reconstruct_map_surface
 from recon.export.product import Made, Order
+from recon.io.models import open3d_meshes
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.cut import Rectangle
@@ -51,6 +62,13 @@ class MeshPiece(NamedTuple):
     path: Path
     vertices: int
     faces: int
+
+
+class Border(NamedTuple):
+    """Open edges of a piece in a plane, float32 (E, 2, 3), and the components that they are of."""
+
+    edges: Float32
+    components: Int64
 
 
 def mesh_product(order: Order) -> Made:
@@ -102,7 +120,8 @@ def export_mesh(
     points = _count(tiles, settings)
     pieces, warnings = _Mesher(tiles, settings, run, at_once, points).written()
     if not pieces:
-        got = "; ".join(warnings) or "no point"
+        small = f"no component of {counted(settings.min_component_faces, 'face')}"
+        got = "; ".join(warnings) or (small if points else "no point")
         raise MeshingError("no part of the map gives a surface", got=got)
     whole = run.path(WHOLE)
     join_meshes(whole, pieces)
@@ -132,18 +151,24 @@ def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:
 
 @dataclass(eq=False)
 class _Mesher:
-    """Reconstructs pieces in parallel; each closes its seams to earlier ones, in order."""
+    """Reconstructs pieces in parallel; each closes its seams to earlier ones, in order.
+
+    Components are numbered over all pieces. Those that meet in a seam are one, and whether that is
+    large enough is known at the end; if faces are simplified, in each piece and its margin before.
+    """
 
     tiles: Tiles
     settings: MeshSettings
     run: RunDirectory
     threads: int
     points: Counter[PieceKey]
-    borders: dict[tuple[PieceKey, Plane], Float32] = field(default_factory=dict)
+    borders: dict[tuple[PieceKey, Plane], Border] = field(default_factory=dict)
+    sizes: list[Int32] = field(default_factory=list)  # of components, faces; for each piece
+    seams: list[Int64] = field(default_factory=list)  # (N, 2), components that meet
 
     def written(self) -> tuple[list[MeshPiece], list[str]]:
         """Return the pieces whose files are written, and what could not be meshed."""
-        pieces: list[MeshPiece] = []
+        paths: list[Path] = []
         failed: dict[PieceKey, MeshingError] = {}
         keys = sorted(self.points)
         surfaces = side_by_side(self._surface, keys, threads=self.threads)
@@ -153,10 +178,21 @@ class _Mesher:
                 continue
             mesh = self._joined(key, surface)
             if len(mesh.faces):
-                path = self.run.path(f"mesh/tiles/tile_{key[0]}_{key[1]}.ply")
-                write_mesh(path, mesh)
-                pieces.append(MeshPiece(path, len(mesh.vertices), len(mesh.faces)))
-        return pieces, self._warnings(failed)
+                paths.append(self.run.path(f"mesh/tiles/tile_{key[0]}_{key[1]}.ply"))
+                write_mesh(paths[-1], mesh)
+        ends = np.cumsum([*map(len, self.sizes)], dtype=np.int64)
+        kept = np.split(self._large_enough(), ends)[: len(paths)]
+        pieces = [_without_crumbs(*each) for each in zip(paths, kept, strict=True)]
+        return [piece for piece in pieces if piece.faces], self._warnings(failed)
+
+    def _large_enough(self) -> Bool:
+        """Return bool (C,), components of enough faces, with those that they meet in seams."""
+        sizes = np.concatenate([np.zeros(0, np.int32), *self.sizes])
+        one, other = np.concatenate([np.zeros((0, 2), np.int64), *self.seams]).T
+        met = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(sizes),) * 2)
+        whole = connected_components(met, directed=False)[1]
+        least = self.settings.min_component_faces if self.settings.target_faces is None else 1
+        return np.asarray((np.bincount(whole, sizes) >= least)[whole])
 
     def _warnings(self, failed: dict[PieceKey, MeshingError]) -> list[str]:
         """Return a line about the pieces without a surface, naming the one with the most points."""
@@ -181,6 +217,8 @@ class _Mesher:
             # By its share of the points.
             target = max(4, round(target * len(cloud) / self.points.total()))
             settings = settings.model_copy(update={"target_faces": target})
+        else:
+            settings = settings.model_copy(update={"min_component_faces": 1})
         try:
             if settings.map_surface == "voxels":
                 voxel_m = self.tiles.config.fusion.voxel_m
@@ -195,14 +233,29 @@ class _Mesher:
 
     def _joined(self, key: PieceKey, mesh: TriangleMesh) -> TriangleMesh:
         """Return the mesh of a piece, joined to those of its earlier neighbours."""
+        borders: dict[Plane, Border | None] = {}
+        reach_m = self.tiles.config.scale * _SEAM_M
         for axis, far in _SIDES:
             plane, step = self._plane(key, axis, far), 2 * far - 1
             neighbour = (key[0], key[1] + step) if axis else (key[0] + step, key[1])
-            border = self.borders.pop((neighbour, plane), None)
+            border = borders[plane] = self.borders.pop((neighbour, plane), None)
             if border is not None:
-                mesh = close_seam(mesh, plane, border, self.tiles.config.scale * _SEAM_M)
-            else:
-                self.borders[key, plane] = open_edges(mesh, plane)
+                mesh = close_seam(mesh, plane, border.edges, reach_m)
+        if not len(mesh.faces):
+            return mesh
+        labels, sizes = open3d_meshes.component_labels(mesh.vertices, mesh.faces)
+        first = sum(map(len, self.sizes))
+        self.sizes.append(sizes)
+        for plane, border in borders.items():
+            components = labels[open_faces(mesh, plane)].astype(np.int64) + first
+            own = Border(open_edges(mesh, plane), components)
+            if border is None:
+                self.borders[key, plane] = own
+            elif len(own.edges) and len(border.edges):
+                found = nearest_on_edges(own.edges.mean(axis=1), border.edges)
+                met = found.distance_m <= reach_m
+                pairs = own.components[met], border.components[found.edge[met]]
+                self.seams.append(np.stack(pairs, axis=1))
         return mesh
 
     def _bounds(self, key: PieceKey) -> Rectangle:
@@ -214,3 +267,16 @@ class _Mesher:
     def _plane(self, key: PieceKey, axis: int, far: int) -> Plane:
         sides = self._bounds(key)
         return Plane(axis, (sides.high if far else sides.low)[axis])
+
+
+def _without_crumbs(path: Path, kept: Bool) -> MeshPiece:
+    """Write a piece again without some of its components, if not all are kept; none: no file."""
+    mesh = read_mesh(path)
+    labels, _ = open3d_meshes.component_labels(mesh.vertices, mesh.faces)
+    if not kept.all():
+        mesh = with_faces(mesh, mesh.faces[kept[labels]])
+        if len(mesh.faces):
+            write_mesh(path, mesh)
+        else:
+            path.unlink()
+    return MeshPiece(path, len(mesh.vertices), len(mesh.faces))

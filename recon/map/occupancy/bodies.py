@@ -26,7 +26,12 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.kernels.voxels import find_keys, pack_keys, unpack_keys
 from recon.core.values import PointCloud, RayCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int8, Int64
-from recon.map.builders import SPREAD_SIGMAS, OccupancySettings, frame_rays
+from recon.map.builders import (
+    RAYS_PER_VOXEL,
+    SPREAD_SIGMAS,
+    OccupancySettings,
+    frame_rays,
+)
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE, cast_rays, make_blocks
 from recon.map.occupancy.error import disagreement, frame_pairs
 
@@ -195,6 +200,13 @@ class Looks:
                 cloud = self._read(int(frame)).cloud()
                 chosen = _towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
                 yield T, self._cast(cloud.select(chosen), T, cells)
+
+    @cached_property
+    def finest(self) -> Looks:
+        """The same frames, in cells as fine as their rays are kept."""
+        cell_m = self.settings.resolution_m / RAYS_PER_VOXEL
+        settings = self.settings.model_copy(update={"resolution_m": cell_m})
+        return Looks(settings, self.T_map_camera, self._read)
 
     @cached_property
     def disagreement(self) -> float:

@@ -16,6 +16,10 @@ Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noi
 through as well, but no frame sees a whole piece of them gone. Nor did a piece move whose surface is
 still there, beside it by no more than the error of depths (`error.py`). A point that its frames
 could not place in a voxel stays if something occupied is in its reach.
+
+The ground is in reach of the lowest part of what moved, outvotes the voxels that touch it, and
+shares one with what stood on it. So a voxel below what moved that is free itself moved as well, and
+points below are judged once more, by what was seen of cells as fine as the rays that are kept.
 """
 
 from __future__ import annotations
@@ -29,7 +33,12 @@ from recon.core.kernels.voxels import are_among, find_keys, pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
-from recon.map.builders import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
+from recon.map.builders import (
+    FREE_MARGIN_SIGMAS,
+    HIT_PROBABILITY,
+    MIN_PROBABILITY,
+    MISS_PROBABILITY,
+)
 from recon.map.occupancy.bodies import Looks, came_or_went, pairs_of, pieces_of, strides
 from recon.map.occupancy.error import Reaches, still_there
 from recon.map.occupancy.part import OccupancyPart
@@ -52,6 +61,10 @@ _AROUND: Final = np.array(list(product((-1, 0, 1), repeat=3)))
 """Steps to a cell itself and to those that touch it."""
 _BESIDE: Final = _AROUND[(_AROUND[:, 2] == 0) & _AROUND[:, :2].any(axis=1)]
 """Steps to the cells that touch a cell at its own height."""
+_ABOVE: Final = _AROUND[_AROUND[:, 2] == 1]
+"""Steps to the cells that touch a cell from above."""
+_OF_LOOK: Final = np.array([0.0, log_odds(HIT_PROBABILITY), log_odds(MISS_PROBABILITY)])
+"""Log-odds of a frame that saw neither (0), hit (1) or looked through (-1) a cell."""
 CellEvidence = tuple[Int64, Float32]
 """Packed cells int64 (N,), sorted, and what a drive saw in each, log-odds float32 (N,)."""
 
@@ -84,7 +97,7 @@ def find_moved(
     packed = pack_keys(np.floor(places).astype(np.int64))
     placed = sigma_m <= _PLACED * voxels.resolution_m
     keys, home = np.unique(packed, return_inverse=True)
-    moved = _mostly_free(keys, _among(home, counted), voxels, evidence)
+    moved, free_itself = _mostly_free(keys, _among(home, counted), voxels, evidence)
     occupied = pack_keys(voxels.keys[voxels.log_odds > 0])
     if moved.any():
         free = keys[moved]
@@ -98,12 +111,30 @@ def find_moved(
             moved[rows[stays]], by_error = False, by_error[~stays]
             if moved[home[counted]].sum() <= _MUCH * counted.sum():
                 break
+        lowest = np.flatnonzero(free_itself & ~moved)
+        moved[lowest] = _touching(keys[lowest], keys[moved], _ABOVE) > 0
     moved = moved[home]
     occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed])])
     unsure = np.flatnonzero(moved & ~placed)
     reach = FREE_MARGIN_SIGMAS * sigma_m[unsure] / voxels.resolution_m
     moved[unsure] = ~_in_reach(places[unsure], reach, occupied)
-    return moved
+    return moved | _left_below(points, packed, moved, looks.finest)
+
+
+def _left_below(points: Float64, packed: Int64, moved: Bool, finest: Looks) -> Bool:
+    """Return bool (N,), points (N, 3) below those that moved whose finest cells were mostly free.
+
+    ``packed`` (N,) are their voxels.
+    """
+    rows = np.flatnonzero(~moved)
+    rows = rows[_touching(packed[rows], np.unique(packed[moved]), _ABOVE) > 0]
+    found = np.zeros(len(points), np.bool_)
+    if len(rows):
+        cells = np.floor(points[rows] / finest.settings.resolution_m).astype(np.int64)
+        keys, home = np.unique(pack_keys(cells), return_inverse=True)
+        seen = sum((_OF_LOOK[look] for look in finest.at(keys)), np.zeros(len(keys)))
+        found[rows] = (seen < 0)[home]
+    return found
 
 
 def _is_beside(keys: Int64, reach: Float64, occupied: Int64) -> Bool:
@@ -120,8 +151,13 @@ def _among(home: Int64, points: Bool) -> Bool:
     return found
 
 
-def _mostly_free(keys: Int64, tells: Bool, voxels: OccupancyVoxels, evidence: CellEvidence) -> Bool:
-    """Return bool (N,), sorted cells with points around which most of those that tell are free."""
+def _mostly_free(
+    keys: Int64, tells: Bool, voxels: OccupancyVoxels, evidence: CellEvidence
+) -> tuple[Bool, Bool]:
+    """Return bool (N,), sorted cells with points around which most of those that tell are free.
+
+    And bool (N,), which are free themselves.
+    """
     place, known = find_keys(keys, evidence[0])
     seen = np.full(len(keys), _MOST)
     seen[known] = evidence[1][place[known]]
@@ -130,7 +166,7 @@ def _mostly_free(keys: Int64, tells: Bool, voxels: OccupancyVoxels, evidence: Ce
     # a later one; or an earlier one, where this one hit it hardly more often than by chance.
     seen[free_in_the_end & (seen > _FREE)] = -_MOST
     mean = _mean_around(keys, keys[tells], seen[tells])
-    return _grown(keys, mean <= 0, mean <= _UNSURE)
+    return _grown(keys, mean <= 0, mean <= _UNSURE), np.asarray(seen <= 0)
 
 
 def _grown(keys: Int64, sure: Bool, unsure: Bool) -> Bool:

@@ -112,7 +112,9 @@ def _clouds(*drives: Drive) -> list[PointCloud]:
     return [join_clouds(t.cloud for t in _tiles(*drives, remove=on)) for on in (False, True)]
 
 
-def _near(cloud: PointCloud, boxes: Sequence[Box], margin_m: float = 0.25) -> Bool:
+def _near(
+    cloud: PointCloud, boxes: Sequence[Box], margin_m: float = 0.25, lowest_m: float = 0.25
+) -> Bool:
     """Points in a box or near it, higher than the ground reaches."""
     right, up, forward = -cloud.xyz[:, 1], cloud.xyz[:, 2] + HEIGHT_M, cloud.xyz[:, 0]
     found = np.zeros(len(cloud), np.bool_)
@@ -120,7 +122,7 @@ def _near(cloud: PointCloud, boxes: Sequence[Box], margin_m: float = 0.25) -> Bo
         near = np.abs(right - x) < wide / 2 + margin_m
         near &= np.abs(forward - z) < long / 2 + margin_m
         near &= forward < WALL_M - 1.0
-        found |= near & (up > max(base - margin_m, 0.25)) & (up < base + high + margin_m)
+        found |= near & (up > max(base - margin_m, lowest_m)) & (up < base + high + margin_m)
     return found
 
 
@@ -149,8 +151,46 @@ def test_what_moved_is_gone(scenes):
     trail, drive = [box for boxes in scenes for box in boxes], _drive(scenes)
     assert _left(trail, drive) <= 0.05
     removed = join_clouds(tile.removed for tile in _tiles(drive))
-    assert _near(removed, trail).mean() > 0.85
+    assert _near(removed, trail, lowest_m=0.05).mean() > 0.85
     assert removed.sigma_m is not None
+
+
+KERB: Box = ((-3.0, 0.0, 16.0), (0.3, 0.15, 28.0))
+
+
+def _trail(drive: Drive, scenes: Sequence[Sequence[Box]], ground_m: float, *, remove: bool):
+    """Heights above the ground of points where something was, and whether they are of the kerb."""
+    cloud = join_clouds(tile.cloud for tile in _tiles(drive, remove=remove))
+    lowered = replace(cloud, xyz=cloud.xyz - np.float32([0, 0, ground_m + HEIGHT_M]))
+    trail = [box for boxes in scenes for box in boxes]
+    there = lowered.select(_near(lowered, trail, 0.15, lowest_m=-0.3))
+    return there.xyz[:, 2] + HEIGHT_M, np.abs(there.xyz[:, 1] - 3.0) < 0.2
+
+
+# The voxel of the ground, 0.2 m high, ends 5, 15 and 20 cm above it.
+@pytest.mark.parametrize(
+    ("scenes", "ground_m"), [(ONCOMING, -1.65), (ONCOMING, -1.75), (CROSSING, 0.0)]
+)
+def test_below_what_moved_is_ground_or_nothing(scenes, ground_m, monkeypatch):
+    T_map_world = make_transform(AXES_MAP_WORLD, np.array([0.0, 0.0, ground_m + HEIGHT_M]))
+    monkeypatch.setitem(globals(), "T_MAP_WORLD", T_map_world)
+    drive = _drive(scenes)
+    (before, _), (after, _) = (_trail(drive, scenes, ground_m, remove=on) for on in (False, True))
+    # Up to a voxel of the cloud, and the noise of the ground, a point may be of both.
+    low = [((heights > 0.15) & (heights < 0.3)).sum() for heights in (before, after)]
+    assert low[0] > 50
+    assert low[1] <= 0.15 * low[0]
+    ground = [(np.abs(heights) < 0.05).sum() for heights in (before, after)]
+    assert ground[1] >= 0.98 * ground[0] > 1000
+
+
+def test_a_kerb_below_what_moved_stays():
+    drives = _drive([[KERB]] * FRAMES), _drive([[*boxes, KERB] for boxes in ONCOMING])
+    of_kerb = []
+    for drive in drives:
+        height, there = _trail(drive, ONCOMING, -HEIGHT_M, remove=True)
+        of_kerb.append((there & (height > 0.07) & (height < 0.2)).sum())
+    assert of_kerb[1] >= 0.95 * of_kerb[0] > 100
 
 
 def test_what_stands_still_stays_even_if_it_is_thin():
