@@ -48,6 +48,11 @@ def to_png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def label_of(name: str) -> str:
+    """Return a name of others as matplotlib draws it: no formula, and bytes that are no text."""
+    return name.encode(errors="backslashreplace").decode().replace("$", r"\$")
+
+
 def show_image(axes: Axes, image: object, title: str = "") -> None:
     """Show an image without ticks; grey from 0 to 255 or RGB."""
     axes.imshow(image, vmin=0, vmax=255)  # type: ignore[arg-type]
