@@ -16,6 +16,16 @@ def counted(number: int, one: str, many: str = "", *, form: str = "") -> str:
     return f"{number:{form}} {one if abs(number) == 1 else many or one + 's'}"
 
 
+def visible(text: str) -> str:
+    """Return a text with control characters, and bytes of odd file names, escaped."""
+    return "".join(
+        letter
+        if letter.isprintable() or letter.isspace()
+        else letter.encode("unicode_escape", "backslashreplace").decode()
+        for letter in text
+    )
+
+
 def parse_number(text: str | bytes) -> float:
     """Return the number that a text is; it may be ``nan`` or ``inf``."""
     _check(text)
