@@ -9,6 +9,7 @@ Nothing heavy is imported before a command runs, so ``recon --help`` answers at 
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from typing import Annotated, Final
@@ -71,6 +72,8 @@ def main() -> None:
     """Run the program; a request to end it is an interruption, after which nothing half is left."""
     _open_standard_streams()
     interrupt_on_signals()
+    # Where its cache is, if not in a home, is of no concern; what an error is comes as one.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         try:
             app()
