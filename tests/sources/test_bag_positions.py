@@ -13,7 +13,9 @@ PLACES = np.column_stack([49.0 + 1e-5 * np.arange(8), np.full(8, 8.4), 115 + 0.1
 START_NS = 1_700_000_000_000_000_000
 
 
-def write(folder, kind="mcap", topics=("/gps/fix",), sigma_m=(0.02, 0.01, 0.03), places=PLACES, **how):
+def write(
+    folder, kind="mcap", topics=("/gps/fix",), sigma_m=(0.02, 0.01, 0.03), places=PLACES, **how
+):
     with recorder(folder, Recording(kind)) as bag:
         bag.write("/imu", START_NS, bag.imu(START_NS, np.zeros(3), np.zeros(3), "imu"))
         for number, place in enumerate(places):

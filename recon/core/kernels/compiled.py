@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Callable
+from tempfile import TemporaryFile
 from typing import Any, Final, Literal, TypeVar, overload
 
 import numpy as np
@@ -12,6 +13,7 @@ from numba import __version__, config, njit
 from numba.core.caching import FunctionCache
 from numpy.typing import NDArray
 
+from recon.core.errors import SettingsError
 from recon.core.kernels.cache import announce, cache_folder, cache_parent
 
 KernelT = TypeVar("KernelT", bound=Callable[..., Any])
@@ -25,7 +27,21 @@ Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_CACHE: Final = str(cache_folder(cache_parent()))
+
+def _usable_cache() -> str:
+    """Return the folder of our cache; where it cannot be written, numba would take another one."""
+    try:
+        parent = cache_parent()
+        parent.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=parent).close()
+    except OSError as error:
+        what, hint = "compiled kernels cannot be kept", "set it to a folder that can be written"
+        got = f"{error.filename or ''} {error.strerror or error}".strip()
+        raise SettingsError(what, where="NUMBA_CACHE_DIR", got=got, hint=hint) from error
+    return str(cache_folder(parent))
+
+
+_CACHE: Final = _usable_cache()
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
