@@ -72,8 +72,7 @@ def main() -> None:
     """Run the program; a request to end it is an interruption, after which nothing half is left."""
     _open_standard_streams()
     interrupt_on_signals()
-    # Where its cache is, if not in a home, is of no concern; what an error is comes as one.
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it says where its cache is
     try:
         try:
             app()

@@ -18,12 +18,11 @@ def counted(number: int, one: str, many: str = "", *, form: str = "") -> str:
 
 def visible(text: str) -> str:
     """Return a text with control characters, and bytes of odd file names, escaped."""
-    return "".join(
-        letter
-        if letter.isprintable() or letter.isspace()
-        else letter.encode("unicode_escape", "backslashreplace").decode()
-        for letter in text
-    )
+    return "".join(one if one.isprintable() or one.isspace() else _escaped(one) for one in text)
+
+
+def _escaped(letter: str) -> str:
+    return letter.encode("unicode_escape", "backslashreplace").decode()
 
 
 def parse_number(text: str | bytes) -> float:

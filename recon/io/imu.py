@@ -30,8 +30,7 @@ _RIGID_TOLERANCE: Final = 1e-3  # files print three to seven digits
 def read_imu(path: Path) -> ImuRecord:
     """Read ``data.csv``: time [ns], rates [rad/s], forces [m/s²]; more columns are not looked at.
 
-    Rows that are no measurement, or not later than those before, are left out, and noted; where
-    most are not later, all are sorted.
+    Rows that are no measurement, or not later than those before (or all are sorted), are noted.
     """
     lines = enumerate(read_text(path).splitlines(), start=1)
     rows = [(n, _row(line)) for n, line in lines if line.partition("#")[0].strip()]
@@ -60,8 +59,7 @@ def imu_of(table: Float64, places: Sequence[str], where: str) -> ImuRecord:
     order = order[kept]
     if len(order) < _LEAST:
         got = f"{counted(len(table), 'row')}, of which {len(order)} can be used"
-        expected = "time, three rates of turn and three forces in each row"
-        raise FormatError("IMU file has no measurements", where=where, got=got, expected=expected)
+        raise FormatError("IMU file has no measurements", where=where, got=got)
     unused = np.setdiff1d(np.arange(len(table)), order)
     if len(unused):
         first, rows = places[unused[0]], f"{counted(len(unused), 'row')} of {len(table)}"

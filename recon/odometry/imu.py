@@ -101,8 +101,7 @@ class ImuGuide:
     gyro: Gyro
     covariance: Float64  # (7, 7) of the unknowns of the gyro
     noise: float  # radians per square root of a second
-    # Acceleration of the camera along an axis, rms, metres per second squared; inf = not known
-    unsteady: float
+    unsteady: float  # acceleration along an axis, rms, metres per second squared; inf = not known
     step_m: float  # standard deviation of a motion that is seen
     up: Float64 | None = None  # (3,), upwards in the axes of the first frame; None = not known
     scale: float = 1.0  # size of the scene against a road
@@ -188,17 +187,14 @@ def find_up(gyro: Gyro, run: SeenRun, arm_m: Float64) -> tuple[Float64 | None, f
 def doubt_forces(record: ImuRecord) -> tuple[str, ...]:
     """Return a line for the user if forces show no gravity: in another unit, or not measured."""
     usual = float(np.median(np.linalg.norm(record.accel, axis=1)))
-    if 0.5 * _G < usual < 2.0 * _G:
-        return ()
-    what = f"its forces, {usual:.2g} m/s² at the median, show no gravity (are they in g?)"
-    return (f"IMU: {what}: its gyro alone is used",)
+    line = f"IMU: its forces, {usual:.2g} m/s² at the median, show no gravity (are they in g?): "
+    return () if 0.5 * _G < usual < 2.0 * _G else (f"{line}its gyro alone is used",)
 
 
 def accelerations(gyro: Gyro) -> float:
     """Return the acceleration of the camera along an axis, rms over parts of a drive.
 
     What changes of the forces, beside the turn, is of the motion; what shakes it is averaged out.
-    Forces without gravity say nothing of it (inf).
     """
     if doubt_forces(gyro.record):
         return float("inf")

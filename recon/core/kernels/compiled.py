@@ -36,8 +36,7 @@ def _usable_cache() -> str:
         TemporaryFile(dir=parent).close()
     except OSError as error:
         what, hint = "compiled kernels cannot be kept", "set it to a folder that can be written"
-        got = f"{error.filename or ''} {error.strerror or error}".strip()
-        raise SettingsError(what, where="NUMBA_CACHE_DIR", got=got, hint=hint) from error
+        raise SettingsError(what, where="NUMBA_CACHE_DIR", got=error, hint=hint) from error
     return str(cache_folder(parent))
 
 
