@@ -13,7 +13,6 @@ from numba import __version__, config, njit
 from numba.core.caching import FunctionCache
 from numpy.typing import NDArray
 
-from recon.core.errors import SettingsError
 from recon.core.kernels.cache import announce, cache_folder, cache_parent
 
 KernelT = TypeVar("KernelT", bound=Callable[..., Any])
@@ -35,8 +34,9 @@ def _usable_cache() -> str:
         parent.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=parent).close()
     except OSError as error:
-        what, hint = "compiled kernels cannot be kept", "set it to a folder that can be written"
-        raise SettingsError(what, where="NUMBA_CACHE_DIR", got=error, hint=hint) from error
+        what = f"compiled kernels cannot be kept ({error.strerror or error})"
+        hint = "set NUMBA_CACHE_DIR to a folder that can be written"
+        raise OSError(error.errno, f"{what}; {hint}", error.filename) from error
     return str(cache_folder(parent))
 
 
