@@ -9,6 +9,7 @@ Nothing heavy is imported before a command runs, so ``recon --help`` answers at 
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from typing import Annotated, Final
@@ -71,6 +72,7 @@ def main() -> None:
     """Run the program; a request to end it is an interruption, after which nothing half is left."""
     _open_standard_streams()
     interrupt_on_signals()
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it says where its cache is
     try:
         try:
             app()

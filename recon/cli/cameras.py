@@ -12,7 +12,7 @@ from recon.cli.drive_options import SourceOptions, Start
 from recon.cli.errors import one_line_errors, until_interrupted
 from recon.cli.tables import print_figures, print_json, print_run
 from recon.core.errors import SettingsError
-from recon.core.text import is_count
+from recon.core.text import is_count, visible
 
 _BOARD = (
     "chess:9x6:25mm (inner corners, square size) or charuco:8x6:30mm:22mm:5x5_100 (squares, "
@@ -231,9 +231,9 @@ def audit(
         return
     print_figures("", audit_lines(found.summary))
     for line in found.summary["warnings"]:
-        typer.echo(f"warning: {line}")
+        typer.echo(visible(f"warning: {line}"))
     for finding in found.findings:
-        typer.echo(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}")
+        typer.echo(visible(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}"))
     typer.echo(f"verdict: {found.verdict}")
     if out is not None:
         typer.echo(f"results: {out}")

@@ -13,7 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from recon.core.text import counted, metres, with_unit
+from recon.core.text import counted, metres, visible, with_unit
 
 if TYPE_CHECKING:
     from recon.commands.config import SettingGroup
@@ -32,12 +32,12 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
     table = Table(show_header=False)
     for name, value in figures.items():
         if isinstance(value, str | bool):
-            table.add_row(name, str(value))
+            table.add_row(Text(visible(name)), Text(visible(str(value))))
         elif isinstance(value, int | float):
             text = f"{value:.4g}" if isinstance(value, float) else str(value)
-            table.add_row(name, with_unit(text, name))
+            table.add_row(Text(visible(name)), with_unit(text, name))
     if title:
-        typer.echo(title)
+        typer.echo(visible(title))
     Console().print(table)
 
 
@@ -52,7 +52,7 @@ def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
         shown |= {f"{key} at {name:g} m": value for key, value in values}
     print_figures(title, shown)
     for warning in figures["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
+        typer.echo(visible(f"warning: {warning}"), err=True)
     if "out" in figures:
         typer.echo(f"results: {figures['out']}")
 
@@ -82,7 +82,7 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
     print_figures("", shown)
     for warning in summary["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
+        typer.echo(visible(f"warning: {warning}"), err=True)
     typer.echo(f"results: {summary['out']}")
 
 
@@ -96,9 +96,9 @@ def print_batch(summary: Mapping[str, Any]) -> None:
         typer.echo(f"and {more} more, in table.csv")
     for job in jobs:
         if "remark" in job:
-            typer.echo(f"remark: {job['name']}: {job['remark']}")
+            typer.echo(visible(f"remark: {job['name']}: {job['remark']}"))
         if job["state"] == "failed":
-            typer.echo(f"error: {job['name']}: {job['error']}", err=True)
+            typer.echo(visible(f"error: {job['name']}: {job['error']}"), err=True)
     typer.echo(f"results: {summary['out']}")
 
 

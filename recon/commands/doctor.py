@@ -53,7 +53,7 @@ def check_kernels() -> Iterator[Check]:
     found = "off: NUMBA_DISABLE_JIT is set" if off else "on"
     hint = "unset NUMBA_DISABLE_JIT; runs take hours with it"
     yield Check("compiled kernels", not off, found, hint, needed=False)
-    hint = "set NUMBA_CACHE_DIR to a folder that can be written, or each run compiles anew"
+    hint = "set NUMBA_CACHE_DIR to a folder that can be written"
     yield check_folder("kernels can be cached", cache_parent(), hint, needed=False)
     for room in sorted(folder.parent.name for folder in _ROOMS.glob("*/kernels")):
         sample = f"from recon.commands.kernel_samples import SAMPLES; SAMPLES[{room!r}]()"

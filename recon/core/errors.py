@@ -12,6 +12,8 @@ from typing import Any, Final
 
 from typing_extensions import Self
 
+from recon.core.text import visible
+
 _LONGEST: Final = 300  # letters of a value in a message: content from outside may have any length
 
 
@@ -51,18 +53,11 @@ class ReconError(Exception):
         line = f"{self.where}: {what}" if self.where is not None else what
         line += f" ({', '.join(found)})" if found else ""
         line += f"; {self.hint}" if self.hint else ""
-        return " ".join("".join(map(_visible, line)).split())
+        return " ".join(visible(line).split())
 
 
 def _clip(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
-
-
-def _visible(letter: str) -> str:
-    """Escape control characters, and bytes of odd file names."""
-    if letter.isprintable() or letter.isspace():
-        return letter
-    return letter.encode("unicode_escape", "backslashreplace").decode()
 
 
 class SettingsError(ReconError):

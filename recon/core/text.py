@@ -26,6 +26,15 @@ def metres(length_m: float, sign: str = "") -> str:
     return f"{length_m:{sign}.{min(max(2 - size, 0), _MOST_DECIMALS)}f} m"
 
 
+def visible(text: str) -> str:
+    """Return a text with control characters, and bytes of odd file names, escaped."""
+    return "".join(one if one.isprintable() or one.isspace() else _escaped(one) for one in text)
+
+
+def _escaped(letter: str) -> str:
+    return letter.encode("unicode_escape", "backslashreplace").decode()
+
+
 def parse_number(text: str | bytes) -> float:
     """Return the number that a text is; it may be ``nan`` or ``inf``."""
     _check(text)

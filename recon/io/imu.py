@@ -22,6 +22,7 @@ from recon.io.files import read_lines, reader
 
 _COLUMNS: Final = 7  # time, three rates of turn, three forces
 _LEAST: Final = 2  # rows
+_MOST: Final = 2e4  # of a rate or force: the widest range of a gyro, in degrees per second
 _RIGID_TOLERANCE: Final = 1e-3  # files print three to seven digits
 
 
@@ -29,7 +30,7 @@ _RIGID_TOLERANCE: Final = 1e-3  # files print three to seven digits
 def read_imu(path: Path) -> ImuRecord:
     """Read ``data.csv``: time [ns], rates [rad/s], forces [m/s²]; more columns are not looked at.
 
-    Rows that are no measurement, or not later than those before, are left out, and noted.
+    Rows that are no measurement, or not later than those before (or all are sorted), are noted.
     """
     lines = enumerate(read_lines(path), start=1)
     rows = [(n, _row(line)) for n, line in lines if line.partition("#")[0].strip()]
@@ -48,18 +49,22 @@ def _row(line: str) -> list[float]:
 
 def imu_of(table: Float64, places: Sequence[str], where: str) -> ImuRecord:
     """Return the record of rows (N, 7): nanoseconds, rates, forces; ``places`` name the rows."""
-    finite = np.flatnonzero(np.isfinite(table).all(axis=1))
-    good = np.zeros(len(table), np.bool_)
-    good[finite] = _in_order(table[finite, 0])
-    if good.sum() < _LEAST:
-        got = f"{counted(len(table), 'row')}, of which {good.sum()} can be used"
+    possible = np.isfinite(table[:, 0]) & (np.abs(table[:, 1:]) <= _MOST).all(axis=1)
+    order, notes = np.flatnonzero(possible), []
+    kept = _in_order(table[order, 0])
+    if 2 * kept.sum() < len(np.unique(table[order, 0])):
+        notes.append("IMU: its rows are not in order of time: sorted")
+        order = order[np.argsort(table[order, 0], kind="stable")]
+        kept = _in_order(table[order, 0])
+    order = order[kept]
+    if len(order) < _LEAST:
+        got = f"{counted(len(table), 'row')}, of which {len(order)} can be used"
         raise FormatError("IMU file has no measurements", where=where, got=got)
-    notes = []
-    if not good.all():
-        first = places[int(np.argmin(good))]
-        rows = f"{counted(int((~good).sum()), 'row')} of {len(table)}"
+    unused = np.setdiff1d(np.arange(len(table)), order)
+    if len(unused):
+        first, rows = places[unused[0]], f"{counted(len(unused), 'row')} of {len(table)}"
         notes.append(f"IMU: {rows} are no measurement after the one before (first {first}): unused")
-    times_s, gyro, accel = table[good, 0] * NS, table[good, 1:4], table[good, 4:7]
+    times_s, gyro, accel = table[order, 0] * NS, table[order, 1:4], table[order, 4:7]
     return ImuRecord(times_s, gyro, accel, None, where, tuple(notes))
 
 

@@ -46,6 +46,7 @@ _RTKLIB: Final = (_ON_EARTH, _FROM_CENTRE)
 """Columns of its solutions that are read."""
 _NMEA: Final = re.compile(r"\$?..(GGA|RMC|ZDA|GST),")
 _FARTHEST_DEG: Final = (90.0, 360.0)
+_HIGHEST_M: Final = 1e6  # no receiver of a rig is farther from the ground
 _NO_PLACE_DEG: Final = 1e-6  # latitude and longitude of a receiver without a position
 
 
@@ -122,6 +123,7 @@ def in_order(found: Positions, path: StrPath) -> Positions:
     good = np.isfinite(found.places).all(axis=1) & np.isfinite(found.times_s)
     if found.degrees:
         good &= np.abs(found.places[:, :2]).max(axis=1, initial=0.0) > _NO_PLACE_DEG
+        good &= np.abs(found.places[:, 2]) < _HIGHEST_M
         beyond = good & (np.abs(found.places[:, :2]) > _FARTHEST_DEG).any(axis=1)
         if beyond.any():
             lat, lon = found.places[beyond][0, :2]
@@ -130,7 +132,8 @@ def in_order(found: Positions, path: StrPath) -> Positions:
             raise FormatError(what, where=path, got=got, expected=expected, hint=hint)
     if not good.any():
         raise FormatError("the file has no position", where=path)
-    sigma_m = np.where(found.sigma_m > 0, found.sigma_m, np.nan)
+    known = (found.sigma_m > 0) & (found.sigma_m < np.inf)
+    sigma_m = np.where(known, found.sigma_m, np.nan)
     order = np.flatnonzero(good)[np.argsort(found.times_s[good], kind="stable")]
     arrays = found.times_s[order], found.places[order], sigma_m[order]
     return Positions(*arrays, degrees=found.degrees, heights=found.heights)

@@ -101,7 +101,7 @@ class ImuGuide:
     gyro: Gyro
     covariance: Float64  # (7, 7) of the unknowns of the gyro
     noise: float  # radians per square root of a second
-    unsteady: float  # acceleration of the camera along an axis, rms, metres per second squared
+    unsteady: float  # acceleration along an axis, rms, metres per second squared; inf = not known
     step_m: float  # standard deviation of a motion that is seen
     up: Float64 | None = None  # (3,), upwards in the axes of the first frame; None = not known
     scale: float = 1.0  # size of the scene against a road
@@ -120,6 +120,7 @@ class ImuGuide:
             # A velocity is the mean since the frame before, and changes meanwhile.
             changed_m = self.unsteady * lasting_s * 0.5 * (lasting_s + seen.interval_s)
             sigma_m = float(np.hypot(changed_m, self.step_m * lasting_s / seen.interval_s))
+            sigma_m = min(sigma_m, _UNKNOWN_M)
         covariance[:3, :3] = sigma_m**2 * np.eye(3)
         moved_m = lasting_s * seen.velocity
         return Guided(
@@ -183,11 +184,20 @@ def find_up(gyro: Gyro, run: SeenRun, arm_m: Float64) -> tuple[Float64 | None, f
     return -gravity / np.linalg.norm(gravity), sigma_deg
 
 
+def doubt_forces(record: ImuRecord) -> tuple[str, ...]:
+    """Return a line for the user if forces show no gravity: in another unit, or not measured."""
+    usual = float(np.median(np.linalg.norm(record.accel, axis=1)))
+    line = f"IMU: its forces, {usual:.2g} m/s² at the median, show no gravity (are they in g?): "
+    return () if 0.5 * _G < usual < 2.0 * _G else (f"{line}its gyro alone is used",)
+
+
 def accelerations(gyro: Gyro) -> float:
     """Return the acceleration of the camera along an axis, rms over parts of a drive.
 
     What changes of the forces, beside the turn, is of the motion; what shakes it is averaged out.
     """
+    if doubt_forces(gyro.record):
+        return float("inf")
     begin_s, end_s = gyro.record.timestamps_s[[0, -1]] - gyro.late_s
     found = []
     for start_s in np.linspace(begin_s, max(begin_s, end_s - _UP_SPAN_S), _PARTS):

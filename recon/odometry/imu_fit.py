@@ -20,7 +20,7 @@ from recon.core.geometry.se3 import angle_rad, distance_in_sigmas, log_so3
 from recon.core.text import counted
 from recon.core.values import ImuRecord
 from recon.core.values.arrays import Float64
-from recon.odometry.imu import Gyro, ImuGuide, accelerations, find_up, turns_after
+from recon.odometry.imu import Gyro, ImuGuide, accelerations, doubt_forces, find_up, turns_after
 from recon.odometry.imu_runs import SeenRun
 from recon.odometry.prior import MAX_SIGMAS
 
@@ -37,6 +37,9 @@ _LATE_S: Final = 5e-3
 """Standard deviations of axes and stamps as they are stated, since boards bend and exposures last;
 also those up to which what is found may take their place."""
 _STATED: Final = np.array([_TURN] * 3 + [_BIAS] * 3 + [_LATE_S])
+_MIRRORED: Final = "its axes are left-handed"
+_IN_DEGREES: Final = "its rates are in degrees per second"
+_CONTRADICTED: Final = 2.0  # how much better a faulty file explains turns than a right one would
 _UNEXPLAINED: Final = 0.3  # share of the turns (rms) that may be left where a gyro is that of a rig
 
 
@@ -68,7 +71,7 @@ def fit_imu(
             they do not.
     """
     covered = _coverage(record, stamps_s)
-    notes = (*record.notes, *covered.notes)
+    notes = (*record.notes, *covered.notes, *doubt_forces(record))
     if not covered.motions:
         return FittedImu(None, notes)
     runs = see()
@@ -82,7 +85,7 @@ def fit_imu(
     if free.misfit > max(_UNEXPLAINED * turned, MAX_SIGMAS * sigma):
         left = f"{np.rad2deg(free.misfit):.2g}° of turns of {np.rad2deg(turned):.2g}° are left"
         return _unused("it does not turn as the cameras do, at any delay, in any axes", left, notes)
-    faults = _faults(free, record, T_stated)
+    faults = _faults(free, T_stated)
     if (faults or T_stated is None) and not free.certain:
         why = faults[0] if faults else "nothing states its axes"
         known = f"known to {free.sigma_deg:.1f}° and {free.sigma_ms:.0f} ms"
@@ -145,6 +148,7 @@ class _Fit:
     covariance: Float64  # (7, 7)
     noise: float  # rad per square root of a second
     misfit: float  # median of what is left of the turns, rad
+    fault: str = ""  # how its record differs from what was read, in words
 
     @property
     def sigma_deg(self) -> float:
@@ -173,16 +177,16 @@ class _Fit:
         }
 
 
-def _faults(fit: _Fit, record: ImuRecord, T_stated: Float64 | None) -> list[str]:
+def _faults(fit: _Fit, T_stated: Float64 | None) -> list[str]:
     """Return what contradicts the files, in words."""
     gyro, P, lines = fit.gyro, fit.covariance, list[str]()
     if abs(gyro.late_s) > MAX_SIGMAS * np.hypot(_LATE_S, np.sqrt(P[6, 6])):
         order = "later" if gyro.late_s > 0 else "earlier"
         size = f"{abs(1e3 * gyro.late_s):.0f} ± {1.96 * fit.sigma_ms:.0f} ms"
         lines.append(f"its stamps are {size} {order} than those of the images")
-    if gyro.record is not record:
-        lines.append("its axes are left-handed")
-    elif T_stated is not None:
+    if fit.fault:
+        lines.append(fit.fault)
+    if fit.fault != _MIRRORED and T_stated is not None:
         off = log_so3(gyro.R_camera_imu @ T_stated[:3, :3].T)
         if distance_in_sigmas(off, P[:3, :3] + _TURN**2 * np.eye(3)) > MAX_SIGMAS:
             size = f"{fit.axes_off_deg(T_stated):.0f} ± {1.96 * fit.sigma_deg:.1f}°"
@@ -203,12 +207,15 @@ def _turns_of(runs: Sequence[SeenRun], record: ImuRecord) -> list[_Turn]:
 
 
 def _free_fit(record: ImuRecord, turns: Sequence[_Turn], T_stated: Float64 | None) -> _Fit:
-    """Return the gyro that fits turns best, in right-handed or left-handed axes."""
+    """Return the gyro that fits turns best, as the file has it or with one of its usual faults."""
     mirrored = replace(record, gyro=-record.gyro, accel=-record.accel)
-    starts = [_aligned(one, turns) for one in (record, mirrored)]
+    in_degrees = replace(record, gyro=np.deg2rad(record.gyro))
+    read = {"": record, _MIRRORED: mirrored, _IN_DEGREES: in_degrees}
+    starts = [(fault, _aligned(one, turns)) for fault, one in read.items()]
     if T_stated is not None:
-        starts.append(Gyro(record, T_stated[:3, :3], np.zeros(3)))
-    return min((_fitted(start, turns) for start in starts), key=lambda fit: fit.misfit)
+        starts.append(("", Gyro(record, T_stated[:3, :3], np.zeros(3))))
+    fits = (replace(_fitted(start, turns), fault=fault) for fault, start in starts)
+    return min(fits, key=lambda fit: fit.misfit * (_CONTRADICTED if fit.fault else 1.0))
 
 
 def _aligned(record: ImuRecord, turns: Sequence[_Turn]) -> Gyro:

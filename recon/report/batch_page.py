@@ -103,7 +103,7 @@ def _draw(axes: Axes, jobs: Sequence[JobResult], setting: str, name: str) -> Non
         axes.plot([place] * len(figures), figures, "o", color="C0", markersize=4, alpha=0.5)
     medians = [float(np.median(figures)) if figures else np.nan for figures in found.values()]
     axes.plot(range(len(found)), medians, "-", color="C1", label="median")
-    axes.set_xticks(range(len(found)), list(found))
+    axes.set_xticks(range(len(found)), [*map(style.label_of, found)])
     axes.set(xlabel=setting, ylabel=name, title=jobs[0].job.command)
     axes.legend()
 

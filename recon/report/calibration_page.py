@@ -77,7 +77,7 @@ def coverage_figure(result: CalibrationRun) -> bytes:
 def errors_figure(result: CalibrationRun) -> bytes:
     """Draw the RMS error of each view in both images, including dropped views."""
     fit = result.fit
-    names = [*(view.name for view in fit.views), *fit.dropped]
+    names = [style.label_of(name) for name in (*(view.name for view in fit.views), *fit.dropped)]
     figure, axes = style.subplots(style.WIDE_IN, 3.4)
     place = np.arange(len(fit.views))
     axes.bar(place - 0.2, fit.errors_px[:, 0], 0.38, label="left")

@@ -109,6 +109,11 @@ def _has_values(drawn: object) -> bool:
     return isinstance(drawn, ScalarMappable) and drawn.get_array() is not None
 
 
+def label_of(name: str) -> str:
+    """Return a name of others as matplotlib draws it: no formula, and bytes that are no text."""
+    return name.encode(errors="backslashreplace").decode().replace("$", r"\$")
+
+
 def show_image(axes: Axes, image: object, title: str = "") -> None:
     """Show an image without ticks; grey from 0 to 255 or RGB."""
     axes.imshow(image, vmin=0, vmax=255)  # type: ignore[arg-type]

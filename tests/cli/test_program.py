@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from recon.cli.program import _NOT_OPTIONS, COMMANDS, _command, plan_jobs
-from recon.cli.tables import print_batch
+from recon.cli.tables import print_batch, print_evaluation, print_run
 from recon.commands import config
 from recon.commands.map_pieces import Piece, piece_job
 from recon.core.errors import SettingsError
@@ -172,6 +172,19 @@ def job(name: str, state: str = "succeeded", **more: Any) -> dict[str, Any]:
         "figures": {},
         **more,
     }
+
+
+@pytest.mark.parametrize("name", ["drive[/b]", "[red]drive", "drive\x1b[2J\x9b2J", "\udcff\x07"])
+def test_a_name_is_printed_as_it_is_without_commands_to_the_terminal(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    figures = {"source": name, f"control {name}": "used", "warnings": [f"{name}: odd"]}
+    print_evaluation(name, figures)
+    print_run({**figures, "out": "outputs/week"})
+    out, err = capsys.readouterr()
+    said = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in name)
+    assert out.count(said) == 5
+    assert err == 2 * f"warning: {said}: odd\n"
+    assert {letter for letter in out + err if not letter.isprintable()} == {"\n"}
 
 
 def test_the_table_has_the_accuracy_of_each_command_and_not_all_of_very_many_jobs(

@@ -41,6 +41,26 @@ def test_an_output_that_takes_nothing_is_no_bug(output):
     assert len(done.stderr.splitlines()) <= 1
 
 
+@pytest.mark.parametrize("home", ["/dev/null", "", None])
+def test_a_home_that_is_none_is_of_no_concern(home, here, monkeypatch):
+    for name in ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.delenv("HOME") if home is None else monkeypatch.setenv("HOME", home)
+    command = f"{PROGRAM} board chess:9x6:25mm --out board.pdf"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert [path.name for path in here.iterdir()] == ["board.pdf"]
+
+
+@pytest.mark.parametrize("folder", ["/dev/null", "/dev/null/cache", "/proc/cache"])
+def test_a_cache_that_cannot_be_written_is_named(folder, pair):
+    command = f"NUMBA_CACHE_DIR={folder} {PROGRAM} disparity left.png right.png --out out"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, check=False)
+    ended = Ended(done.returncode, done.stdout.decode(), done.stderr.decode())
+    assert_refused(ended, "NUMBA_CACHE_DIR", folder)
+    assert not Path("out").exists()
+
+
 @pytest.mark.parametrize("threads", ["0", "-1", "many", "", "\u0661"])
 def test_a_number_of_threads_that_is_none_is_refused(threads, monkeypatch, here):
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.core.geometry.se3 import angle_rad, exp_so3, invert, log_so3, make_transform
+from recon.core.geometry.se3 import Motion, angle_rad, exp_so3, invert, log_so3, make_transform
 from recon.core.values import ImuRecord, Trajectory
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.guide import Guided
@@ -106,6 +106,28 @@ def test_a_unit_that_does_not_fit_is_not_used_and_that_is_said(record, spoil, sa
     fitted = fit_imu(spoil(record), FRAMES_S, seen, T_CAMERA_IMU)
     assert fitted.guide is None
     assert said in fitted.lines[-1]
+
+
+UNITS = {
+    "degrees": (lambda r: replace(r, gyro=np.degrees(r.gyro)), True, "its rates are in degrees"),
+    "g": (lambda r: replace(r, accel=r.accel / 9.81), False, r"1 m/s² .* gravity .* in g\?"),
+    "no forces": (lambda r: replace(r, accel=0.0 * r.accel), False, "0 m/s² .* gravity"),
+}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_units_that_are_not_those_of_the_file_are_said(record, unit):
+    spoil, forces, said = UNITS[unit]
+    fitted = fit_imu(spoil(record), FRAMES_S, seen, T_CAMERA_IMU)
+    guide = fitted.guide
+    assert re.search(said, " ".join(fitted.lines))
+    np.testing.assert_allclose(guide.gyro.bias, BIAS, atol=5e-4)
+    # Without forces nothing says how steadily it moves: the camera may be anywhere.
+    assert (guide.up is not None) is forces
+    last = Motion(np.eye(4), 3.0, np.eye(4), 0.1)
+    guided = guide.guide(last, last, 3.1)
+    assert (guided.sigma_m < 1.0) is forces
+    assert np.isfinite(guided.covariance).all()
 
 
 def test_axes_that_nothing_states_are_found_and_gaps_are_counted(record):

@@ -1,5 +1,6 @@
 """Structure from motion of rendered pairs in no order, of a room, and of what shows nothing."""
 
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -24,6 +25,7 @@ from recon.street.settings import StreetScene
 from tests.flow.runs import Breaks
 from tests.scenery.film import RIG, Film, film
 from tests.scenery.kitti import street_drive
+from tests.scenery.patience import LONG_S
 
 ORDER = [5, 2, 8, 0, 7, 3, 6, 1, 4]
 OPTIONS = SfmOptions(RectificationSettings(), threads=2)
@@ -167,3 +169,22 @@ def test_a_room_is_placed_to_two_centimetres(recon_data):
     rigid = fit_points(positions_m, truth)
     moved = positions_m @ rigid.T_to_from[:3, :3].T + rigid.T_to_from[:3, 3]
     assert np.sqrt(np.mean(np.sum((moved - truth) ** 2, axis=1))) < 0.022
+
+
+def test_a_request_to_end_the_program_still_interrupts_it():
+    """COLMAP's own handler would print a stack trace and end the process at once."""
+    pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
+    script = """
+import os, signal
+from recon.odometry.sfm.colmap import load_colmap
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+load_colmap()
+try:
+    os.kill(os.getpid(), signal.SIGTERM)
+    signal.pause()
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, check=False, timeout=LONG_S)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"interrupted\n", b"")

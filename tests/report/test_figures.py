@@ -41,7 +41,10 @@ from recon.report import (
     style,
 )
 from recon.report import drive_figures as figures
+from recon.report.batch_page import sweep_figure
 from recon.report.page import page_environment, timing_figure
+from recon.run.batch.job import Job, Outcome
+from recon.run.batch.results import JobResult
 
 
 def picture(png: bytes) -> UInt8:
@@ -300,6 +303,22 @@ def test_points_lie_on_lines_of_their_colour_and_level_ones_are_rows_of_the_left
         assert not np.array_equal(one.get_color(), other.get_color())
     spread = calibration_page.spread_points(np.array([[0.0, y] for y in (9, 1, 5, 3, 7)]), 3)
     assert spread.tolist() == [1, 2, 0]
+
+
+@pytest.mark.parametrize("name", ["US$5 and $_$", "a$\\frac{a$.jpg", "left\udcff.png", "links ä"])
+def test_a_name_of_a_file_or_setting_is_drawn_and_no_formula(name, drawn):
+    fit = SimpleNamespace(
+        views=[SimpleNamespace(name=name)], dropped={}, errors_px=np.ones((1, 2)), rms_px=0.3
+    )
+    calibration_page.errors_figure(SimpleNamespace(fit=fit))
+    jobs = [Job("a", "map", "", (), True, "", swept={"axes": text}) for text in (name, "other")]
+    sweep_figure([JobResult(job, Outcome("succeeded"), {"points": 1.0}) for job in jobs])
+    for figure in drawn:
+        figure.savefig(io.BytesIO())  # raises where a formula or a text is none
+        label = figure.axes[0].get_xticklabels()[0].get_text()
+        assert label.replace("\\$", "$") == name.replace("\udcff", "\\udcff")
+        assert ("$" in label) == ("\\$" in label)
+    assert len(drawn) == 2
 
 
 def test_each_view_of_a_calibration_has_its_error_and_corners(drawn):

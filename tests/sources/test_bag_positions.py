@@ -13,10 +13,12 @@ PLACES = np.column_stack([49.0 + 1e-5 * np.arange(8), np.full(8, 8.4), 115 + 0.1
 START_NS = 1_700_000_000_000_000_000
 
 
-def write(folder, kind="mcap", topics=("/gps/fix",), sigma_m=(0.02, 0.01, 0.03), **how):
+def write(
+    folder, kind="mcap", topics=("/gps/fix",), sigma_m=(0.02, 0.01, 0.03), places=PLACES, **how
+):
     with recorder(folder, Recording(kind)) as bag:
         bag.write("/imu", START_NS, bag.imu(START_NS, np.zeros(3), np.zeros(3), "imu"))
-        for number, place in enumerate(PLACES):
+        for number, place in enumerate(places):
             time_ns = START_NS + 100_000_000 * number
             for topic in topics:
                 bag.write(topic, time_ns + 5_000_000, bag.fix(time_ns, place, sigma_m, **how))
@@ -37,8 +39,18 @@ def test_positions_have_the_times_of_their_headers_and_the_spread_of_their_covar
 def test_what_is_not_known_is_not_invented(tmp_path):
     path = write(tmp_path, sigma_m=None)
     assert np.isnan(read_measured(path).sigma_m).all()
+    endless = write(tmp_path / "endless", sigma_m=np.full(3, np.inf))
+    assert np.isnan(read_measured(endless).sigma_m).all()
     with pytest.raises(ReconError, match="no position"):
         read_measured(write(tmp_path / "none", status=-1))
+
+
+@pytest.mark.parametrize("height_m", [np.nan, np.inf, 1e300, -1e20])
+def test_a_message_without_a_height_on_earth_is_left_out(tmp_path, height_m):
+    places = PLACES.copy()
+    places[3, 2] = height_m
+    found = read_measured(write(tmp_path, places=places))
+    np.testing.assert_allclose(found.places, np.delete(PLACES, 3, axis=0), rtol=1e-12)
 
 
 def test_of_several_receivers_one_is_named(tmp_path):

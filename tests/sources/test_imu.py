@@ -55,6 +55,9 @@ BROKEN = {
     "not finite": ([*ROWS[:9], ROWS[9].replace("0.3", "nan"), *ROWS[10:]], 199, r"data.csv:11"),
     "backwards": ([*ROWS[:60], *ROWS[40:]], 200, r"20 rows of 220"),
     "a stamp far ahead": ([*ROWS[:9], "9" + ROWS[9][1:], *ROWS[10:]], 199, r"data.csv:11"),
+    "a rate of no gyro": ([*ROWS[:9], ROWS[9].replace("0.3", "1e300"), *ROWS[10:]], 199, r"csv:11"),
+    "in no order": ([*ROWS[1::3], *ROWS[::3], *ROWS[2::3]][::-1], 200, r"not in order of time"),
+    "each row three times": ([row for row in ROWS for _ in range(3)], 200, r"400 rows of 600"),
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Callable
+from tempfile import TemporaryFile
 from typing import Any, Final, Literal, TypeVar, overload
 
 import numpy as np
@@ -25,7 +26,21 @@ Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_CACHE: Final = str(cache_folder(cache_parent()))
+
+def _usable_cache() -> str:
+    """Return the folder of our cache; where it cannot be written, numba would take another one."""
+    try:
+        parent = cache_parent()
+        parent.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=parent).close()
+    except OSError as error:
+        what = f"compiled kernels cannot be kept ({error.strerror or error})"
+        hint = "set NUMBA_CACHE_DIR to a folder that can be written"
+        raise OSError(error.errno, f"{what}; {hint}", error.filename) from error
+    return str(cache_folder(parent))
+
+
+_CACHE: Final = _usable_cache()
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]

@@ -160,6 +160,9 @@ class Store:
             try:
                 most = min(most_bytes, max(_SMALL_BYTES, _MOST_GROWTH * content.left))
                 return from_bytes(text, content.read, most)
+            except (KeyboardInterrupt, MemoryError):
+                checksum = content.checksum  # what is cut short may be whole
+                raise
             finally:
                 content.close()
                 if content.checksum != checksum:

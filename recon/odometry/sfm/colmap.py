@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,13 +44,22 @@ _SEED: Final = 0
 _LEFT, _RIGHT = "left", "right"  # what names of images begin with
 
 
+def load_colmap() -> Any:
+    """Import COLMAP, which takes SIGTERM as a crash, and leave that signal to who had it before."""
+    before = signal.getsignal(signal.SIGTERM)
+    api = require("pycolmap", extra="sfm")
+    if threading.current_thread() is threading.main_thread():  # elsewhere Python sets no handler
+        signal.signal(signal.SIGTERM, before)
+    return api
+
+
 class Colmap:
     """COLMAP at work on the pairs of a rectified camera, with its database in a folder."""
 
     def __init__(
         self, camera: RectifiedCamera, folder: Path, threads: int, limit_mb: float | None
     ) -> None:
-        self._api: Any = require("pycolmap", extra="sfm")
+        self._api = load_colmap()
         self._api.logging.minloglevel = int(self._api.logging.Level.FATAL.value)
         self._api.set_random_seed(_SEED)
         self._camera, self._folder, self._threads = camera, folder, threads

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from recon.core.errors import RegistrationError, SettingsError, require
+from recon.core.errors import RegistrationError, SettingsError
 from recon.core.text import counted
-from recon.odometry.sfm.colmap import Colmap
+from recon.odometry.sfm.colmap import Colmap, load_colmap
 from recon.odometry.sfm.found import FoundPoses
 from recon.run.work import Stopwatch
 from recon.sources.source import StereoSource
@@ -26,7 +26,7 @@ from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 
 def check_sfm(source: StereoSource) -> None:
     """Refuse what structure from motion cannot work with, and say which package is missing."""
-    require("pycolmap", extra="sfm")
+    load_colmap()
     if source.live:
         what = "structure from motion needs all pairs before it begins"
         raise SettingsError(what, where=source.name, hint="record the drive, then recon map it")

@@ -112,7 +112,8 @@ def last_outcome(folder: Path, name: str) -> Outcome:
                         last = Outcome(**json.loads(line)["try"])
     if is_done(folder / name):
         return replace(last, state="succeeded", error="")
-    return replace(last, state="broken") if last.state == "succeeded" else last
+    gone = last.state == "succeeded"
+    return replace(last, state="broken", error="its result is gone") if gone else last
 
 
 def is_done(out: Path) -> bool:

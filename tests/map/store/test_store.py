@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as some
 
 from recon.core.errors import FormatError, OutputError, ReconError
+from recon.map.store import database
 from recon.map.store.records import Cache, Store
 
 KINDS = ("rays", "submap")
@@ -286,6 +287,21 @@ def test_a_damaged_file_is_refused_or_gives_what_was_put(place, bit, cut, tmp_pa
                 assert _same(store.read("rays", key), _record(90 + key))
     except ReconError as error:
         assert str(path) in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize("ended", [KeyboardInterrupt, MemoryError])
+@pytest.mark.parametrize("copied", [False, True])
+def test_a_record_whose_reading_is_cut_short_is_not_called_damaged(ended, copied, monkeypatch):
+    def cut(size):
+        raise ended
+
+    with Store.temporary() as store, Store.temporary() as other:
+        store.put("rays", 0, {"a": np.arange(9)})
+        monkeypatch.setattr(database, "bytearray", cut, raising=False)
+        with pytest.raises((KeyboardInterrupt, FormatError)) as told:
+            store.copy("rays", other) if copied else store.read("rays", 0)
+    assert "damaged" not in str(told.value)
+    assert isinstance(told.value, KeyboardInterrupt) == (ended is KeyboardInterrupt)
 
 
 def test_a_missing_record_is_named(tmp_path):

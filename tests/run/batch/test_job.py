@@ -48,7 +48,8 @@ def test_what_is_left_of_a_log_counts(tmp_path):
     assert last_outcome(tmp_path, "a") == tried
     assert run_job(job("a"), tmp_path).tries == 7
     (tmp_path / "a" / "run.json").unlink()
-    assert last_outcome(tmp_path, "a").state == "broken"
+    removed = last_outcome(tmp_path, "a")
+    assert (removed.state, removed.error) == ("broken", "its result is gone")
 
 
 def test_a_log_that_is_none_or_leads_elsewhere_is_one_line(tmp_path):
