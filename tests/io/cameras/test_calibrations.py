@@ -616,5 +616,5 @@ def test_a_rig_with_left_and_right_swapped_is_refused_as_a_pair_would_be(form, t
     vertical = replace(given, T_right_left=make_transform(np.eye(3), np.array([0.01, -0.12, 0])))
     if form != "ros":
         WRITERS[form](path, vertical)
-        with pytest.raises(CalibrationError, match="not side by side.*rotate the images"):
+        with pytest.raises(CalibrationError, match=r"not side by side.*rotate the images"):
             read_calibration(path, 640, 480)
