@@ -27,7 +27,7 @@ from rich.text import Text
 
 from recon.core.progress import LOGGER, Silent, Step, showing
 from recon.core.progress import Progress as Shown
-from recon.core.text import counted
+from recon.core.text import counted, visible
 
 if TYPE_CHECKING:
     from recon.sources.source import StereoSource
@@ -160,12 +160,12 @@ class ProgressBar:
     def _show(self, name: str, column: FittingColumn, *, total: int | None) -> None:
         self._since_s = time.monotonic()
         self._progress = Progress(column, console=self._console, refresh_per_second=4)
-        self._progress.add_task(name, total=total, rate="", state="", bad="")
+        self._progress.add_task(visible(name), total=total, rate="", state="", bad="")
         self._progress.start()
 
-    def _update(self, **fields: Any) -> None:
+    def _update(self, *, state: str = "", **fields: Any) -> None:
         if self._progress is not None:
-            self._progress.update(self._progress.task_ids[0], **fields)
+            self._progress.update(self._progress.task_ids[0], state=visible(state), **fields)
 
     @property
     def _waited_s(self) -> float:
@@ -279,5 +279,5 @@ def _write(
 ) -> None:
     out = sys.stderr if stream is None else stream
     if not quiet and (out.isatty() or verbose):
-        out.write((text if out.isatty() else json.dumps(event, ensure_ascii=False)) + "\n")
+        out.write((visible(text) if out.isatty() else json.dumps(event, ensure_ascii=False)) + "\n")
         out.flush()
