@@ -166,20 +166,15 @@ class MapOptions:
         run.check_targets([*source.files, *map(Path, named)])
         path, memory = run.state(STARTED), config.memory.cache_bytes
         images = self.images_of(source)
-        mark = images[IMAGES]["mark"] if images else mark_of(source)
         identity = {
             "config": config.model_dump(mode="json"),
-            "source": mark,
+            "source": images[IMAGES]["mark"] if images else mark_of(source),
             "poses": _digest(self.known_poses),
             "prior": _digest(self.prior),
             "versions": versions(),
         }
         if run.resumes:
-            then = _read_started(run.folder)["identity"]
-            if isinstance(then.get("source"), dict):
-                # What earlier versions did not note down is not compared.
-                then["source"] = {**mark, **then["source"]}
-            _refuse_others(identity, then, run.folder)
+            _refuse_others(identity, _read_started(run.folder)["identity"], run.folder)
             with resuming(path):
                 return Map.open(path, read_only=False, cache_bytes=memory)
         map_ = Map.create(path, cache_bytes=memory)

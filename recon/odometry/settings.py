@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import BeforeValidator, Field, InstanceOf, field_serializer
+from pydantic import Field, InstanceOf, field_serializer
 
 from recon.core.plugins import name_of
 from recon.core.settings import Length, Settings
@@ -29,11 +29,6 @@ class PriorSettings(Settings):
     """Standard deviation of its rotation from frame to frame."""
 
 
-def _name_today(name: object) -> object:
-    """Return what an odometry is called today: in runs of older versions it may be "fused"."""
-    return "visual" if name == "fused" else name
-
-
 class RigSettings(Settings):
     """Whether the calibration is refined by what the motion of a drive shows."""
 
@@ -46,7 +41,7 @@ class RigSettings(Settings):
 class OdometrySettings(Settings):
     """Where the camera is in each frame."""
 
-    method: Annotated[str | InstanceOf[Odometry], BeforeValidator(_name_today)] = "visual"
+    method: str | InstanceOf[Odometry] = "visual"
     """visual = features followed from frame to frame; kiss = kiss-icp, which from there registers
     the points that stereo measures well over time, to compare with; sfm = structure from motion by
     COLMAP over all pairs, in any order (extra sfm); or one that an installed package registers;

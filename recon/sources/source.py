@@ -185,13 +185,8 @@ _SAMPLES: Final = 32  # of a file: a change over a 31st of it is seen, and all o
 
 
 def mark_of(source: StereoSource) -> dict[str, Any]:
-    """Return what a source is known again by: its number of pairs, names and samples of its files.
-
-    ``sha256`` is of their heads alone, by which maps know it that were made before there were
-    ``samples_sha256``.
-    """
-    heads, samples = (fingerprint(source.files, samples=count) for count in (1, _SAMPLES))
-    return {"frames": len(source), **heads, "samples_sha256": samples["sha256"]}
+    """Return what a source is known again by: number of pairs, names and samples of its files."""
+    return {"frames": len(source), **fingerprint(source.files, samples=_SAMPLES)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

@@ -11,7 +11,6 @@ from recon.core.errors import FormatError, OutputError, SettingsError
 from recon.core.progress import showing
 from recon.map.drive.mapper import FrameResult
 from recon.sources.registry import open_source
-from recon.sources.source import mark_of
 from tests.flow.runs import STATE, Breaks, content
 from tests.scenery.kitti import street_drive
 
@@ -74,20 +73,6 @@ def test_other_settings_sources_and_poses_are_refused(drive, tmp_path):
     with pytest.raises(SettingsError, match="other poses"):
         _run(drive, begun, resume=True, known_poses=truth.trajectory)
     assert (begun / STATE).is_file()
-
-
-def test_a_run_of_a_version_that_looked_at_less_of_the_files_goes_on(
-    drive, unbroken, tmp_path, monkeypatch
-):
-    def heads(source):
-        return {name: one for name, one in mark_of(source).items() if name != "samples_sha256"}
-
-    with monkeypatch.context() as earlier:
-        earlier.setattr("recon.commands.map_options.mark_of", heads)
-        with pytest.raises(KeyboardInterrupt):
-            _run(drive, tmp_path, Breaks(6))
-    _run(drive, tmp_path, resume=True)
-    assert content(tmp_path) == unbroken
 
 
 def test_a_second_run_is_refused(drive, unbroken, tmp_path):

@@ -41,11 +41,10 @@ def test_a_saved_odometry_goes_on_to_the_bit(name, street, tmp_path):
         assert repr(ours.health) == repr(theirs.health)
 
 
-def test_the_settings_offer_what_there_is_and_runs_of_older_versions_were_visual_too():
+def test_the_settings_offer_what_there_is():
     with pytest.raises(SettingsError, match=r"unknown odometry.*one of: kiss, sfm, visual"):
         make_odometry("lidar")
     assert OdometrySettings().method == "visual"
-    assert OdometrySettings.parse({"method": "fused"}).method == "visual"
 
 
 def test_known_poses_begin_at_the_identity_and_are_picked_by_the_number_of_the_frame(

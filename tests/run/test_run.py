@@ -1,6 +1,5 @@
 """A run's folder appears complete, or not at all, with configuration, summary and record."""
 
-import hashlib
 import itertools
 import json
 import math
@@ -121,18 +120,6 @@ def test_a_hash_of_samples_knows_small_files_and_what_changes_over_a_part_of_lar
         content[-1] = 1
         assert hashed(content) != before
     assert hashed(bytearray()) != plain_image
-
-
-def test_one_sample_is_what_earlier_versions_hashed(tmp_path):
-    """Their maps know drives by the first 4,096 bytes of each file."""
-    digest = hashlib.sha256()
-    files = [tmp_path / name for name in ("small", "large")]
-    for file, length in zip(files, (4096, 5000), strict=True):
-        file.write_bytes(bytes(range(250)) * 20)
-        os.truncate(file, length)
-        digest.update(file.name.encode() + b"\0" + length.to_bytes(8, "little"))
-        digest.update(file.read_bytes()[:4096])
-    assert fingerprint(files, samples=1)["sha256"] == digest.hexdigest()
 
 
 @pytest.mark.parametrize("samples", [None, 32])

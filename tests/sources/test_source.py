@@ -71,7 +71,7 @@ def test_a_drive_whose_uncompressed_pixels_differ_later_is_another_one(tmp_path,
         source = recon.open_source(tmp_path)
         mark = mark_of(source)
         assert mark == mark_of(recon.open_source(tmp_path))
-        marks.add((mark["samples_sha256"], mark["bytes"], mark["frames"]))
+        marks.add((mark["sha256"], mark["bytes"], mark["frames"]))
     assert len(marks) == 4
     assert len({size for _, size, _ in marks}) == 1
 

@@ -204,7 +204,6 @@ FRAMES: Final = "frames"
 FARTHEST_M: Final = 1e5  # from the start: farther than any drive, or ray
 _SKEW: Final = 1e-3  # of poses that were written with few digits
 _HEALTH: Final = tuple(f.name for f in fields(OdometryHealth))
-_NEW: Final = ("visual_m", "begins")  # maps of older versions lack it
 
 
 def frames_record(
@@ -223,9 +222,7 @@ def frames_in(content: Mapping[str, Any]) -> Iterator[tuple[Float64, float, Odom
     times_s = array_in(content, "times_s", np.float64, (None,))
     path, columns = path_of(content["T_world_camera"], times_s), content["health"]
     for number, (T, time_s) in enumerate(zip(path.T_world_camera, times_s.tolist(), strict=True)):
-        # Older versions measured more.
-        names = [name for name in _HEALTH if name in columns or name not in _NEW]
-        values = {name: columns[name][number] for name in names}
+        values = {name: columns[name][number] for name in _HEALTH}
         yield T, time_s, value_in(OdometryHealth, values)
 
 
