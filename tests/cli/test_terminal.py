@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from recon.core.values.board import parse_board
@@ -12,6 +13,7 @@ from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.scenery.kitti import street_drive
 from tests.scenery.middlebury import write_scene
 from tests.scenery.terminal import COLUMNS, show
+from tests.sources.drives import write_video
 
 pytestmark = pytest.mark.slow  # but for the first test, commands of seconds
 
@@ -36,6 +38,9 @@ def place(tmp_path_factory):
     for number, views in enumerate(render_views(rig, board, place_boards(rig, board, 8, seed=4))):
         for side, view in zip(("left", "right"), views, strict=True):
             write_image(folder / "boards" / side / f"{number:02d}.png", view)
+    for side in ("left", "right"):
+        seen = [np.full((96, 128), 80 + number, np.uint8) for number in range(20)]
+        write_video(folder / f"{side}.avi", seen)
     (folder / "jobs.toml").write_text(
         "[[job]]\nname = 'one'\ncommand = 'audit'\nsource = ['drive']\n"
     )
@@ -60,6 +65,7 @@ COMMANDS = [
         "calibrate boards/left boards/right --board chess:9x6:25mm --report r --out c.yaml",
         r"find the board .*\d+/16",
     ),
+    ("capture left.avi right.avi --out captured", r"record .*\d+/\?"),
     ("evaluate middlebury scenes --out bench", r"scenes .*\d/1"),
     ("evaluate map run later/map/cloud.ply --out compared", r"compare "),
     ("batch jobs.toml --workers 1 --out week", r"week .*1/1"),
