@@ -23,6 +23,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from recon.core.errors import ShapeError
+from recon.core.text import visible
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyTruth, Reason
 from recon.core.values.arrays import UInt8
 from recon.evaluation.occupancy import grid_on_truth
@@ -67,7 +68,7 @@ def pack_png(image: Image.Image, notes: Mapping[str, str]) -> bytes:
     """Return an image as a PNG file with notes."""
     buffer, info = io.BytesIO(), PngInfo()
     for name, text in notes.items():
-        info.add_text(name, text)
+        info.add_text(name, visible(text))  # bytes that are no text, too
     # Pages embed WebP; to pack these bytes well would take longer than to draw the figure.
     image.save(buffer, "PNG", compress_level=1, pnginfo=info)
     return buffer.getvalue()
