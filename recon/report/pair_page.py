@@ -204,7 +204,7 @@ def depth_marks(
     """Return depths > 0 to mark on a scale with these ends, as many as its labels have room for."""
     powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
     choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
-    if high_m < 2.0 * low_m:  # hardly any of these lies in between
+    if low_m < high_m < 2.0 * low_m:  # hardly any of these lies in between
         whole_m = 10.0 ** math.floor(math.log10(high_m - low_m))
         for step_m in (whole_m, 0.5 * whole_m, 0.2 * whole_m):
             steps = range(math.ceil(low_m / step_m), int(high_m / step_m) + 1)

@@ -14,6 +14,7 @@ import recon
 from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.core.progress import showing
 from recon.core.values import StereoPair
 from recon.map.store.map_file import MapFile
 from recon.sources.images import ImageSource
@@ -25,6 +26,15 @@ CODE = Path(recon.__file__).parent
 MOST_FILES = 25
 FOLLOWED = 5
 """The pair that is followed: features, submap and a keyframe are there by then."""
+
+
+class Untold:
+    """Who is told nothing: what is said of a pair is no part of its walk."""
+
+    def on_start(self, *_: object) -> None:
+        return
+
+    on_step = on_stage = on_finish = on_start
 
 
 def walked(street_film: Film, folder: Path) -> set[str]:
@@ -56,7 +66,8 @@ def walked(street_film: Film, folder: Path) -> set[str]:
         try:
             config = load_config(None, ["checkpoints.every_frames=8"])
             options = MapOptions(out=folder / "out", audit=False, mesh=False)
-            run_map(open_source(folder / "drive"), config, options)
+            with showing(Untold()):
+                run_map(open_source(folder / "drive"), config, options)
         finally:
             sys.setprofile(None)
             threading.setprofile(None)

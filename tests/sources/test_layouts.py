@@ -217,7 +217,7 @@ def cut(name: str) -> Spoil:
     (remove("calib.txt"), r"calib\.txt: calibration is missing .*--calib"),
     (write("calib.txt", f"P0: {CALIB[0]}\n"), r"calib\.txt: .*has no P1"),
     (write("calib.txt", f"P0: {CALIB[0]}\nP1: {CALIB[0]}\n"), r"calib\.txt: baseline is zero"),
-    (write("calib.txt", f"P0: {CALIB[1]}\nP1: {CALIB[0]}\n"), r"baseline is negative.*swapped"),
+    (write("calib.txt", f"P0: {CALIB[1]}\nP1: {CALIB[0]}\n"), r"camera is to the left.*swap left"),
     (remove("times.txt"), r"times\.txt: times are missing; .*source\.rate_hz="),
     (write("times.txt", "0\n0.1\n"), r"times\.txt: fewer times than images \(got 2"),
     (write("times.txt", "0\n0.2\n0.1\n"), r"times\.txt:3: timestamps are out of order"),
