@@ -54,7 +54,7 @@ COMMANDS = [
     ("audit drive", r"check the recording .*\d/\d"),
     ("export run --to cloud,mesh,mcap --images drive --out products", r"mcap .*\d/\d .*images/s"),
     ("export run --to costmap,gridmap --out ros", r"costmap .*\d/\d.* tiles"),
-    ("mesh run --out mesh", r"mesh .*\d/\d"),
+    ("mesh run --out mesh --set mesh.min_component_faces=1", r"mesh .*\d/\d"),
     ("occupancy run --out grid", r"grid .*\d/\d"),
     ("merge run later --out merged", r"cut into tiles .*\d/\d"),
     ("localize drive --map run --out found", r"drive .*\d/8"),
