@@ -92,8 +92,6 @@ class _Logged(threading.local):
 
 
 _SHOWN: Final[ContextVar[Progress]] = ContextVar("progress", default=_Logged())  # noqa: B039
-
-
 _STAGE: Final = ContextVar("stage", default="")
 
 

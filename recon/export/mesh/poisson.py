@@ -57,7 +57,8 @@ class MeshSettings(Settings):
     """Farthest a vertex may lie from the points, in local point spacings; none = keep all. Lower it
     to keep holes open."""
     min_component_faces: int = Field(100, ge=1, le=1_000_000_000)
-    """Connected pieces with fewer faces, over all tiles, are dropped. Raise it against crumbs."""
+    """Connected pieces with fewer faces, over all tiles (with target_faces in each), are dropped.
+    Raise it against crumbs."""
     target_faces: int | None = Field(None, ge=4, le=1_000_000_000)
     """Simplify to about so many faces; none = do not. For viewers and other programs with a limit.
     """
