@@ -37,7 +37,7 @@ from recon.io.trajectory import read_kitti_poses, write_kitti_poses
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
 from recon.odometry.rig.refine import RefinedRig, refine_rig
-from recon.run.work import serial_algebra
+from recon.core.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor

@@ -31,7 +31,7 @@ from recon.evaluation.trajectory import TrajectoryRules, compare_paths
 from recon.odometry.health import RIG_BASELINE, RIG_DISPARITY_PX, RIG_YAW_DEG, expected_drift
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
-from recon.run.work import serial_algebra
+from recon.core.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

@@ -42,7 +42,7 @@ from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
 from recon.run.batch.cluster import Cluster, local_cluster
 from recon.run.batch.job import Job, Outcome
-from recon.run.machine import available_cores
+from recon.core.work import available_cores
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti

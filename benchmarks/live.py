@@ -37,8 +37,8 @@ from recon.evaluation.trajectory import associate, evaluate_trajectory
 from recon.io.trajectory import read_tum
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
-from recon.run.machine import available_cores
-from recon.run.work import serial_algebra
+from recon.core.work import available_cores
+from recon.core.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor

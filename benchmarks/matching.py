@@ -27,7 +27,7 @@ import numpy as np
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.io.middlebury import stand_in_camera
-from recon.run.machine import peak_memory_mb
+from recon.core.memory import peak_memory_mb
 from recon.stereo.match import sad
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import SadMatcher, SadSettings

@@ -226,7 +226,7 @@ def occupancy(
     """
     with one_line_errors(quiet=quiet):
         from recon.commands.evaluate import run_evaluate_occupancy
-        from recon.run.run import plain
+        from recon.core.text import plain
 
         compared = run_evaluate_occupancy(run, least_frames, image=picture)
         figures = {**plain(compared.metrics), "warnings": compared.doubts}

@@ -12,11 +12,11 @@ from typing import Any, Final
 import typer
 
 from recon.core.errors import SettingsError
+from recon.core.memory import parse_size_mb
 from recon.io.files import naming
 from recon.io.middlebury import find_image, find_layout
 from recon.run.batch.job import Job
 from recon.run.batch.job_file import Entry, JobList, check_names, name_of_swept
-from recon.run.work import parse_size_mb
 
 COMMANDS: Final = (
     "map", "localize", "merge", "pair", "disparity", "export", "mesh", "occupancy", "rectify",

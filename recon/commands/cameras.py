@@ -14,6 +14,7 @@ from recon.commands.config import ReconConfig
 from recon.core.errors import FormatError, OutputError, SourceError
 from recon.core.progress import tracked
 from recon.core.values.board import CalibrationBoard
+from recon.core.work import serial_algebra
 from recon.io.atomic import check_targets, write_text
 from recon.io.files import StrPath
 from recon.io.images.image import write_image
@@ -42,7 +43,6 @@ from recon.rig.rectification import (
 )
 from recon.rig.written import CalibrationForm, targets_of
 from recon.run.run import Run
-from recon.run.work import serial_algebra
 from recon.sources.image_names import ImagePairs, pair_images
 from recon.sources.one_pair import read_pair
 from recon.sources.opencv_camera import Camera

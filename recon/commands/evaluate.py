@@ -13,7 +13,7 @@ from recon.commands.config import run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError, SettingsError
 from recon.core.progress import stage
-from recon.core.text import counted
+from recon.core.text import counted, plain
 from recon.core.values import (
     Disparity,
     DisparityTruth,
@@ -61,7 +61,7 @@ from recon.report.map_page import write_map_errors, write_trajectory_page
 from recon.report.style import colour_grid_errors
 from recon.run.directory import recorded_files
 from recon.run.finished import CLOUD, GRID, OCTOMAP, command_of_map
-from recon.run.run import Run, plain
+from recon.run.run import Run
 from recon.sources.times import read_times
 
 

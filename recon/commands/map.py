@@ -20,7 +20,7 @@ from recon.core.errors import (
     SettingsError,
 )
 from recon.core.plugins import name_of
-from recon.core.text import counted
+from recon.core.text import counted, plain
 from recon.core.values import (
     OccupancyGrid,
     PointCloud,
@@ -50,7 +50,7 @@ from recon.report.map_page import map_content
 from recon.report.page import write_page
 from recon.rig.audit.audit import check_related, quick_warnings
 from recon.run.directory import STARTED, RunDirectory, state_folder
-from recon.run.run import Run, plain
+from recon.run.run import Run
 from recon.sources.calibration import RIG_FILE
 from recon.sources.source import StereoSource, check_source
 

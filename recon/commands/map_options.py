@@ -20,6 +20,7 @@ from recon.commands.config import Changes, ReconConfig, load_config
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import Trajectory
+from recon.core.versions import versions
 from recon.export.make import USUAL
 from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_trajectory
@@ -28,7 +29,6 @@ from recon.map.map import Map
 from recon.map.store.session import IMAGES
 from recon.run.batch.cluster import BatchOptions
 from recon.run.directory import RECORD, STARTED, state_folder
-from recon.run.machine import versions
 from recon.run.run import Run
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource, mark_of

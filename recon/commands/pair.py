@@ -13,6 +13,7 @@ from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
 from recon.core.plugins import name_of
 from recon.core.progress import stage
+from recon.core.text import plain
 from recon.core.values import (
     Disparity,
     Reason,
@@ -31,7 +32,7 @@ from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.sequence import check_cloud
 from recon.report.pair_page import PairRun, write_disparity_images, write_pair_page
 from recon.rig.audit.audit import check_found, find_pair_faults
-from recon.run.run import Run, plain
+from recon.run.run import Run
 from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 from recon.stereo.match.onnx import describe_network

@@ -7,9 +7,12 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from itertools import chain
+from typing import Any, Final
 
 from recon.core.errors import ReconError, SettingsError
+
+_GROUPS: Final = "recon."  # what the names of our entry point groups begin with
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,13 @@ class Plugins:
     def _fits(self, given: object) -> bool:
         names = (method.partition("(")[0] for method in self.methods)
         return all(callable(getattr(given, name, None)) for name in names)
+
+
+def packages() -> tuple[str, ...]:
+    """Return the installed packages that register parts, in the order of their names."""
+    ours = [group for group in entry_points().groups if group.startswith(_GROUPS)]
+    points = chain.from_iterable(entry_points(group=group) for group in ours)
+    return tuple(sorted({point.dist.name for point in points if point.dist is not None}))
 
 
 def name_of(given: str | object) -> str:

@@ -15,6 +15,7 @@ from pydantic import Field, field_validator
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
 from recon.core.settings import Settings
+from recon.core.text import plain
 from recon.core.values import (
     Disparity,
     DisparityTruth,
@@ -28,7 +29,6 @@ from recon.core.values.arrays import Float32, Int32
 from recon.core.values.camera import depth_from_disparity
 from recon.evaluation.disparity import evaluate_disparity
 from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
-from recon.run.run import plain
 from recon.stereo.frame import CloudSettings, FrameReconstructor, StereoSettings, back_project
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import SadMatcher, SadSettings

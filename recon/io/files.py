@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import codecs
 import errno
+import hashlib
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
+from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import Final, ParamSpec, TypeVar, cast
+from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -181,3 +183,53 @@ def parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[fl
     if not np.isfinite(row).all():
         raise FormatError("number is not finite", where=where, got=" ".join(words)[:60])
     return row
+
+
+def refuse_links(folder: Path, *, below: Path | None = None) -> None:
+    """Refuse a folder of ours that has links in it, which may lead to files of anybody.
+
+    From a folder around it on, ``below``, it is reached by no link either.
+    """
+    way = [] if below is None else [folder, *folder.parents][: -len(below.parents) - 1]
+    inside = (
+        Path(place, name)
+        for place, folders, files in os.walk(folder)
+        for name in sorted((*folders, *files))
+    )
+    for path in chain(reversed(way), inside):
+        if path.is_symlink():
+            hint = "remove it; what it leads to stays"
+            raise FormatError("a link in a result folder is not followed", where=path, hint=hint)
+
+
+_PIECE_BYTES: Final = 1 << 20
+_SAMPLE_BYTES: Final = 1 << 12
+
+
+def fingerprint(files: Iterable[Path], *, samples: int | None = None) -> dict[str, Any]:
+    """Return the number, size and one SHA-256 of a list of files, in that order.
+
+    The hash covers each file's name and bytes, so a renamed frame changes it too. To tell sources
+    apart without reading a large drive, it covers of each larger file ``samples`` pieces of 4 KiB,
+    evenly spread from its first byte to its last. A pipe or device is a `FormatError`.
+    """
+    digest, count, size = hashlib.sha256(), 0, 0
+    for path in files:
+        refuse_special(path)
+        length = path.stat().st_size
+        digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
+        with path.open("rb", buffering=0) as content:
+            for start, many in _pieces(length, samples):
+                content.seek(start)
+                digest.update(content.read(many))
+        count, size = count + 1, size + length
+    return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
+
+
+def _pieces(length: int, samples: int | None) -> list[tuple[int, int]]:
+    """Return first byte and number of bytes of what is hashed of a file: all of it, or samples."""
+    if samples is None or length <= samples * _SAMPLE_BYTES:
+        # In pieces: a recording may be larger than memory.
+        return [(start, _PIECE_BYTES) for start in range(0, length, _PIECE_BYTES)]
+    last, steps = length - _SAMPLE_BYTES, max(1, samples - 1)
+    return [(number * last // steps, _SAMPLE_BYTES) for number in range(samples)]

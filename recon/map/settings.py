@@ -7,6 +7,7 @@ from typing import Final
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from recon.core.memory import MemorySettings
 from recon.core.settings import Length, Settings
 from recon.map.builders import OccupancySettings
 from recon.map.fusion import FusionSettings
@@ -19,7 +20,6 @@ from recon.map.submaps import SubmapSettings
 from recon.odometry.protocol import Odometry
 from recon.odometry.registry import check_odometry
 from recon.odometry.settings import OdometrySettings, RigSettings
-from recon.run.work import MemorySettings
 from recon.stereo.frame import FilterSettings, StereoSettings
 
 SCALES: Final = (1e-5, 1e3)

@@ -11,10 +11,10 @@ import numpy as np
 
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.work import serial_algebra, side_by_side
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.rig.tracks import THREADS
 from recon.odometry.visual import VisualOdometry
-from recon.run.work import serial_algebra, side_by_side
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 

@@ -21,12 +21,12 @@ from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from recon.core.text import counted, metres, with_unit
+from recon.core.versions import versions
 from recon.io.atomic import write_text
 from recon.report import style
 from recon.report.still import draw_still
 from recon.report.table import NOT_KNOWN
 from recon.run.directory import RunDirectory
-from recon.run.machine import versions
 
 _WEBP_QUALITY: Final = 80
 _NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError
+from recon.core.text import plain
 from recon.core.values import StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64, UInt8, size_text
 from recon.io.cameras.calibration import read_calibration
@@ -20,7 +21,6 @@ from recon.io.fields import write_yaml
 from recon.io.files import naming
 from recon.rig.uncalibrated import rectify_images
 from recon.run.directory import RunDirectory
-from recon.run.run import plain
 from recon.sources.image_names import ImagePairs
 from recon.sources.one_pair import read_pair
 from recon.stereo.rectify.features import map_pixels, match_exactly

@@ -17,7 +17,6 @@ import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
-from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -25,7 +24,7 @@ from typing_extensions import Self
 
 from recon.core.errors import ClusterError, FormatError, MemoryLimitError, OutputError
 from recon.io.atomic import check_targets, exchange, take_lock, write_text
-from recon.io.files import read_text, reading, resolved
+from recon.io.files import read_text, reading, refuse_links, resolved
 
 RECORD: Final = "run.json"
 RECORD_BYTES: Final = 1 << 26  # larger than any record: it lists the files of a run
@@ -55,23 +54,6 @@ def default_folder(command: str) -> Path:
     """Return ``outputs/<command>/<UTC stamp>``."""
     stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S.%fZ")
     return Path("outputs") / command / stamp
-
-
-def refuse_links(folder: Path, *, below: Path | None = None) -> None:
-    """Refuse a folder of ours that has links in it, which may lead to files of anybody.
-
-    From a folder around it on, ``below``, it is reached by no link either.
-    """
-    way = [] if below is None else [folder, *folder.parents][: -len(below.parents) - 1]
-    inside = (
-        Path(place, name)
-        for place, folders, files in os.walk(folder)
-        for name in sorted((*folders, *files))
-    )
-    for path in chain(reversed(way), inside):
-        if path.is_symlink():
-            hint = "remove it; what it leads to stays"
-            raise FormatError("a link in a result folder is not followed", where=path, hint=hint)
 
 
 class RunDirectory:

@@ -13,8 +13,8 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.io.files import StrPath, read_text, reader, reading, resolved
-from recon.run.directory import RECORD, RECORD_BYTES, refuse_links, state_folder
+from recon.io.files import StrPath, read_text, reader, reading, refuse_links, resolved
+from recon.run.directory import RECORD, RECORD_BYTES, state_folder
 from recon.run.run import SUMMARY
 
 STATES: Final = "states.csv"  # of the frames of a drive that was located

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import math
-import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, is_dataclass
 from datetime import datetime, timezone
 from functools import cached_property
 from pathlib import Path
@@ -18,12 +14,13 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.core import progress
+from recon.core.memory import peak_memory_mb
 from recon.core.settings import Settings
+from recon.core.versions import versions
+from recon.core.work import Stopwatch, use_threads
 from recon.io.fields import write_yaml
-from recon.io.files import StrPath, refuse_special, resolved
+from recon.io.files import StrPath, fingerprint, resolved
 from recon.run.directory import RECORD, RunDirectory, default_folder
-from recon.run.machine import peak_memory_mb, versions
-from recon.run.work import Stopwatch, use_threads
 
 CONFIG: Final = "config.yaml"
 SUMMARY: Final = "summary.json"
@@ -144,49 +141,3 @@ class WholeRun(Run):
     """A run whose folder appears, or takes the place of an earlier one, in one step."""
 
     whole = True
-
-
-_PIECE_BYTES: Final = 1 << 20
-_SAMPLE_BYTES: Final = 1 << 12
-
-
-def fingerprint(files: Iterable[Path], *, samples: int | None = None) -> dict[str, Any]:
-    """Return the number, size and one SHA-256 of a list of files, in that order.
-
-    The hash covers each file's name and bytes, so a renamed frame changes it too. To tell sources
-    apart without reading a large drive, it covers of each larger file ``samples`` pieces of 4 KiB,
-    evenly spread from its first byte to its last. A pipe or device is a `FormatError`.
-    """
-    digest, count, size = hashlib.sha256(), 0, 0
-    for path in files:
-        refuse_special(path)
-        length = path.stat().st_size
-        digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
-        with path.open("rb", buffering=0) as content:
-            for start, many in _pieces(length, samples):
-                content.seek(start)
-                digest.update(content.read(many))
-        count, size = count + 1, size + length
-    return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
-
-
-def _pieces(length: int, samples: int | None) -> list[tuple[int, int]]:
-    """Return first byte and number of bytes of what is hashed of a file: all of it, or samples."""
-    if samples is None or length <= samples * _SAMPLE_BYTES:
-        # In pieces: a recording may be larger than memory.
-        return [(start, _PIECE_BYTES) for start in range(0, length, _PIECE_BYTES)]
-    last, steps = length - _SAMPLE_BYTES, max(1, samples - 1)
-    return [(number * last // steps, _SAMPLE_BYTES) for number in range(samples)]
-
-
-def plain(value: Any) -> Any:
-    """Convert a value for JSON: dataclasses to mappings, NaN and infinity to None."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

@@ -28,8 +28,7 @@ from recon.core.settings import Settings
 from recon.io.atomic import take_lock, write_text
 from recon.io.download import OnBytes, download, unpack
 from recon.io.fields import read_toml
-from recon.io.files import read_text, reading
-from recon.run.directory import refuse_links
+from recon.io.files import read_text, reading, refuse_links
 
 _LIST: Final = Path(__file__).with_suffix(".toml")
 RECORD: Final = "dataset.json"  # what was fetched, and size and hash of each file

@@ -22,8 +22,8 @@ from recon.core.values import (
     Trajectory,
 )
 from recon.core.values.arrays import Float64
+from recon.io.files import fingerprint
 from recon.io.trajectory import read_tum
-from recon.run.run import fingerprint
 from recon.sources.settings import SourceSettings
 
 

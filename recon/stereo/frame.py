@@ -29,7 +29,7 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import Float32, UInt8
-from recon.run.work import Stopwatch
+from recon.core.work import Stopwatch
 from recon.stereo import open3d_clouds
 from recon.stereo.kernels import points
 from recon.stereo.match.protocol import Matcher

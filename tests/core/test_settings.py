@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, field_validator
 from recon.cli.options import parse_numbers as parse_option
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import MissingDependencyError, ReconError, SettingsError, require
+from recon.core.memory import parse_size_mb
 from recon.core.settings import Settings
 from recon.core.text import (
     counted,
@@ -27,7 +28,6 @@ from recon.io.files import read_table
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_frames
 from recon.rig.capture import RecordingSettings
-from recon.run.work import parse_size_mb
 from recon.sources.times import read_dates, read_stamped_names
 from recon.street.settings import StreetScene
 from tests.scenery.bounds import numbers_of

@@ -15,10 +15,12 @@ import yaml
 from recon.core.errors import FormatError, OutputError
 from recon.core.progress import Silent, showing
 from recon.core.settings import Settings
+from recon.core.text import plain
 from recon.io.atomic import exchange
+from recon.io.files import fingerprint, refuse_links
 from recon.run import directory
-from recon.run.directory import RunDirectory, refuse_links, state_folder
-from recon.run.run import Run, WholeRun, fingerprint, plain
+from recon.run.directory import RunDirectory, state_folder
+from recon.run.run import Run, WholeRun
 
 
 class _Size(Settings):

@@ -14,7 +14,7 @@ import numpy as np
 
 from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.plugins import name_of
-from recon.core.text import counted
+from recon.core.text import counted, plain
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float32
 from recon.evaluation.middlebury.score import (
@@ -38,7 +38,6 @@ from recon.io.middlebury import (
     scene_root,
     stand_in_camera,
 )
-from recon.run.run import plain
 from recon.stereo.frame import StereoSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import check_matcher, make_matcher, searched_ndisp

@@ -20,6 +20,7 @@ from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32, Int64
 from recon.core.values.cloud import Frame
+from recon.core.work import available_cores, side_by_side
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import (
     Plane,
@@ -42,8 +43,6 @@ from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
-from recon.run.machine import available_cores
-from recon.run.work import side_by_side
 
 WHOLE: Final = "mesh/mesh.ply"
 LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where the run has no other cloud

@@ -20,6 +20,8 @@ import numpy as np
 from recon.core.errors import FormatError, ReconError, RegistrationError
 from recon.core.values import RectifiedPair, Trajectory
 from recon.core.values.arrays import tree_of
+from recon.core.versions import versions
+from recon.core.work import Stopwatch, look_ahead, work_in_background
 from recon.io.files import reading
 from recon.map.builders import thin_rays
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
@@ -32,8 +34,6 @@ from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.rig.tracks import LiveTracks
 from recon.places.detector import LastView, NewViews
 from recon.places.keyframe import coarse_of
-from recon.run.machine import versions
-from recon.run.work import Stopwatch, look_ahead, work_in_background
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 

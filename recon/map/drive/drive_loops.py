@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.work import Stopwatch
 from recon.map.store.session import Keyframes
 from recon.odometry.protocol import OdometryHealth
 from recon.places.adjustment import Adjustment, adjust_path
 from recon.places.closure import Closure, DrivePath, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.places import path_lengths
-from recon.run.work import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
 _TELLING: Final = 3  # implausible place recognitions from which a warning is given

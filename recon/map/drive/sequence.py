@@ -27,6 +27,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import depth_from_disparity
+from recon.core.work import available_cores, serial_algebra
 from recon.map.drive.drive import Drive, Workspace
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, imu_of, odometry_of
@@ -45,8 +46,6 @@ from recon.odometry.rig.tracks import LiveTracks, StereoTracks
 from recon.odometry.sfm.find import SfmOptions, find_poses
 from recon.odometry.sfm.found import FoundOdometry, FoundPoses
 from recon.odometry.visual import VisualOdometry
-from recon.run.machine import available_cores
-from recon.run.work import serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedFrame
 

@@ -15,13 +15,13 @@ from recon.core.progress import series, stage
 from recon.core.text import counted
 from recon.core.values import OccupancyGrid, StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
+from recon.core.work import look_ahead, serial_algebra
 from recon.map.drive.drive import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
-from recon.run.work import look_ahead, serial_algebra
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
 

@@ -21,6 +21,7 @@ from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply
 from recon.core.values import RayCloud
 from recon.core.values.arrays import Bool, Float64
+from recon.core.work import side_by_side
 from recon.io.files import resolved
 from recon.map.cut import Cutter, TileKey, TileParts
 from recon.map.occupancy.bodies import Looks
@@ -32,7 +33,6 @@ from recon.map.store.records import Store
 from recon.map.store.session import Session, Submaps
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
-from recon.run.work import side_by_side
 
 Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
 """Calls a function with each of several values, somewhere, and waits until all are done."""

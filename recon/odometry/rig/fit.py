@@ -15,6 +15,7 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
+from recon.core.work import serial_algebra, side_by_side
 from recon.odometry.kernels import bundle
 from recon.odometry.pose import (
     CAUCHY_SIGMAS,
@@ -28,7 +29,6 @@ from recon.odometry.pose import (
 )
 from recon.odometry.rig.fault import Places, RigFault, shrink
 from recon.odometry.rig.tracks import THREADS, StereoTracks
-from recon.run.work import serial_algebra, side_by_side
 
 _ROUNDS: Final = 32  # times at most that all windows are adjusted, without the fault as known then
 _LAST_STEP: Final = 0.5  # length of a step, in standard deviations, after which there is no other

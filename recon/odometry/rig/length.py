@@ -16,13 +16,13 @@ from recon.core.errors import RegistrationError, SettingsError
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.work import look_ahead, serial_algebra
 from recon.odometry.health import RIG_BASELINE, expected_drift, trusted_poses
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.rig.fault import shrink
 from recon.odometry.rig.tracks import plan_stretches
 from recon.odometry.visual import VisualOdometry
-from recon.run.work import look_ahead, serial_algebra
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import make_transform
 from recon.core.progress import stage
-from recon.core.text import metres
+from recon.core.text import metres, plain
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
@@ -27,7 +27,6 @@ from recon.odometry.rig.length import SeenBaseline
 from recon.odometry.rig.rigidity import Rigidity, measure_rigidity
 from recon.odometry.rig.tracks import FRAMES, StereoTracks, plan_stretches, track_stretches
 from recon.odometry.settings import RigSettings
-from recon.run.run import plain
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.rectify.features import match_features, pool_features

@@ -12,12 +12,11 @@ import numpy as np
 from recon.core.progress import tracked
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
+from recon.core.work import available_cores, serial_algebra, side_by_side
 from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.pose import TrackWindow
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
-from recon.run.machine import available_cores
-from recon.run.work import serial_algebra, side_by_side
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 

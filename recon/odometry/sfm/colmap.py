@@ -17,8 +17,8 @@ from recon.core.errors import require
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, UInt8
+from recon.core.work import side_by_side
 from recon.odometry.sfm.found import Model
-from recon.run.work import side_by_side
 
 _PIXELS: Final = 1_300_000
 """Of the image in which features are found; larger ones are shrunk. They stay accurate to a tenth

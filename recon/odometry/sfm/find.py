@@ -17,9 +17,9 @@ from pathlib import Path
 
 from recon.core.errors import RegistrationError, SettingsError
 from recon.core.text import counted
+from recon.core.work import Stopwatch
 from recon.odometry.sfm.colmap import Colmap, load_colmap
 from recon.odometry.sfm.found import FoundPoses
-from recon.run.work import Stopwatch
 from recon.sources.source import StereoSource
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
 from recon.core.progress import stage
+from recon.core.text import plain
 from recon.core.values import Disparity, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
@@ -20,7 +21,6 @@ from recon.rig.audit.measures import find_gaps
 from recon.rig.audit.sample import Look, measure_geometry, take_sample
 from recon.rig.settings import AuditedSettings
 from recon.rig.written import form_of, nearest_of_kalibr, write_rig
-from recon.run.run import plain
 from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor

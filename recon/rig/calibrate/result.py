@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.text import plain
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.rig.calibrate.board_views import BoardViews
@@ -18,7 +19,6 @@ from recon.rig.calibrate.stereo import StereoFit
 from recon.rig.calibrate.verdict import TILT_DEG
 from recon.rig.settings import CalibratedSettings
 from recon.rig.written import CalibrationForm, write_rig
-from recon.run.run import plain
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 _CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there

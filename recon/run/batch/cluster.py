@@ -14,8 +14,8 @@ from typing import Any, Final
 from uuid import uuid4
 
 from recon.core.errors import ClusterError, ReconError, SettingsError, require
+from recon.core.work import available_cores
 from recon.run.batch.job import Job, Outcome, last_outcome, run_job
-from recon.run.machine import available_cores
 
 EXTRA: Final = "cluster"
 _REACH_S: Final = 20.0

@@ -25,8 +25,8 @@ from pydantic.dataclasses import dataclass as checked
 
 from recon.core.errors import OutputError
 from recon.io.atomic import is_locked
-from recon.io.files import reading
-from recon.run.directory import RECORD, STARTED, lock_file, refuse_links, state_folder
+from recon.io.files import reading, refuse_links
+from recon.run.directory import RECORD, STARTED, lock_file, state_folder
 from recon.run.run import SUMMARY, Run
 
 State = Literal["not run", "running", "succeeded", "failed", "broken"]

@@ -1,9 +1,8 @@
-"""Work and its cost: what runs at the same time, in how much memory; seconds."""
+"""Threads, and the seconds that stages take."""
 
 from __future__ import annotations
 
 import os
-import re
 import sys
 import threading
 import time
@@ -14,15 +13,17 @@ from contextlib import contextmanager
 from typing import Final, TypeVar
 
 import cv2
-from pydantic import Field
 from threadpoolctl import threadpool_limits
-
-from recon.core.errors import MemoryLimitError, SettingsError
-from recon.core.settings import Settings
-from recon.run.machine import available_cores, peak_memory_mb, return_free_memory
 
 _NICER: Final = 5
 """How much nicer background threads are: beside another on one core they get a quarter."""
+
+
+def available_cores() -> int:
+    """Return cores that this process may use; in a container, fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def use_threads(threads: int | None) -> int:
@@ -129,64 +130,6 @@ class OneBehind:
         """Wait until the last job has ended, ignoring its errors; no other can start."""
         self._job = None
         self._pool.shutdown(wait=True)
-
-
-_UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
-_SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", re.ASCII)
-#: Shares of the limit for an open submap, the cells of one tile, and what was read from the map.
-#: Sums grow by doubling and are copied when closed, so each briefly costs several times its size;
-#: most of the limit is left to the libraries, the images and the matcher.
-_SUBMAP_SHARE: Final = 1 / 40
-_TILE_SHARE: Final = 1 / 24
-_CACHE_SHARE: Final = 1 / 10
-_CACHE_BYTES: Final = 100_000_000
-
-
-class MemorySettings(Settings):
-    """How much memory a run may take."""
-
-    limit_mb: float | None = Field(None, ge=1.0, le=1_000_000_000.0)
-    """Largest resident memory of the process, in 10⁶ bytes; none = no limit. Submaps and tiles are
-    made smaller to meet it, so results may differ by rounding."""
-
-    @property
-    def submap_bytes(self) -> int | None:
-        """Size at which a submap is closed; None = closed by the path alone."""
-        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _SUBMAP_SHARE)
-
-    @property
-    def tile_bytes(self) -> int | None:
-        """Largest size of a tile's cells before they are merged; None = unlimited."""
-        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _TILE_SHARE)
-
-    @property
-    def cache_bytes(self) -> int:
-        """Most that is kept in memory of what was read from a map."""
-        return _CACHE_BYTES if self.limit_mb is None else int(1e6 * self.limit_mb * _CACHE_SHARE)
-
-    def check(self, where: str) -> None:
-        """Stop a run that exceeds the limit; else return what is free, for what comes next."""
-        if self.limit_mb is None:
-            return
-        if peak_memory_mb() > self.limit_mb:
-            raise MemoryLimitError(
-                "the memory limit cannot be kept",
-                where=where,
-                got=f"{peak_memory_mb():.0f} MB",
-                expected=f"at most {self.limit_mb:g} MB",
-                hint="give more with --memory-limit, or take smaller images, fewer disparities "
-                "or a coarser map",
-            )
-        return_free_memory()
-
-
-def parse_size_mb(text: str) -> float:
-    """Parse a size into 10⁶ bytes, which is also the unit if none is given."""
-    found = _SIZE.fullmatch(text)
-    unit = None if found is None else _UNITS_MB.get(found[2].upper())
-    if found is None or unit is None or float(found[1]) == 0:
-        raise SettingsError("cannot read this size", got=text, expected="such as 2G or 1500M")
-    return float(found[1]) * unit
 
 
 class Stopwatch:

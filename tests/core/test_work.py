@@ -17,24 +17,18 @@ from hypothesis import strategies as st
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.core import memory as memory_file
+from recon.core import work as work_file
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
+from recon.core.memory import MemorySettings, parse_size_mb, peak_memory_mb
 from recon.core.values import PointCloud, join_clouds, join_voxels
+from recon.core.work import OneBehind, available_cores, look_ahead, side_by_side, use_threads
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.store.records import Store
 from recon.map.store.session import Submaps
 from recon.map.tiles import Tiles
-from recon.run import work as work_file
-from recon.run.machine import available_cores, peak_memory_mb
-from recon.run.work import (
-    MemorySettings,
-    OneBehind,
-    look_ahead,
-    parse_size_mb,
-    side_by_side,
-    use_threads,
-)
 from tests.run.pools import observed_pool
 from tests.scenery.kitti import street_drive
 from tests.scenery.patience import LONG_S
@@ -142,7 +136,7 @@ T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 
 def test_the_peak_is_that_of_the_process_alone_and_stays():
     ballast = np.ones(100_000_000)  # 800 MB
-    code = "from recon.run.machine import peak_memory_mb; print(peak_memory_mb())"
+    code = "from recon.core.memory import peak_memory_mb; print(peak_memory_mb())"
     below_mb = float(subprocess.check_output([sys.executable, "-c", code], text=True))
     peak_mb = peak_memory_mb()
     assert peak_mb > ballast.nbytes / 1e6
@@ -161,9 +155,9 @@ def test_a_size_is_read_in_its_unit_and_what_takes_more_than_the_limit_is_one_li
     free, limited = MemorySettings(), MemorySettings(limit_mb=500)
     assert (free.submap_bytes, free.tile_bytes) == (None, None)
     assert 0 < (limited.submap_bytes or 0) < (limited.tile_bytes or 0) < limited.cache_bytes < 1e8
-    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: 500.0)
+    monkeypatch.setattr(memory_file, "peak_memory_mb", lambda: 500.0)
     limited.check("frame 7")
-    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: 512.0)
+    monkeypatch.setattr(memory_file, "peak_memory_mb", lambda: 512.0)
     free.check("frame 7")
     with pytest.raises(MemoryLimitError, match=r"^frame 7: .*got 512 MB.*at most 500 MB") as caught:
         limited.check("frame 7")
@@ -192,7 +186,7 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(monke
     assert len(stores[0]) == 1
     assert len(stores[1]) > 3
     # The limit is that of a map alone here: the libraries of the test take more.
-    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: 0.0)
+    monkeypatch.setattr(memory_file, "peak_memory_mb", lambda: 0.0)
     maps = [
         Tiles.of_submaps(store, config, T_MAP_WORLD)
         for store, config in zip(stores, (free, limited), strict=True)
@@ -216,7 +210,7 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(monke
 @pytest.mark.usefixtures("blank_figures")
 def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(tmp_path, monkeypatch):
     peaks = iter([400.0] * 6)
-    monkeypatch.setattr(work_file, "peak_memory_mb", lambda: next(peaks, 600.0))
+    monkeypatch.setattr(memory_file, "peak_memory_mb", lambda: next(peaks, 600.0))
     drive, out = street_drive(tmp_path / "drive", 12, speed_m_per_frame=0.5), tmp_path / "run"
     overrides = ["checkpoints.every_frames=4", "submaps.length_m=4", "memory.limit_mb=500"]
     config = load_config(None, overrides)
