@@ -31,13 +31,14 @@ from recon.commands.demo import demo_source
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
+from recon.core.work import serial_algebra
 from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.images.image import write_image
 from recon.io.trajectory import read_kitti_poses, write_kitti_poses
+from recon.look.look import refine_rig
+from recon.look.rig import RefinedRig
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
-from recon.odometry.rig.refine import RefinedRig, refine_rig
-from recon.core.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor

@@ -27,11 +27,11 @@ from altered_drives import Altered, alterations
 from recon.commands.config import load_config
 from recon.core.values import RectifiedCamera, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
+from recon.core.work import serial_algebra
 from recon.evaluation.trajectory import TrajectoryRules, compare_paths
 from recon.odometry.health import RIG_BASELINE, RIG_DISPARITY_PX, RIG_YAW_DEG, expected_drift
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
-from recon.core.work import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

@@ -39,10 +39,10 @@ import psutil
 from distributed import Client, LocalCluster
 
 from recon.core.values import RectifiedCamera
+from recon.core.work import available_cores
 from recon.io.images.image import write_image
 from recon.run.batch.cluster import Cluster, local_cluster
 from recon.run.batch.job import Job, Outcome
-from recon.core.work import available_cores
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti

@@ -21,8 +21,8 @@ import checkout  # noqa: F401 - what is measured
 from altered_drives import alterations, run
 
 from recon.commands.config import load_config
+from recon.look.look import refine_rig
 from recon.odometry.registry import make_odometry
-from recon.odometry.rig.refine import refine_rig
 from recon.odometry.settings import OdometrySettings
 from recon.sources.registry import open_source
 

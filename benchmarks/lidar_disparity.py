@@ -38,7 +38,8 @@ from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import project
 from recon.io.models.ply import read_ply
-from recon.odometry.rig.refine import RefinedRig, refine_rig
+from recon.look.look import refine_rig
+from recon.look.rig import RefinedRig
 from recon.odometry.settings import RigSettings
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource

@@ -35,8 +35,8 @@ from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
-from recon.map.builders import OccupancyBuilder, OccupancySettings
 from recon.core.work import available_cores
+from recon.map.builders import OccupancyBuilder, OccupancySettings
 from recon.sources.registry import open_source
 
 Int64 = NDArray[np.int64]

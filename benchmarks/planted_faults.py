@@ -23,9 +23,10 @@ from altered_drives import alterations, run
 
 from recon.commands.config import load_config
 from recon.core.values import StereoCalibration
+from recon.look.fault import NAMES, RigFault, without_fault
+from recon.look.look import refine_rig
+from recon.look.rig import DEPTHS_M, RefinedRig, RigChange, compare_rigs
 from recon.odometry.registry import make_odometry
-from recon.odometry.rig.fault import NAMES, RigFault, without_fault
-from recon.odometry.rig.refine import DEPTHS_M, RefinedRig, RigChange, compare_rigs, refine_rig
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 from recon.stereo.rectify.rectifier import turns_of

@@ -1,7 +1,7 @@
 """Whether a rig that is refined knows its error: how often its 95 % intervals hold.
 
 Short drives through rendered streets are given calibrations that are off by random amounts: each
-term of both lenses by three times what `recon.odometry.rig.fault` expects, the right camera by
+term of both lenses by three times what `recon.look.fault` expects, the right camera by
 0.3° and 0.5 % of its focal length. Images get noise of their own in each case. An interval holds if
 what is left of the disparity error at a place of the image, of the yaw, or of the length of the
 path that the windows show is within 1.96 of its standard deviations.
@@ -24,11 +24,12 @@ import numpy as np
 from recon.commands.config import load_config
 from recon.core.values import RectifiedCamera, Rig, StereoPair
 from recon.core.values.arrays import Float64, UInt8
+from recon.look.fault import NAMES, TURN, RigFault, spread_pixels, without_fault
+from recon.look.fit import FittedFault
+from recon.look.look import refine_rig
+from recon.look.rig import DEPTHS_M, compare_rigs
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
-from recon.odometry.rig.fault import NAMES, TURN, RigFault, spread_pixels, without_fault
-from recon.odometry.rig.fit import FittedFault
-from recon.odometry.rig.refine import DEPTHS_M, compare_rigs, refine_rig
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource
 from recon.sources.synthetic import SyntheticSource

@@ -21,8 +21,8 @@ from recon.commands.config import load_config
 from recon.core.geometry import se3
 from recon.core.geometry.alignment import fit_points
 from recon.core.values import StereoPair
+from recon.look.look import refine_rig
 from recon.map.drive.sequence import map_sequence
-from recon.odometry.rig.refine import refine_rig
 from recon.places.loop import Loop
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene

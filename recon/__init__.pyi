@@ -58,7 +58,7 @@ from recon.odometry.protocol import Odometry as Odometry
 from recon.odometry.protocol import OdometryFrame as OdometryFrame
 from recon.odometry.protocol import OdometryHealth as OdometryHealth
 from recon.odometry.protocol import OdometryResult as OdometryResult
-from recon.rig.audit.audit import Audit as Audit
+from recon.rig.audit import Audit as Audit
 from recon.sources.one_pair import PairInput as PairInput
 from recon.sources.registry import open_source as open_source
 from recon.sources.settings import SourceSettings as SourceSettings

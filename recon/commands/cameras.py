@@ -20,7 +20,7 @@ from recon.io.files import StrPath
 from recon.io.images.image import write_image
 from recon.report.audit_page import write_audit_page
 from recon.report.calibration_page import write_calibration_page, write_epipolar_images
-from recon.rig.audit.audit import Audit, audit_source, correct_calibration
+from recon.rig.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
 from recon.rig.calibrate.bootstrap import measure_spread
 from recon.rig.calibrate.result import CalibrationRun, describe_calibration, write_calibration

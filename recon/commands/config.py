@@ -28,9 +28,10 @@ from recon.evaluation.paper import PaperConfig
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings
 from recon.io.fields import parse_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
+from recon.look.settings import AuditedSettings
 from recon.map.settings import DriveSettings
 from recon.rig.capture import CaptureSettings
-from recon.rig.settings import AuditedSettings, CalibratedSettings
+from recon.rig.settings import CalibratedSettings
 from recon.run.finished import is_pair_run
 from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings

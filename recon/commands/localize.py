@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map import refine_drive, run_map
+from recon.commands.map import look_first, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.progress import Silent, showing, stage
@@ -18,13 +18,12 @@ from recon.export.trajectories import begin_states, export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
 from recon.map.drive.drive import Workspace
-from recon.map.drive.scale import look_at_scene
+from recon.map.drive.scale import measure_scene
 from recon.map.drive.sequence import map_sequence
 from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
-from recon.rig.audit.audit import quick_warnings
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
 from recon.sources.source import DerivedSource, StereoSource
@@ -54,8 +53,6 @@ def run_localize(
     config, options = config or load_config(), options or MapOptions(command="localize")
     map_path = Path(map_path)
     refuse_as_target(map_path, options.out)
-    findings = quick_warnings(source, config) if options.audit else ()
-    options.warn(findings)
     with (
         Map.open(map_path, cache_bytes=config.memory.cache_bytes) as map_,
         options.run(config.at_scale(map_.first.scale)) as run,
@@ -63,9 +60,8 @@ def run_localize(
         folder = map_path if map_path.is_dir() else None
         inputs = [*source.files, map_path if folder is None else folder / MAP_FILE]
         run.check_targets(inputs)
-        rig = refine_drive(source, config, run, map_.known_rig(source.calibration))
-        options.warn(rig.not_rigid)
-        source = rig.applied(source)
+        before = look_first(source, config, options, run, map_.known_rig(source.calibration))
+        rig, source = before.rig, before.drive
         workspace = Workspace(map_, run.watch, run.threads)
         T_map_world = map_.first.T_map_world.tolist()
         where = {"map_run": str(map_path), "T_map_world": T_map_world}
@@ -76,8 +72,13 @@ def run_localize(
         grid = read_nav2(map_path / GRID) if has_grid else None
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, **where, **drive.figures())
-        seen = [*findings, *rig.warnings(findings), *drive.warnings(), *source.warnings()]
-        warnings = [*rig.not_rigid, *map_.doubts, *seen]
+        seen = [
+            *before.findings,
+            *rig.warnings(before.findings),
+            *drive.warnings(),
+            *source.warnings(),
+        ]
+        warnings = [*before.first, *map_.doubts, *seen]
         made.summary["warnings"], made.summary["rig"] = warnings, rig.figures()
         made.summary.update(source.figures())
         with run.stage("write"):
@@ -137,7 +138,8 @@ def run_live(
     stage("warm up")
     with Map.temporary() if map_path is None else Map.open(map_path) as map_, showing(Silent()):
         if map_path is None:
-            config = config.at_scale(look_at_scene(beginning, config).scale)
+            scene = measure_scene(beginning, beginning.calibration, config)
+            config = config.at_scale(scene.scale)
             map_sequence(first, config, workspace=Workspace(map_))
         else:
             localize_sequence(first, Workspace(map_), config)

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions
@@ -18,13 +18,13 @@ from recon.core.errors import (
     OutputError,
     ReconError,
     SettingsError,
+    SourceError,
 )
 from recon.core.plugins import name_of
 from recon.core.text import counted, plain
 from recon.core.values import (
     OccupancyGrid,
     PointCloud,
-    Trajectory,
     TrajectoryMetrics,
     TriangleMesh,
 )
@@ -33,9 +33,13 @@ from recon.export.make import Products, make
 from recon.export.product import Order
 from recon.export.trajectories import export_paths
 from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.look.findings import find_faults
+from recon.look.length import check_length, see_baseline
+from recon.look.look import Look, look_at
+from recon.look.rig import DEPTHS_M, KnownRig, RefinedRig, rig_shown
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.scale import Scene, look_at_scene
+from recon.map.drive.scale import Scene, measure_scene
 from recon.map.drive.sequence import MappedSequence, break_warnings, check_map, map_sequence
 from recon.map.map import Map
 from recon.map.store.finished import keep_map
@@ -43,16 +47,14 @@ from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
 from recon.odometry.prior import MotionPrior
 from recon.odometry.registry import check_odometry
-from recon.odometry.rig.length import check_length, see_baseline
-from recon.odometry.rig.refine import DEPTHS_M, KnownRig, RefinedRig, refine_rig, rig_shown
 from recon.odometry.sfm.find import check_sfm
-from recon.report.map_page import map_content
-from recon.report.page import write_page
-from recon.rig.audit.audit import check_related, quick_warnings
+from recon.rig.audit import check_related
 from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.run import Run
 from recon.sources.calibration import RIG_FILE
 from recon.sources.source import StereoSource, check_source
+
+_SAID: Final = frozenset({"rig", "nonrigid", "lag"})  # findings that a run says anyway
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,15 +120,10 @@ def run_map(
     check_odometry(config.odometry.method)
     if config.odometry.method == "sfm" and options.known_poses is None:
         refuse_with_sfm(source, options)
-    findings = quick_warnings(source, config) if options.audit else ()
-    if options.audit and options.known_poses is not None:
-        findings += doubt_poses(options.known_poses, source, config)
-    options.warn(findings)
-    with _begun(source, config, options) as (run, map_, found, scene, config):
+    with _begun(source, config, options) as (run, map_, seen, scene, config):
+        found, findings, source = seen.rig, seen.findings, seen.drive
         if config.rig.refine:
             map_.session().set_rig(found)
-        options.warn(found.not_rigid)
-        source = found.applied(source)
         if options.known_poses is not None and found.refined:
             poses = found.poses(options.known_poses, config.rectification)
             options = replace(options, known_poses=poses)
@@ -135,7 +132,7 @@ def run_map(
         mapped = map_drive(source, config, options, run, map_)
         rig = _shown_live(mapped, source, config, run) if source.live else found
         with run.stage("cloud"):
-            check_map(mapped, source.name, (*found.not_rigid, *findings))
+            check_map(mapped, source.name, (*seen.first, *findings))
         made = make(Order(map_, mapped.placed, run, config.mesh), options.products)
         with run.stage("compare"):
             given = options.known_poses is not None
@@ -147,7 +144,7 @@ def run_map(
         breaks = break_warnings(mapped)
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
         known = [*first, *breaks, *findings]
-        warnings = [*found.not_rigid, *known, *doubts, *made.warnings, *errors.warnings]
+        warnings = [*seen.first, *known, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         result.summary["typical_depth_m"] = scene.depth_m
@@ -155,6 +152,10 @@ def run_map(
             export_paths(map_.first, mapped.joined, made.camera_height_m, run)
             keep_map(map_, run.path(MAP_FILE))
         with run.report(result.summary):
+            # Its figures take long to load, and the drive is mapped without them.
+            from recon.report.map_page import map_content  # noqa: PLC0415
+            from recon.report.page import write_page  # noqa: PLC0415
+
             shown = map_content(map_, made, errors, mapped.sample, rig)
             write_page("map", run, result.summary, **shown)
         config.memory.check("report")
@@ -178,43 +179,94 @@ def refuse_with_sfm(source: StereoSource, options: MapOptions) -> None:
 @contextmanager
 def _begun(
     source: StereoSource, config: ReconConfig, options: MapOptions
-) -> Iterator[tuple[Run, Map, RefinedRig, Scene, ReconConfig]]:
-    """Begin a run and its map, once it is known what the drive shows of its rig and its scene.
+) -> Iterator[tuple[Run, Map, Seen, Scene, ReconConfig]]:
+    """Begin a run and its map, once it is known what a look at the drive shows.
 
     The settings are those of the map, in which lengths that are not set follow from the scene.
     """
     with options.run(config) as run, with_resume_hint(run, source):
-        rig = refine_drive(source, config, run, prior=options.prior)
-        scene = look_at_scene(rig.applied(source), config)
-        fitted = config.at_scale(scene.scale)
+        seen = look_first(source, config, options, run)
+        scene = measure_scene(seen.look.recorded, seen.rig.calibration, config)
+        fitted = seen.shifted(config).at_scale(scene.scale)
         run.settle(fitted)
-        with options.begin(run, source, fitted) as map_:
+        with options.begin(run, seen.look.source, fitted) as map_:
             options.begun(run.folder)
-            yield run, map_, rig, scene, fitted
+            yield run, map_, seen, scene, fitted
 
 
-def refine_drive(
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What is known of a drive before it is mapped or localized."""
+
+    look: Look
+    rig: RefinedRig  # with the baseline that measured lengths show, if there are any
+    findings: tuple[str, ...]  # what is wrong with the recording
+
+    @property
+    def first(self) -> tuple[str, ...]:
+        """What to know first of all; else empty."""
+        return self.look.first
+
+    @property
+    def drive(self) -> StereoSource:
+        """The drive as it is to be read: with the rig to be used, its images in step."""
+        return self.rig.applied(self.look.source)
+
+    def shifted(self, config: ReconConfig) -> ReconConfig:
+        """Return the settings by which the drive is read as it was looked at."""
+        if not self.look.shifted:
+            return config
+        by = {"shift_frames": self.look.source.shift_of(0)}
+        return config.model_copy(update={"source": config.source.model_copy(update=by)})
+
+
+def look_first(
     source: StereoSource,
     config: ReconConfig,
+    options: MapOptions,
     run: Run,
     known: KnownRig | None = None,
-    prior: Trajectory | None = None,
-) -> RefinedRig:
-    """Refine the rig of a drive; the folder of the run gets its calibration."""
-    guide = None if prior is None else MotionPrior(prior, config.odometry.prior)
+) -> Seen:
+    """Look at a drive, and say what is wrong; the folder of the run gets its calibration.
+
+    Raises:
+        SourceError: One camera is late by whole frames, and the images cannot be paired otherwise:
+            whatever is made of them is wrong.
+    """
+    guide = None if options.prior is None else MotionPrior(options.prior, config.odometry.prior)
     measured = config.source.length or guide
     if config.source.length is not None:
         check_length(source, config.source.length)
-    with run.stage("rig"):
-        rig = refine_rig(source, config, config.rig, known)
+    with run.stage("look"):
+        look = look_at(source, config, config.rig, known=known)
+        if look.sample.broken is not None:
+            raise look.sample.broken
+        findings = _findings(look, config, options)
+        options.warn((*look.first, *findings))
+        rig = look.rig
         if rig.rigidity is not None and not rig.rigidity.frames:
-            check_related(source, config)
+            check_related(look, config)
         if measured is not None:
-            seen = see_baseline(rig.applied(source), config, measured, rig.length_share)
+            seen = see_baseline(rig.applied(look.source), config, measured, rig.length_share)
             rig = rig if seen is None else rig.with_baseline(seen, config.rig)
         if rig.refined:
             write_recon_calibration(run.path(RIG_FILE), rig.calibration)
-        return rig
+        return Seen(look, rig, findings)
+
+
+def _findings(look: Look, config: ReconConfig, options: MapOptions) -> tuple[str, ...]:
+    """Return what is wrong with a drive, but what is said of its rig."""
+    if not (options.audit and config.audit.quick) or look.source.live:
+        return ()
+    found = find_faults(look, config)
+    for finding in found:
+        if finding.code == "lag" and finding.fatal:
+            what = "left and right images are of different moments"
+            raise SourceError(what, where=look.source.name, got=finding.text)
+    lines = tuple(f"{one.text} [quick audit]" for one in found if one.code not in _SAID)
+    if options.known_poses is None:
+        return lines
+    return (*lines, *doubt_poses(options.known_poses, look.source, config))
 
 
 def _shown_live(

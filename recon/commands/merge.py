@@ -15,13 +15,14 @@ import numpy as np
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.export import REMADE
-from recon.commands.map import map_drive, refine_drive
+from recon.commands.map import look_first, map_drive
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, ReconError, SettingsError
 from recon.export.make import make
 from recon.export.product import Order
 from recon.export.trajectories import export_sessions
 from recon.io.files import resolved
+from recon.look.rig import RefinedRig
 from recon.map.drive.drive import session_info
 from recon.map.drive.sequence import check_map
 from recon.map.map import Map
@@ -32,9 +33,7 @@ from recon.map.sessions.placed import place_map, settings_of
 from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.session import Session
-from recon.odometry.rig.refine import RefinedRig
 from recon.report.map_page import write_joined_page
-from recon.rig.audit.audit import quick_warnings
 from recon.run.finished import command_of_map, refuse_as_target
 from recon.run.run import Run, WholeRun
 from recon.sources.source import StereoSource
@@ -105,13 +104,13 @@ def run_map_into(
         _copied(folder / MAP_FILE, map_, settings)
         kept = run.state("kept.recon")
         known = map_.known_rig(source.calibration)
-        options.warn(quick_warnings(source, settings) if options.audit else ())
-        rig = refine_drive(source, settings, run, known, options.prior)
-        options.warn(rig.not_rigid)
+        seen = look_first(source, settings, options, run, known)
+        rig, drive_settings = seen.rig, seen.shifted(settings)
         with Map.create(run.state("drive.recon")) as drive:
-            drive.begin(session_info(source, settings, options.images_of(source)))
-            mapped = map_drive(rig.applied(source), settings, options, run, drive)
-            check_map(mapped, source.name, rig.not_rigid)
+            images = options.images_of(seen.look.source)
+            drive.begin(session_info(seen.look.source, drive_settings, images))
+            mapped = map_drive(seen.drive, drive_settings, options, run, drive)
+            check_map(mapped, source.name, seen.first)
             if settings.rig.refine:
                 mapped.session.set_rig(rig)
             keep_map(drive, kept)

@@ -31,7 +31,7 @@ from recon.io.middlebury import stand_in_camera
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.sequence import check_cloud
 from recon.report.pair_page import PairRun, write_disparity_images, write_pair_page
-from recon.rig.audit.audit import check_found, find_pair_faults
+from recon.rig.audit import check_found, find_pair_faults
 from recon.run.run import Run
 from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame

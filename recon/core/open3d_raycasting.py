@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from recon.core.errors import ShapeError
+from recon.core.lazy import Lazy
 from recon.core.values.arrays import Bool, Float32, Float64, Int32
+
+o3d = Lazy("open3d")
 
 _NO_HIT = np.uint32(0xFFFFFFFF)
 

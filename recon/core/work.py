@@ -26,6 +26,10 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+FEW: Final = min(2, available_cores())
+"""Threads for a few large pieces of work, whose results are the same in any number of them."""
+
+
 def use_threads(threads: int | None) -> int:
     """Limit OpenCV to ``threads`` (None = all cores) and return the number in use.
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from recon.core.errors import EvaluationError, RegistrationError
+from recon.core.lazy import Lazy
 from recon.core.values import MapMetrics, PointCloud, Trajectory
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.stereo import open3d_clouds
+
+o3d = Lazy("open3d")
 
 _BAND_PERCENT: Final = (0.1, 99.9)
 _BAND_M: Final = 0.2

@@ -11,9 +11,8 @@ import numpy as np
 
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.core.work import serial_algebra, side_by_side
+from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.odometry.protocol import OdometryFrame, OdometryResult
-from recon.odometry.rig.tracks import THREADS
 from recon.odometry.visual import VisualOdometry
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
@@ -42,7 +41,7 @@ def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[S
     rest = np.linspace(_FIRST, max(_FIRST, len(source) - _FRAMES), _PARTS).astype(int)
     parts = [(0, _FIRST), *((int(start), _FRAMES) for start in np.unique(rest))]
     with serial_algebra():
-        return [run for runs in side_by_side(seen, parts, threads=THREADS) for run in runs]
+        return [run for runs in side_by_side(seen, parts, threads=FEW) for run in runs]
 
 
 def _runs(frames: Iterable[OdometryFrame]) -> Iterator[SeenRun]:

@@ -11,12 +11,12 @@ import numpy as np
 
 from recon.core.text import counted
 from recon.core.values import RectifiedPair
+from recon.look.sample import Inspected
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import disparity_figure, is_wide, pair_figure
 from recon.report.rig_part import rig_content
-from recon.rig.audit.audit import Audit
-from recon.rig.audit.sample import Look
+from recon.rig.audit import Audit
 from recon.run.directory import RunDirectory
 from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
@@ -36,13 +36,13 @@ def write_audit_page(
         source=source,
         lines=audit_lines(audit.summary),
         rig=rig_content(audit.rig),
-        frames=frames_figure(audit.looks) if audit.looks else None,
-        pairs=[_pair(look, look.pair, matcher) for look in audit.looks if look.pair is not None],
+        frames=frames_figure(audit.pairs) if audit.pairs else None,
+        pairs=[_pair(look, look.pair, matcher) for look in audit.pairs if look.pair is not None],
         warnings=[finding.text for finding in audit.findings],
     )
 
 
-def _pair(look: Look, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
+def _pair(look: Inspected, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
     disparity = matcher.match(pair)
     return {
         "index": look.index,
@@ -55,7 +55,7 @@ def _pair(look: Look, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
 
 
 @style.styled
-def rows_figure(look: Look, pair: RectifiedPair) -> bytes:
+def rows_figure(look: Inspected, pair: RectifiedPair) -> bytes:
     """Draw the left image with the row error of each feature."""
     height, width = pair.left.shape
     size_in = style.WIDE_IN if is_wide(pair.left.shape) else style.WIDE_IN / 2
@@ -74,7 +74,7 @@ def rows_figure(look: Look, pair: RectifiedPair) -> bytes:
 
 
 @style.styled
-def frames_figure(looks: Sequence[Look]) -> bytes:
+def frames_figure(looks: Sequence[Inspected]) -> bytes:
     """Draw brightness, sharpness and row error of the measured pairs."""
     labels = ("mean grey level", "sharpness (0 to 1)", "row error (px)\nmedian, middle half")
     figure, (brightness, sharpness, rows) = style.stacked(6.4, "frame", labels)

@@ -17,11 +17,11 @@ from recon.evaluation.trajectory import TrajectoryComparison
 from recon.export.make import Products
 from recon.io.atomic import write_bytes
 from recon.io.models.ply import write_ply
+from recon.look.rig import RefinedRig
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
 from recon.map.store.map_file import MapFile
 from recon.odometry.health import expected_drift
-from recon.odometry.rig.refine import RefinedRig
 from recon.report import drive_figures as figures
 from recon.report import style
 from recon.report.page import write_page

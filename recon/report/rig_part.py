@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from recon.odometry.rig.fault import LENS, LENS_SIGMA_PX
-from recon.odometry.rig.refine import RefinedRig, RigChange
+from recon.look.fault import LENS, LENS_SIGMA_PX
+from recon.look.rig import RefinedRig, RigChange
 from recon.report import style
 from recon.report.scene import Json
 from recon.report.table import NOT_KNOWN

@@ -2,7 +2,7 @@
 
 - `calibrate/board_views.py` finds the board, `calibrate/stereo.py` fits the rig, and
   `calibrate/verdict.py` judges it;
-- `audit/audit.py`: is a recording, or a pair, good enough;
+- `audit.py`: is a recording, or a pair, good enough (`recon.look`); the corrected calibration;
 - `rectification.py`: `recon rectify`, by a calibration or, in `uncalibrated.py`, without;
 - `capture.py`: pairs from cameras; `cameras.py`: the same as a source;
 - `board_sheet.py`: a board to print; `settings.py`: what calibration and audit can be set to.

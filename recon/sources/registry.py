@@ -72,8 +72,14 @@ def open_source(
             hint = "leave it out; --source folders takes image folders of any name"
             settings.refuse_names(("left", "right"), path, hint)
         source = opening[kind](Path(path), settings)
-    rig = Path(path) / RIG_FILE
-    if not isinstance(source, Recording) or settings.has_camera or not rig.is_file():
+    if not isinstance(source, Recording):
+        return source
+
+    def again(shift: int) -> StereoSource:
+        return open_source(path, kind, settings.model_copy(update={"shift_frames": shift}))
+
+    source, rig = replace(source, again=again), Path(path) / RIG_FILE
+    if settings.has_camera or not rig.is_file():
         return source
     note = f"{rig} is not used: the drive has a calibration of its own; --calib takes it instead"
     return source if rig in source.texts else replace(source, notes=(*source.notes, note))

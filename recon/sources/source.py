@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -130,6 +130,10 @@ class StereoSource(ABC):
         """Return ``source.shift_frames`` for right images of so many pairs later; None = none."""
         return None
 
+    def shifted(self, pairs: int) -> StereoSource | None:
+        """Return the same drive with right images of so many pairs later; None = it cannot be."""
+        return None
+
     def read_prior(self, name: str) -> ReadPrior:
         """Read the motion by other sensors: a TUM file, or what else this kind of source has."""
         return ReadPrior(read_tum(name), name)
@@ -200,6 +204,8 @@ class Recording(StereoSource):
     texts: tuple[Path, ...]  # calibration and other text files that were read
     notes: tuple[str, ...] = ()  # on the calibration, for the user
     truth: SequenceTruth | None = None
+    # Opens it again, with right images that were taken so many frames later
+    again: Callable[[int], StereoSource] | None = None
 
     @cached_property
     def left_out(self) -> int:
@@ -219,6 +225,9 @@ class Recording(StereoSource):
     def shift_of(self, pairs: int) -> int:
         chosen = self.listing.chosen
         return self.listing.shift + pairs * (1 if chosen is None else chosen.step)
+
+    def shifted(self, pairs: int) -> StereoSource | None:
+        return None if self.again is None else self.again(self.shift_of(pairs))
 
     def warnings(self) -> list[str]:
         out = self.left_out

@@ -11,7 +11,7 @@ from recon.cli import app
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
-from tests.rig.audit import faults
+from tests.look import faults
 from tests.sources import drives
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

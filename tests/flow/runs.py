@@ -12,11 +12,11 @@ import numpy as np
 from recon.core.errors import FormatError
 from recon.core.progress import Silent
 from recon.core.values import StereoCalibration
+from recon.look.fault import NAMES
+from recon.look.fit import FittedFault
+from recon.look.rig import RefinedRig
 from recon.map.drive.mapper import FrameResult
 from recon.map.map import Map
-from recon.odometry.rig.fault import NAMES
-from recon.odometry.rig.fit import FittedFault
-from recon.odometry.rig.refine import RefinedRig
 from recon.stereo.rectify.row_alignment import correct_rig
 
 ROOT = Path(__file__).parents[2]

@@ -30,7 +30,7 @@ from recon.street.settings import StreetScene
 from tests.commands.test_cameras import FakeCamera
 from tests.flow.runs import all_files, keep_turned_rig, summary_of
 from tests.hostile.refusals import assert_refused, run
-from tests.rig.audit import faults
+from tests.look import faults
 from tests.scenery.film import RIG, film
 from tests.scenery.kitti import write_kitti
 from tests.scenery.patience import be_patient

@@ -14,6 +14,9 @@ import pytest
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import RayCloud, RectifiedCamera
 from recon.io.models.octomap import read_octomap
+from recon.look.fault import NAMES
+from recon.look.fit import FittedFault
+from recon.look.rig import RefinedRig
 from recon.map.builders import OccupancySettings, ray_grain
 from recon.map.fusion import FusedPart, join_fused
 from recon.map.kernels.clamped import CellRows
@@ -25,9 +28,6 @@ from recon.map.store.session import ALONE, BENT, SessionInfo
 from recon.map.store.trees import Link
 from recon.map.submaps import Submap
 from recon.odometry.protocol import OdometryHealth
-from recon.odometry.rig.fault import NAMES
-from recon.odometry.rig.fit import FittedFault
-from recon.odometry.rig.refine import RefinedRig
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import Fixes
 from recon.places.keyframe import Keyframe

@@ -20,10 +20,10 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.evaluation.map_comparison import DriveErrors
+from recon.look.fault import NAMES, RigFault
+from recon.look.fit import FittedFault
+from recon.look.rig import DEPTHS_M, RefinedRig, RigChange
 from recon.odometry.protocol import OdometryHealth
-from recon.odometry.rig.fault import NAMES, RigFault
-from recon.odometry.rig.fit import FittedFault
-from recon.odometry.rig.refine import DEPTHS_M, RefinedRig, RigChange
 from recon.report.scene import T_UPRIGHT_CAMERA
 
 HEIGHT_PX, WIDTH_PX = 24, 60

@@ -29,8 +29,8 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import UInt8
 from recon.evaluation.paper import ABSOLUTE, AS_PRINTED, CORRECTED, TITLES
+from recon.look.rig import RigChange
 from recon.odometry.protocol import OdometryHealth
-from recon.odometry.rig.refine import RigChange
 from recon.report import (
     audit_page,
     calibration_page,

@@ -8,8 +8,8 @@ import pytest
 from recon.core.errors import SettingsError
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.calibration import read_calibration
-from recon.odometry.rig.fault import RigFault, without_fault
-from recon.odometry.rig.refine import compare_rigs
+from recon.look.fault import RigFault, without_fault
+from recon.look.rig import compare_rigs
 from recon.rig.written import form_of, nearest_of_kalibr, targets_of, write_rig
 from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 

@@ -21,7 +21,7 @@ from recon.io.images.image import write_image
 from recon.io.trajectory import FRAMES as FRAME_LIST
 from recon.io.trajectory import CapturedFrame
 from recon.map.drive.sequence import map_sequence
-from recon.rig.audit.audit import audit_source
+from recon.rig.audit import audit_source
 from recon.rig.cameras import open_camera_source
 from recon.rig.capture import CaptureSettings
 from recon.sources.registry import open_source, recognise_source

@@ -15,7 +15,7 @@ import recon
 from recon.core.errors import FormatError, SourceError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.map.localize.sequence import localize_sequence
-from recon.rig.audit.audit import audit_source
+from recon.rig.audit import audit_source
 from recon.sources.live import LiveSource
 from recon.sources.source import SourcePart, StereoSource, mark_of
 from recon.sources.synthetic import SyntheticSource

@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, MeshingError, OutputError
+from recon.core.lazy import Lazy
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Int32
 from recon.io.files import StrPath
+
+o3d = Lazy("open3d")
 
 
 def write_mesh(path: StrPath, mesh: TriangleMesh) -> None:

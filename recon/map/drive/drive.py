@@ -23,6 +23,7 @@ from recon.core.values.arrays import tree_of
 from recon.core.versions import versions
 from recon.core.work import Stopwatch, look_ahead, work_in_background
 from recon.io.files import reading
+from recon.look.tracks import LiveTracks
 from recon.map.builders import thin_rays
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.mapper import FrameResult, Mapper
@@ -31,7 +32,6 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
 from recon.odometry.health import stretches
 from recon.odometry.protocol import OdometryFrame, OdometryResult
-from recon.odometry.rig.tracks import LiveTracks
 from recon.places.detector import LastView, NewViews
 from recon.places.keyframe import coarse_of
 from recon.sources.source import StereoSource

@@ -15,6 +15,7 @@ from recon.core.text import counted
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64, freeze, tree_of
 from recon.core.work import OneBehind, Stopwatch
+from recon.look.geometry import MOST_ROWS_PX
 from recon.map.builders import (
     CloudBuilder,
     OccupancyBuilder,
@@ -29,7 +30,6 @@ from recon.map.store.session import Session
 from recon.map.submaps import Submap, SubmapSettings
 from recon.odometry.checked import StretchCounter
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
-from recon.odometry.rig.rigidity import MOST_ROWS_PX
 from recon.stereo.frame import ReconstructedFrame
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -11,13 +11,11 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import ReconError
-from recon.core.progress import tracked
+from recon.core.values import Rig, StereoPair
 from recon.map.fusion import FusionSettings
 from recon.map.settings import SCALES
-from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 
-_FRAMES: Final = 5  # of a drive that are looked at, evenly spread
 _ROAD_DEPTH_M: Final = 12.5  # that of the mean disparity on a road: KITTI's have 11 to 14 m
 _LIKE_A_ROAD: Final = 2.0  # times as deep, or less deep: still the lengths of a road
 _MOST_VOXELS: Final = 5.0
@@ -33,9 +31,9 @@ class Scene:
     depth_m: float | None = None  # typical depth; None = nothing was matched, or looked at
 
 
-def look_at_scene(source: StereoSource, settings: StereoSettings) -> Scene:
-    """Measure how large what a drive shows is, on a few of its frames; a live one is not read."""
-    depths = [] if source.live else list(_depths(source, settings))
+def measure_scene(pairs: Iterable[StereoPair], rig: Rig, settings: StereoSettings) -> Scene:
+    """Measure how large what a drive shows is, on a few of its pairs."""
+    depths = list(_depths(pairs, rig, settings))
     if not depths:
         return Scene()
     depth_m, sigma_m = np.median(depths, axis=0).tolist()
@@ -58,17 +56,18 @@ def scale_of(depth_m: float, sigma_m: float) -> float:
     return float(np.clip(max(nearest, placed), *SCALES))
 
 
-def _depths(source: StereoSource, settings: StereoSettings) -> Iterator[tuple[float, float]]:
+def _depths(
+    pairs: Iterable[StereoPair], rig: Rig, settings: StereoSettings
+) -> Iterator[tuple[float, float]]:
     """Yield depth of the mean disparity of some frames, and its standard deviation, metres.
 
-    A frame that cannot be read is left out: that is said when it is mapped.
+    A frame that cannot be matched is left out: that is said when it is mapped.
     """
-    reconstructor = FrameReconstructor(source.calibration, settings)
+    reconstructor = FrameReconstructor(rig, settings)
     camera = reconstructor.camera
-    numbers = np.unique(np.linspace(0, len(source) - 1, _FRAMES).astype(int)).tolist()
-    for number in tracked(numbers, "frames", "measure the scene"):
-        with suppress(ReconError, StopIteration):
-            _, disparity = reconstructor.match(next(source.frames(number)))
+    for pair in pairs:
+        with suppress(ReconError):
+            _, disparity = reconstructor.match(pair)
             found = disparity.values[disparity.valid] + camera.doffs_px
             if len(found) and found.mean() > 0.0:
                 depth_m = camera.focal_px * camera.baseline_m / float(found.mean())

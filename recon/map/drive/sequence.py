@@ -28,6 +28,7 @@ from recon.core.values import (
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import depth_from_disparity
 from recon.core.work import available_cores, serial_algebra
+from recon.look.tracks import LiveTracks, StereoTracks
 from recon.map.drive.drive import Drive, Workspace
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import UsedPrior, axes_of, imu_of, odometry_of
@@ -42,7 +43,6 @@ from recon.odometry.checked import CheckedOdometry
 from recon.odometry.health import name_frames, stretches
 from recon.odometry.imu_fit import FittedImu
 from recon.odometry.protocol import Odometry, OdometryHealth
-from recon.odometry.rig.tracks import LiveTracks, StereoTracks
 from recon.odometry.sfm.find import SfmOptions, find_poses
 from recon.odometry.sfm.found import FoundOdometry, FoundPoses
 from recon.odometry.visual import VisualOdometry

@@ -16,11 +16,11 @@ from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Bool, Float64, Int64
 from recon.io.files import StrPath, reading, refuse_links
+from recon.look.rig import KnownRig
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
 from recon.map.store.trees import LINKS, Link
 from recon.odometry.health import doubt_about, name_frames, stretches
-from recon.odometry.rig.refine import KnownRig
 from recon.places.detector import KnownPlaces, KnownView
 
 MAP_FILE: Final = "map/map.recon"  # where a finished run keeps its map

@@ -14,6 +14,7 @@ from recon.core.text import counted
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in, tree_of
 from recon.io.files import reading
+from recon.look.rig import KnownRig, RefinedRig
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -33,7 +34,6 @@ from recon.map.store.trees import (
 from recon.map.submaps import Submap
 from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
-from recon.odometry.rig.refine import KnownRig, RefinedRig
 from recon.places.closure import Closure
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import NO_FIXES, Fixes

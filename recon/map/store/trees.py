@@ -27,10 +27,10 @@ from recon.core.values import (
     check_size,
 )
 from recon.core.values.arrays import Float64, UInt8, array_in, frozen_array
+from recon.look.fault import active
+from recon.look.fit import FittedFault
+from recon.look.rig import KnownRig
 from recon.odometry.protocol import OdometryHealth
-from recon.odometry.rig.fault import active
-from recon.odometry.rig.fit import FittedFault
-from recon.odometry.rig.refine import KnownRig
 from recon.places.loop import Loop
 from recon.stereo.rectify.row_alignment import as_raw
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
-from recon.map.drive.scale import look_at_scene, scale_of
+from recon.map.drive.scale import measure_scene, scale_of
 from recon.map.drive.sequence import map_sequence
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
@@ -63,10 +64,12 @@ def test_a_pair_of_millimetres_gives_the_points_of_the_street(scale):
 
 
 def test_a_drive_of_millimetres_gives_the_path_and_the_map_of_the_street():
-    street, small = (
-        map_sequence(source, load_config().at_scale(look_at_scene(source, load_config()).scale))
-        for source in (STREET, sized(1e-4))
-    )
+    def mapped(source):
+        config = load_config()
+        scene = measure_scene(islice(source, 5), source.calibration, config)
+        return map_sequence(source, config.at_scale(scene.scale))
+
+    street, small = (mapped(source) for source in (STREET, sized(1e-4)))
     assert small.config.scale == pytest.approx(1e-4 * street.config.scale)
     path = small.trajectory.positions_m / 1e-4
     np.testing.assert_allclose(path, street.trajectory.positions_m, atol=1e-4)

@@ -8,6 +8,9 @@ import pytest
 from recon.core.errors import FormatError
 from recon.core.geometry import se3
 from recon.core.values import PointCloud, RayCloud, RayGrain, RectifiedCamera
+from recon.look.fault import NAMES
+from recon.look.fit import FittedFault
+from recon.look.rig import RefinedRig
 from recon.map.fusion import join_fused
 from recon.map.map import Map
 from recon.map.occupancy.part import join_occupancy
@@ -19,9 +22,6 @@ from recon.map.store.map_file import MapViews
 from recon.map.store.session import Session, SessionInfo
 from recon.map.store.trees import Link
 from recon.odometry.protocol import OdometryHealth
-from recon.odometry.rig.fault import NAMES
-from recon.odometry.rig.fit import FittedFault
-from recon.odometry.rig.refine import RefinedRig
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 from recon.places.loop import Loop

@@ -15,7 +15,9 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
-from recon.core.work import serial_algebra, side_by_side
+from recon.core.work import FEW, serial_algebra, side_by_side
+from recon.look.fault import Places, RigFault, shrink
+from recon.look.tracks import StereoTracks
 from recon.odometry.kernels import bundle
 from recon.odometry.pose import (
     CAUCHY_SIGMAS,
@@ -27,13 +29,12 @@ from recon.odometry.pose import (
     model_of,
     reprojection,
 )
-from recon.odometry.rig.fault import Places, RigFault, shrink
-from recon.odometry.rig.tracks import THREADS, StereoTracks
 
 _ROUNDS: Final = 32  # times at most that all windows are adjusted, without the fault as known then
-_LAST_STEP: Final = 0.5  # length of a step, in standard deviations, after which there is no other
+_LAST_STEP: Final = 1.0  # length of a step, in standard deviations, after which there is no other
 _ROUNDING: Final = 1e-9  # share of the best known direction below which one is not known at all
 _RECALLED: Final = 4  # last rounds that the next one learns from
+_FIRST: Final = 4  # every so many-th track is fitted first, so that few rounds take all of them
 _ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the right image
 _IN_STEP: Final = 0.02
 """Frames by which right images may seem late where one trigger takes both: on drives with one it is
@@ -84,7 +85,7 @@ def fit_fault(
     prior, scatter = np.diag(1.0 / sigmas**2), 1.0
     values, windows = np.zeros(len(active)), [part.window for part in tracks]
     held = np.zeros_like(prior)  # of what was known before
-    tried, stepped = list[Float64](), list[Float64]()
+    few = [part.thinned(_FIRST) for part in tracks]
 
     def linearised(part: StereoTracks, window: TrackWindow) -> tuple[TrackWindow, _System]:
         places = fault.correct(part.window.uvd[..., :2], part.right_uv, values[:-1])
@@ -92,27 +93,34 @@ def fit_fault(
         window = adjust(_seen(window, part, places), fault.camera)
         return window, _system(window, places, fault.camera)
 
-    for _ in range(_ROUNDS):
-        with serial_algebra():
-            each = zip(tracks, windows, strict=True)
-            found = list(side_by_side(lambda pair: linearised(*pair), each, threads=THREADS))
-        windows = [window for window, _ in found]
-        H = np.stack([system.H for _, system in found])[:, active][:, :, active]
-        g = np.stack([system.g for _, system in found])[:, active]
-        total = _information(H.sum(axis=0), sigmas)
-        seen, pull = total / scatter, g.sum(axis=0) / scatter
-        if before is not None:
-            known = np.diag(sigmas**2)
-            known[:-1, :-1] = before.covariance[np.ix_(active[:-1], active[:-1])]
-            held = _not_contradicted(known, seen, pull + seen @ values[active]) - prior
-            held = _information(held, sigmas)
-        shown = seen + held
-        step = np.linalg.solve(shown + prior, pull - (held + prior) @ values[active])
-        tried, stepped = [*tried, values[active]][-_RECALLED:], [*stepped, step][-_RECALLED:]
-        values[active] = _accelerated(tried, stepped, shown + prior)
-        scatter = _scatter(total + prior, total, g - H @ step)
-        if step @ (shown + prior) @ step < _LAST_STEP**2:
-            break
+    for parts in (few, tracks):
+        # As they were moved by the parts before.
+        poses = [window.T_world_camera for window in windows]
+        windows = [
+            replace(part.window, T_world_camera=T) for part, T in zip(parts, poses, strict=True)
+        ]
+        tried, stepped = list[Float64](), list[Float64]()
+        for _ in range(_ROUNDS):
+            with serial_algebra():
+                each = zip(parts, windows, strict=True)
+                found = list(side_by_side(lambda pair: linearised(*pair), each, threads=FEW))
+            windows = [window for window, _ in found]
+            H = np.stack([system.H for _, system in found])[:, active][:, :, active]
+            g = np.stack([system.g for _, system in found])[:, active]
+            total = _information(H.sum(axis=0), sigmas)
+            seen, pull = total / scatter, g.sum(axis=0) / scatter
+            if before is not None:
+                known = np.diag(sigmas**2)
+                known[:-1, :-1] = before.covariance[np.ix_(active[:-1], active[:-1])]
+                held = _not_contradicted(known, seen, pull + seen @ values[active]) - prior
+                held = _information(held, sigmas)
+            shown = seen + held
+            step = np.linalg.solve(shown + prior, pull - (held + prior) @ values[active])
+            tried, stepped = [*tried, values[active]][-_RECALLED:], [*stepped, step][-_RECALLED:]
+            values[active] = _accelerated(tried, stepped, shown + prior)
+            scatter = _scatter(total + prior, total, g - H @ step)
+            if step @ (shown + prior) @ step < _LAST_STEP**2:
+                break
     rig, covariance = active[:-1], np.zeros((len(active) - 1,) * 2)
     own, known, late, sigma = _without_late(values[active], shown, sigmas)
     values[:-1][rig], covariance[np.ix_(rig, rig)], spread = shrink(own, known, sigmas[:-1], spread)

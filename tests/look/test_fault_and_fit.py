@@ -10,11 +10,11 @@ import pytest
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.core.values.camera import project
+from recon.look.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
+from recon.look.fit import FittedFault, fit_fault
+from recon.look.rig import compare_rigs
+from recon.look.tracks import StereoTracks
 from recon.odometry.pose import TrackWindow, adjust
-from recon.odometry.rig.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
-from recon.odometry.rig.fit import FittedFault, fit_fault
-from recon.odometry.rig.refine import compare_rigs
-from recon.odometry.rig.tracks import StereoTracks
 from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 
 CAMERA = RectifiedCamera(700.0, 600.0, 180.0, 610.0, 0.5, 1200, 370)

@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from recon.core.progress import tracked
-from recon.core.values import RectifiedCamera
+from recon.core.values import RectifiedCamera, RectifiedPair, StereoPair
 from recon.core.values.arrays import Float64
-from recon.core.work import available_cores, serial_algebra, side_by_side
 from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.pose import TrackWindow
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
-from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
-THREADS: Final = min(2, available_cores())  # that windows are worked on in; results are the same
 FRAMES: Final = 6  # frames in a window
 _MIN_FRAMES: Final = 4  # windows of fewer frames, after a loss, are left out
 _LEAST_MOTION: Final = 0.1  # in baselines; a window that moves less shows no depth by its motion
 _LEAST_SEEN: Final = 3  # frames that a point is seen in; what is seen less checks hardly anything
-_READ: Final = 72  # frames to read in all
-_REACH: Final = 600  # frames from the start that they are among: a video is decoded up to each
-_STRETCHES: Final = 6  # parts of the drive that they are from, two windows in each
+TRACKED: Final = 72  # frames to track features through in all
+REACH: Final = 600  # frames from the start that they are among: a video is decoded up to each
+_PARTS: Final = 6  # of the drive that they are from, two windows in each
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,38 +32,23 @@ class StereoTracks:
     window: TrackWindow
     right_uv: Float64  # (W, N, 2), columns and rows; NaN = not found
 
+    def thinned(self, every: int) -> StereoTracks:
+        """Return every so many-th of the tracks."""
+        window, chosen = self.window, np.arange(0, len(self.window.xyz_world), every)
+        fewer = replace(window, uvd=window.uvd[:, chosen], xyz_world=window.xyz_world[chosen])
+        return StereoTracks(fewer, self.right_uv[:, chosen])
 
-def plan_stretches(frames: int) -> list[tuple[int, int]]:
-    """Return first frame and end of each stretch, in the middle of equal parts of a drive."""
-    frames = min(frames, _REACH)
-    if frames <= _READ:
+
+def tracked_parts(frames: int) -> list[tuple[int, int]]:
+    """Return first frame and end of each tracked part, in the middle of equal parts of a drive."""
+    frames = min(frames, REACH)
+    if frames <= TRACKED:
         whole = frames - frames % FRAMES
         half = whole // 2 - whole // 2 % FRAMES
-        return [(0, half), (half, whole)]
-    length = _READ // _STRETCHES
-    starts = [int((k + 0.5) * frames / _STRETCHES - length / 2) for k in range(_STRETCHES)]
+        return [(0, half), (half, whole)] if half >= 2 * FRAMES else [(0, whole)]
+    length = TRACKED // _PARTS
+    starts = [int((k + 0.5) * frames / _PARTS - length / 2) for k in range(_PARTS)]
     return [(start, start + length) for start in starts]
-
-
-def track_stretches(
-    source: StereoSource, reconstructor: FrameReconstructor
-) -> tuple[StereoTracks, ...]:
-    """Return windows of tracks from all over a drive, stretches side by side in threads."""
-
-    def tracks(stretch: tuple[int, int]) -> list[StereoTracks]:
-        start, stop = stretch
-        pairs = islice(source.frames(start), stop - start)
-        odometry = VisualOdometry()
-        tracker = StereoTracker(odometry)
-        frames = (OdometryFrame(*reconstructor.match_roughly(pair)) for pair in pairs)
-        found = (tracker.add(frame, odometry.register(frame)) for frame in frames)
-        return [window for window in found if window is not None]
-
-    with serial_algebra():
-        stretches = plan_stretches(len(source))
-        found = side_by_side(tracks, stretches, threads=THREADS)
-        counted = tracked(found, "windows", "track features", total=len(stretches))
-        return tuple(window for stretch in counted for window in stretch)
 
 
 class StereoTracker:
@@ -90,6 +70,23 @@ class StereoTracker:
         return StereoTracks(window, _in_right(window, frames))
 
 
+class Tracking:
+    """Windows of tracks of consecutive frames, which are matched roughly and registered."""
+
+    def __init__(self, reconstructor: FrameReconstructor) -> None:
+        self.found = list[StereoTracks]()
+        self._reconstructor, self._odometry = reconstructor, VisualOdometry()
+        self._tracker = StereoTracker(self._odometry)
+
+    def add(self, recorded: StereoPair) -> RectifiedPair:
+        """Add the next pair; returns it rectified."""
+        frame = OdometryFrame(*self._reconstructor.match_roughly(recorded))
+        window = self._tracker.add(frame, self._odometry.register(frame))
+        if window is not None:
+            self.found.append(window)
+        return frame.pair
+
+
 class LiveTracks:
     """Windows of tracks from all over a drive while it arrives.
 
@@ -109,13 +106,13 @@ class LiveTracks:
 
     def add(self, index: int, frame: OdometryFrame, found: OdometryResult) -> None:
         """Add the frame that was registered last."""
-        part, place = divmod(index, _READ // _STRETCHES)
+        part, place = divmod(index, TRACKED // _PARTS)
         if part % self._every:
             return
         if place == 0:
             self._tracker = StereoTracker(self._odometry)
             self._stretches.append([])
-        if len(self._stretches) > _STRETCHES:
+        if len(self._stretches) > _PARTS:
             self._stretches, self._every = self._stretches[::2], 2 * self._every
         window = self._tracker.add(frame, found)
         if window is not None:

@@ -11,12 +11,14 @@ import numpy as np
 from recon.core.text import counted, metres
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
-from recon.odometry.rig.refine import LATER, LEAST_FRAMES, MOST_LATE, RefinedRig
-from recon.rig.audit.measures import Gaps
-from recon.rig.audit.sample import BLANK_DN, MIN_FEATURES, Geometry, Sample
-from recon.rig.settings import AuditedSettings
-from recon.sources.source import StereoSource
+from recon.look.look import Look
+from recon.look.measures import MIN_FEATURES, Gaps
+from recon.look.rig import LATER, MOST_LATE, RefinedRig
+from recon.look.sample import BLANK_DN, Sample
+from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.registry import MatchingSettings, settings_of
+from recon.stereo.match.search import SearchSettings
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
@@ -53,6 +55,7 @@ _TEXTS: Final = {
     "swapped": "left and right are swapped: {percent:.0f} % of the near features are farther right "
     "in the right image; exchange --left and --right (or un-mirror the images)",
     "lag": "the {late} camera is {frames} late; {in_step}",
+    "lag shifted": "{paired}",
     "skew": f"the right images are taken {{skew:+.2f}} frames {LATER}; trigger both cameras "
     "together, or drive slowly",
     "nonrigid": "{found}",
@@ -84,24 +87,6 @@ class Finding:
     text: str  # description and advice, for people
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """What an audit measured of a drive."""
-
-    source: StereoSource
-    camera: RectifiedCamera  # the rectified one
-    sample: Sample
-    geometry: Geometry
-    gaps: Gaps
-    rig: RefinedRig | None  # None if it was not measured
-
-    @property
-    def skew(self) -> tuple[float, float] | None:
-        """Frames by which right images are late, and the standard error: by motion, else rows."""
-        fitted = None if self.rig is None else self.rig.fitted
-        return self.geometry.skew if fitted is None else (fitted.late, fitted.late_sigma)
-
-
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
     """Return good without findings, not usable with a fatal one, else usable."""
     if any(finding.fatal for finding in findings):
@@ -109,15 +94,17 @@ def verdict_of(findings: Sequence[Finding]) -> Verdict:
     return "usable" if findings else "good"
 
 
-def find_faults(measured: Measured, config: AuditedSettings, reach_px: int | None) -> list[Finding]:
-    """Return all problems, fatal ones first; ``reach_px`` is the largest disparity if fixed."""
-    sample, camera, rig = measured.sample, measured.camera, measured.source.calibration
+def find_faults(look: Look, config: AuditedSettings) -> list[Finding]:
+    """Return all problems, fatal ones first."""
+    sample, camera, rig = look.sample, look.camera, look.source.calibration
     found = [
         *_of_images(sample, config.matching.matcher),
-        *_of_series(sample, measured.gaps),
-        *_of_geometry(measured),
-        *_of_rig(measured.rig, measured.geometry.disparity_px),
-        *_of_range(measured.geometry.disparity_px, reach_px, camera),
+        *_of_series(sample, look.gaps),
+        *_of_geometry(look),
+        *_of_rig(look.rig, look.geometry.disparity_px),
+        *_of_range(
+            look.geometry.disparity_px, _reach_px(look.camera, config.matching), look.camera
+        ),
         *_of_calibration(sample, rig, camera, config.audit.baseline_m),
     ]
     findings = []
@@ -167,13 +154,15 @@ def _of_series(sample: Sample, gaps: Gaps) -> Found:
         yield "gaps", {"places": counted(gaps.count, "place"), "gaps": gaps}
 
 
-def _of_geometry(measured: Measured) -> Found:
-    geometry, skew = measured.geometry, measured.skew
+def _of_geometry(look: Look) -> Found:
+    geometry, skew = look.geometry, look.skew
     swapped, lag = geometry.swapped_share, geometry.lag
+    if look.shifted:
+        yield "lag shifted", {"fatal": False, "paired": look.first[0]}
     if swapped >= _SWAPPED_SHARE:
         yield "swapped", {"percent": 100 * swapped}
     if lag:
-        shift = measured.source.shift_of(lag)
+        shift = look.source.shift_of(lag)
         in_step = f"--set source.shift_frames={shift} pairs the images that belong together"
         yield (
             "lag",
@@ -188,23 +177,21 @@ def _of_geometry(measured: Measured) -> Found:
     rows = geometry.alignment
     if lag:  # rows say nothing of the cameras then
         return
-    if measured.rig is not None and measured.rig.not_rigid:
-        yield "nonrigid", {"found": measured.rig.not_rigid[0]}
+    if look.rig.not_rigid:
+        yield "nonrigid", {"found": look.rig.not_rigid[0]}
     elif rows is None and geometry.pairs:
         yield "features", {"matched": geometry.matched}
     elif rows is not None and rows.rms_px > _ROW_PX:
         pitch, _, roll, _ = np.degrees(rows.turn)
-        corrected = len(measured.source) >= LEAST_FRAMES
-        if measured.rig is not None:
-            corrected = measured.rig.fitted is not None
+        corrected = look.rig.fitted is not None
         fatal = rows.rms_px > _BAD_ROW_PX and not corrected
         who = "recon map does so, and " if corrected else ""
         yield "rows", {"fatal": fatal, "rows": rows, "pitch": pitch, "roll": roll, "who": who}
 
 
-def _of_rig(rig: RefinedRig | None, disparity_px: Float64) -> Found:
+def _of_rig(rig: RefinedRig, disparity_px: Float64) -> Found:
     """Yield a rig with which depth is off where most of what it sees is."""
-    if rig is None or not rig.changes or not len(disparity_px):
+    if not rig.changes or not len(disparity_px):
         return
     working_m = (
         rig.camera.focal_px * rig.camera.baseline_m / max(float(np.median(disparity_px)), 1.0)
@@ -253,3 +240,11 @@ def _centres(rig: Rig) -> list[tuple[str, tuple[float, float], tuple[int, int]]]
         (name, (float(c.matrix[0, 2]), float(c.matrix[1, 2])), (c.width_px, c.height_px))
         for name, c in zip(_SIDES, (rig.left, rig.right), strict=True)
     ]
+
+
+def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
+    """Return the largest disparity that is searched; None if the range adapts to each pair."""
+    own = settings_of(matching.matcher, matching)
+    if not isinstance(own, SearchSettings) or (own.ndisp is None and camera.ndisp is None):
+        return None
+    return own.min_disparity_px + own.ndisp_for(camera)

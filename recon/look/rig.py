@@ -10,7 +10,7 @@ ECMR 2021.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
@@ -21,22 +21,20 @@ from recon.core.progress import stage
 from recon.core.text import metres, plain
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
-from recon.odometry.rig.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
-from recon.odometry.rig.fit import FittedFault, fit_fault
-from recon.odometry.rig.length import SeenBaseline
-from recon.odometry.rig.rigidity import Rigidity, measure_rigidity
-from recon.odometry.rig.tracks import FRAMES, StereoTracks, plan_stretches, track_stretches
+from recon.look.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
+from recon.look.fit import FittedFault, fit_fault
+from recon.look.geometry import Rigidity
+from recon.look.length import SeenBaseline
+from recon.look.tracks import FRAMES, StereoTracks
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource
-from recon.stereo.frame import FrameReconstructor, StereoSettings
-from recon.stereo.rectify.features import match_features, pool_features
+from recon.stereo.frame import StereoSettings
 from recon.stereo.rectify.lens import project_raw
 from recon.stereo.rectify.rectifier import (
     RectificationSettings,
-    Rectifier,
     turns_of,
 )
-from recon.stereo.rectify.row_alignment import align_rows, as_raw, correct_rig
+from recon.stereo.rectify.row_alignment import RowAlignment, as_raw, correct_rig
 
 MIN_WINDOWS: Final = 6  # fewer windows do not show how much they contradict each other
 DEPTHS_M: Final = (10.0, 30.0)  # distances for which the depth error is stated
@@ -160,11 +158,17 @@ class RefinedRig:
         return 100.0 * (share - 1.0), 100.0 * share * self.sigma_px / given_px
 
     def rms_percent(self, depth_m: float) -> float:
-        """Return the depth error there, root mean square over the image; 0 if none is known."""
+        """Return the depth error there, root mean square over the image; 0 if none is known.
+
+        Infinite where some of it seems to be behind infinity.
+        """
         if not self.changes:
             return 0.0
-        share = 100.0 * depth_m / (self.camera.focal_px * self.camera.baseline_m)
-        return share * self.changes[0].rms_px
+        disparity_px = self.camera.focal_px * self.camera.baseline_m / depth_m
+        given_px = disparity_px + self.changes[0].off_px
+        if np.nanmin(given_px) <= 0.0:
+            return float("inf")
+        return 100.0 * float(np.sqrt(np.nanmean((disparity_px / given_px - 1.0) ** 2)))
 
     def wrong_at(self, depth_m: float) -> bool:
         """Return whether depth there is off by more than 2 %, and two standard deviations."""
@@ -226,8 +230,10 @@ class RefinedRig:
         """Return in words what the drive shows of the rig given, and what it does to a depth."""
         near = self.changes[0]
         off = f"{near.mean_px:+.2f} ± {1.96 * self.sigma_px:.2f} px"
-        depth = f"by {self.rms_percent(depth_m):.0f} % at {metres(depth_m)}"
-        return f"disparities are {off} off, {near.rms_px:.2f} px rms over the image, depth {depth}"
+        percent = self.rms_percent(depth_m)
+        depth = f"by {percent:.0f} %" if np.isfinite(percent) else "up to behind infinity"
+        off += f" off, {near.rms_px:.2f} px rms over the image"
+        return f"disparities are {off}, depth {depth} at {metres(depth_m)}"
 
     def warnings(self, known: Sequence[str] = ()) -> list[str]:
         """Return what the user should know of a rig, and does not from lines that are ``known``."""
@@ -270,56 +276,50 @@ class KnownRig:
         return replace(rig, fitted=fitted, begun_with=self.name)
 
 
-def refine_rig(
-    source: StereoSource, config: StereoSettings, rig: RigSettings, known: KnownRig | None = None
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What the motion of a drive is fitted to: its tracks, and the rig that they were seen with."""
+
+    tracks: Sequence[StereoTracks]
+    rig: Rig
+    turn: Float64  # what turned the right camera of that rig so that rows meet
+    again: Callable[[Rig], Sequence[StereoTracks]]  # the same with another rig
+
+
+def refine(
+    begun: RefinedRig, seen: Tracked, config: StereoSettings, known: KnownRig | None
 ) -> RefinedRig:
-    """Refine the rig of a drive by its motion, before it is mapped.
+    """Refine the rig that a drive began with by what its motion shows.
 
     A few windows of frames, from all over the drive, show how the right camera is turned, how long
-    its focal length is, and what both lenses bend; see `recon.odometry.rig.fault`. Where a drive
-    shows little the calibration stays, or what is ``known`` by an earlier drive of the rig. Drives
-    of less than 36 frames, live ones, and those whose cameras move against each other are not
-    refined: they take that as it is. If ``rig.refine`` is off, the calibration stays, and what the
-    drive shows is only said.
+    its focal length is, and what both lenses bend; see `recon.look.fault`. Where a drive shows
+    little the rig stays.
     """
-    given, known = source.calibration, known if rig.refine else None
-    begun = Rectifier(given, config.rectification)
-    found = RefinedRig(given, given, begun.camera)
-    if known is not None:
-        found = known.begun(config.rectification)
-        begun = Rectifier(found.calibration, config.rectification)
-    if source.live:
-        return found
-    found = replace(found, rigidity=measure_rigidity(source, begun))
-    if found.not_rigid or len(source) < LEAST_FRAMES:
-        return found
     values = np.zeros(len(NAMES)) if known is None else known.fitted.values.copy()
-    refined, turn = _with_rows_aligned(source, found.calibration, begun)
-    values[: len(TURN)] += turn
-    spread = 1.0
+    values[: len(TURN)] += seen.turn
+    refined, tracks, spread = seen.rig, seen.tracks, 1.0
     # A rig that has turned since is not as it was known.
-    before = None if known is None or turn.any() else known.fitted
-    for _ in range(_PASSES):
-        reconstructor = FrameReconstructor(refined, config)
-        tracks = track_stretches(source, reconstructor)
+    before = None if known is None or seen.turn.any() else known.fitted
+    for left in reversed(range(_PASSES)):
         if len(tracks) < MIN_WINDOWS:
-            return found
-        camera = reconstructor.camera
-        stage("fit the rig")
-        fitted = fit_fault(tracks, RigFault(camera), active(refined), before, spread)
-        values, spread = values + fitted.values, fitted.spread
+            return begun
         last, turns = refined, turns_of(refined, config.rectification)
+        stage("fit the rig")
+        fitted = fit_fault(tracks, RigFault(turns.camera), active(last), before, spread)
+        values, spread = values + fitted.values, fitted.spread
         refined, before = without_fault(last, turns, fitted.values), None
         change = compare_rigs(last, refined, DEPTHS_M[-1], config.rectification)
-        if change.moved_px < _FAR_OFF_PX:
+        if change.moved_px < _FAR_OFF_PX or not left:
             break
-    described = _described(given, refined, replace(fitted, values=values), config.rectification)
-    steps_s = np.zeros(0) if source.stamps_s is None else np.diff(source.stamps_s)
-    period_s = float(np.median(steps_s)) if len(steps_s) else float("nan")
-    if not rig.refine:
-        described = replace(described, calibration=given)
-    described = replace(described, begun_with=found.begun_with, period_s=period_s)
-    return replace(described, rigidity=found.rigidity)
+        tracks = seen.again(refined)
+    fitted = replace(fitted, values=values)
+    described = _described(begun.given, refined, fitted, config.rectification)
+    return replace(
+        described,
+        begun_with=begun.begun_with,
+        period_s=begun.period_s,
+        rigidity=begun.rigidity,
+    )
 
 
 def rig_shown(
@@ -372,18 +372,13 @@ def compare_rigs(
     return RigChange(depth_m, off_px, rows_px)
 
 
-def _with_rows_aligned(
-    source: StereoSource, given: Rig, rectifier: Rectifier
+def turned_to_meet(
+    rig: Rig, alignment: RowAlignment | None, settings: RectificationSettings
 ) -> tuple[Rig, Float64]:
     """Return a rig whose rows meet well enough to be matched, and what turned its right camera."""
-    starts = [start for start, _ in plan_stretches(len(source))[::2]]
-    pairs = [rectifier.rectify(next(source.frames(start))) for start in starts]
-    features = pool_features(match_features(p.left, p.right, _FEATURES) for p in pairs)
-    alignment = align_rows(features.left_uv, features.right_uv, rectifier.camera)
     if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
-        return given, np.zeros(len(TURN))
-    R_left = turns_of(given, rectifier.settings).R_left
-    return correct_rig(given, alignment.turn, R_left), alignment.turn
+        return rig, np.zeros(len(TURN))
+    return correct_rig(rig, alignment.turn, turns_of(rig, settings).R_left), alignment.turn
 
 
 def _mean_sigma(camera: RectifiedCamera, fitted: FittedFault) -> float:

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from recon.core.geometry.se3 import exp_so3
 from recon.core.values import RectifiedCamera
-from recon.rig.audit import measures
-from recon.rig.audit.findings import Finding, verdict_of
-from recon.rig.audit.sample import FRAMES, plan_centres, plan_stretches
+from recon.look import measures
+from recon.look.findings import Finding, verdict_of
+from recon.look.sample import QUICK, THOROUGH, plan_windows
+from recon.look.tracks import REACH
 from recon.stereo.rectify.row_alignment import align_rows, correct_rig, count_aligned, turn_features
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
@@ -139,24 +140,31 @@ def test_repeats_are_counted_apart_from_frozen_cameras_and_the_worst_finding_dec
     for left, right in ((0, 0), (1, 0), (2, 0), (3, 0), (4, 4), (4, 4), (5, 5)):
         counter.add(images[left], images[right])
     assert (counter.steps, counter.both, counter.frozen) == (6, 1, [0, 3])
-    counter.restart()
-    counter.add(images[5], images[5])
-    assert counter.both == 1
+    later = measures.RepeatCounter()
+    for _ in range(3):
+        later.add(images[5], images[5])
+    counter.join(later)
+    assert (counter.steps, counter.both, counter.frozen) == (8, 3, [0, 3])
     small, large = Finding("gain", False, "dark"), Finding("rows", True, "off")
     assert verdict_of([]) == "good"
     assert verdict_of([small]) == "usable"
     assert verdict_of([small, large, small]) == "not usable"
 
 
-@given(frames=st.integers(1, 5000), quick=st.booleans())
-def test_what_is_looked_at_lies_within_the_drive(frames, quick):
-    stretches = plan_stretches(frames, FRAMES, quick=quick)
-    assert stretches[0][0] >= 0
-    assert stretches[-1][1] <= frames
-    assert all(before[1] <= after[0] for before, after in pairwise(stretches))
-    assert sum(stop - start for start, stop in stretches) <= FRAMES
-    if quick:
-        assert stretches[-1][1] <= 300
-    centres = plan_centres(stretches, quick=quick)
-    assert centres
-    assert all(any(start <= centre < stop for start, stop in stretches) for centre in centres)
+@given(frames=st.integers(1, 5000), effort=st.sampled_from([QUICK, THOROUGH]))
+def test_what_is_looked_at_lies_within_the_drive(frames, effort):
+    windows = plan_windows(frames, effort)
+    assert windows[0].start >= 0
+    assert windows[-1].stop <= frames
+    assert all(before.stop <= after.start for before, after in pairwise(windows))
+    assert sum(window.stop - window.start for window in windows) <= effort.frames
+    for window in windows:
+        assert window.centres
+        assert all(window.start <= centre < window.stop for centre in window.centres)
+        assert window.start <= window.tracked[0] <= window.tracked[1] <= window.stop
+    if effort is QUICK:  # a video is decoded up to each of them
+        assert windows[-1].stop <= REACH
+    tracked = [window.tracked for window in plan_windows(frames, QUICK)]
+    assert [window.tracked for window in windows][: len(tracked)] == tracked
+    if frames <= QUICK.frames:
+        assert (windows[0].start, windows[-1].stop) == (0, frames)

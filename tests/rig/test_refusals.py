@@ -5,29 +5,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MatchingError, SourceError
-from recon.odometry.rig.refine import refine_rig
-from recon.odometry.rig.rigidity import Rigidity, measure_rigidity
+from recon.look.findings import Finding, find_faults
+from recon.look.geometry import Rigidity
+from recon.look.look import look_at, refine_rig
 from recon.odometry.settings import RigSettings
-from recon.rig.audit.audit import (
+from recon.rig.audit import (
     audit_source,
     check_related,
     correct_calibration,
-    quick_warnings,
 )
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
-from recon.sources.source import SourcePart
-from recon.stereo.rectify.rectifier import Rectifier
+from recon.sources.source import SourcePart, StereoSource
 from tests.hostile.refusals import assert_refused, run
-from tests.rig.audit import faults
-from tests.rig.audit.test_audit_run import CONFIG, rendered
+from tests.look import faults
+from tests.rig.test_audit_run import CONFIG, rendered
 from tests.sources import drives
 
 FRAMES = 16
+
+
+def findings(source: StereoSource) -> list[Finding]:
+    return find_faults(look_at(source, CONFIG), CONFIG)
+
+
+def codes(source: StereoSource) -> set[str]:
+    return {finding.code for finding in findings(source)}
 
 
 @pytest.fixture(scope="module")
@@ -71,32 +77,43 @@ def late(street, tmp_path):
     return drives.write_kitti(grey, faults.rectified(street), tmp_path)
 
 
-def test_a_late_drive_is_refused_with_the_setting_that_pairs_it(late, tmp_path):
-    found = "right camera is 2 frames late; --set source.shift_frames=2 pairs"
-    with pytest.raises(SourceError, match=f"of different moments.*{found}"):
-        run_map(open_source(late), CONFIG, MapOptions(out=tmp_path / "out"))
+def test_a_late_drive_is_paired_as_it_belongs_together_and_says_so_first(late, tmp_path):
+    found = "right camera is 2 frames late: its images are paired"
     out = tmp_path / "out"
-    assert_refused(run("map", late, "--out", out), found)
-    assert_refused(run("audit", late, "--mend", tmp_path / "rig.yaml"), found)
-    assert not out.exists()
-    assert not (tmp_path / "rig.yaml").exists()
+    paired = run_map(open_source(late), CONFIG, MapOptions(out=out, mesh=False))
+    assert found in paired.warnings[0]
+    assert "source.shift_frames=2" in paired.warnings[0]
+    assert "shift_frames: 2" in (out / "config.yaml").read_text()
     shifted = open_source(late, settings=SourceSettings(shift_frames=2))
-    assert quick_warnings(shifted, CONFIG) == ()
-    assert quick_warnings(open_source(late), load_config(None, ["audit.quick=false"])) == ()
+    assert codes(shifted) == set()
+    same = run_map(shifted, CONFIG, MapOptions(out=tmp_path / "set", mesh=False))
+    assert found not in str(same.warnings)
+    poses = [run.mapped.trajectory.T_world_camera for run in (paired, same)]
+    np.testing.assert_array_equal(*poses)
+    audit = audit_source(open_source(late), CONFIG)
+    assert (audit.verdict, [one.code for one in audit.findings]) == ("usable", ["lag"])
+    assert_refused(run("audit", late, "--mend", tmp_path / "rig.yaml"), found)
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_a_late_drive_that_cannot_be_paired_otherwise_is_refused(street, tmp_path):
+    with pytest.raises(SourceError, match=r"of different moments.*right camera is 2 frames late"):
+        run_map(faults.lag(street, 2), CONFIG, MapOptions(out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_clean_drive_a_part_of_it_and_one_that_stands_are_not_refused(street):
     part = SourcePart(street, 3, FRAMES)
     still = faults.Spoiled(street.camera, FRAMES, lambda _: street.take(4))
-    assert quick_warnings(street, CONFIG) == quick_warnings(part, CONFIG) == ()
-    assert not any("different moments" in text for text in quick_warnings(still, CONFIG))
+    assert codes(street) == codes(part) == set()
+    assert "lag" not in codes(still)
 
 
 def test_cameras_that_move_against_each_other_are_found_and_keep_their_calibration(street):
     moved = loose(street)
-    (finding,) = [one for one in audit_source(moved, CONFIG).findings if one.code == "nonrigid"]
+    (finding,) = [one for one in findings(moved) if one.code == "nonrigid"]
     assert finding.fatal
-    assert "-9 px in frame 0" in finding.text
+    assert "-9 px in frame 3" in finding.text
     found = refine_rig(moved, CONFIG, RigSettings())
     assert found.not_rigid == (finding.text,)
     assert not found.refined
@@ -110,7 +127,7 @@ def test_a_rig_that_is_only_turned_or_one_odd_pair_is_rigid(street, fault):
         "a turn": lambda s: faults.turned(s, pitch_deg=0.6, roll_deg=0.5),
         "one wrong pair": lambda s: loose(s, (0,) * (FRAMES - 1) + (20,)),
     }[fault]
-    found = measure_rigidity(plant(street), Rectifier(street.camera, CONFIG.rectification))
+    found = look_at(plant(street), CONFIG).rig.rigidity
     assert len(found.frames) >= 5
     assert found.kept
     assert found.spread_px < 1.0
@@ -127,10 +144,10 @@ def test_a_drive_of_two_drives_is_refused_and_one_in_the_dark_is_not_for_that(st
         street.camera, FRAMES, lambda k: replace(street.take(k), right=other.take(k).right)
     )
     with pytest.raises(
-        MatchingError, match=r"^spoiled, frame 15: nothing shows that left and right"
+        MatchingError, match=r"^spoiled, frame 12: nothing shows that left and right"
     ):
         run_map(mixed, CONFIG, MapOptions(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
     black = faults.changed(street, lambda left, right: (0 * left, 0 * right))
-    check_related(black, CONFIG)
-    check_related(street, CONFIG)
+    check_related(look_at(black, CONFIG), CONFIG)
+    check_related(look_at(street, CONFIG), CONFIG)

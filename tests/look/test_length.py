@@ -8,9 +8,9 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.errors import RegistrationError, SettingsError
 from recon.core.values import Trajectory
+from recon.look.length import check_length, see_baseline
+from recon.look.rig import RefinedRig
 from recon.odometry.prior import MotionPrior
-from recon.odometry.rig.length import check_length, see_baseline
-from recon.odometry.rig.refine import RefinedRig
 from recon.odometry.settings import PriorSettings, RigSettings
 from recon.sources.live import LiveSource
 from recon.stereo.rectify.row_alignment import as_raw

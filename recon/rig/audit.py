@@ -8,25 +8,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import CalibrationError, MatchingError, SourceError
+from recon.core.errors import CalibrationError, MatchingError
 from recon.core.progress import stage
 from recon.core.text import plain
 from recon.core.values import Disparity, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
-from recon.odometry.rig.refine import RefinedRig, refine_rig
-from recon.odometry.settings import RigSettings
-from recon.rig.audit.findings import Finding, Measured, Verdict, find_faults, verdict_of
-from recon.rig.audit.measures import find_gaps
-from recon.rig.audit.sample import Look, measure_geometry, take_sample
-from recon.rig.settings import AuditedSettings
+from recon.look.findings import Finding, Verdict, find_faults, verdict_of
+from recon.look.look import Look, look_at
+from recon.look.rig import RefinedRig
+from recon.look.sample import QUICK, THOROUGH, Inspected
+from recon.look.settings import AuditedSettings
 from recon.rig.written import form_of, nearest_of_kalibr, write_rig
 from recon.sources.one_pair import OnePair, PairInput
-from recon.sources.source import StereoSource, check_source
-from recon.stereo.frame import FrameReconstructor
-from recon.stereo.match.registry import MatchingSettings, settings_of
-from recon.stereo.match.search import SearchSettings
-from recon.stereo.rectify.rectifier import Rectifier, turns_of
+from recon.sources.source import StereoSource
+from recon.stereo.frame import FrameReconstructor, StereoSettings
+from recon.stereo.rectify.rectifier import turns_of
 from recon.stereo.rectify.row_alignment import RowAlignment, correct_rig
 from recon.stereo.support import Support
 
@@ -40,7 +37,6 @@ _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 _FEW_MEASURED_SHARE: Final = 0.25
 # Findings with which rows and motion say nothing about the calibration.
 _NOT_OF_THE_RIG: Final = frozenset({"lag", "nonrigid", "swapped", "size", "frozen", "unreadable"})
-_RELATED_PAIRS: Final = 3
 _TURNED: Final = ("pitch_deg", "yaw_deg", "roll_deg", "focal_percent")
 _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 
@@ -54,8 +50,8 @@ class Audit:
         findings: Problems found, fatal ones first.
         figures: All measures, ready for JSON.
         alignment: Row errors of all pairs together; None if there are too few features.
-        rig: The rig as the motion of the drive shows it; None if it was not measured.
-        looks: What was measured in each pair, and a few of the images.
+        rig: The rig as given, and as the motion of the drive shows it.
+        pairs: What was measured in each pair, and a few of the images.
         corrected: What `correct_calibration` did, if it was asked to.
     """
 
@@ -63,8 +59,8 @@ class Audit:
     findings: tuple[Finding, ...]
     figures: dict[str, Any]
     alignment: RowAlignment | None
-    rig: RefinedRig | None = None
-    looks: tuple[Look, ...] = ()
+    rig: RefinedRig
+    pairs: tuple[Inspected, ...] = ()
     corrected: dict[str, Any] | None = None
 
     def __repr__(self) -> str:
@@ -83,23 +79,17 @@ class Audit:
 
 
 def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool = False) -> Audit:
-    """Check a drive before a long run; ``quick``: in a second or two, as `recon map` does."""
-    check_source(source)
-    rectifier = Rectifier(source.calibration, config.rectification)
-    camera = rectifier.camera
+    """Check a drive before a long run; ``quick``: as much as `recon map` looks at."""
     stage("audit")
-    sample = take_sample(source, rectifier, quick=quick)
-    geometry = measure_geometry(sample, camera)
-    if quick and geometry.out_of_step:  # which a few pairs do not tell from half a frame, or chance
-        sample = take_sample(source, rectifier, quick=False)
-        geometry = measure_geometry(sample, camera)
-    readable = not quick and sample.broken is None
-    rig = refine_rig(source, config, RigSettings()) if readable else None
-    measured = Measured(source, camera, sample, geometry, find_gaps(source), rig)
-    findings = find_faults(measured, config, _reach_px(camera, config.matching))
-    verdict, looks = verdict_of(findings), tuple(sample.looks)
-    figures = _figures(measured)
-    return Audit(verdict, tuple(findings), figures, geometry.alignment, rig, looks)
+    return audit_of(look_at(source, config, effort=QUICK if quick else THOROUGH), config)
+
+
+def audit_of(look: Look, config: AuditedSettings) -> Audit:
+    """Return what a look at a drive says of it."""
+    findings = find_faults(look, config)
+    verdict, seen = verdict_of(findings), tuple(look.sample.pairs)
+    alignment, figures = look.geometry.alignment, _figures(look)
+    return Audit(verdict, tuple(findings), figures, alignment, look.rig, seen)
 
 
 def correct_calibration(
@@ -127,7 +117,7 @@ def correct_calibration(
             hint="record scenes with more texture, or recalibrate the cameras",
         )
     figures = {"row_error_before_px": rows.rms_px}
-    if rig is None or rig.fitted is None:
+    if rig.fitted is None:
         R_left = turns_of(source.calibration, config.rectification).R_left
         corrected: Rig = correct_rig(source.calibration, rows.turn, R_left)
         pitch_deg, _, roll_deg, _ = np.degrees(rows.turn).tolist()
@@ -143,17 +133,9 @@ def correct_calibration(
     return {**figures, "calibration": str(files[0]), "files": [str(file) for file in files]}
 
 
-def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
-    """Return the largest disparity that is searched; None if the range adapts to each pair."""
-    own = settings_of(matching.matcher, matching)
-    if not isinstance(own, SearchSettings) or (own.ndisp is None and camera.ndisp is None):
-        return None
-    return own.min_disparity_px + own.ndisp_for(camera)
-
-
-def _figures(measured: Measured) -> dict[str, Any]:
-    source, sample, gaps = measured.source, measured.sample, measured.gaps
-    geometry, camera, rig = measured.geometry, measured.camera, measured.rig
+def _figures(look: Look) -> dict[str, Any]:
+    source, sample, gaps = look.source, look.sample, look.gaps
+    geometry, camera, rig = look.geometry, look.camera, look.rig
     sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
     gains = np.concatenate([np.zeros(0), *sample.gains])
     return {
@@ -175,13 +157,13 @@ def _figures(measured: Measured) -> dict[str, Any]:
         "features": len(geometry.features),
         "swapped_share": plain(geometry.swapped_share),
         "lag_frames": geometry.lag,
-        "time_skew_frames": None if measured.skew is None else measured.skew[0],
+        "time_skew_frames": None if look.skew is None else look.skew[0],
         "baseline_m": camera.baseline_m,
         "focal_px": camera.focal_px,
         "field_of_view_deg": camera.field_of_view_deg,
         "speed_m_per_s": float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else None,
         **_alignment_figures(geometry.alignment, geometry.disparity_px, camera),
-        **({"rig_by_motion": rig.figures()} if rig and rig.fitted else {}),
+        **({"rig_by_motion": rig.figures()} if rig.fitted else {}),
     }
 
 
@@ -211,31 +193,19 @@ def _alignment_figures(
     }
 
 
-def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, ...]:
-    """Return findings of a quick audit, one line each; none if it is switched off.
+def check_related(look: Look, config: StereoSettings) -> None:
+    """Refuse a drive if in most of a few pairs nothing shows that left and right belong together.
 
-    Raises:
-        SourceError: One camera is late by whole frames: whatever is made of such pairs is wrong.
+    Of unrelated images some look alike by chance.
     """
-    found = _quick_findings(source, config)
-    for finding in found:
-        if finding.code == "lag":
-            what = "left and right images are of different moments"
-            raise SourceError(what, where=source.name, got=finding.text)
-    return tuple(f"{finding.text} [quick audit]" for finding in found)
-
-
-def check_related(source: StereoSource, config: AuditedSettings) -> None:
-    """Refuse a drive if in none of a few pairs left and right belong together."""
-    reconstructor, where = FrameReconstructor(source.calibration, config), source.name
-    last: Support | None = None
-    for number in np.unique(np.linspace(0, len(source) - 1, _RELATED_PAIRS).astype(int)).tolist():
-        last = reconstructor.inspect(reconstructor.rectify(next(source.frames(number))))[1]
-        if last is None or last.shown:
-            return
-        where = f"{source.name}, frame {number}"
-    if last is not None:
-        last.check(where)
+    source = look.source
+    reconstructor = FrameReconstructor(source.calibration, config)
+    seen = [(p.index, reconstructor.inspect(reconstructor.rectify(p))[1]) for p in look.recorded]
+    judged = [(index, support) for index, support in seen if support is not None]
+    unlike = [(index, support) for index, support in judged if not support.shown]
+    if 2 * len(unlike) > len(judged):
+        index, support = unlike[-1]
+        support.check(f"{source.name}, frame {index}")
 
 
 def find_pair_faults(
@@ -248,8 +218,13 @@ def find_pair_faults(
         hint = "name the image of each camera"
         raise MatchingError("left and right are the same image", where=pair.name or None, hint=hint)
     codes = _BY_IMAGES | _BY_CALIBRATION if metric else _BY_IMAGES
-    findings = _quick_findings(OnePair(pair, given.calibration), config)
-    return tuple(finding for finding in findings if finding.code in codes)
+    if not config.audit.quick:
+        return ()
+    try:
+        look = look_at(OnePair(pair, given.calibration), config)
+    except CalibrationError:  # it cannot rectify, which the run itself reports
+        return ()
+    return tuple(one for one in find_faults(look, config) if one.code in codes)
 
 
 def check_found(
@@ -284,11 +259,3 @@ def _reasons(disparity: Disparity) -> str:
     shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
     most = list(shares.items())[:2]
     return ", ".join(f"{share:.0f} % {r.name.lower().replace('_', ' ')}" for r, share in most)
-
-
-def _quick_findings(source: StereoSource, config: AuditedSettings) -> tuple[Finding, ...]:
-    """Return findings of a quick audit; none if it is switched off."""
-    try:
-        return audit_source(source, config, quick=True).findings if config.audit.quick else ()
-    except CalibrationError:  # it cannot rectify, which the run itself reports
-        return ()

@@ -17,11 +17,11 @@ from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.work import look_ahead, serial_algebra
+from recon.look.fault import shrink
+from recon.look.tracks import tracked_parts
 from recon.odometry.health import RIG_BASELINE, expected_drift, trusted_poses
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryResult
-from recon.odometry.rig.fault import shrink
-from recon.odometry.rig.tracks import plan_stretches
 from recon.odometry.visual import VisualOdometry
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, StereoSettings
@@ -103,7 +103,7 @@ def see_baseline(
         common = measured.settings.sigma_share
         if source.live or common >= _BASELINE_SIGMA:
             return None
-        parts = plan_stretches(len(source))
+        parts = tracked_parts(len(source))
         stretches = [_seen(source, config, start, stop, rig_share) for start, stop in parts]
         beside = [None if one is None else _beside(one, measured) for one in stretches]
         lengths = [length for length in beside if length is not None]

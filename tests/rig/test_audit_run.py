@@ -9,12 +9,12 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.values import StereoPair
 from recon.io.cameras.calibration import read_calibration
-from recon.rig.audit.audit import audit_source, correct_calibration
+from recon.rig.audit import audit_source, correct_calibration
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
-from tests.rig.audit import faults
+from tests.look import faults
 from tests.sources import drives
 
 CONFIG = load_config()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -13,6 +14,8 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.odometry.pose import find_consensus, fit_pose
 from recon.sources.source import StereoSource
+from recon.stereo.rectify.features import PairFeatures
+from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
 
 _AROUND_PX: Final = 9  # half of these may be saturated before their median is
 _DARK: Final = 12.0
@@ -22,6 +25,9 @@ _GAP_PERIODS: Final = 1.7  # time step, in frame periods, above which frames cou
 _MIN_POINTS: Final = 20
 _MIN_DISPARITY_PX: Final = 2.0
 _AGREE_PX: Final = 2.0
+MIN_FEATURES: Final = 60  # minimum number of features, in all, to judge geometry
+LARGEST_SKEW: Final = 0.75  # a larger skew, in frames, is closer to a lag of one frame
+_IN_STEP: Final = 0.8  # share of features that agree on one rotation, of images of one moment
 _MIN_FLOW_PX: Final = 1.0  # rows per frame by which features must move to reveal a time skew
 
 
@@ -73,9 +79,10 @@ class RepeatCounter:
     _run: list[int] = field(default_factory=lambda: [0, 0])
     _last: tuple[UInt8, UInt8] | None = None
 
-    def restart(self) -> None:
-        """Start a new series: the next pair does not follow the last one."""
-        self._last, self._run = None, [0, 0]
+    def join(self, later: RepeatCounter) -> None:
+        """Add what was counted in a later series."""
+        self.steps, self.both = self.steps + later.steps, self.both + later.both
+        self.frozen = [max(sides) for sides in zip(self.frozen, later.frozen, strict=True)]
 
     def add(self, left: UInt8, right: UInt8) -> None:
         if self._last is not None:
@@ -168,3 +175,42 @@ def find_gaps(source: StereoSource) -> Gaps:
     after = int(np.argmax(steps))
     count = int(np.count_nonzero(steps > _GAP_PERIODS * usual_s))
     return Gaps(count, float(steps[after]), after, usual_s)
+
+
+def align_features(features: PairFeatures, camera: RectifiedCamera) -> RowAlignment | None:
+    """Fit the rotation that aligns the rows of features; None if too few agree."""
+    if len(features) < MIN_FEATURES:
+        return None
+    found = align_rows(features.left_uv, features.right_uv, camera)
+    return found if found is not None and found.agreeing >= MIN_FEATURES else None
+
+
+def time_skew(
+    pairs: Sequence[PairFeatures],
+    flows: Sequence[Float64],
+    camera: RectifiedCamera,
+    alignment: RowAlignment | None,
+) -> tuple[float, float] | None:
+    """Return the skew in frames with its standard error, from features of pairs and their flow."""
+    if alignment is None:
+        return None
+    errors, moving = [np.zeros(0)], [np.zeros(0)]
+    for features, flow in zip(pairs, flows, strict=True):
+        rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
+        # The skew is at most half a frame, so a larger row error means a wrong match.
+        known = np.isfinite(flow) & (np.abs(rows) < 1.5 + 0.5 * np.abs(flow))
+        errors.append(rows[known])
+        moving.append(flow[known])
+    return measure_time_skew(np.concatenate(errors), np.concatenate(moving))
+
+
+def in_step(features: PairFeatures, flow: Float64, camera: RectifiedCamera) -> bool:
+    """Return whether moving features show that both images are of one moment, of no other frame.
+
+    They agree on one rotation, and their rows do not move on with the flow.
+    """
+    alignment = align_features(features, camera)
+    if alignment is None or alignment.agreeing < _IN_STEP * len(features):
+        return False
+    skew = time_skew([features], [flow], camera, alignment)
+    return skew is not None and abs(skew[0]) + 4 * skew[1] < 1 - LARGEST_SKEW

@@ -1,0 +1,155 @@
+"""The stereo geometry that features of a drive show together: rows, swapped or delayed cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Float64
+from recon.look.measures import LARGEST_SKEW, MIN_FEATURES, align_features, time_skew
+from recon.look.sample import Sample
+from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
+from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
+
+_LAG_FACTOR: Final = 1.25  # agreement relative to lag 0 from which a delay is reported
+_ALIKE: Final = 1.5  # agreement of the best lag relative to another that fits about as well
+MOST_ROWS_PX: Final = 1.5
+"""Epipolar error from which a pair is not matched rightly. As far as cameras turn against each
+other up and down, they turn to the side, which shifts every disparity and is seen nowhere."""
+_LEAST_PAIRS: Final = 3  # of which half would have to be wrong for the spread to be
+_SIGMAS: Final = 1.4826  # of a normal distribution, from its median absolute deviation
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Stereo geometry measured from the features of a drive."""
+
+    pairs: int  # whose features were matched
+    features: PairFeatures  # of all pairs; if one camera is delayed, of pairs shifted by the lag
+    matched: int  # number of features matched in pairs as recorded
+    alignment: RowAlignment | None  # row errors; None if there are too few features
+    disparity_px: Float64  # (M,), of the features whose rows agree; 0 is at infinity
+    swapped_share: float  # of near features, farther right in the right image; NaN = too few
+    out_of_step: bool  # whether images of other moments fit better
+    lag: int  # delay of the right camera in whole frames
+    # its delay in parts of a frame, and the standard error; None if unknown, or whole frames
+    skew: tuple[float, float] | None
+
+
+def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
+    """Measure the geometry from the features of all pairs."""
+    features = pool_features(sample.features)
+    matched = len(features)
+    alignment = align_features(features, camera)
+    skew = time_skew(sample.features, sample.flows, camera, alignment)
+    lag = _best_lag(sample, skew, camera)
+    if lag:
+        features, skew = pool_features(each.features for each in sample.lagged[lag]), None
+        alignment = align_features(features, camera)
+    return Geometry(
+        pairs=len(sample.features),
+        features=features,
+        matched=matched,
+        alignment=alignment,
+        disparity_px=_disparities(features, alignment, camera),
+        swapped_share=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share,
+        out_of_step=bool(lag) or _best_fit(sample)[1] > _LAG_FACTOR,
+        lag=lag,
+        skew=skew,
+    )
+
+
+def _disparities(
+    features: PairFeatures, alignment: RowAlignment | None, camera: RectifiedCamera
+) -> Float64:
+    if alignment is None:
+        return np.zeros(0)
+    rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
+    shift = features.left_uv[:, 0] - features.right_uv[:, 0] + camera.doffs_px
+    return shift[np.abs(rows) < max(1.0, 3 * alignment.residual_px)].astype(np.float64)
+
+
+def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: RectifiedCamera) -> int:
+    """Return the lag that fits best, if it fits clearly better than none.
+
+    A delay of half a frame fits both neighbours badly; it is a skew, which moving features show.
+    """
+    best, times = _best_fit(sample)
+    best = _best_moving(sample, best, camera)
+    if abs(best) == 1:
+        found, flows, _ = zip(*sample.lagged[best], strict=True)
+        left = time_skew(found, flows, camera, align_features(pool_features(found), camera))
+        if left is not None:
+            return best if abs(left[0]) < 1 - LARGEST_SKEW else 0
+        if skew is not None and 4 * skew[1] < abs(skew[0]) < LARGEST_SKEW:
+            return 0
+    return best if times > _LAG_FACTOR else 0
+
+
+def _best_moving(sample: Sample, best: int, camera: RectifiedCamera) -> int:
+    """Return of the lags that fit about as well as the best one that at which moving rows do best.
+
+    Where little moves, or what is ahead comes nearer, neighbouring frames match as well.
+    """
+    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in sample.lagged.items()}
+    sigmas = {}
+    for lag in (lag for lag in fit if _ALIKE * fit[lag] >= fit[best]):
+        found, flows, _ = zip(*sample.lagged[lag], strict=True)
+        skew = time_skew(found, flows, camera, align_features(pool_features(found), camera))
+        if skew is not None and abs(skew[0]) < 1 - LARGEST_SKEW:
+            sigmas[lag] = skew[1]
+    return min(sigmas, key=lambda lag: sigmas[lag], default=best)
+
+
+def _best_fit(sample: Sample) -> tuple[int, float]:
+    """Return the lag that fits best, and how many times as well as none; 1 if few features do."""
+    # Lags were tried on different numbers of pairs.
+    total = {lag: sum(n.agreeing for n in at) for lag, at in sample.lagged.items()}
+    fit = {lag: number / len(sample.lagged[lag]) for lag, number in total.items()}
+    best = max(fit, key=lambda lag: (fit[lag], -abs(lag)), default=0)
+    if total.get(best, 0) < MIN_FEATURES:
+        return best, 1.0
+    return best, fit[best] / max(fit.get(0, 0.0), 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Rigidity:
+    """Epipolar errors, right minus left row, of some pairs of a drive."""
+
+    frames: tuple[int, ...]
+    rows_px: Float64  # (N,), mean of the features of each pair
+
+    @property
+    def spread_px(self) -> float:
+        """Robust standard deviation; 0 where too few pairs show it."""
+        if len(self.frames) < _LEAST_PAIRS:
+            return 0.0
+        return _SIGMAS * float(np.median(np.abs(self.rows_px - np.median(self.rows_px))))
+
+    @property
+    def kept(self) -> bool:
+        return self.spread_px <= MOST_ROWS_PX
+
+    def describe(self) -> str:
+        """Return in words how the cameras moved; of pairs that are not rigid."""
+        rows = zip(self.frames, self.rows_px, strict=True)
+        found = ", ".join(f"{row:+.0f} px in frame {frame}" for frame, row in rows)
+        return (
+            "the cameras move against each other, or their images are of different moments: the "
+            f"right image is too low by {found}; no calibration holds for such a drive: fix both "
+            "to one bar, and trigger them together"
+        )
+
+
+def measure_rigidity(sample: Sample, camera: RectifiedCamera) -> Rigidity:
+    """Measure the epipolar error of each pair of which most features agree on one."""
+    found: dict[int, float] = {}
+    for one in sample.pairs:
+        seen = one.features
+        aligned = align_rows(seen.left_uv, seen.right_uv, camera)
+        if aligned is not None and 2 * aligned.agreeing > len(seen):
+            found[one.index] = aligned.mean_px
+    return Rigidity(tuple(found), np.array([*found.values()]))

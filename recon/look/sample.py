@@ -1,0 +1,264 @@
+"""Which frames of a drive a look reads, and what is measured in their pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from recon.core.errors import ReconError
+from recon.core.values import RectifiedPair, StereoPair
+from recon.core.values.arrays import Float32, Float64
+from recon.look.measures import (
+    RepeatCounter,
+    in_step,
+    measure_gain,
+    measure_sharpness,
+    measure_speed,
+    track,
+)
+from recon.look.tracks import REACH, TRACKED, tracked_parts
+from recon.stereo.rectify.features import NO_FEATURES, PairFeatures, match_features
+from recon.stereo.rectify.rectifier import Rectifier
+from recon.stereo.rectify.row_alignment import count_aligned
+
+Sides = tuple[float, float]  # of the left and of the right image
+_KEPT: Final = 6  # pairs that are kept as recorded
+_LEAST_SIDE_PX: Final = 16  # smaller images have no features, and no sharpness
+BLANK_DN: Final = 4.0  # an image counts as blank below this standard deviation, in grey levels
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much of a drive is looked at."""
+
+    frames: int  # that are read in all
+    pairs: int  # in which features are matched
+    features: int  # at most, per image
+    lag: int  # largest delay of one camera to look for, in frames
+    lag_pairs: int  # pairs that are also compared at other lags
+    margin: int  # of a window that is left for lags at each end: one of so many parts
+    whole: bool  # whether a drive is looked at that is longer than what is tracked
+
+
+QUICK: Final = Effort(TRACKED, pairs=6, features=800, lag=3, lag_pairs=2, margin=2, whole=False)
+# In a short window, several pairs with a few lags are better than one pair with all.
+THOROUGH: Final = Effort(300, pairs=12, features=1500, lag=4, lag_pairs=4, margin=3, whole=True)
+
+
+class Window(NamedTuple):
+    """Consecutive frames that are read: ``start`` to ``stop - 1``."""
+
+    start: int
+    stop: int
+    tracked: tuple[int, int]  # first frame and end of the part whose motion is seen
+    centres: tuple[int, ...]  # frames in which features are matched
+
+
+def plan_windows(frames: int, effort: Effort) -> list[Window]:
+    """Return the windows of a look at a drive, around its tracked parts; of a short one, all."""
+    parts = tracked_parts(frames)
+    if effort.whole and frames > REACH:
+        after = np.linspace(REACH, frames, 2 * len(parts) + 1)[1::2].astype(int).tolist()
+        parts += [(middle, middle) for middle in after]
+    if frames <= effort.frames:
+        spans = list(pairwise([0, *(sum(at) // 2 for at in _between(parts)), frames]))
+    else:
+        half = effort.frames // len(parts) // 2
+        starts = [min(max(0, sum(part) // 2 - half), frames - 2 * half) for part in parts]
+        spans = [(start, start + 2 * half) for start in starts]
+    many = max(1, effort.pairs // len(parts))
+    return [
+        Window(start, stop, part, _centres(start, stop, many, effort))
+        for (start, stop), part in zip(spans, parts, strict=True)
+    ]
+
+
+def _between(parts: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the end of each part and the first frame of the next one."""
+    return [(before[1], after[0]) for before, after in pairwise(parts)]
+
+
+def _centres(start: int, stop: int, many: int, effort: Effort) -> tuple[int, ...]:
+    """Return frames, evenly spread, with a margin for the lags."""
+    margin = min(effort.lag, (stop - start - 1) // effort.margin)
+    places = np.rint(np.linspace(start + margin, stop - 1 - margin, many)).astype(int)
+    return tuple(np.unique(places).tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Inspected:
+    """What was measured in one pair."""
+
+    index: int  # number of the pair
+    brightness_dn: Sides  # mean grey levels
+    sharpness: Sides  # shares of the finest detail; NaN if unknown
+    features: PairFeatures  # matched features
+    pair: RectifiedPair | None  # the images; None where they are not kept
+
+    @property
+    def rows_px(self) -> Float64:
+        """float64 (N,): row of each feature in the right image minus that in the left one."""
+        apart = self.features.right_uv[:, 1] - self.features.left_uv[:, 1]
+        return apart.astype(np.float64)
+
+
+class Lagged(NamedTuple):
+    """A pair at a lag: its matched features, their `Sample.flows`, how many agree on a rotation."""
+
+    features: PairFeatures
+    flow: Float64
+    agreeing: int
+
+
+@dataclass(eq=False)
+class Sample:
+    """Measures of the pairs that were looked at; lists have an entry for each measured pair."""
+
+    frames: int = 0  # number of pairs that were read
+    repeats: RepeatCounter = field(default_factory=RepeatCounter)
+    contrast_dn: list[Sides] = field(default_factory=list)  # standard deviations of grey levels
+    brightness_dn: list[Sides] = field(default_factory=list)  # mean grey levels
+    sharpness: list[Sides] = field(default_factory=list)  # shares of the finest detail
+    gains: list[Float64] = field(default_factory=list)  # brightness ratios around features
+    features: list[PairFeatures] = field(default_factory=list)  # matched features
+    speeds_m_per_s: list[float] = field(default_factory=list)  # of the rig, where measured
+    # (N,), rows by which each feature moves to the next frame; NaN if unknown
+    flows: list[Float64] = field(default_factory=list)
+    # by how many frames after the left image the right image is taken from
+    lagged: dict[int, list[Lagged]] = field(default_factory=dict)
+    pairs: list[Inspected] = field(default_factory=list)  # each pair
+    recorded: list[StereoPair] = field(default_factory=list)  # a few pairs, as recorded
+    broken: ReconError | None = None  # the error that ended the sampling, if any
+
+    @classmethod
+    def joined(cls, parts: Iterable[Sample]) -> Sample:
+        """Return the measures of several windows together, as far as the first that is broken."""
+        whole = cls()
+        for part in parts:
+            whole.frames += part.frames
+            whole.repeats.join(part.repeats)
+            for name in _LISTS:
+                getattr(whole, name).extend(getattr(part, name))
+            for lag, found in part.lagged.items():
+                whole.lagged.setdefault(lag, []).extend(found)
+            whole.broken = part.broken
+            if whole.broken is not None:
+                break
+        return whole
+
+
+_LISTS: Final = [one.name for one in fields(Sample) if one.type.startswith("list")]
+
+
+class Chosen(NamedTuple):
+    """Centres of which more is done than of others; all would not fit into memory."""
+
+    shown: Container[int]  # whose rectified images are kept: the first, middle and last
+    kept: Container[int]  # which are kept as recorded
+    lagged: Container[int]  # that are compared at other lags, if need be
+
+
+def choose(windows: Sequence[Window], effort: Effort) -> Chosen:
+    """Choose centres of a look, evenly spread."""
+    all_ = [centre for window in windows for centre in window.centres]
+    shown = {all_[n] for n in (0, len(all_) // 2, -1)} if all_ else set()
+    kept, lagged = (set(all_[:: max(1, len(all_) // n)]) for n in (_KEPT, effort.lag_pairs))
+    return Chosen(shown, kept, lagged)
+
+
+class Sampler:
+    """Measures the pairs of one window, given in order."""
+
+    def __init__(
+        self,
+        window: Window,
+        rectifier: Rectifier,
+        effort: Effort,
+        chosen: Chosen,
+    ) -> None:
+        self.sample = Sample()
+        self._window, self._rectifier, self._effort = window, rectifier, effort
+        self._chosen = chosen
+        self._waiting = list(window.centres)
+        self._recent: dict[int, RectifiedPair] = {}
+
+    def add(self, number: int, recorded: StereoPair, view: RectifiedPair | None = None) -> None:
+        """Add the next pair, and its rectified view if there is one.
+
+        A pair is measured once its neighbours have been read.
+        """
+        self.sample.frames += 1
+        self.sample.repeats.add(recorded.left, recorded.right)
+        if number in self._chosen.kept:
+            self.sample.recorded.append(recorded)
+        if not self._waiting:
+            return
+        lag = self._effort.lag
+        if number >= self._waiting[0] - lag:
+            # A pair, or part of a drive, may have its numbers from elsewhere.
+            view = view or self._rectifier.rectify(recorded)
+            self._recent[number] = replace(view, index=number)
+        self._recent.pop(number - 2 * lag - 1, None)
+        last = self._window.stop - 1
+        while self._waiting and number >= min(self._waiting[0] + lag, last):
+            self._measure(self._waiting.pop(0))
+
+    def _measure(self, centre: int) -> None:
+        pair, sample = self._recent[centre], self.sample
+        sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
+        sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
+        shown = pair if centre in self._chosen.shown else None
+        seen = Inspected(centre, sample.brightness_dn[-1], (np.nan, np.nan), NO_FEATURES, shown)
+        if min(sample.contrast_dn[-1]) < BLANK_DN:
+            sample.pairs.append(seen)
+            return
+        if min(pair.left.shape) < _LEAST_SIDE_PX:
+            sample.features.append(NO_FEATURES)
+            sample.flows.append(np.zeros(0))
+            return
+        sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
+        features = match_features(pair.left, pair.right, self._effort.features)
+        sample.features.append(features)
+        sample.pairs.append(replace(seen, sharpness=sample.sharpness[-1], features=features))
+        places = (features.left_uv, features.right_uv)
+        sample.gains.append(measure_gain(pair.left, pair.right, *places))
+        self._measure_motion(centre, features)
+        if centre in self._chosen.lagged and not in_step(features, sample.flows[-1], pair.camera):
+            self._compare_lags(centre, features)
+
+    def _compare_lags(self, centre: int, features: PairFeatures) -> None:
+        span = min(self._effort.lag, centre - min(self._recent), max(self._recent) - centre)
+        pair, sample = self._recent[centre], self.sample
+        for lag in range(-span, span + 1):
+            found = features
+            if lag:
+                right = self._recent[centre + lag].right
+                found = match_features(pair.left, right, self._effort.features)
+            agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
+            flow, _ = self._follow(centre, found)
+            sample.lagged.setdefault(lag, []).append(Lagged(found, flow, agreeing))
+
+    def _measure_motion(self, centre: int, features: PairFeatures) -> None:
+        flow, there = self._follow(centre, features)
+        self.sample.flows.append(flow)
+        found, later = np.isfinite(flow), self._recent.get(centre + 1)
+        if later is not None:
+            pair = self._recent[centre]
+            seen = (features.left_uv[found], features.right_uv[found], there[found])
+            moved_m = measure_speed(*seen, pair.camera)
+            step_s = later.timestamp_s - pair.timestamp_s
+            if moved_m is not None and step_s > 0:
+                self.sample.speeds_m_per_s.append(moved_m / step_s)
+
+    def _follow(self, centre: int, features: PairFeatures) -> tuple[Float64, Float32]:
+        """Return rows by which features move to the next frame, NaN = unknown, and their places."""
+        flow, there = np.full(len(features), np.nan), features.left_uv
+        later = self._recent.get(centre + 1)
+        if later is not None and len(features):
+            there, found = track(self._recent[centre].left, later.left, features.left_uv)
+            flow[found] = there[found, 1] - features.left_uv[found, 1]
+        return flow, there
