@@ -120,25 +120,24 @@ def _of_images(sample: Sample, matcher: str | Matcher) -> Found:
         key = "size error" if "size" in sample.broken.what else "unreadable"
         yield key, {"error": sample.broken}
     for side in _blank_sides(sample):
-        mean = np.median([pair[side] for pair in sample.brightness_dn])
+        mean = np.median([one.brightness_dn[side] for one in sample.pairs])
         yield "black", {"side": _SIDES[side], "mean": mean}
-    if sample.sharpness:
-        left, right = np.median(sample.sharpness, axis=0)
+    if sample.sharpness is not None:
+        left, right = sample.sharpness
         worse, better = min(left, right), max(left, right)
         if worse < _SHARPNESS_RATIO * better:
             yield "blur", {"side": _SIDES[int(right < left)], "worse": worse, "better": better}
         elif better < _SHARPNESS:
             yield "blur both", {"left": left, "right": right}
-    gains = np.concatenate([np.zeros(0), *sample.gains])
-    gain = float(np.median(gains)) if len(gains) >= MIN_FEATURES else 1.0
-    if not 1 / _GAIN < gain < _GAIN:
+    gain, features = sample.gain
+    if features >= MIN_FEATURES and not 1 / _GAIN < gain < _GAIN:
         # The census transform of sgm compares grey levels only with their neighbours.
         yield "gain", {"gain": gain, "other": "" if matcher == "sgm" else ", or match with sgm"}
 
 
 def _blank_sides(sample: Sample) -> list[int]:
     """Return cameras whose images are uniform in most pairs."""
-    blank = np.array(sample.contrast_dn).reshape(-1, 2) < BLANK_DN
+    blank = np.array([one.contrast_dn for one in sample.pairs]).reshape(-1, 2) < BLANK_DN
     return [side for side in range(2) if len(blank) and blank[:, side].mean() >= 0.5]
 
 
@@ -226,7 +225,7 @@ def _of_calibration(
             yield "size", {"side": side, **own}
             break
     shortest, longest = baseline_m
-    speed = float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else 0.0
+    speed = sample.speed_m_per_s
     if not shortest <= camera.baseline_m <= longest or speed > _MAX_SPEED_M_PER_S:
         moving = f", with which the rig moves at {speed:.0f} m/s" if speed > 0 else ""
         yield "baseline", {"baseline_m": camera.baseline_m, "moving": moving}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,10 +11,11 @@ import numpy as np
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.look.measures import LARGEST_SKEW, MIN_FEATURES, align_features, time_skew
-from recon.look.sample import Sample
+from recon.look.sample import Lagged, Sample
 from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
 from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
 
+_ByLag = Mapping[int, Sequence[Lagged]]
 _LAG_FACTOR: Final = 1.25  # agreement relative to lag 0 from which a delay is reported
 _ALIKE: Final = 1.5  # agreement of the best lag relative to another that fits about as well
 MOST_ROWS_PX: Final = 1.5
@@ -41,22 +43,23 @@ class Geometry:
 
 def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
     """Measure the geometry from the features of all pairs."""
-    features = pool_features(sample.features)
+    each = [features for features, _ in sample.matched]
+    features, lagged = pool_features(each), sample.lagged
     matched = len(features)
     alignment = align_features(features, camera)
-    skew = time_skew(sample.features, sample.flows, camera, alignment)
-    lag = _best_lag(sample, skew, camera)
+    skew = time_skew(each, [flow for _, flow in sample.matched], camera, alignment)
+    lag = _best_lag(lagged, skew, camera)
     if lag:
-        features, skew = pool_features(each.features for each in sample.lagged[lag]), None
+        features, skew = pool_features(one.features for one in lagged[lag]), None
         alignment = align_features(features, camera)
     return Geometry(
-        pairs=len(sample.features),
+        pairs=len(each),
         features=features,
         matched=matched,
         alignment=alignment,
         disparity_px=_disparities(features, alignment, camera),
         swapped_share=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share,
-        out_of_step=bool(lag) or _best_fit(sample)[1] > _LAG_FACTOR,
+        out_of_step=bool(lag) or _best_fit(lagged)[1] > _LAG_FACTOR,
         lag=lag,
         skew=skew,
     )
@@ -72,15 +75,15 @@ def _disparities(
     return shift[np.abs(rows) < max(1.0, 3 * alignment.residual_px)].astype(np.float64)
 
 
-def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: RectifiedCamera) -> int:
+def _best_lag(lagged: _ByLag, skew: tuple[float, float] | None, camera: RectifiedCamera) -> int:
     """Return the lag that fits best, if it fits clearly better than none.
 
     A delay of half a frame fits both neighbours badly; it is a skew, which moving features show.
     """
-    best, times = _best_fit(sample)
-    best = _best_moving(sample, best, camera)
+    best, times = _best_fit(lagged)
+    best = _best_moving(lagged, best, camera)
     if abs(best) == 1:
-        found, flows, _ = zip(*sample.lagged[best], strict=True)
+        found, flows, _ = zip(*lagged[best], strict=True)
         left = time_skew(found, flows, camera, align_features(pool_features(found), camera))
         if left is not None:
             return best if abs(left[0]) < 1 - LARGEST_SKEW else 0
@@ -89,26 +92,26 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None, camera: Rectifie
     return best if times > _LAG_FACTOR else 0
 
 
-def _best_moving(sample: Sample, best: int, camera: RectifiedCamera) -> int:
+def _best_moving(lagged: _ByLag, best: int, camera: RectifiedCamera) -> int:
     """Return of the lags that fit about as well as the best one that at which moving rows do best.
 
     Where little moves, or what is ahead comes nearer, neighbouring frames match as well.
     """
-    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in sample.lagged.items()}
+    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in lagged.items()}
     sigmas = {}
     for lag in (lag for lag in fit if _ALIKE * fit[lag] >= fit[best]):
-        found, flows, _ = zip(*sample.lagged[lag], strict=True)
+        found, flows, _ = zip(*lagged[lag], strict=True)
         skew = time_skew(found, flows, camera, align_features(pool_features(found), camera))
         if skew is not None and abs(skew[0]) < 1 - LARGEST_SKEW:
             sigmas[lag] = skew[1]
     return min(sigmas, key=lambda lag: sigmas[lag], default=best)
 
 
-def _best_fit(sample: Sample) -> tuple[int, float]:
+def _best_fit(lagged: _ByLag) -> tuple[int, float]:
     """Return the lag that fits best, and how many times as well as none; 1 if few features do."""
     # Lags were tried on different numbers of pairs.
-    total = {lag: sum(n.agreeing for n in at) for lag, at in sample.lagged.items()}
-    fit = {lag: number / len(sample.lagged[lag]) for lag, number in total.items()}
+    total = {lag: sum(n.agreeing for n in at) for lag, at in lagged.items()}
+    fit = {lag: number / len(lagged[lag]) for lag, number in total.items()}
     best = max(fit, key=lambda lag: (fit[lag], -abs(lag)), default=0)
     if total.get(best, 0) < MIN_FEATURES:
         return best, 1.0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -28,6 +29,7 @@ from recon.stereo.rectify.row_alignment import count_aligned
 Sides = tuple[float, float]  # of the left and of the right image
 _KEPT: Final = 6  # pairs that are kept as recorded
 _LEAST_SIDE_PX: Final = 16  # smaller images have no features, and no sharpness
+_none: Final = partial(np.zeros, 0)
 BLANK_DN: Final = 4.0  # an image counts as blank below this standard deviation, in grey levels
 
 
@@ -89,15 +91,31 @@ def _centres(start: int, stop: int, many: int, effort: Effort) -> tuple[int, ...
     return tuple(np.unique(places).tolist())
 
 
+class Lagged(NamedTuple):
+    """A pair at a lag: its matched features, their `Inspected.flow`, how many agree on a turn."""
+
+    features: PairFeatures
+    flow: Float64
+    agreeing: int
+
+
 @dataclass(frozen=True, eq=False)
 class Inspected:
     """What was measured in one pair."""
 
     index: int  # number of the pair
+    contrast_dn: Sides  # standard deviations of grey levels
     brightness_dn: Sides  # mean grey levels
-    sharpness: Sides  # shares of the finest detail; NaN if unknown
-    features: PairFeatures  # matched features
-    pair: RectifiedPair | None  # the images; None where they are not kept
+    shown: RectifiedPair | None = None  # the images; None where they are not kept
+    sharpness: Sides = (np.nan, np.nan)  # shares of the finest detail; NaN if unknown
+    gains: Float64 = field(default_factory=_none)  # brightness ratios around features
+    features: PairFeatures = NO_FEATURES  # matched features
+    flow: Float64 = field(
+        default_factory=_none
+    )  # (N,), rows by which each moves to the next frame; NaN = unknown
+    speed_m_per_s: float = np.nan  # of the rig; NaN if unknown
+    # by how many frames after the left image the right image is taken from
+    lagged: Mapping[int, Lagged] = field(default_factory=dict)
 
     @property
     def rows_px(self) -> Float64:
@@ -106,31 +124,13 @@ class Inspected:
         return apart.astype(np.float64)
 
 
-class Lagged(NamedTuple):
-    """A pair at a lag: its matched features, their `Sample.flows`, how many agree on a rotation."""
-
-    features: PairFeatures
-    flow: Float64
-    agreeing: int
-
-
 @dataclass(eq=False)
 class Sample:
-    """Measures of the pairs that were looked at; lists have an entry for each measured pair."""
+    """What was measured in the pairs that were looked at."""
 
     frames: int = 0  # number of pairs that were read
     repeats: RepeatCounter = field(default_factory=RepeatCounter)
-    contrast_dn: list[Sides] = field(default_factory=list)  # standard deviations of grey levels
-    brightness_dn: list[Sides] = field(default_factory=list)  # mean grey levels
-    sharpness: list[Sides] = field(default_factory=list)  # shares of the finest detail
-    gains: list[Float64] = field(default_factory=list)  # brightness ratios around features
-    features: list[PairFeatures] = field(default_factory=list)  # matched features
-    speeds_m_per_s: list[float] = field(default_factory=list)  # of the rig, where measured
-    # (N,), rows by which each feature moves to the next frame; NaN if unknown
-    flows: list[Float64] = field(default_factory=list)
-    # by how many frames after the left image the right image is taken from
-    lagged: dict[int, list[Lagged]] = field(default_factory=dict)
-    pairs: list[Inspected] = field(default_factory=list)  # each pair
+    pairs: list[Inspected] = field(default_factory=list)
     recorded: list[StereoPair] = field(default_factory=list)  # a few pairs, as recorded
     broken: ReconError | None = None  # the error that ended the sampling, if any
 
@@ -141,17 +141,42 @@ class Sample:
         for part in parts:
             whole.frames += part.frames
             whole.repeats.join(part.repeats)
-            for name in _LISTS:
-                getattr(whole, name).extend(getattr(part, name))
-            for lag, found in part.lagged.items():
-                whole.lagged.setdefault(lag, []).extend(found)
+            whole.pairs += part.pairs
+            whole.recorded += part.recorded
             whole.broken = part.broken
             if whole.broken is not None:
                 break
         return whole
 
+    @property
+    def matched(self) -> list[tuple[PairFeatures, Float64]]:
+        """Features and their flow, of each pair that is not uniform."""
+        seen = (one for one in self.pairs if min(one.contrast_dn) >= BLANK_DN)
+        return [(one.features, one.flow) for one in seen]
 
-_LISTS: Final = [one.name for one in fields(Sample) if one.type.startswith("list")]
+    @property
+    def lagged(self) -> dict[int, list[Lagged]]:
+        """By lag, the pairs that were compared at it."""
+        lags = sorted({lag for one in self.pairs for lag in one.lagged})
+        return {lag: [one.lagged[lag] for one in self.pairs if lag in one.lagged] for lag in lags}
+
+    @property
+    def sharpness(self) -> Float64 | None:
+        """float64 (2,), median of the sharpness of both sides; None if unknown."""
+        known = [one.sharpness for one in self.pairs if np.isfinite(one.sharpness).all()]
+        return np.asarray(np.median(known, axis=0)) if known else None
+
+    @property
+    def gain(self) -> tuple[float, int]:
+        """Median brightness of right images relative to left ones, of so many features."""
+        gains = np.concatenate([np.zeros(0), *(one.gains for one in self.pairs)])
+        return (float(np.median(gains)), len(gains)) if len(gains) else (np.nan, 0)
+
+    @property
+    def speed_m_per_s(self) -> float:
+        """Median speed of the rig; NaN if unknown."""
+        speeds = [one.speed_m_per_s for one in self.pairs if np.isfinite(one.speed_m_per_s)]
+        return float(np.median(speeds)) if speeds else np.nan
 
 
 class Chosen(NamedTuple):
@@ -174,11 +199,7 @@ class Sampler:
     """Measures the pairs of one window, given in order."""
 
     def __init__(
-        self,
-        window: Window,
-        rectifier: Rectifier,
-        effort: Effort,
-        chosen: Chosen,
+        self, window: Window, rectifier: Rectifier, effort: Effort, chosen: Chosen
     ) -> None:
         self.sample = Sample()
         self._window, self._rectifier, self._effort = window, rectifier, effort
@@ -208,51 +229,51 @@ class Sampler:
             self._measure(self._waiting.pop(0))
 
     def _measure(self, centre: int) -> None:
-        pair, sample = self._recent[centre], self.sample
-        sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
-        sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
-        shown = pair if centre in self._chosen.shown else None
-        seen = Inspected(centre, sample.brightness_dn[-1], (np.nan, np.nan), NO_FEATURES, shown)
-        if min(sample.contrast_dn[-1]) < BLANK_DN:
-            sample.pairs.append(seen)
-            return
-        if min(pair.left.shape) < _LEAST_SIDE_PX:
-            sample.features.append(NO_FEATURES)
-            sample.flows.append(np.zeros(0))
-            return
-        sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
-        features = match_features(pair.left, pair.right, self._effort.features)
-        sample.features.append(features)
-        sample.pairs.append(replace(seen, sharpness=sample.sharpness[-1], features=features))
-        places = (features.left_uv, features.right_uv)
-        sample.gains.append(measure_gain(pair.left, pair.right, *places))
-        self._measure_motion(centre, features)
-        if centre in self._chosen.lagged and not in_step(features, sample.flows[-1], pair.camera):
-            self._compare_lags(centre, features)
+        pair = self._recent[centre]
+        sides = (pair.left, pair.right)
+        seen = Inspected(
+            index=centre,
+            contrast_dn=(float(pair.left.std()), float(pair.right.std())),
+            brightness_dn=(float(pair.left.mean()), float(pair.right.mean())),
+            shown=pair if centre in self._chosen.shown else None,
+        )
+        if min(seen.contrast_dn) >= BLANK_DN and min(pair.left.shape) >= _LEAST_SIDE_PX:
+            features = match_features(*sides, self._effort.features)
+            flow, speed = self._motion(centre, features)
+            seen = replace(
+                seen,
+                sharpness=(measure_sharpness(pair.left), measure_sharpness(pair.right)),
+                features=features,
+                gains=measure_gain(*sides, features.left_uv, features.right_uv),
+                flow=flow,
+                speed_m_per_s=speed,
+            )
+            if centre in self._chosen.lagged and not in_step(features, flow, pair.camera):
+                seen = replace(seen, lagged=self._lags(centre, features))
+        self.sample.pairs.append(seen)
 
-    def _compare_lags(self, centre: int, features: PairFeatures) -> None:
+    def _lags(self, centre: int, features: PairFeatures) -> dict[int, Lagged]:
         span = min(self._effort.lag, centre - min(self._recent), max(self._recent) - centre)
-        pair, sample = self._recent[centre], self.sample
+        pair, lags = self._recent[centre], dict[int, Lagged]()
         for lag in range(-span, span + 1):
             found = features
             if lag:
                 right = self._recent[centre + lag].right
                 found = match_features(pair.left, right, self._effort.features)
             agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
-            flow, _ = self._follow(centre, found)
-            sample.lagged.setdefault(lag, []).append(Lagged(found, flow, agreeing))
+            lags[lag] = Lagged(found, self._follow(centre, found)[0], agreeing)
+        return lags
 
-    def _measure_motion(self, centre: int, features: PairFeatures) -> None:
+    def _motion(self, centre: int, features: PairFeatures) -> tuple[Float64, float]:
+        """Return rows by which features move to the next frame, and the speed of the rig."""
         flow, there = self._follow(centre, features)
-        self.sample.flows.append(flow)
         found, later = np.isfinite(flow), self._recent.get(centre + 1)
-        if later is not None:
-            pair = self._recent[centre]
-            seen = (features.left_uv[found], features.right_uv[found], there[found])
-            moved_m = measure_speed(*seen, pair.camera)
-            step_s = later.timestamp_s - pair.timestamp_s
-            if moved_m is not None and step_s > 0:
-                self.sample.speeds_m_per_s.append(moved_m / step_s)
+        if later is None:
+            return flow, np.nan
+        pair = self._recent[centre]
+        seen = (features.left_uv[found], features.right_uv[found], there[found])
+        moved_m, step_s = measure_speed(*seen, pair.camera), later.timestamp_s - pair.timestamp_s
+        return flow, moved_m / step_s if moved_m is not None and step_s > 0 else np.nan
 
     def _follow(self, centre: int, features: PairFeatures) -> tuple[Float64, Float32]:
         """Return rows by which features move to the next frame, NaN = unknown, and their places."""

@@ -37,7 +37,7 @@ def write_audit_page(
         lines=audit_lines(audit.summary),
         rig=rig_content(audit.rig),
         frames=frames_figure(audit.pairs) if audit.pairs else None,
-        pairs=[_pair(look, look.pair, matcher) for look in audit.pairs if look.pair is not None],
+        pairs=[_pair(look, look.shown, matcher) for look in audit.pairs if look.shown is not None],
         warnings=[finding.text for finding in audit.findings],
     )
 

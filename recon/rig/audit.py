@@ -136,8 +136,7 @@ def correct_calibration(
 def _figures(look: Look) -> dict[str, Any]:
     source, sample, gaps = look.source, look.sample, look.gaps
     geometry, camera, rig = look.geometry, look.camera, look.rig
-    sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
-    gains = np.concatenate([np.zeros(0), *sample.gains])
+    sharpness = [None, None] if sample.sharpness is None else sample.sharpness.tolist()
     return {
         "source": source.name,
         "description": source.description,
@@ -151,7 +150,7 @@ def _figures(look: Look) -> dict[str, Any]:
         "gaps": gaps.count,
         "longest_step_s": plain(gaps.longest_s),
         "usual_step_s": plain(gaps.usual_s),
-        "gain": float(np.median(gains)) if len(gains) else None,
+        "gain": plain(sample.gain[0]),
         "sharpness_left": sharpness[0],
         "sharpness_right": sharpness[1],
         "features": len(geometry.features),
@@ -161,7 +160,7 @@ def _figures(look: Look) -> dict[str, Any]:
         "baseline_m": camera.baseline_m,
         "focal_px": camera.focal_px,
         "field_of_view_deg": camera.field_of_view_deg,
-        "speed_m_per_s": float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else None,
+        "speed_m_per_s": plain(sample.speed_m_per_s),
         **_alignment_figures(geometry.alignment, geometry.disparity_px, camera),
         **({"rig_by_motion": rig.figures()} if rig.fitted else {}),
     }
