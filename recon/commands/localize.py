@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map import look_first, run_map
+from recon.commands.map import lines_of, look_first, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.progress import Silent, showing, stage
@@ -17,6 +17,7 @@ from recon.core.values import StereoPair
 from recon.export.trajectories import begin_states, export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
+from recon.look.look import look_at
 from recon.map.drive.drive import Workspace
 from recon.map.drive.scale import measure_scene
 from recon.map.drive.sequence import map_sequence
@@ -26,7 +27,7 @@ from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
 from recon.run.finished import GRID, figure_of, refuse_as_target
 from recon.sources.live import LiveSource
-from recon.sources.source import DerivedSource, StereoSource
+from recon.sources.source import DerivedSource, SourcePart, StereoSource
 
 
 def run_localize(
@@ -91,6 +92,8 @@ def run_localize(
 
 
 _SLOWEST: Final = 1e-3
+_LOOK_S: Final = 2.0  # that are looked at before the first pose
+_MOST: Final = 24  # pairs of them
 _FIRST: Final = 3  # pairs that do not count: the first use of a library takes long
 _PACE_S: Final = 0.1  # between them, whatever their own times are: there may be a gap
 
@@ -133,12 +136,17 @@ def run_live(
     if config.odometry.method == "kiss":
         what = "while images arrive, poses come before the points that kiss-icp needs"
         raise SettingsError(what, where="odometry.method", got="kiss", expected="visual")
+    stage("look")
     beginning = _Beginning(source)
-    first = LiveSource(beginning, stopped=stopped)  # what comes is done once and forgotten
+    look = look_at(beginning, config)
+    if options.audit:
+        options.warn(lines_of(look, config))
+    # What comes is done once and forgotten.
+    first = LiveSource(SourcePart(beginning, 0, min(_FIRST, len(beginning))), stopped=stopped)
     stage("warm up")
     with Map.temporary() if map_path is None else Map.open(map_path) as map_, showing(Silent()):
         if map_path is None:
-            scene = measure_scene(beginning, beginning.calibration, config)
+            scene = measure_scene(look.recorded, beginning.calibration, config)
             config = config.at_scale(scene.scale)
             map_sequence(first, config, workspace=Workspace(map_))
         else:
@@ -158,12 +166,17 @@ def run_live(
 
 
 class _Beginning(DerivedSource):
-    """The first pairs of a source, read once: a camera takes none again."""
+    """The first two seconds of a source, read once: a camera takes them not again."""
 
     def __init__(self, source: StereoSource) -> None:
         super().__init__(source)
-        first = enumerate(islice(source.frames(), _FIRST))
-        self._pairs = [replace(pair, timestamp_s=n * _PACE_S) for n, pair in first]
+        self._pairs = list[StereoPair]()
+        begun_s = None
+        for pair in islice(source.frames(), _MOST):
+            self._pairs.append(replace(pair, timestamp_s=len(self._pairs) * _PACE_S))
+            begun_s = pair.timestamp_s if begun_s is None else begun_s
+            if len(self._pairs) >= _FIRST and pair.timestamp_s - begun_s >= _LOOK_S:
+                break
 
     def __len__(self) -> int:
         return len(self._pairs)

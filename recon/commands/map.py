@@ -258,15 +258,21 @@ def _findings(look: Look, config: ReconConfig, options: MapOptions) -> tuple[str
     """Return what is wrong with a drive, but what is said of its rig."""
     if not (options.audit and config.audit.quick) or look.source.live:
         return ()
-    found = find_faults(look, config)
-    for finding in found:
+    for finding in find_faults(look, config):
         if finding.code == "lag" and finding.fatal:
             what = "left and right images are of different moments"
             raise SourceError(what, where=look.source.name, got=finding.text)
-    lines = tuple(f"{one.text} [quick audit]" for one in found if one.code not in _SAID)
+    lines = lines_of(look, config)
     if options.known_poses is None:
         return lines
     return (*lines, *doubt_poses(options.known_poses, look.source, config))
+
+
+def lines_of(look: Look, config: ReconConfig) -> tuple[str, ...]:
+    """Return a line for each problem that a look shows, but those that a run says anyway."""
+    said = _SAID if look.shifted or not look.geometry.lag else _SAID - {"lag"}
+    found = find_faults(look, config)
+    return tuple(f"{one.text} [quick audit]" for one in found if one.code not in said)
 
 
 def _shown_live(
