@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,15 +50,10 @@ def arrays_product(order: Order) -> Made:
     }
     points = write_npz(
         order.run.path("map/map.npz"),
-        (_fields(tile.cloud) for tile in order.placed.tiles if len(tile.cloud)),
+        (tile.cloud.arrays for tile in order.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
     return Made({"points": points})
-
-
-def _fields(cloud: PointCloud) -> dict[str, NDArray[Any]]:
-    values = {field.name: getattr(cloud, field.name) for field in fields(cloud)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:

@@ -14,6 +14,8 @@ from recon.core.text import counted
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in, tree_of
 from recon.io.files import reading
+from recon.map.fusion import KNOWABLE, VOXEL_BYTES
+from recon.map.store.database import MORE_ATTRIBUTES
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -265,7 +267,6 @@ class Session:
 
 SUBMAP: Final = "submap"
 ENTRY: Final = "submap_entry"
-_VOXEL_BYTES: Final = 60
 _CELL_BYTES: Final = 54  # most of one cell: its values, its surface point, and a block of its own
 
 
@@ -282,7 +283,7 @@ class SubmapEntry:
     @property
     def nbytes(self) -> int:
         """Most bytes that its arrays take."""
-        return _VOXEL_BYTES * self.voxels + _CELL_BYTES * self.cells
+        return VOXEL_BYTES * self.voxels + _CELL_BYTES * self.cells
 
     @property
     def middle(self) -> int:
@@ -315,6 +316,8 @@ class Submaps:
     def add(self, submap: Submap, *, compress: bool = False) -> None:
         entry = _entry_of(submap)
         key = (self._session, submap.index)
+        if not set(submap.fused.known) <= set(KNOWABLE):
+            self.store.need_format(MORE_ATTRIBUTES)
         self.store.put(SUBMAP, key, tree_of(submap), compress=compress)
         self.store.put(ENTRY, key, asdict(entry))
         self.entries.append(entry)
