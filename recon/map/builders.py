@@ -17,7 +17,7 @@ from recon.core.settings import Length, Settings
 from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, RayGrain
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.core.values.grid import log_odds
-from recon.map.fusion import ALL, FusedPart, FusionSettings, columns_in, sums_of, values_in
+from recon.map.fusion import ALL, FusedPart, FusionSettings, columns_in, sums_in, sums_of
 from recon.map.kernels import clamped, raycast
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, sum_points
 
@@ -35,7 +35,7 @@ class CloudBuilder:
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
         self._known: tuple[str, ...] = ALL
-        self._sums = voxels.make_sums(1, values_in(ALL))
+        self._sums = voxels.make_sums(1, sums_in(ALL) - 4)
         self._frames = 0
 
     def __len__(self) -> int:
@@ -64,13 +64,13 @@ class CloudBuilder:
     def take(self) -> FusedPart:
         """Return the part so far; the builder starts a new one."""
         part = self.part()
-        self._sums, self._known, self._frames = voxels.make_sums(1, values_in(ALL)), ALL, 0
+        self._sums, self._known, self._frames = voxels.make_sums(1, sums_in(ALL) - 4), ALL, 0
         return part
 
     def resume(self, part: FusedPart, frames: int) -> None:
         """Continue a part into which so many frames were integrated."""
         self._known, self._frames = part.known if frames else ALL, frames
-        empty = voxels.make_sums(max(1, len(part)), values_in(self._known))
+        empty = voxels.make_sums(max(1, len(part)), sums_in(self._known) - 4)
         self._sums = voxels.add_rows(empty, part.keys, part.sums, part.information, part.frames)
 
     def _know(self, known: tuple[str, ...]) -> None:
@@ -95,7 +95,7 @@ class CloudBuilder:
 
     def _values(self, cloud: PointCloud) -> Float32:
         """Return what is averaged of each point, float32 (N, C); 0 = unknown."""
-        values = np.zeros((len(cloud), values_in(self._known)), np.float32)
+        values = np.zeros((len(cloud), sums_in(self._known) - 4), np.float32)
         columns, found = columns_in(self._known), dict(cloud.attributes)
         for each in columns.keys() & found.keys():
             values[:, columns[each].start - 4 : columns[each].stop - 4] = each.averaged(found[each])

@@ -19,7 +19,7 @@ from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64, Int64, tree_of
-from recon.map.fusion import ALL, VOXEL_BYTES, FusedPart
+from recon.map.fusion import ALL, FusedPart, row_bytes
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.map.occupancy.moving import GROWTH_CELLS
@@ -174,7 +174,7 @@ class Cutter:
         fused, occupancy, voxel_m = submap.fused, submap.occupancy, self._config.fusion.voxel_m
         centres_m = apply(self._T_map_world, (fused.cells + 0.5) * voxel_m)
         for key, inside in parts.near(centres_m, self._filter_margin_m):
-            yield FUSED, key, fused.select(inside), int(inside.sum()) * VOXEL_BYTES
+            yield FUSED, key, fused.select(inside), int(inside.sum()) * row_bytes(fused.known)
         for key, inside in parts.near(self.centres_m(occupancy), self.grid_margin_m):
             yield OCCUPANCY, key, occupancy.select(inside), int(inside.sum()) * _BLOCK_BYTES
 

@@ -52,32 +52,35 @@ def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
 
 KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")
 """What every map has room for, in the order of its sums; others only where clouds have them."""
-_OF_NAME: Final = {each.name: each for each in ATTRIBUTES}
-_MORE: Final = tuple(
-    each.name
-    for each in ATTRIBUTES
-    if each.fused not in ("own", None) and each.name not in KNOWABLE
-)
-ALL: Final = (*KNOWABLE, *_MORE)
+_OF_NAME: Final = {each.name: each for each in ATTRIBUTES if each.fused is not None}
+_MORE: Final = [name for name, each in _OF_NAME.items() if each.fused != "own"]
+ALL: Final = (*KNOWABLE, *(name for name in _MORE if name not in KNOWABLE))
 """What a map may know of its points, beside how many frames saw each."""
 
 
 def columns_in(known: Collection[str]) -> dict[Attribute, slice]:
     """Return where in the sums of a voxel those of attributes lie."""
+    if unknown := [name for name in known if name not in ALL]:
+        what = "points of the map have an attribute that this version does not know"
+        raise FormatError(what, got=unknown[0], hint="update recon")
     found, begin = {}, 4  # behind the weight and the offset
-    for name in (*KNOWABLE, *(name for name in _MORE if name in known)):
-        if (each := _OF_NAME[name]).fused != "own":
+    for each in (_OF_NAME[name] for name in ALL if name in known or name in KNOWABLE):
+        if each.fused != "own":
             found[each] = slice(begin, begin + each.columns)
             begin += each.columns
     return found
 
 
-def values_in(known: Collection[str]) -> int:
-    """Return how many numbers of a point are summed, without its offset."""
-    return sum(each.columns for each in columns_in(known))
+def sums_in(known: Collection[str]) -> int:
+    """Return how many sums of a voxel there are: of weight, offset and attributes."""
+    return 4 + sum(each.columns for each in columns_in(known))
 
 
-VOXEL_BYTES: Final = 16 + 4 * (4 + values_in(ALL))  # most of one row of a `FusedPart`
+def row_bytes(known: Collection[str]) -> int:
+    """Return the bytes of one voxel of a `FusedPart`."""
+    return 16 + 4 * sums_in(known)
+
+
 _PRECISE: Final = 0.8  # voxels known to this share of their edge need one frame less
 _PLACED: Final = slice(0, 4)
 _MOST: Final = 1e20
@@ -134,10 +137,7 @@ class FusedPart:
     def from_tree(cls, tree: Mapping[str, Any]) -> FusedPart:
         """Return the part that a tree (`tree_of`) is of."""
         keys, known = array_in(tree, "keys", np.int64, (None,)), tuple(tree["known"])
-        if unknown := [name for name in known if name not in ALL]:
-            what = "the points of the map have an attribute that this version does not know"
-            raise FormatError(what, got=unknown[0], hint="update recon")
-        sums = array_in(tree, "sums", np.float32, (len(keys), 4 + values_in(known)))
+        sums = array_in(tree, "sums", np.float32, (len(keys), sums_in(known)))
         information = array_in(tree, "information", np.float32, (len(keys),))
         frames = array_in(tree, "frames", np.int32, (len(keys),))
         least = [each.min(initial=1) for each in (sums[:, 0], information, frames)]
@@ -221,7 +221,7 @@ def sums_of(sums: Float32, known: tuple[str, ...], wanted: Collection[str]) -> F
     """Return sums (N, 4 + C) with the columns of other attributes, all of them ``known``."""
     have, want = columns_in(known), columns_in(wanted)
     if have == want or not len(sums):
-        return sums if have == want else np.zeros((0, 4 + values_in(wanted)), np.float32)
+        return sums if have == want else np.zeros((0, sums_in(wanted)), np.float32)
     return np.concatenate([sums[:, :4], *(sums[:, have[each]] for each in want)], axis=1)
 
 
@@ -230,7 +230,7 @@ def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
 
     Attributes that one of the parts does not know are unknown in the sum; empty parts do not count.
     """
-    total, known = voxels.make_sums(1, values_in(ALL)), ALL
+    total, known = voxels.make_sums(1, sums_in(ALL) - 4), ALL
     for part in filter(len, parts):
         both = tuple(name for name in known if name in part.known)
         total = total._replace(sums=sums_of(total.sums, known, both))
