@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from dataclasses import fields, replace
+from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
@@ -19,6 +20,7 @@ from recon.map.store import database
 
 LABEL = Attribute("label", np.uint8, fused="vote", values=4)
 FUSED = [each for each in (*ATTRIBUTES, LABEL) if each.fused is not None]
+JOINED = {"mean": "mean", "direction": "mean direction", "own": "by fusion", None: "–"}
 FORMATS = ("ply", "pcd", "las", "e57", "ros")
 SHARES = st.floats(0, 1, width=32)
 
@@ -33,6 +35,14 @@ def test_clouds_have_a_field_for_each_row_and_no_other():
 def test_no_format_has_two_columns_of_one_name(name):
     columns = ["x", "y", "z", *(column for each in ATTRIBUTES for column in getattr(each, name))]
     assert len({*columns}) == len(columns)
+
+
+def test_the_page_of_formats_has_the_names_of_the_rows():
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text()
+    for each in ATTRIBUTES:
+        columns = [" ".join(f"`{column}`" for column in getattr(each, name)) for name in FORMATS]
+        cells = [f"`{each.name}`", each.unit, JOINED[each.fused], *columns]
+        assert f"| {' | '.join(cells)} |".replace("|  |", "| |").replace("|  |", "| |") in page
 
 
 @pytest.mark.parametrize("each", ATTRIBUTES, ids=lambda each: each.name)
