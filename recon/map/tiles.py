@@ -156,16 +156,6 @@ class Tiles:
     def bounds(self, key: TileKey) -> Rectangle:
         return self._parts.bounds(key)
 
-    def put_cloud(self, cloud: PointCloud) -> None:
-        """Add points that are fused and filtered, frame ``map``."""
-        for key, inside in self._parts.near(cloud.xyz, 0.0):
-            self._parts.put(_POINTS, key, cloud.select(inside).arrays)
-
-    def put_voxels(self, voxels: OccupancyVoxels) -> None:
-        """Add observed voxels; none is given twice."""
-        for key, inside in self._parts.near(voxels.centres_m, 0.0):
-            self._parts.put(_VOXELS, key, _voxel_tree(voxels.select(inside)))
-
     def removed(self, key: TileKey) -> PointCloud:
         """Return the points that are left out of the cloud of a tile since they moved."""
         self.cloud(key)
@@ -199,7 +189,8 @@ class Tiles:
         """
         if self._parts.numbers(OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
             joined = self._chain.joined(key, note=self.config.fusion.remove_moving)
-            self._parts.put(_VOXELS, key, _voxel_tree(joined.voxels(self.resolution_m)))
+            voxels = joined.voxels(self.resolution_m)
+            self._parts.put(_VOXELS, key, {"keys": voxels.keys, "log_odds": voxels.log_odds})
             self.config.memory.check("putting the occupancy together")
         found = self._parts.read(_VOXELS, key)
         seen = (OccupancyVoxels(**tree, resolution_m=self.resolution_m) for _, tree in found)
@@ -288,10 +279,6 @@ class Tiles:
         voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
         sigma_m = fused.frame_sigma_m
         return find_moved(points, sigma_m, counted, voxels, evidence, self._looks)
-
-
-def _voxel_tree(voxels: OccupancyVoxels) -> dict[str, Any]:
-    return {"keys": voxels.keys, "log_odds": voxels.log_odds}
 
 
 _EVIDENCE: Final = "evidence"

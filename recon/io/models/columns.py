@@ -46,6 +46,11 @@ def table_of(xyz: NDArray[Any], columns: Columns) -> Table:
     return table
 
 
+def tables_of(clouds: Iterable[PointCloud], of: Format) -> Iterator[Table]:
+    """Yield the tables of clouds with points, or one without rows."""
+    return (table_of(cloud.xyz, columns_of(cloud, of)) for cloud in with_first(clouds)[1])
+
+
 def positions_in(table: Table) -> Float32:
     """Return float32 (N, 3), the positions of a table, which must have them."""
     if (xyz := _stacked(table, AXES)) is None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from recon.core.values import PointCloud
 from recon.io.files import StrPath
-from recon.io.models.columns import columns_of, table_of
-from recon.io.models.ply_tables import Table, write_row_stream
+from recon.io.models.columns import tables_of
+from recon.io.models.ply_tables import write_row_stream
 
 
 def write_pcd(path: StrPath, clouds: Iterable[PointCloud]) -> int:
@@ -21,12 +21,7 @@ def write_pcd(path: StrPath, clouds: Iterable[PointCloud]) -> int:
 
     Ref: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, version 0.7.
     """
-    nothing = _table(PointCloud(np.zeros((0, 3), np.float32)))
-    return write_row_stream(path, map(_table, clouds), nothing, _header)
-
-
-def _table(cloud: PointCloud) -> Table:
-    return table_of(cloud.xyz, columns_of(cloud, "pcd"))
+    return write_row_stream(path, tables_of(clouds, "pcd"), _header)
 
 
 def _header(rows: int, filler: str, dtype: np.dtype[Any]) -> bytes:

@@ -12,7 +12,14 @@ from recon.core.errors import FormatError
 from recon.core.values import ATTRIBUTES, Frame, PointCloud
 from recon.core.values.arrays import Float32
 from recon.io.files import StrPath, reader
-from recon.io.models.columns import AXES, attributes_in, columns_of, positions_in, table_of
+from recon.io.models.columns import (
+    AXES,
+    attributes_in,
+    columns_of,
+    positions_in,
+    table_of,
+    tables_of,
+)
 from recon.io.models.ply_tables import Table, read_tables, write_table_stream, write_tables
 
 _FRAME: Final = "frame "
@@ -35,13 +42,13 @@ def write_ply(
     The frame is a comment. A file that cannot be written is an `OutputError`.
     """
     rated = cloud if quality is None else replace(cloud, confidence=quality)
-    write_tables(path, {"vertex": _table(rated)}, [_FRAME + cloud.frame], ascii=ascii)
+    table = table_of(cloud.xyz, columns_of(rated, "ply"))
+    write_tables(path, {"vertex": table}, [_FRAME + cloud.frame], ascii=ascii)
 
 
 def write_ply_tiles(path: StrPath, clouds: Iterable[PointCloud], *, frame: Frame) -> int:
     """Write clouds of that frame with the same fields, one at a time; returns their points."""
-    nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
-    return write_table_stream(path, "vertex", map(_table, clouds), [_FRAME + frame], nothing)
+    return write_table_stream(path, "vertex", tables_of(clouds, "ply"), [_FRAME + frame])
 
 
 @reader
@@ -67,10 +74,6 @@ def read_ply(path: StrPath) -> PointCloud:
     if len(cloud) and not finite.any():
         raise FormatError("no point of the PLY file is finite")
     return cloud if finite.all() else cloud.select(finite)
-
-
-def _table(cloud: PointCloud) -> Table:
-    return table_of(cloud.xyz, columns_of(cloud, "ply"))
 
 
 def _check_precision(vertex: Table) -> None:
