@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon.core.errors import MappingError
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
-from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, RayGrain
+from recon.core.values import Frame, OccupancyVoxels, PointCloud, RayCloud, RayGrain
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.core.values.grid import log_odds
 from recon.map.fusion import ALL, FusedPart, FusionSettings, columns_in, sums_in, sums_of
@@ -103,13 +103,8 @@ class CloudBuilder:
 
     def _check(self, cloud: PointCloud) -> None:
         """Refuse what would silently spoil the map."""
-        if cloud.frame != "world":
-            raise MappingError(
-                "the fused map takes clouds in world axes", got=cloud.frame, expected="world"
-            )
+        _check_cloud(cloud, "world", "the fused map")
         limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
-        if not all(np.isfinite(values).all() for values in cloud.arrays.values()):
-            raise MappingError("a point to map is not finite")
         if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
             raise MappingError(
                 "a point is too far from the origin for this voxel size",
@@ -163,7 +158,7 @@ class OccupancyBuilder:
         ``cloud`` is in camera axes; ``sigma_m`` None = exact, ``confidence`` None = 1, and
         ``count`` is the number of points that each stands for, None = 1.
         """
-        check_camera_cloud(cloud)
+        _check_cloud(cloud, "camera", "the occupancy map")
         _check_pose(T_world_camera, self._settings.resolution_m)
         rays = frame_rays(cloud, self._T_map_world @ T_world_camera, self._settings)
         self._evidence = raycast.cast_rays(self._evidence, rays, SPREAD_SIGMAS)
@@ -253,14 +248,11 @@ def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
     )
 
 
-def check_camera_cloud(cloud: PointCloud) -> None:
+def _check_cloud(cloud: PointCloud, frame: Frame, what: str) -> None:
     """Refuse a cloud that would silently spoil the map."""
-    if cloud.frame != "camera":
-        raise MappingError(
-            "the occupancy map takes clouds in camera axes", got=cloud.frame, expected="camera"
-        )
-    numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence)
-    if not all(a is None or np.isfinite(a).all() for a in numbers):
+    if cloud.frame != frame:
+        raise MappingError(f"{what} takes clouds in {frame} axes", got=cloud.frame, expected=frame)
+    if not all(np.isfinite(values).all() for values in cloud.arrays.values()):
         raise MappingError("a point to map is not finite")
 
 
@@ -297,7 +289,7 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
     A point out of the map's range is moved along its ray to just beyond it: it is still no hit, and
     frees the same space. ``cloud`` is as for `OccupancyBuilder.integrate`.
     """
-    check_camera_cloud(cloud)
+    _check_cloud(cloud, "camera", "the occupancy map")
     grain = ray_grain(settings)
     sigma_m, sure = sigma_and_confidence(cloud)
     xyz, sigma_m = raycast.limit_points(

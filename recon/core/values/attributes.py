@@ -102,6 +102,6 @@ ATTRIBUTES: Final = (
     ),
     Attribute("weight", np.float32, fused="own", ply=("weight",)),
     Attribute("count", np.int32, fused="own", ply=("count",)),
-    Attribute("time_s", np.float32, unit="s", ply=("time",), view="age", scale="viridis"),
+    Attribute("time_s", np.float32, unit="s", ply=("time_s",), view="age", scale="viridis"),
     Attribute("session", np.int32, ply=("session",), view="session", scale="tab10"),
 )  # fmt: skip
