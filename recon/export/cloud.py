@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,7 +31,7 @@ def cloud_product(order: Order) -> Made:
 def pcd_product(order: Order) -> Made:
     """Write ``map/cloud.pcd``, the fused cloud for PCL."""
     clouds = (tile.cloud for tile in order.placed.tiles)
-    return Made({"points": write_pcd(order.run.path("map/cloud.pcd"), filter(len, clouds))})
+    return Made({"points": write_pcd(order.run.path("map/cloud.pcd"), clouds)})
 
 
 def arrays_product(order: Order) -> Made:
@@ -51,15 +50,10 @@ def arrays_product(order: Order) -> Made:
     }
     points = write_npz(
         order.run.path("map/map.npz"),
-        (_fields(tile.cloud) for tile in order.placed.tiles if len(tile.cloud)),
+        (tile.cloud.arrays for tile in order.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
     return Made({"points": points})
-
-
-def _fields(cloud: PointCloud) -> dict[str, NDArray[Any]]:
-    values = {field.name: getattr(cloud, field.name) for field in fields(cloud)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
@@ -71,16 +65,14 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
 
     def clouds() -> Iterator[PointCloud]:
         for tile in tiles:
-            cloud = tile.cloud
-            if len(cloud):
-                sample.add(cloud)
-                yield cloud
+            sample.add(cloud := tile.cloud)
+            yield cloud
 
     points = write_ply_tiles(path, clouds(), frame="map")
     left_out = 0
     if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
-        left_out = write_ply_tiles(removed, (cloud for cloud in moved if len(cloud)), frame="map")
+        left_out = write_ply_tiles(removed, moved, frame="map")
     figures = {"points": points, "points_removed": left_out}
     return Made(figures, _doubts(tiles, points, left_out), sample.cloud())
 
@@ -88,8 +80,8 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
 def even_sample(tiles: Tiles) -> PointCloud:
     """Return an even sample of the cloud of a map, all points of a small one; frame ``map``."""
     sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
-    for cloud in filter(len, (tile.cloud for tile in tiles)):
-        sample.add(cloud)
+    for tile in tiles:
+        sample.add(tile.cloud)
     return sample.cloud()
 
 
@@ -116,7 +108,7 @@ class CloudSample:
 
     def add(self, cloud: PointCloud) -> None:
         """Add points; all clouds are in map axes and have the same fields."""
-        self._kept.append(self._thinned(cloud))
+        self._kept += [self._thinned(cloud)] if len(cloud) else []
         if sum(map(len, self._kept)) > self._limit:
             self._kept = [self._within_the_limit(join_clouds(self._kept))]
 

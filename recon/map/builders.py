@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from recon.core.errors import MappingError
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
-from recon.core.values import OccupancyVoxels, PointCloud, RayCloud, RayGrain
+from recon.core.values import Frame, OccupancyVoxels, PointCloud, RayCloud, RayGrain
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.core.values.grid import log_odds
-from recon.map.fusion import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPart, FusionSettings
+from recon.map.fusion import ALL, FusedPart, FusionSettings, columns_in, sums_in, sums_of
 from recon.map.kernels import clamped, raycast
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, sum_points
 
@@ -34,9 +34,9 @@ class CloudBuilder:
 
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
-        self._sums = voxels.make_sums(1, VALUES)
+        self._known: tuple[str, ...] = ALL
+        self._sums = voxels.make_sums(1, sums_in(ALL) - 4)
         self._frames = 0
-        self._known = dict.fromkeys(KNOWABLE, True)
 
     def __len__(self) -> int:
         """Return the number of voxels seen by at least one frame."""
@@ -49,32 +49,34 @@ class CloudBuilder:
         not have, the map does not have.
         """
         self._check(cloud)
-        for name in self._known:
-            self._known[name] &= getattr(cloud, name) is not None or len(cloud) == 0
-        points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), _values(cloud))
+        if len(cloud):
+            self._know(tuple(name for name in self._known if name in cloud.arrays))
+        points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), self._values(cloud))
         self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
         self._frames += 1
 
     def part(self) -> FusedPart:
         """Return what was seen since the start, or since the last `take`."""
-        n, s = len(self), self._sums
-        known = tuple(name for name, value in self._known.items() if value and self._frames)
-        keys, sums = voxels.copy_sums(s)
-        return FusedPart(keys, sums, s.information[:n].copy(), s.frames[:n].copy(), known)
+        n, s, (keys, sums) = len(self), self._sums, voxels.copy_sums(self._sums)
+        part = FusedPart(keys, sums, s.information[:n].copy(), s.frames[:n].copy(), self._known)
+        return part if self._frames else part.knowing(())
 
     def take(self) -> FusedPart:
         """Return the part so far; the builder starts a new one."""
         part = self.part()
-        self._sums = voxels.make_sums(1, VALUES)
-        self._known, self._frames = dict.fromkeys(self._known, True), 0
+        self._sums, self._known, self._frames = voxels.make_sums(1, sums_in(ALL) - 4), ALL, 0
         return part
 
     def resume(self, part: FusedPart, frames: int) -> None:
         """Continue a part into which so many frames were integrated."""
-        empty = voxels.make_sums(max(1, len(part)), VALUES)
+        self._known, self._frames = part.known if frames else ALL, frames
+        empty = voxels.make_sums(max(1, len(part)), sums_in(self._known) - 4)
         self._sums = voxels.add_rows(empty, part.keys, part.sums, part.information, part.frames)
-        self._known = {name: name in part.known or frames == 0 for name in self._known}
-        self._frames = frames
+
+    def _know(self, known: tuple[str, ...]) -> None:
+        """Forget what one of the clouds does not have."""
+        self._sums = self._sums._replace(sums=sums_of(self._sums.sums, self._known, known))
+        self._known = known
 
     @property
     def nbytes(self) -> int:
@@ -91,32 +93,24 @@ class CloudBuilder:
         weights = confidence / bounded**2
         return np.where(cloud.sigma_m <= _MAX_SIGMA * voxel_m, weights, 0).astype(np.float32)
 
+    def _values(self, cloud: PointCloud) -> Float32:
+        """Return what is averaged of each point, float32 (N, C); 0 = unknown."""
+        values = np.zeros((len(cloud), sums_in(self._known) - 4), np.float32)
+        columns, found = columns_in(self._known), dict(cloud.attributes)
+        for each in columns.keys() & found.keys():
+            values[:, columns[each].start - 4 : columns[each].stop - 4] = each.averaged(found[each])
+        return values
+
     def _check(self, cloud: PointCloud) -> None:
         """Refuse what would silently spoil the map."""
-        if cloud.frame != "world":
-            raise MappingError(
-                "the fused map takes clouds in world axes", got=cloud.frame, expected="world"
-            )
+        _check_cloud(cloud, "world", "the fused map")
         limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
-        numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence, cloud.normals)
-        if not all(a is None or np.isfinite(a).all() for a in numbers):
-            raise MappingError("a point to map is not finite")
         if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
             raise MappingError(
                 "a point is too far from the origin for this voxel size",
                 got=f"{np.abs(cloud.xyz).max():.0f} m",
                 expected=f"at most {limit_m:.0f} m",
             )
-
-
-def _values(cloud: PointCloud) -> Float32:
-    """Return what is averaged of each point, (N, 7): colour, normal, confidence; 0 = unknown."""
-    values = np.zeros((len(cloud), VALUES), np.float32)
-    named = ((RGB, cloud.rgb), (NORMAL, cloud.normals), (CONFIDENCE, cloud.confidence))
-    for columns, array in named:
-        if array is not None:
-            values[:, columns] = array
-    return values
 
 
 _FIRST_POINTS: Final = 1 << 12
@@ -164,7 +158,7 @@ class OccupancyBuilder:
         ``cloud`` is in camera axes; ``sigma_m`` None = exact, ``confidence`` None = 1, and
         ``count`` is the number of points that each stands for, None = 1.
         """
-        check_camera_cloud(cloud)
+        _check_cloud(cloud, "camera", "the occupancy map")
         _check_pose(T_world_camera, self._settings.resolution_m)
         rays = frame_rays(cloud, self._T_map_world @ T_world_camera, self._settings)
         self._evidence = raycast.cast_rays(self._evidence, rays, SPREAD_SIGMAS)
@@ -254,14 +248,11 @@ def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
     )
 
 
-def check_camera_cloud(cloud: PointCloud) -> None:
+def _check_cloud(cloud: PointCloud, frame: Frame, what: str) -> None:
     """Refuse a cloud that would silently spoil the map."""
-    if cloud.frame != "camera":
-        raise MappingError(
-            "the occupancy map takes clouds in camera axes", got=cloud.frame, expected="camera"
-        )
-    numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence)
-    if not all(a is None or np.isfinite(a).all() for a in numbers):
+    if cloud.frame != frame:
+        raise MappingError(f"{what} takes clouds in {frame} axes", got=cloud.frame, expected=frame)
+    if not all(np.isfinite(values).all() for values in cloud.arrays.values()):
         raise MappingError("a point to map is not finite")
 
 
@@ -298,7 +289,7 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
     A point out of the map's range is moved along its ray to just beyond it: it is still no hit, and
     frees the same space. ``cloud`` is as for `OccupancyBuilder.integrate`.
     """
-    check_camera_cloud(cloud)
+    _check_cloud(cloud, "camera", "the occupancy map")
     grain = ray_grain(settings)
     sigma_m, sure = sigma_and_confidence(cloud)
     xyz, sigma_m = raycast.limit_points(

@@ -19,7 +19,7 @@ from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64, Int64, tree_of
-from recon.map.fusion import KNOWABLE, FusedPart
+from recon.map.fusion import ALL, FusedPart, row_bytes
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.map.occupancy.moving import GROWTH_CELLS
@@ -33,7 +33,6 @@ OCCUPANCY: Final = "occupancy"  # kind of the parts of the occupancy
 # Lengths are those on a road: they are times the scale of the scene.
 _FILTER_MARGIN_M: Final = 1.0  # least margin around a tile for the filters of the fused cloud
 _LEAST_TILE_M: Final = 5.0
-_FUSED_BYTES: Final = 60
 _BLOCK_BYTES: Final = 4 * 3 * BLOCK_EDGE**3
 
 
@@ -46,14 +45,14 @@ class Cut:
     """
 
     frames: list[int] = field(default_factory=list)
-    known: set[str] = field(default_factory=lambda: set(KNOWABLE))
+    known: set[str] = field(default_factory=lambda: set(ALL))
     corners: list[TileKey] = field(default_factory=list)
     nbytes: Counter[tuple[str, TileKey]] = field(default_factory=Counter)
 
     def add(self, submap: Submap) -> None:
         """Add the next submap, where it was put."""
         self.frames.append(submap.frames)
-        self.known &= set(submap.fused.known if len(submap.fused) else KNOWABLE)
+        self.known &= set(submap.fused.known if len(submap.fused) else ALL)
         columns = submap.occupancy.cells[:, :2]
         if len(columns):
             low, high = columns.min(axis=0).tolist(), (columns.max(axis=0) + 1).tolist()
@@ -175,7 +174,7 @@ class Cutter:
         fused, occupancy, voxel_m = submap.fused, submap.occupancy, self._config.fusion.voxel_m
         centres_m = apply(self._T_map_world, (fused.cells + 0.5) * voxel_m)
         for key, inside in parts.near(centres_m, self._filter_margin_m):
-            yield FUSED, key, fused.select(inside), int(inside.sum()) * _FUSED_BYTES
+            yield FUSED, key, fused.select(inside), int(inside.sum()) * row_bytes(fused.known)
         for key, inside in parts.near(self.centres_m(occupancy), self.grid_margin_m):
             yield OCCUPANCY, key, occupancy.select(inside), int(inside.sum()) * _BLOCK_BYTES
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
-from recon.core.values import PointCloud, RectifiedCamera
+from recon.core.values import ATTRIBUTES, Attribute, PointCloud, RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, array_in
 
 _NOMINAL_ERROR_PX: Final = 0.3  # error of a good match, by which the range of fusion is found
@@ -50,11 +50,37 @@ def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
     return math.sqrt(settings.max_depth_error_m * fb / _NOMINAL_ERROR_PX)
 
 
-RGB: Final = slice(0, 3)
-NORMAL: Final = slice(3, 6)
-CONFIDENCE: Final = 6
-VALUES: Final = 7
 KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")
+"""What every map has room for, in the order of its sums; others only where clouds have them."""
+_OF_NAME: Final = {each.name: each for each in ATTRIBUTES if each.fused is not None}
+_MORE: Final = [name for name, each in _OF_NAME.items() if each.fused != "own"]
+ALL: Final = (*KNOWABLE, *(name for name in _MORE if name not in KNOWABLE))
+"""What a map may know of its points, beside how many frames saw each."""
+
+
+def columns_in(known: Collection[str]) -> dict[Attribute, slice]:
+    """Return where in the sums of a voxel those of attributes lie."""
+    if unknown := [name for name in known if name not in ALL]:
+        what = "points of the map have an attribute that this version does not know"
+        raise FormatError(what, got=unknown[0], hint="update recon")
+    found, begin = {}, 4  # behind the weight and the offset
+    for each in (_OF_NAME[name] for name in ALL if name in known or name in KNOWABLE):
+        if each.fused != "own":
+            found[each] = slice(begin, begin + each.columns)
+            begin += each.columns
+    return found
+
+
+def sums_in(known: Collection[str]) -> int:
+    """Return how many sums of a voxel there are: of weight, offset and attributes."""
+    return 4 + sum(each.columns for each in columns_in(known))
+
+
+def row_bytes(known: Collection[str]) -> int:
+    """Return the bytes of one voxel of a `FusedPart`."""
+    return 16 + 4 * sums_in(known)
+
+
 _PRECISE: Final = 0.8  # voxels known to this share of their edge need one frame less
 _PLACED: Final = slice(0, 4)
 _MOST: Final = 1e20
@@ -63,7 +89,6 @@ _LARGEST_M: Final = 1e3  # larger than any voxel
 _FARTHEST_CELL: Final = voxels.KEY_LIMIT - (voxels.KEY_LIMIT >> 4)
 """Voxels that are moved by loops still have a key."""
 _OFFSET: Final = slice(1, 4)
-_TURNED: Final = slice(4 + NORMAL.start, 4 + NORMAL.stop)
 _PLACE_BITS: Final = 12
 """Of weights and offsets: the mean of a voxel of 0.1 m moves by some µm at most."""
 _VALUE_BITS: Final = 8  # of colours, normals and the rest: half a level of 255, a tenth of a degree
@@ -76,13 +101,12 @@ class FusedPart:
 
     # int64 (N,), packed cells in world axes (`recon.core.kernels.voxels`), each once
     keys: Int64
-    # float32 (N, 11): sum of weights; weighted sums of the offset from the voxel's centre and of
-    # the values (colour, normal, confidence)
+    # float32 (N, 4 + C): sum of weights; weighted sums of the offset from the voxel's centre and of
+    # the values (`columns_in`)
     sums: Float32
     information: Float32  # (N,), sum over frames of the largest weight in each frame
     frames: Int32  # int32 (N,), number of frames that saw the voxel
-    # Which of ``rgb``, ``normals``, ``sigma_m`` and ``confidence`` all clouds had; empty where
-    # there was no cloud
+    # Which of `ALL` all clouds had; empty where there was no cloud
     known: tuple[str, ...] = KNOWABLE
 
     def __len__(self) -> int:
@@ -98,6 +122,10 @@ class FusedPart:
         keys, sums, information = self.keys[which], self.sums[which], self.information[which]
         return FusedPart(keys, sums, information, self.frames[which], self.known)
 
+    def knowing(self, known: tuple[str, ...]) -> FusedPart:
+        """Return the part with these attributes alone, all of which it has, unless it is empty."""
+        return replace(self, sums=sums_of(self.sums, self.known, known), known=known)
+
     def rounded(self) -> FusedPart:
         """Return the sums to as many digits as they mean something, so that they compress."""
         sums = self.sums.copy()
@@ -108,8 +136,8 @@ class FusedPart:
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> FusedPart:
         """Return the part that a tree (`tree_of`) is of."""
-        keys = array_in(tree, "keys", np.int64, (None,))
-        sums = array_in(tree, "sums", np.float32, (len(keys), 4 + VALUES))
+        keys, known = array_in(tree, "keys", np.int64, (None,)), tuple(tree["known"])
+        sums = array_in(tree, "sums", np.float32, (len(keys), sums_in(known)))
         information = array_in(tree, "information", np.float32, (len(keys),))
         frames = array_in(tree, "frames", np.int32, (len(keys),))
         least = [each.min(initial=1) for each in (sums[:, 0], information, frames)]
@@ -118,8 +146,7 @@ class FusedPart:
         wrong = (
             keys.min(initial=0) < 0 or far or min(least) <= 0 or np.abs(sums).max(initial=0) > _MOST
         )
-        known = tuple(tree["known"])
-        if wrong or beside.any() or not all(name in KNOWABLE for name in known):
+        if wrong or beside.any():
             raise FormatError("a submap of the map has an impossible voxel")
         return cls(keys, sums, information, frames, known)
 
@@ -135,7 +162,9 @@ class FusedPart:
         cells = np.floor(points / voxel_m).astype(np.int64)
         sums = self.sums.copy()
         sums[:, _OFFSET] = self.sums[:, :1] * (points - (cells + 0.5) * voxel_m)
-        sums[:, _TURNED] = rotate(T_new_world, sums[:, _TURNED])
+        for each, columns in columns_in(self.known).items():
+            if each.fused == "direction":
+                sums[:, columns] = rotate(T_new_world, sums[:, columns])
         return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
 
     def cloud(self, voxel_m: float, least: int) -> PointCloud:
@@ -147,18 +176,16 @@ class FusedPart:
         rows = np.flatnonzero(self.enough(least, voxel_m))
         part = self.select(rows[self._has_direction(rows)])
         weight = part.sums[:, :1]
-        values = part.sums[:, 4:] / weight
-        centres = (part.cells + 0.5) * voxel_m
-        known = frozenset(self.known)
+        found: dict[str, Any] = {
+            each.name: each.of_means(part.sums[:, columns] / weight)
+            for each, columns in columns_in(self.known).items()
+            if each.name in self.known
+        }
+        if "sigma_m" in self.known:
+            found["sigma_m"] = part.information ** np.float32(-0.5)
+        xyz = part.points(voxel_m).astype(np.float32)
         return PointCloud(
-            xyz=(centres + part.sums[:, _OFFSET] / weight).astype(np.float32),
-            rgb=np.rint(values[:, RGB]).astype(np.uint8) if "rgb" in known else None,
-            normals=_unit(values[:, NORMAL]) if "normals" in known else None,
-            sigma_m=part.information ** np.float32(-0.5) if "sigma_m" in known else None,
-            confidence=values[:, CONFIDENCE].copy() if "confidence" in known else None,
-            weight=weight[:, 0].copy(),
-            count=part.frames,
-            frame="world",
+            xyz, weight=weight[:, 0].copy(), count=part.frames, frame="world", **found
         )
 
     def points(self, voxel_m: float) -> Float64:
@@ -182,12 +209,20 @@ class FusedPart:
 
     def _has_direction(self, rows: NDArray[np.intp]) -> Bool:
         """Return which voxels have normals that do not cancel; all, where normals are not known."""
-        if "normals" not in self.known:
-            return np.ones(len(rows), dtype=np.bool_)
-        sums = self.sums[rows]
-        # 1e-3: below, the direction is that of rounding errors.
-        length = np.linalg.norm(sums[:, 4:][:, NORMAL], axis=1)
-        return np.asarray(length > 1e-3 * sums[:, 0])
+        has, weight = np.ones(len(rows), np.bool_), self.sums[rows, 0]
+        for each, columns in columns_in(self.known).items():
+            if each.fused == "direction" and each.name in self.known:
+                # 1e-3: below, the direction is that of rounding errors.
+                has &= np.linalg.norm(self.sums[rows, columns], axis=1) > 1e-3 * weight
+        return np.asarray(has)
+
+
+def sums_of(sums: Float32, known: tuple[str, ...], wanted: Collection[str]) -> Float32:
+    """Return sums (N, 4 + C) with the columns of other attributes, all of them ``known``."""
+    have, want = columns_in(known), columns_in(wanted)
+    if have == want or not len(sums):
+        return sums if have == want else np.zeros((0, sums_in(wanted)), np.float32)
+    return np.concatenate([sums[:, :4], *(sums[:, have[each]] for each in want)], axis=1)
 
 
 def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
@@ -195,16 +230,17 @@ def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
 
     Attributes that one of the parts does not know are unknown in the sum; empty parts do not count.
     """
-    total = voxels.make_sums(1, VALUES)
-    known, any_known = set(KNOWABLE), False
-    for part in parts:
-        total = voxels.add_rows(total, part.keys, part.sums, part.information, part.frames)
-        if len(part):
-            known &= set(part.known)
-            any_known = True
+    total, known = voxels.make_sums(1, sums_in(ALL) - 4), ALL
+    for part in filter(len, parts):
+        both = tuple(name for name in known if name in part.known)
+        total = total._replace(sums=sums_of(total.sums, known, both))
+        sums, known = sums_of(part.sums, part.known, both), both
+        total = voxels.add_rows(total, part.keys, sums, part.information, part.frames)
     n = int(total.used[0])
-    names = tuple(name for name in KNOWABLE if name in known) if any_known else ()
-    return FusedPart(total.keys[:n], total.sums[:n], total.information[:n], total.frames[:n], names)
+    found = FusedPart(
+        total.keys[:n], total.sums[:n], total.information[:n], total.frames[:n], known
+    )
+    return found if n else found.knowing(())
 
 
 def _merged(part: FusedPart) -> FusedPart:
@@ -228,8 +264,3 @@ def _rounded(values: Float32, bits: int) -> Float32:
     half = np.int32(1 << (drop - 1))
     whole = np.ascontiguousarray(values).view(np.int32) + half
     return np.asarray((whole >> drop << drop).view(np.float32))
-
-
-def _unit(vectors: Float32) -> Float32:
-    """Return vectors (N, 3) at unit length."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -7,7 +7,7 @@ fused and filtered when it is first asked for, and then kept for all products.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import reduce
 from heapq import merge
 from itertools import groupby, product
@@ -25,7 +25,7 @@ from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_vox
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, TileParts
-from recon.map.fusion import KNOWABLE, FusedPart, join_fused
+from recon.map.fusion import ALL, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.occupancy.bodies import Looks
@@ -87,7 +87,7 @@ class Tiles:
         self.edge_cells, self.edge_m = self._cutter.edge_cells, self._cutter.edge_m
         self._parts = TileParts(self.edge_m, path)
         self._chain = DriveChain(self._parts)
-        self._known: tuple[str, ...] = KNOWABLE
+        self._known: tuple[str, ...] = ALL
         self._looks: Looks | None = None
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
         self.submap_of_frame: Int64 = np.zeros(0, np.int64)
@@ -156,16 +156,6 @@ class Tiles:
     def bounds(self, key: TileKey) -> Rectangle:
         return self._parts.bounds(key)
 
-    def put_cloud(self, cloud: PointCloud) -> None:
-        """Add points that are fused and filtered, frame ``map``."""
-        for key, inside in self._parts.near(cloud.xyz, 0.0):
-            self._parts.put(_POINTS, key, _cloud_tree(cloud.select(inside)))
-
-    def put_voxels(self, voxels: OccupancyVoxels) -> None:
-        """Add observed voxels; none is given twice."""
-        for key, inside in self._parts.near(voxels.centres_m, 0.0):
-            self._parts.put(_VOXELS, key, _voxel_tree(voxels.select(inside)))
-
     def removed(self, key: TileKey) -> PointCloud:
         """Return the points that are left out of the cloud of a tile since they moved."""
         self.cloud(key)
@@ -180,7 +170,7 @@ class Tiles:
         """
         if self._parts.numbers(FUSED, key) and not self._parts.numbers(_POINTS, key):
             for kind, cloud in zip((_POINTS, _REMOVED), self._fused(key), strict=True):
-                self._parts.put(kind, key, _cloud_tree(cloud))
+                self._parts.put(kind, key, cloud.arrays)
             self._parts.drop(FUSED, key)
             self.config.memory.check("putting the cloud together")
         found = self._parts.read(_POINTS, key)
@@ -199,7 +189,8 @@ class Tiles:
         """
         if self._parts.numbers(OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
             joined = self._chain.joined(key, note=self.config.fusion.remove_moving)
-            self._parts.put(_VOXELS, key, _voxel_tree(joined.voxels(self.resolution_m)))
+            voxels = joined.voxels(self.resolution_m)
+            self._parts.put(_VOXELS, key, {"keys": voxels.keys, "log_odds": voxels.log_odds})
             self.config.memory.check("putting the occupancy together")
         found = self._parts.read(_VOXELS, key)
         seen = (OccupancyVoxels(**tree, resolution_m=self.resolution_m) for _, tree in found)
@@ -248,7 +239,7 @@ class Tiles:
         self.extent, self.submap_of_frame = cut.extent, cut.submap_of_frame(drives)
         self._chain.drive_of = np.repeat(np.arange(len(drives)), np.array(drives, np.int64))
         # Attributes missing in one submap are dropped, so that all tiles have the same fields.
-        self._known = tuple(name for name in KNOWABLE if name in cut.known)
+        self._known = tuple(name for name in ALL if name in cut.known)
         return cut.fits(self._cutter.limit_bytes)
 
     def _fused(self, key: TileKey) -> tuple[PointCloud, PointCloud]:
@@ -265,7 +256,7 @@ class Tiles:
 
     def _exported(self, parts: Iterable[FusedPart]) -> PointCloud:
         """Return the points of voxels that enough frames saw, frame ``world``."""
-        fused = replace(join_fused(parts), known=self._known)
+        fused = join_fused(parts).knowing(self._known)
         return fused.cloud(self.config.fusion.voxel_m, self._least_frames)
 
     @property
@@ -288,15 +279,6 @@ class Tiles:
         voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
         sigma_m = fused.frame_sigma_m
         return find_moved(points, sigma_m, counted, voxels, evidence, self._looks)
-
-
-def _cloud_tree(cloud: PointCloud) -> dict[str, Any]:
-    arrays = {f.name: getattr(cloud, f.name) for f in fields(cloud) if f.name != "frame"}
-    return {name: array for name, array in arrays.items() if array is not None}
-
-
-def _voxel_tree(voxels: OccupancyVoxels) -> dict[str, Any]:
-    return {"keys": voxels.keys, "log_odds": voxels.log_odds}
 
 
 _EVIDENCE: Final = "evidence"

@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import Self
 
@@ -335,36 +334,15 @@ def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
 
 
 def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
-    """Return one point per voxel, the mean of its points in every attribute."""
-    names = [name for name in _ATTRIBUTES if getattr(cloud, name) is not None]
-    columns = [np.reshape(getattr(cloud, name), (len(cloud), -1)) for name in names]
-    packed = np.concatenate(columns, axis=1) if columns else np.zeros((len(cloud), 0))
+    """Return one point per voxel, the mean of its points in every attribute that has one."""
+    fused = [(each, values) for each, values in cloud.attributes if each.fused is not None]
+    columns = [each.averaged(values) for each, values in fused]
+    packed = np.concatenate([np.zeros((len(cloud), 0), np.float32), *columns], axis=1)
     xyz, means = open3d_clouds.voxel_downsample(cloud.xyz, packed, voxel_m)
-    widths = np.cumsum([column.shape[1] for column in columns])[:-1]
-    parts = dict(zip(names, np.split(means, widths, axis=1), strict=True)) if names else {}
-    fields: dict[str, Any] = {name: _restored(name, parts[name]) for name in names}
-    return replace(cloud, xyz=xyz, **fields)
-
-
-#: Attributes of a point except its position, and the dtype that a mean is converted to.
-_ATTRIBUTES = {
-    "rgb": np.uint8,
-    "normals": np.float32,
-    "sigma_m": np.float32,
-    "confidence": np.float32,
-    "weight": np.float32,
-    "count": np.int32,
-}
-
-
-def _restored(name: str, mean: Float32) -> NDArray[Any]:
-    """Return the mean of an attribute, converted to the dtype and shape used in a cloud."""
-    if name == "normals":
-        length = np.linalg.norm(mean, axis=1, keepdims=True)
-        return np.asarray(mean / np.maximum(length, np.float32(1e-12)), dtype=np.float32)
-    dtype = np.dtype(_ATTRIBUTES[name])
-    rounded = np.rint(mean) if dtype.kind in "iu" else mean
-    return rounded.astype(dtype) if name == "rgb" else rounded[:, 0].astype(dtype)
+    ends = np.cumsum([each.columns for each, _ in fused])
+    parts = zip(fused, np.split(means, ends[:-1], axis=1), strict=False)
+    found: dict[str, Any] = {each.name: each.of_means(part) for (each, _), part in parts}
+    return PointCloud(xyz, frame=cloud.frame, **found)
 
 
 class StereoSettings(Settings):

@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import apply, invert, transform_cloud
 from recon.core.text import counted
-from recon.core.values import PointCloud
-from recon.core.values.arrays import Float64, UInt8
+from recon.core.values import PointCloud, join_clouds
+from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.camera import project
 from recon.export.images import open_images
 from recon.io.files import read_text, reading
@@ -60,8 +60,7 @@ def _paths(map_: Map) -> tuple[Points, ...]:
         path, number = drive.trajectory, drive.number
         xyz = apply(drive.T_map_world, path.positions_m).astype(np.float32)
         rgb = _TRUST[drive.trusted.astype(np.int64) + placed[number]]
-        seen = np.stack([np.full(len(xyz), number), path.timestamps_s - path.timestamps_s[0]], 1)
-        paths.append(Points(f"{number}", PointCloud(xyz, rgb), seen.astype(np.float32)))
+        paths.append(Points(f"{number}", _seen(xyz, rgb, path.timestamps_s, number)))
     return tuple(paths)
 
 
@@ -90,19 +89,28 @@ def add_located(scene: Scene, run: Path) -> Scene:
         times_s = [float(row["time_s"]) for row in found]
         T_map_world = np.array(json.loads(read_text(table.with_name(SUMMARY)))["T_map_world"])
     trust = [2 if row["state"] == State.TRACKING.value else 1 for row in found]
-    ages_s = np.array(times_s) - min(times_s, default=0.0)
-    seen = np.column_stack([np.full(len(found), _LOCATED), ages_s]).astype(np.float32)
     xyz = apply(T_map_world, xyz.reshape(-1, 3)).astype(np.float32)
-    path = Points("located", PointCloud(xyz, _TRUST[trust]), seen)
+    path = Points("located", _seen(xyz, _TRUST[trust], np.array(times_s), _LOCATED))
     lines = [*scene.lines, f"{run}: {len(found)} of {counted(len(rows), 'frame')} located"]
     return replace(scene, lines=lines, paths=(*scene.paths, path))
 
 
+def _seen(xyz: Float32, rgb: UInt8, times_s: Float64, number: int) -> PointCloud:
+    """Return where the camera of a drive was, and when in the drive."""
+    ages_s = (times_s - times_s[:1]).astype(np.float32)
+    return PointCloud(xyz, rgb, time_s=ages_s, session=np.full(len(xyz), number, np.int32))
+
+
 def _dated(parts: Sequence[Points], paths: Sequence[Points]) -> tuple[Points, ...]:
     """Return points with the time and the drive that passed nearest to each."""
-    near = cKDTree(np.concatenate([path.cloud.xyz for path in paths]))
-    seen = np.concatenate([path.seen for path in paths if path.seen is not None])
-    return tuple(replace(p, seen=seen[near.query(p.cloud.xyz, workers=-1)[1]]) for p in parts)
+    path = join_clouds(path.cloud for path in paths)
+    near = cKDTree(path.xyz)
+
+    def dated(cloud: PointCloud) -> PointCloud:
+        nearest = path.select(near.query(cloud.xyz, workers=-1)[1])
+        return replace(cloud, time_s=nearest.time_s, session=nearest.session)
+
+    return tuple(replace(part, cloud=dated(part.cloud)) for part in parts)
 
 
 def grow(run: Path, path: Path) -> Iterator[Scene | None]:

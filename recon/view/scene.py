@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
-from recon.core.values.arrays import Float32, Float64, UInt8
+from recon.core.values import ATTRIBUTES, OccupancyGrid, PointCloud, TriangleMesh
+from recon.core.values.arrays import Float64, UInt8
 
 if TYPE_CHECKING:
     from recon.view.follow import KeyframeViews
@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 HOST: Final = "127.0.0.1"  # whoever looks is on this machine
 MOST_POINTS: Final = 1_500_000  # in the browser: about 25 MB
 _TILE_VOXELS: Final = 256  # edge of what is thinned together
-_SCALES: Final = {
-    "height": ("turbo", "m, blue to red"), "sigma": ("viridis", "m, blue to yellow"),
-    "age": ("viridis", "s, blue to yellow"),
-}  # fmt: skip
+_SHOWN: Final = {each.view: each for each in ATTRIBUTES if each.view}
+COLOURINGS: Final = ("image", "height", *(by for by in _SHOWN if by != "image"))
+_SCALES: Final = {"turbo": "blue to red", "viridis": "blue to yellow"}  # others have no legend
 _CLICK_RAD: Final = 0.006  # about five pixels of a screen
 
 
@@ -29,19 +28,17 @@ _CLICK_RAD: Final = 0.006  # about five pixels of a screen
 class Points:
     """Points that are thinned together: a tile of a map, or a submap of one that grows.
 
-    ``seen`` is float32 (N, 2): number of the drive that came nearest, and when in it [s].
+    ``time_s`` and ``session`` of its ``cloud`` are of the drive that came nearest.
     """
 
     name: str
     cloud: PointCloud
-    seen: Float32 | None = None
 
     def values(self, by: str) -> NDArray[Any] | None:
         """Return what a colouring shows: (N,), or colours (N, 3) by ``image``; None = unknown."""
-        if by in ("age", "session"):
-            return None if self.seen is None else self.seen[:, int(by == "age")]
-        known = {"image": self.cloud.rgb, "sigma": self.cloud.sigma_m}
-        return known.get(by, self.cloud.xyz[:, 2])
+        if by in _SHOWN:
+            return self.cloud.arrays.get(_SHOWN[by].name)
+        return self.cloud.xyz[:, 2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +77,15 @@ def halvings(parts: Sequence[Points], eye_m: Float64, limit: int = MOST_POINTS) 
 def colours(parts: Sequence[Points], by: str) -> tuple[list[UInt8], str]:
     """Return uint8 (N, 3) of each part, which all know what they are coloured by, and a legend."""
     values = [found for part in parts if (found := part.values(by)) is not None]
-    if by == "image" or not values:
+    scale, unit = (_SHOWN[by].scale, _SHOWN[by].unit) if by in _SHOWN else ("turbo", "m")
+    if not (scale and values):
         return values, ""
     from recon.report.style import colour_values, value_range  # noqa: PLC0415 - takes a second
 
-    if by == "session":
-        return [colour_values(each % 10, "tab10", (0.0, 9.0)) for each in values], ""
-    ends, (scale, unit) = value_range(np.concatenate(values)), _SCALES[by]
-    legend = f"{ends[0]:.3g} to {ends[1]:.3g} {unit}"
+    if scale not in _SCALES:
+        return [colour_values(each % 10, scale, (0.0, 9.0)) for each in values], ""
+    ends = value_range(np.concatenate(values))
+    legend = f"{ends[0]:.3g} to {ends[1]:.3g} {unit}, {_SCALES[scale]}"
     return [colour_values(each, scale, ends) for each in values], legend
 
 

@@ -15,11 +15,19 @@ from recon.core.errors import require
 from recon.core.values import UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64
 from recon.view.guard import Guard, stop
-from recon.view.scene import MOST_POINTS, Points, Scene, colours, first_view, halvings, pick
+from recon.view.scene import (
+    COLOURINGS,
+    MOST_POINTS,
+    Points,
+    Scene,
+    colours,
+    first_view,
+    halvings,
+    pick,
+)
 
 # Shown at first. A grid is flat, and the ground is not: behind a bend it would hide the road.
 _LAYERS: Final = {"cloud": True, "grid": False, "mesh": False, "path": True}
-_COLOURINGS: Final = ("image", "height", "sigma", "age", "session")
 FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
@@ -41,7 +49,7 @@ class Viewer:
         self._scenes: dict[Path, Scene] = {}
         self._parts: list[Points] = []
         self._keyframes: list[tuple[Any, int]] = []  # each by its views, and its number there
-        self._known: list[str] = [*_COLOURINGS[:1]]  # of colourings
+        self._known: list[str] = [*COLOURINGS[:1]]  # of colourings
         self._drawn: dict[str, tuple[Any, ...]] = {}  # what each node was made of
         self._eye_m: Float64 = np.zeros(3)
         self._wanted: dict[str, Any] = {}
@@ -59,7 +67,7 @@ class Viewer:
         self._parts = [part for one in scenes for part in one.points]
         views = [one.keyframes for one in scenes if one.keyframes is not None]
         self._keyframes = [(of, n) for of in views for n in range(len(of.T_map_camera))]
-        known = [by for by in _COLOURINGS if all(p.values(by) is not None for p in self._parts)]
+        known = [by for by in COLOURINGS if all(p.values(by) is not None for p in self._parts)]
         self._by.options, last = known, len(self._keyframes) - 1
         self._known = known
         self._text.content = "<br>".join(_html(one.lines) for one in scenes)
@@ -99,7 +107,7 @@ class Viewer:
         gui, scene = self._server.gui, self._server.scene
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._text = gui.add_html(_html(["nothing to be seen yet"]))
-        self._by = gui.add_dropdown("Colours", _COLOURINGS[:1])
+        self._by = gui.add_dropdown("Colours", COLOURINGS[:1])
         self._legend = gui.add_html("")
         self._layers = [
             (gui.add_checkbox(f"Show {name}", shown), scene.add_frame(f"/{name}", False))

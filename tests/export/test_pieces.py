@@ -20,6 +20,7 @@ from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
+from tests.map.walls import put_cloud, put_voxels
 
 
 def sheet(seed: int, n: int = 24, shift_m: float = 0.0, noise_m: float = 0.0) -> TriangleMesh:
@@ -167,7 +168,7 @@ def store(monkeypatch):
     cloud = street()
     # As from a drive: in pieces that do not know the tiles.
     for part in np.array_split(np.arange(len(cloud)), 7):
-        store.put_cloud(cloud.select(part))
+        put_cloud(store, cloud.select(part))
     return store
 
 
@@ -232,10 +233,10 @@ def test_what_hangs_where_cameras_looked_is_cut_off(store, tmp_path):
     ball = np.random.default_rng(5).normal(0, 1, (3000, 3)).astype(np.float32)
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     xyz, rgb = 0.5 * ball + np.float32([1.0, 0.0, 1.6]), np.full((3000, 3), 255, np.uint8)
-    store.put_cloud(PointCloud(xyz, rgb, ball, frame="map"))
+    put_cloud(store, PointCloud(xyz, rgb, ball, frame="map"))
     cells = np.stack(np.meshgrid(*[np.arange(-8, 20)] * 2, np.arange(3, 13), indexing="ij"), -1)
     free = cells.reshape(-1, 3).astype(np.int32)
-    store.put_voxels(OccupancyVoxels(free, np.full(len(free), -1, np.float32), 0.2))
+    put_voxels(store, OccupancyVoxels(free, np.full(len(free), -1, np.float32), 0.2))
     kept = SETTINGS.model_copy(update={"free_space": False})
     assert (written(store, tmp_path / "kept", kept)[0].vertices[:, 2] > 1.0).sum() > 500
     whole = written(store, tmp_path / "cut")[0]
@@ -265,8 +266,8 @@ def components(mesh: TriangleMesh) -> list[list[float]]:
 
 def test_components_are_counted_over_all_tiles(store, tmp_path):
     # A ribbon of which a tile and its margin have only the tip; and a crumb over the seam.
-    store.put_cloud(flat((-1.5, 0.0), (4.6, 0.15), 2.0))
-    store.put_cloud(flat((3.8, -1.5), (4.2, -1.2), 2.0))
+    put_cloud(store, flat((-1.5, 0.0), (4.6, 0.15), 2.0))
+    put_cloud(store, flat((3.8, -1.5), (4.2, -1.2), 2.0))
     large = SETTINGS.model_copy(update={"min_component_faces": 180})
     found = [written(store, tmp_path / "tiled", large)[0]]
     found.append(written(store, tmp_path / "whole", large.model_copy(update={"tile_m": 50.0}))[0])
@@ -289,7 +290,7 @@ def test_tiles_with_too_few_points_are_reported_and_none_is_an_error(store, tmp_
         written(store, tmp_path / "out")
     stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
     cloud = street().select(np.arange(3))
-    store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
+    put_cloud(store, PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
     coarse = SETTINGS.model_copy(update={"max_depth": 5})
     warnings = written(store, tmp_path / "few", coarse)[2]
     assert len(warnings) == 1

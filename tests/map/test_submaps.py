@@ -31,6 +31,8 @@ from tests.map.walls import (
     cloud_of,
     drive,
     frames,
+    put_cloud,
+    put_voxels,
     voxels_of,
 )
 
@@ -204,15 +206,15 @@ def test_points_and_voxels_that_are_put_in_come_out(store):
     made, filled = _tiles(store), Tiles(CUT, T_MAP_WORLD)
     cloud, voxels = cloud_of(made), voxels_of(made)
     for part in np.array_split(np.arange(len(cloud)), 5):  # in pieces that do not know the tiles
-        filled.put_cloud(cloud.select(part))
+        put_cloud(filled, cloud.select(part))
     for part in np.array_split(np.arange(len(voxels)), 5):
-        filled.put_voxels(voxels.select(part))
+        put_voxels(filled, voxels.select(part))
     np.testing.assert_array_equal(cloud_of(filled).xyz, cloud.xyz)
     assert_same_voxels(voxels_of(filled), voxels)
     assert all(filled.bounds(tile.key).contains(tile.cloud.xyz).all() for tile in filled)
     # A tile without points takes nothing from the others.
     far = OccupancyVoxels(np.int32([[40, 3, 0]]), np.ones(1, np.float32), filled.resolution_m)
-    filled.put_voxels(far)
+    put_voxels(filled, far)
     assert filled.cloud_in(EVERYWHERE).sigma_m is not None
 
 

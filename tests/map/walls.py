@@ -108,6 +108,19 @@ def off_m(map_: Map, number: int) -> float:
     return float(np.linalg.norm((T - TRUE[number])[:, :3, 3], axis=1).max())
 
 
+def put_cloud(tiles: Tiles, cloud: PointCloud) -> None:
+    """Add points to tiles as if they had been fused and filtered there, frame ``map``."""
+    for key, inside in tiles._parts.near(cloud.xyz, 0.0):
+        tiles._parts.put("points", key, cloud.select(inside).arrays)
+
+
+def put_voxels(tiles: Tiles, voxels: OccupancyVoxels) -> None:
+    """Add voxels that were observed, none twice."""
+    for key, inside in tiles._parts.near(voxels.centres_m, 0.0):
+        part = voxels.select(inside)
+        tiles._parts.put("voxels", key, {"keys": part.keys, "log_odds": part.log_odds})
+
+
 def cloud_of(tiles: Tiles) -> PointCloud:
     cloud = join_clouds(tile.cloud for tile in tiles)
     return cloud.select(np.lexsort(cloud.xyz.T))

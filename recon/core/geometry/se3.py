@@ -191,9 +191,11 @@ what a camera saw in front of it is in front of the viewer."""
 
 
 def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> PointCloud:
-    """Transform a cloud to another frame by ``T`` (4, 4); only positions and normals change."""
-    normals = None if cloud.normals is None else rotate(T, cloud.normals)
-    return replace(cloud, xyz=apply(T, cloud.xyz), normals=normals, frame=frame)
+    """Transform a cloud to another frame by ``T`` (4, 4); only positions and directions change."""
+    of = {
+        each.name: rotate(T, all_) for each, all_ in cloud.attributes if each.fused == "direction"
+    }
+    return replace(cloud, xyz=apply(T, cloud.xyz), frame=frame, **of)
 
 
 def part_of(T: Float64, share: float) -> Float64:

@@ -3,6 +3,8 @@
 What a notebook shows of them is made by `recon.report.notebook`, on demand (`shown.py`).
 """
 
+from recon.core.values.attributes import ATTRIBUTES as ATTRIBUTES
+from recon.core.values.attributes import Attribute as Attribute
 from recon.core.values.camera import LARGEST_CENTRE_OFFSET as LARGEST_CENTRE_OFFSET
 from recon.core.values.camera import CameraIntrinsics as CameraIntrinsics
 from recon.core.values.camera import LensModel as LensModel

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon.core.text import counted
 from recon.core.values.arrays import Float32, Int32, UInt8, extent_text, freeze
+from recon.core.values.attributes import ATTRIBUTES, Attribute
 from recon.core.values.shown import Shape
 
 Frame = Literal["camera", "world", "map"]
@@ -29,6 +30,8 @@ class PointCloud(Shape):
         weight: float32 (N,), sum of the weights of the fused measurements.
         count: int32 (N,), number of frames that saw the point; in a thinned frame, number of
             points that it replaces.
+        time_s: float32 (N,), when in its drive it was seen, seconds.
+        session: int32 (N,), number of the drive that saw it.
         frame: Frame of ``xyz``: camera (x right, y down, z forward), world (the first rectified
             left camera) or map (x forward, y left, z up).
     """
@@ -40,50 +43,53 @@ class PointCloud(Shape):
     confidence: Float32 | None = None
     weight: Float32 | None = None
     count: Int32 | None = None
+    time_s: Float32 | None = None
+    session: Int32 | None = None
     frame: Frame = "camera"
 
     def __post_init__(self) -> None:
         freeze(self, "xyz", np.float32, (None, 3))
-        n = len(self.xyz)
-        freeze(self, "rgb", np.uint8, (n, 3))
-        freeze(self, "normals", np.float32, (n, 3))
-        for name in ("sigma_m", "confidence", "weight"):
-            freeze(self, name, np.float32, (n,))
-        freeze(self, "count", np.int32, (n,))
+        for each in ATTRIBUTES:
+            freeze(self, each.name, each.dtype, each.shape(len(self.xyz)))
 
     def __repr__(self) -> str:
-        known = [f.name for f in fields(self)[1:-1] if getattr(self, f.name) is not None]
+        _, *known = self.arrays
         parts = (counted(len(self), "point"), extent_text(self.xyz), f"{self.frame} axes", *known)
         return f"PointCloud({', '.join(parts)})"
 
     def __len__(self) -> int:
         return len(self.xyz)
 
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The fields that are known, by name: ``xyz`` and its attributes."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)[:-1]}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def attributes(self) -> list[tuple[Attribute, NDArray[Any]]]:
+        """The attributes that are known, with their values, in the order of `ATTRIBUTES`."""
+        arrays = self.arrays
+        return [(each, arrays[each.name]) for each in ATTRIBUTES if each.name in arrays]
+
     def select(self, which: NDArray[Any]) -> PointCloud:
         """Return the points of a boolean mask (N,) or of an index array, in that order."""
         # Indexing by position is several times faster than by mask.
         index = np.flatnonzero(which) if which.dtype == np.bool_ else which
-        arrays = {
-            field.name: getattr(self, field.name).take(index, axis=0)
-            for field in fields(self)
-            if isinstance(getattr(self, field.name), np.ndarray)
+        arrays: dict[str, Any] = {
+            name: values.take(index, axis=0) for name, values in self.arrays.items()
         }
         return replace(self, **arrays)
 
 
 def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointCloud:
     """Concatenate clouds of one frame; attributes that one with points lacks are dropped."""
-    parts = [cloud for cloud in clouds if len(cloud)]
+    parts = [cloud.arrays for cloud in clouds if len(cloud)]
     if not parts:
         return PointCloud(np.zeros((0, 3), np.float32), frame=frame)
-    names = [field.name for field in fields(PointCloud) if field.name != "frame"]
-    columns = {name: [getattr(cloud, name) for cloud in parts] for name in names}
-    shared = {
-        name: np.concatenate(arrays)
-        for name, arrays in columns.items()
-        if all(array is not None for array in arrays)
-    }
-    return PointCloud(**shared, frame=frame)
+    shared = [name for name in parts[0] if all(name in part for part in parts)]
+    joined: dict[str, Any] = {name: np.concatenate([p[name] for p in parts]) for name in shared}
+    return PointCloud(**joined, frame=frame)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from recon.core.kernels.voxels import KEY_BITS, pack_keys
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, Int64
 from recon.io.files import StrPath
+from recon.io.models.columns import with_first
 from recon.io.models.las import COLOURED, AreGround, las_header, las_record, packing
 
 _EXTRA: Final = "survey"
@@ -43,7 +44,8 @@ def write_copc(
     All points are in memory at once.
     """
     laspy, lazrs = require("laspy", extra=_EXTRA), require("lazrs", extra=_EXTRA)
-    header = las_header(laspy, T_to_from, crs, step_m)
+    first, clouds = with_first(clouds)
+    header = las_header(laspy, first, T_to_from, crs, step_m)
     records = [las_record(laspy, header, cloud, T_to_from, ground) for cloud in clouds]
     points = laspy.ScaleAwarePointRecord.empty(header=header)
     points.array = np.concatenate([points.array, *(one.array for one in records)])

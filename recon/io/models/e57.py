@@ -14,10 +14,10 @@ from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
+from recon.io.models.columns import columns_of
 from recon.io.models.las import check_crs
 
 _AXES: Final = ("cartesianX", "cartesianY", "cartesianZ")
-_COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
 
 
 def write_e57(
@@ -81,7 +81,5 @@ def _columns(cloud: PointCloud, T_scan_from: Float64) -> dict[str, Any]:
         name: np.ascontiguousarray(values) for name, values in zip(_AXES, xyz.T, strict=True)
     }
     columns["cartesianInvalidState"] = np.zeros(len(cloud), np.int8)  # readers look for it
-    if cloud.rgb is not None:
-        pairs = zip(_COLOURS, cloud.rgb.T, strict=True)
-        columns |= {name: np.ascontiguousarray(values) for name, values in pairs}
-    return columns
+    own = columns_of(cloud, "e57").items()
+    return columns | {name: np.ascontiguousarray(values) for name, values in own}

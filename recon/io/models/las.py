@@ -15,6 +15,7 @@ from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
+from recon.io.models.columns import columns_of, with_first
 
 _EXTRA: Final = "survey"
 COLOURED: Final = 7  # point format with colours, of LAS 1.4
@@ -35,15 +36,16 @@ def write_las(
 ) -> int:
     """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
 
-    Positions are rounded to multiples of ``step_m``; colours, and the standard deviation of the
-    depth as the extra dimension ``sigma``, are written where the clouds have them. ``T_to_from``
+    Positions are rounded to multiples of ``step_m``; colours and, as extra dimensions, what else
+    `ATTRIBUTES` say are written where the clouds have them, all the same. ``T_to_from``
     (4, 4) leads to the coordinates of the file, in the system ``crs``. Points that ``ground`` says
     are ground have class 2, all others 1, unclassified. The number of points is returned.
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
     laspy, points = require("laspy", extra=_EXTRA), 0
-    header, packed = las_header(laspy, T_to_from, crs, step_m), Path(path).suffix == ".laz"
+    first, clouds = with_first(clouds)
+    header, packed = las_header(laspy, first, T_to_from, crs, step_m), Path(path).suffix == ".laz"
     with (
         packing(path) as temporary,
         laspy.open(temporary, mode="w", header=header, do_compress=packed) as file,
@@ -65,14 +67,17 @@ def packing(path: StrPath) -> Iterator[Path]:
             raise OSError(str(error)) from error
 
 
-def las_header(laspy: Any, T_to_from: Float64, crs: str | None, step_m: float) -> Any:
+def las_header(
+    laspy: Any, first: PointCloud, T_to_from: Float64, crs: str | None, step_m: float
+) -> Any:
     """Return the header of a file as `write_las` describes it, without points."""
     header = laspy.LasHeader(point_format=COLOURED, version="1.4")
     header.generating_software = "recon"
     header.global_encoding.wkt = True  # as the format of its points needs, even without a system
     header.scales, header.offsets = np.full(3, step_m), np.floor(T_to_from[:3, 3])
-    sigma = laspy.ExtraBytesParams("sigma", np.float32, "depth, 1 sigma, metres")
-    header.add_extra_dims([sigma])
+    for each, _ in first.attributes:
+        if each.las and each.width == 1:
+            header.add_extra_dim(laspy.ExtraBytesParams(*each.las, each.dtype, each.about))
     if crs is not None:
         header.add_crs(check_crs(crs))
     return header
@@ -146,8 +151,7 @@ def las_record(
     record.return_number[:] = record.number_of_returns[:] = 1  # 0 is not permitted
     record.classification[:] = 1 if ground is None else np.where(ground(cloud), 2, 1)
     record.x, record.y, record.z = apply(T_to_from, cloud.xyz.astype(np.float64)).T
-    if cloud.rgb is not None:
-        record.red, record.green, record.blue = cloud.rgb.T.astype(np.uint16) * _FULL_COLOUR
-    if cloud.sigma_m is not None:
-        record["sigma"] = cloud.sigma_m
+    for name, values in columns_of(cloud, "las").items():
+        own = name in header.point_format.extra_dimension_names
+        record[name] = values if own else values.astype(np.uint16) * _FULL_COLOUR
     return record

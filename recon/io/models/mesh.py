@@ -20,7 +20,7 @@ from recon.core.values.cloud import Frame
 from recon.io.atomic import atomic_path, write_bytes, write_text
 from recon.io.files import StrPath, reader
 from recon.io.images.image import encode_image, write_image
-from recon.io.models.ply import colours_of, fill_vertices, normals_of, positions_of, vertex_dtype
+from recon.io.models.columns import attributes_in, columns_of, positions_in, table_of
 from recon.io.models.ply_tables import (
     Table,
     list_length,
@@ -143,17 +143,14 @@ def read_mesh(path: StrPath) -> TriangleMesh:
 
 def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
     """Return the two tables of a PLY mesh, with ``start`` added to the indices of its faces."""
-    fields = vertex_dtype(normals=mesh.normals is not None, colours=mesh.rgb is not None)
-    fields += [] if mesh.texture is None else [("s", "<f4"), ("t", "<f4")]
-    vertices = np.zeros(len(mesh.vertices), fields)
-    fill_vertices(vertices, mesh.vertices, mesh.normals, mesh.rgb)
+    columns = columns_of(mesh, "ply")
     if mesh.texture is not None:
-        vertices["s"], vertices["t"] = mesh.texture.uv[:, 0], 1 - mesh.texture.uv[:, 1]
+        columns |= {"s": mesh.texture.uv[:, 0], "t": 1 - mesh.texture.uv[:, 1]}
     name = _INDICES[0]
     faces = np.zeros(len(mesh.faces), [(list_length(name), "u1"), (name, "<i4", (3,))])
     faces[list_length(name)] = 3
     faces[name] = mesh.faces + np.int32(start)
-    return {"vertex": vertices, "face": faces}
+    return {"vertex": table_of(mesh.vertices, columns), "face": faces}
 
 
 def _read_ply(path: StrPath) -> TriangleMesh:
@@ -163,7 +160,7 @@ def _read_ply(path: StrPath) -> TriangleMesh:
     if vertex is None or name is None or len(face) == 0:
         raise FormatError("the PLY file has no faces: it is a point cloud")
     faces = face[name].astype(np.int32)
-    return TriangleMesh(positions_of(vertex), faces, normals_of(vertex), colours_of(vertex))
+    return TriangleMesh(positions_in(vertex), faces, **attributes_in(vertex, "normals", "rgb"))
 
 
 def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:

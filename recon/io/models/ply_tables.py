@@ -5,8 +5,9 @@ Ref: G. Turk, "The PLY polygon file format", 1994.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from os import SEEK_END
 from pathlib import Path
 from typing import IO, Any, Final
@@ -96,20 +97,19 @@ def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[
 
 
 def write_table_stream(
-    path: StrPath, name: str, tables: Iterable[Table], comments: Sequence[str], empty: Table
+    path: StrPath, name: str, tables: Iterator[Table], comments: Sequence[str]
 ) -> int:
-    """Write one element whose rows arrive in parts, ``empty`` if there are none, atomically."""
+    """Write one element whose rows arrive in parts, atomically; returns how many."""
 
     def header(rows: int, filler: str, dtype: np.dtype[Any]) -> bytes:
         return _header([(name, rows, dtype)], [*comments, filler])
 
-    return write_row_stream(path, tables, empty, header)
+    return write_row_stream(path, tables, header)
 
 
 def write_row_stream(
     path: StrPath,
-    tables: Iterable[Table],
-    empty: Table,
+    tables: Iterator[Table],
     header: Callable[[int, str, np.dtype[Any]], bytes],
 ) -> int:
     """Write rows that arrive in parts, behind a header that says how many, atomically.
@@ -117,19 +117,15 @@ def write_row_stream(
     All tables get the dtype of the first. The number of rows is filled in at the end: ``header``
     has a comment with a filler of dots, so that it is as long for every number.
     """
-    dtype: np.dtype[Any] | None = None
-    rows = 0
+    first, rows = next(tables), 0
 
     def head() -> bytes:
-        filler = "." * (_LONGEST_NUMBER - len(str(rows)))
-        return header(rows, filler, empty.dtype if dtype is None else dtype)
+        return header(rows, "." * (_LONGEST_NUMBER - len(str(rows))), first.dtype)
 
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        for table in tables:
-            if dtype is None:
-                dtype = table.dtype
-                stream.write(head())
-            stream.write(table.astype(dtype, copy=False).tobytes())
+        stream.write(head())
+        for table in chain([first], tables):
+            stream.write(table.astype(first.dtype, copy=False).tobytes())
             rows += len(table)
         stream.seek(0)
         stream.write(head())

@@ -14,9 +14,11 @@ from recon.core.geometry.se3 import quaternion_from_rotation
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
 from recon.io.atomic import writing_to
+from recon.io.models.columns import columns_of, table_of
 
 _EXTRA: Final = "ros"
-_FLOAT32: Final = 7  # number of the type in a PointField
+# Numbers of types in a PointField.
+_TYPES: Final = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 # Of grid_map_msgs for ROS 2, which rosbags does not bring.
 _GRID_MAP: Final = {
     "GridMapInfo": "float64 resolution\nfloat64 length_x\nfloat64 length_y\n"
@@ -79,16 +81,13 @@ def pose(T: Float64, place: str = "position", turn: str = "orientation") -> dict
 
 
 def points(head: Mapping[str, Any], cloud: PointCloud) -> Message:
-    """Return a cloud: x, y, z, and rgb (a float with the bits 0x00RRGGBB) and sigma if known."""
-    columns = dict(zip("xyz", cloud.xyz.T, strict=True))
-    if cloud.rgb is not None:
-        packed = cloud.rgb.astype("<u4") @ np.array([1 << 16, 1 << 8, 1], "<u4")
-        columns["rgb"] = packed.view("<f4")
-    if cloud.sigma_m is not None:
-        columns["sigma"] = cloud.sigma_m
-    rows = np.stack([*columns.values()], axis=1).astype("<f4")
-    each, size = {"datatype": _FLOAT32, "count": 1}, rows.itemsize * len(columns)
-    fields = [{"name": name, "offset": 4 * k, **each} for k, name in enumerate(columns)]
+    """Return a cloud: x, y, z and, if known, what `ATTRIBUTES` say."""
+    rows = table_of(cloud.xyz, columns_of(cloud, "ros"))
+    fields = [
+        {"name": name, "offset": at, "datatype": _TYPES[kind.str[1:]], "count": 1}
+        for name, (kind, at, *_) in (rows.dtype.fields or {}).items()
+    ]
+    size = rows.itemsize
     content = {
         "header": head, "height": 1, "width": len(rows), "is_dense": True, "fields": fields,
         "point_step": size, "row_step": size * len(rows), "data": rows.view(np.uint8).reshape(-1),

@@ -13,8 +13,11 @@ from typing import Final
 
 from recon.core.errors import FormatError
 
-FORMAT: Final = 1
-"""Number of the format; it grows with every change that older versions cannot read."""
+MORE_ATTRIBUTES: Final = 2
+"""Number of the format of a map whose points carry more than those of format 1 could."""
+FORMAT: Final = MORE_ATTRIBUTES
+"""The newest number; it grows with every change that older versions cannot read. A map has the
+least number of all that read it, beginning with 1."""
 _OURS: Final = 0x7265636E  # "recn"
 _TABLE: Final = """CREATE TABLE record (
     kind TEXT NOT NULL, key TEXT NOT NULL, tree TEXT NOT NULL, checksum INTEGER NOT NULL,
@@ -50,9 +53,14 @@ def make_tables(database: sqlite3.Connection) -> None:
     database.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
     database.execute("BEGIN")
     database.execute(f"PRAGMA application_id = {_OURS}")
-    database.execute(f"PRAGMA user_version = {FORMAT}")
+    database.execute("PRAGMA user_version = 1")
     database.execute(_TABLE)
     database.execute("COMMIT")
+
+
+def format_of(database: sqlite3.Connection) -> int:
+    """Return the number of the format of a store."""
+    return int(database.execute("PRAGMA user_version").fetchone()[0])
 
 
 class Content:
@@ -106,7 +114,7 @@ def check_format(database: sqlite3.Connection, path: Path) -> None:
     """Refuse files of other programs, of newer versions, and with tables of another make."""
     try:
         (ours,) = database.execute("PRAGMA application_id").fetchone()
-        (number,) = database.execute("PRAGMA user_version").fetchone()
+        number = format_of(database)
         tables = {sql for (sql,) in database.execute("SELECT sql FROM sqlite_master") if sql}
     except sqlite3.DatabaseError as error:
         if "lock" in str(error):

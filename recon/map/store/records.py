@@ -27,6 +27,7 @@ from recon.map.store.database import (
     check_format,
     closed_on_error,
     connect,
+    format_of,
     make_tables,
 )
 from recon.map.store.trees import Bytes, from_bytes, to_bytes
@@ -168,6 +169,12 @@ class Store:
                 if content.checksum != checksum:
                     raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
 
+    def need_format(self, number: int) -> None:
+        """Let no version open the store that reads older formats alone."""
+        with self._lock, writing(self.path):
+            if number > format_of(self._database):
+                self._database.execute(f"PRAGMA user_version = {number}")
+
     def delete(self, kind: str, key: Key | None = None) -> None:
         """Delete a record, or all of a kind; it need not exist."""
         with self._lock, writing(self.path):
@@ -213,6 +220,9 @@ class Store:
 
         ``keys`` are those to copy, with their keys in the other store; None = all, under their own.
         """
+        with self._lock, reading(self.name):
+            number = format_of(self._database)
+        other.need_format(number)
         for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
             with self._lock, reading(self.name):
                 text, content, checksum = self._row(kind, _name(key))

@@ -15,6 +15,8 @@ from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in, tree_of
 from recon.io.files import reading
 from recon.look.rig import KnownRig, RefinedRig
+from recon.map.fusion import KNOWABLE, row_bytes
+from recon.map.store.database import MORE_ATTRIBUTES
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -265,7 +267,6 @@ class Session:
 
 SUBMAP: Final = "submap"
 ENTRY: Final = "submap_entry"
-_VOXEL_BYTES: Final = 60
 _CELL_BYTES: Final = 54  # most of one cell: its values, its surface point, and a block of its own
 
 
@@ -278,11 +279,12 @@ class SubmapEntry:
     frames: int
     voxels: int
     cells: int
+    more: tuple[str, ...] = ()  # attributes of its points that format 1 does not have
 
     @property
     def nbytes(self) -> int:
         """Most bytes that its arrays take."""
-        return _VOXEL_BYTES * self.voxels + _CELL_BYTES * self.cells
+        return row_bytes(self.more) * self.voxels + _CELL_BYTES * self.cells
 
     @property
     def middle(self) -> int:
@@ -315,8 +317,11 @@ class Submaps:
     def add(self, submap: Submap, *, compress: bool = False) -> None:
         entry = _entry_of(submap)
         key = (self._session, submap.index)
+        if entry.more:
+            self.store.need_format(MORE_ATTRIBUTES)
         self.store.put(SUBMAP, key, tree_of(submap), compress=compress)
-        self.store.put(ENTRY, key, asdict(entry))
+        content = asdict(entry).items()
+        self.store.put(ENTRY, key, {name: value for name, value in content if value != ()})
         self.entries.append(entry)
 
     def __getitem__(self, index: int) -> Submap:
@@ -335,7 +340,8 @@ class Submaps:
 
 def _entry_of(submap: Submap) -> SubmapEntry:
     fused, cells = len(submap.fused), len(submap.occupancy)
-    return SubmapEntry(submap.index, submap.first_frame, submap.frames, fused, cells)
+    more = tuple(name for name in submap.fused.known if name not in KNOWABLE)
+    return SubmapEntry(submap.index, submap.first_frame, submap.frames, fused, cells, more)
 
 
 KEYFRAME: Final = "view"  # "keyframe" was of features that are compared no more

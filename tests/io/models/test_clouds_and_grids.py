@@ -31,6 +31,7 @@ from recon.core.errors import (
 )
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import (
+    ATTRIBUTES,
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -51,7 +52,6 @@ from recon.io.models.ply import read_ply, write_ply
 from recon.io.models.ros_bag import header, points, write_bag
 from tests.scenery.octomaps import write_octomap
 
-FIELDS = ("rgb", "normals", "confidence", "sigma_m", "weight", "count")
 NUMBERS = st.floats(-1e6, 1e6, width=32)
 SHARES = st.floats(0, 1, width=32)
 
@@ -60,12 +60,12 @@ SHARES = st.floats(0, 1, width=32)
 def clouds(draw: st.DrawFn) -> PointCloud:
     n = draw(st.integers(0, 12))
     parts = {
-        "rgb": arrays(np.uint8, (n, 3)),
-        "normals": arrays(np.float32, (n, 3), elements=NUMBERS),
-        "confidence": arrays(np.float32, n, elements=SHARES),
-        "sigma_m": arrays(np.float32, n, elements=SHARES),
-        "weight": arrays(np.float32, n, elements=NUMBERS),
-        "count": arrays(np.int32, n, elements=st.integers(0, 2**31 - 1)),
+        each.name: arrays(
+            each.dtype,
+            each.shape(n),
+            elements={np.float32: SHARES if each.bounds else NUMBERS}.get(each.dtype),
+        )
+        for each in ATTRIBUTES
     }
     return PointCloud(
         xyz=draw(arrays(np.float32, (n, 3), elements=NUMBERS)),
@@ -96,11 +96,9 @@ def test_a_cloud_comes_back_bit_by_bit(tmp_path, ascii, cloud):  # noqa: A002
     again = read_ply(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(again.xyz, cloud.xyz)
     assert again.frame == cloud.frame
-    for name in FIELDS:
-        expected, got = getattr(cloud, name), getattr(again, name)
-        assert (got is None) == (expected is None)
-        if expected is not None:
-            np.testing.assert_array_equal(got, expected)
+    assert [*again.arrays] == [*cloud.arrays]
+    for name, values in cloud.arrays.items():
+        np.testing.assert_array_equal(again.arrays[name], values)
 
 
 @pytest.mark.parametrize("ascii", [False, True])
@@ -207,6 +205,7 @@ def test_points_of_a_survey_come_back_turned_and_moved(tmp_path, suffix):
     write_las(path, [PointCloud(np.ones((1, 3), np.float32))], np.eye(4))
     found = laspy.read(path)
     np.testing.assert_allclose(found.xyz, 1.0)
+    assert [*found.point_format.extra_dimension_names] == []  # these have no sigma
     assert found.header.parse_crs() is None
     assert found.header.global_encoding.wkt  # as points of this format need
 
