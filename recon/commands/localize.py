@@ -13,7 +13,7 @@ from recon.commands.map import look_first, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.progress import Silent, showing, stage
-from recon.core.values import StereoPair
+from recon.core.values import Recorded
 from recon.export.trajectories import begin_states, export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
@@ -168,5 +168,5 @@ class _Beginning(DerivedSource):
     def __len__(self) -> int:
         return len(self._pairs)
 
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
         return iter(self._pairs[start:])

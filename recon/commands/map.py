@@ -246,7 +246,7 @@ def look_first(
         rig = look.rig
         if rig.rigidity is not None and not rig.rigidity.frames:
             check_related(look, config)
-        if measured is not None:
+        if measured is not None and source.stereo:
             seen = see_baseline(rig.applied(look.source), config, measured, rig.length_share)
             rig = rig if seen is None else rig.with_baseline(seen, config.rig)
         if rig.refined:
@@ -256,17 +256,18 @@ def look_first(
 
 def _findings(look: Look, config: ReconConfig, options: MapOptions) -> tuple[str, ...]:
     """Return what is wrong with a drive, but what is said of its rig."""
-    if not (options.audit and config.audit.quick) or look.source.live:
+    source = look.source
+    if not (options.audit and config.audit.quick and source.stereo) or source.live:
         return ()
     found = find_faults(look, config)
     for finding in found:
         if finding.code == "lag" and finding.fatal:
             what = "left and right images are of different moments"
-            raise SourceError(what, where=look.source.name, got=finding.text)
+            raise SourceError(what, where=source.name, got=finding.text)
     lines = tuple(f"{one.text} [quick audit]" for one in found if one.code not in _SAID)
     if options.known_poses is None:
         return lines
-    return (*lines, *doubt_poses(options.known_poses, look.source, config))
+    return (*lines, *doubt_poses(options.known_poses, source, config))
 
 
 def _shown_live(
