@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import checkout  # noqa: F401 - what is measured
 import cv2
@@ -96,7 +96,7 @@ class Altered(StereoSource):
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """The altered pairs, from frame ``start`` on."""
         for index in range(start, len(self)):
-            pair = next(iter(self.drive.frames(self.order[index])))
+            pair = cast("StereoPair", next(self.drive.frames(self.order[index])))
             left, right = self.change(self.order[index], pair.left, pair.right)
             stamp_s = float(self.stamps_s[index])
             yield StereoPair(left, right, stamp_s, index=index, name=pair.name)

@@ -126,7 +126,7 @@ class Kept(DerivedSource):
 
     def __init__(self, source: SyntheticSource) -> None:
         super().__init__(source)
-        self.pairs, self.truth = list(source), SequenceTruth(source.trajectory)
+        self.pairs, self.truth = list(source.frames()), SequenceTruth(source.trajectory)
 
     def __len__(self) -> int:
         return len(self.pairs)

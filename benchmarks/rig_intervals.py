@@ -76,7 +76,7 @@ def noisy(image: UInt8, rng: np.random.Generator) -> UInt8:
 def street(seed: int) -> tuple[list[StereoPair], RectifiedCamera]:
     size = {"width_px": 400, "height_px": 136, "focal_px": 225.0, "smooth_edges": False}
     source = SyntheticSource(StreetScene(seed=seed, frames=FRAMES, **size))
-    return list(source), source.calibration
+    return list(source.frames()), source.calibration
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from recon.core.values import OccupancyVoxels as OccupancyVoxels
 from recon.core.values import PointCloud as PointCloud
 from recon.core.values import Reason as Reason
 from recon.core.values import RectifiedCamera as RectifiedCamera
+from recon.core.values import RectifiedImage as RectifiedImage
 from recon.core.values import RectifiedPair as RectifiedPair
 from recon.core.values import StereoCalibration as StereoCalibration
 from recon.core.values import StereoPair as StereoPair

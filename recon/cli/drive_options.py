@@ -71,7 +71,8 @@ class SourceOptions(RectifiedOptions):
     kind: Annotated[
         str | None,
         opt.option(
-            "Kind, else detected: kitti, kitti-raw, euroc, tum, folders, video, bag, middlebury.",
+            "Kind, else detected: kitti, kitti-raw, euroc, tum, rgbd, folders, video, bag, "
+            "middlebury.",
             "--source",
         ),
     ] = None

@@ -77,7 +77,7 @@ def compile_kernels() -> dict[str, Any]:
         submaps = mapped.session.submaps
         turns = np.stack([turn] * len(submaps))
         len(Tiles.of_submaps(submaps, mapped.config, mapped.T_map_world, turns))
-        colour = next(iter(source))
+        colour = next(source.frames())
         grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
         for kind, pair in {"colour": colour, "grey": grey}.items():
             run_pair(PairInput(pair, source.calibration), out=folder / kind)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map import lines_of, look_first, run_map
+from recon.commands.map import as_line, faults_of, look_first, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.progress import Silent, showing, stage
-from recon.core.values import StereoPair
+from recon.core.values import Recorded
 from recon.export.trajectories import begin_states, export_localized
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
@@ -140,7 +140,7 @@ def run_live(
     beginning = _Beginning(source)
     look = look_at(beginning, config)
     if options.audit:
-        options.warn(lines_of(look, config))
+        options.warn(tuple(map(as_line, faults_of(look, config))))
     # What comes is done once and forgotten.
     first = LiveSource(SourcePart(beginning, 0, min(_FIRST, len(beginning))), stopped=stopped)
     stage("warm up")
@@ -170,7 +170,7 @@ class _Beginning(DerivedSource):
 
     def __init__(self, source: StereoSource) -> None:
         super().__init__(source)
-        self._pairs = list[StereoPair]()
+        self._pairs = list[Recorded]()
         begun_s = None
         for pair in islice(source.frames(), _MOST):
             self._pairs.append(replace(pair, timestamp_s=len(self._pairs) * _PACE_S))
@@ -181,5 +181,5 @@ class _Beginning(DerivedSource):
     def __len__(self) -> int:
         return len(self._pairs)
 
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
         return iter(self._pairs[start:])

@@ -33,7 +33,7 @@ from recon.export.make import Products, make
 from recon.export.product import Order
 from recon.export.trajectories import export_paths
 from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.look.findings import find_faults
+from recon.look.findings import Finding, find_faults
 from recon.look.length import check_length, see_baseline
 from recon.look.look import Look, look_at
 from recon.look.rig import DEPTHS_M, KnownRig, RefinedRig, rig_shown
@@ -246,7 +246,7 @@ def look_first(
         rig = look.rig
         if rig.rigidity is not None and not rig.rigidity.frames:
             check_related(look, config)
-        if measured is not None:
+        if measured is not None and source.stereo:
             seen = see_baseline(rig.applied(look.source), config, measured, rig.length_share)
             rig = rig if seen is None else rig.with_baseline(seen, config.rig)
         if rig.refined:
@@ -256,23 +256,28 @@ def look_first(
 
 def _findings(look: Look, config: ReconConfig, options: MapOptions) -> tuple[str, ...]:
     """Return what is wrong with a drive, but what is said of its rig."""
-    if not (options.audit and config.audit.quick) or look.source.live:
+    source = look.source
+    if not options.audit or source.live:
         return ()
-    for finding in find_faults(look, config):
+    found = faults_of(look, config)
+    for finding in found:
         if finding.code == "lag" and finding.fatal:
             what = "left and right images are of different moments"
-            raise SourceError(what, where=look.source.name, got=finding.text)
-    lines = lines_of(look, config)
+            raise SourceError(what, where=source.name, got=finding.text)
+    lines = tuple(as_line(one) for one in found if one.code not in _SAID)
     if options.known_poses is None:
         return lines
-    return (*lines, *doubt_poses(options.known_poses, look.source, config))
+    return (*lines, *doubt_poses(options.known_poses, source, config))
 
 
-def lines_of(look: Look, config: ReconConfig) -> tuple[str, ...]:
-    """Return a line for each problem that a look shows, but those that a run says anyway."""
-    said = _SAID if look.shifted or not look.geometry.lag else _SAID - {"lag"}
-    found = find_faults(look, config)
-    return tuple(f"{one.text} [quick audit]" for one in found if one.code not in said)
+def faults_of(look: Look, config: ReconConfig) -> list[Finding]:
+    """Return what is wrong with a recording; nothing where that is not asked for."""
+    return find_faults(look, config) if config.audit.quick and look.source.stereo else []
+
+
+def as_line(finding: Finding) -> str:
+    """Return a finding as a warning of a run."""
+    return f"{finding.text} [quick audit]"
 
 
 def _shown_live(

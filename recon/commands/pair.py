@@ -17,8 +17,8 @@ from recon.core.text import plain
 from recon.core.values import (
     Disparity,
     Reason,
+    Rectified,
     RectifiedCamera,
-    RectifiedPair,
     StereoCalibration,
     StereoPair,
 )
@@ -128,7 +128,7 @@ def run_disparity(
 def _compared(
     given: PairInput,
     config: ReconConfig,
-    matched: tuple[RectifiedPair, Disparity],
+    matched: tuple[Rectified, Disparity],
     figures: dict[str, Any],
     warnings: tuple[str, ...],
 ) -> PairRun:

@@ -21,6 +21,7 @@ from recon.core.values import (
     DisparityTruth,
     PointCloud,
     Reason,
+    Rectified,
     RectifiedCamera,
     RectifiedPair,
     StereoPair,
@@ -93,7 +94,7 @@ class MethodResult:
     """Result of one method on one experiment."""
 
     method: str  # a key of `TITLES`
-    pair: RectifiedPair  # the grey images, with the camera that the method assumes
+    pair: Rectified  # the grey images, with the camera that the method assumes
     disparity: Disparity
     depth_m: Float32  # (H, W), metres; NaN = unknown
     cloud: PointCloud  # in camera axes

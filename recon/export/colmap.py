@@ -16,6 +16,7 @@ from recon.io.models.colmap import ColmapModel, Seen, write_colmap
 from recon.map.store.trees import loop_in
 from recon.places.adjustment import SharedPoints, shared_points
 from recon.places.closure import Closure, DrivePath
+from recon.sources.source import check_source
 
 
 def colmap_product(order: Order) -> Made:
@@ -27,6 +28,7 @@ def colmap_product(order: Order) -> Made:
     images = points = 0
     with write_colmap(order.run.path("colmap/sparse/0/points3D.txt").parent) as model:
         for drive in open_images(order.map, order.images):
+            check_source(drive.source, stereo=True)
             written = _Written(drive, model, first=points + 1)
             for names, pair in written.frames():
                 for name, image in zip(names, pair, strict=True):
@@ -57,11 +59,11 @@ class _Written:
         self._off_px = np.zeros(len(self._xyz))  # summed over the images of a point
         self._tracks: list[list[tuple[int, int]]] = [[] for _ in self._rgb]
 
-    def frames(self) -> Iterator[tuple[list[str], tuple[UInt8, UInt8]]]:
+    def frames(self) -> Iterator[tuple[list[str], tuple[UInt8, ...]]]:
         """Add all frames, one after the other; yield the names of their images, and these."""
         drive, rig = self._drive, self._model.add_rig(self._camera)
         for frame, pair in drive.pairs():
-            images = drive.rectifier.warp(pair)
+            images = drive.rectified(pair)
             names = [drive.file(side, frame) for side in ("left", "right")]
             T_camera_map = invert(drive.T_map_camera[frame])
             seen = self._seen(frame, images[0], T_camera_map)

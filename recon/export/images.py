@@ -11,8 +11,8 @@ import numpy as np
 
 from recon.core.errors import ReconError, SourceError
 from recon.core.progress import tracked
-from recon.core.values import Rig, StereoPair
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values import Recorded, Rig, StereoPair
+from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.io.files import reading, resolved
 from recon.map.map import Map
 from recon.map.sessions.placed import settings_of
@@ -45,10 +45,14 @@ class DriveImages:
         """What rectifies the images as they were when they were mapped."""
         return Rectifier(self.rig, settings_of(self.session).rectification)
 
+    def rectified(self, pair: Recorded) -> tuple[UInt8, ...]:
+        """Return what images there are of a frame, rectified, the left one first."""
+        return self.rectifier.warp(pair) if isinstance(pair, StereoPair) else (pair.views[0][1],)
+
     def file(self, side: str, frame: int) -> str:
         return f"{self.prefix}{side}_{frame:06d}.png"
 
-    def pairs(self) -> Iterator[tuple[int, StereoPair]]:
+    def pairs(self) -> Iterator[tuple[int, Recorded]]:
         """Yield number and pair of the frames that have a place, one in memory at a time."""
         first = int(np.argmax(self.placed))
         frames = range(first, len(self.placed))

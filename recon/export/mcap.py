@@ -106,7 +106,7 @@ class _Drive:
         if images is None:
             yield from ((frame, ()) for frame in np.flatnonzero(self.placed).tolist())
         else:
-            yield from ((frame, images.rectifier.warp(pair)) for frame, pair in images.pairs())
+            yield from ((frame, images.rectified(pair)) for frame, pair in images.pairs())
 
     def write(self, bag: RosBag, frame: int, views: tuple[UInt8, ...]) -> None:
         """Write all messages of a frame."""

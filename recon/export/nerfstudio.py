@@ -84,8 +84,7 @@ def _frames(
         depth_m = np.zeros(rectified.left.shape)
         depth_m[pixels_of(xyz, rectified.camera)] = xyz[:, 2]
         depth_m[depth_m > _FARTHEST_M] = 0.0
-        colours = rectified.left if rectified.left_rgb is None else rectified.left_rgb
-        images: dict[str, NDArray[Any]] = {"images": colours}
+        images: dict[str, NDArray[Any]] = {"images": rectified.views[0][1]}
         images["depths"] = np.rint(1000.0 * depth_m).astype(np.uint16)
         if moved is not None:
             cells = np.floor(apply(drive.T_map_camera[frame], xyz) / voxel_m).astype(np.int64)

@@ -15,6 +15,7 @@ from recon.core.values import Disparity, PointCloud, RectifiedCamera, Texture, T
 from recon.core.values.arrays import UInt8
 from recon.core.values.camera import depth_from_disparity, project
 from recon.core.values.cloud import Frame
+from recon.core.values.image import in_colour
 from recon.export.mesh.grid import check_coverage, mesh_coverage, mesh_grid
 from recon.export.mesh.pieces import LAYER, WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
@@ -142,7 +143,7 @@ def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:
         what, expected = "the image is not that of the run", f"{size[1]}x{size[0]} pixels"
         got = f"{image.shape[1]}x{image.shape[0]}"
         raise FormatError(what, where=path, got=got, expected=expected)
-    return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
+    return in_colour(image)
 
 
 def export_pair(

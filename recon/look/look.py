@@ -16,7 +16,7 @@ import numpy as np
 from recon.core.errors import ReconError
 from recon.core.progress import tracked
 from recon.core.text import counted
-from recon.core.values import RectifiedCamera, Rig, StereoPair
+from recon.core.values import Recorded, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.geometry import Geometry, measure_geometry, measure_rigidity
@@ -55,7 +55,7 @@ class Look:
     shifted: int = 0
 
     @property
-    def recorded(self) -> Sequence[StereoPair]:
+    def recorded(self) -> Sequence[Recorded]:
         """A few pairs, evenly spread, as recorded."""
         return self.sample.recorded
 
@@ -91,7 +91,7 @@ def look_at(
     paired as they belong together, and the look is one at that.
 
     Args:
-        source: The drive. Of a live one nothing is read.
+        source: The drive. Of a live one nothing is read, of a camera with depth nothing measured.
         config: How pairs are rectified and matched.
         rig: Whether the rig that the motion shows is used. Drives of less than 36 frames, and those
             whose cameras move against each other, show none. None = it is.
@@ -131,7 +131,7 @@ def _looked(
         begun = replace(known.begun(config.rectification), period_s=gaps.usual_s)
     windows = [] if source.live else plan_windows(len(source), effort)
     used, turn, tracking = begun.calibration, np.zeros(0), None
-    if windows and len(source) >= LEAST_FRAMES:
+    if windows and source.stereo and len(source) >= LEAST_FRAMES:
         used, turn = _rows_met(source, used, config, windows)
         tracking = FrameReconstructor(used, config)
     how = _Reading(rectifier, tracking, effort, shared=used is given)
@@ -221,7 +221,7 @@ def _track(
         return [one for tracks in counts for one in tracks]
 
 
-def _pairs(source: StereoSource, start: int, stop: int) -> Iterator[tuple[int, StereoPair]]:
+def _pairs(source: StereoSource, start: int, stop: int) -> Iterator[tuple[int, Recorded]]:
     return enumerate(islice(source.frames(start), stop - start), start)
 
 

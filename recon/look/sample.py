@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.core.errors import ReconError
-from recon.core.values import RectifiedPair, StereoPair
+from recon.core.values import Recorded, Rectified, RectifiedPair, StereoPair
 from recon.core.values.arrays import Float32, Float64
 from recon.look.measures import (
     RepeatCounter,
@@ -131,7 +131,7 @@ class Sample:
     frames: int = 0  # number of pairs that were read
     repeats: RepeatCounter = field(default_factory=RepeatCounter)
     pairs: list[Inspected] = field(default_factory=list)
-    recorded: list[StereoPair] = field(default_factory=list)  # a few pairs, as recorded
+    recorded: list[Recorded] = field(default_factory=list)  # a few pairs, as recorded
     broken: ReconError | None = None  # the error that ended the sampling, if any
 
     @classmethod
@@ -207,22 +207,24 @@ class Sampler:
         self._waiting = list(window.centres)
         self._recent: dict[int, RectifiedPair] = {}
 
-    def add(self, number: int, recorded: StereoPair, view: RectifiedPair | None = None) -> None:
+    def add(self, number: int, recorded: Recorded, view: Rectified | None = None) -> None:
         """Add the next pair, and its rectified view if there is one.
 
         A pair is measured once its neighbours have been read.
         """
         self.sample.frames += 1
-        self.sample.repeats.add(recorded.left, recorded.right)
         if number in self._chosen.kept:
             self.sample.recorded.append(recorded)
+        if not isinstance(recorded, StereoPair):  # it has no other image to compare with
+            return
+        self.sample.repeats.add(recorded.left, recorded.right)
         if not self._waiting:
             return
         lag = self._effort.lag
         if number >= self._waiting[0] - lag:
             # A pair, or part of a drive, may have its numbers from elsewhere.
-            view = view or self._rectifier.rectify(recorded)
-            self._recent[number] = replace(view, index=number)
+            both = view if isinstance(view, RectifiedPair) else self._rectifier.rectify(recorded)
+            self._recent[number] = replace(both, index=number)
         self._recent.pop(number - 2 * lag - 1, None)
         last = self._window.stop - 1
         while self._waiting and number >= min(self._waiting[0] + lag, last):

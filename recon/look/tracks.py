@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.values import RectifiedCamera, RectifiedPair, StereoPair
+from recon.core.values import Recorded, Rectified, RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.pose import TrackWindow
@@ -78,7 +78,7 @@ class Tracking:
         self._reconstructor, self._odometry = reconstructor, VisualOdometry()
         self._tracker = StereoTracker(self._odometry)
 
-    def add(self, recorded: StereoPair) -> RectifiedPair:
+    def add(self, recorded: Recorded) -> Rectified:
         """Add the next pair; returns it rectified."""
         frame = OdometryFrame(*self._reconstructor.match_roughly(recorded))
         window = self._tracker.add(frame, self._odometry.register(frame))

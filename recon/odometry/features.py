@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import Motion, apply, invert
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, Rectified, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry.kernels.patches import Placing, place_patches
@@ -332,7 +332,7 @@ def warp_of(
     )
 
 
-def measure_disparity(pair: RectifiedPair, uv: Float64, near: Float64, slope: Float64) -> Float64:
+def measure_disparity(pair: Rectified, uv: Float64, near: Float64, slope: Float64) -> Float64:
     """The disparity (N,) of features, measured in the images near a guess, which may be NaN.
 
     NaN where nothing alike is found on that row; ``slope`` as in `warp_of`.
@@ -343,8 +343,10 @@ def measure_disparity(pair: RectifiedPair, uv: Float64, near: Float64, slope: Fl
     return np.where(same_row, uv[:, 0] - there[:, 0], np.nan)
 
 
-def find_in_right(pair: RectifiedPair, uv: Float64, near: Float64, slope: Float64) -> Float64:
+def find_in_right(pair: Rectified, uv: Float64, near: Float64, slope: Float64) -> Float64:
     """Columns and rows (N, 2) of features in the right image; see `measure_disparity`."""
+    if not isinstance(pair, RectifiedPair):  # there is none: only its disparity says where
+        return uv - near[:, None] * [1.0, 0.0]
     warp = np.tile(np.eye(2), (len(uv), 1, 1))
     warp[:, 0] -= slope
     return find_again(pair.left, pair.right, uv, warp, uv - near[:, None] * [1.0, 0.0])

@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from recon.core.values import Disparity, RectifiedPair
+from recon.core.values import Disparity, Rectified
 from recon.core.values.arrays import Float64, array_in
 
 
@@ -15,7 +15,7 @@ from recon.core.values.arrays import Float64, array_in
 class OdometryFrame:
     """What an odometry is given of one frame."""
 
-    pair: RectifiedPair  # the rectified images
+    pair: Rectified  # the rectified images
     disparity: Disparity  # their disparity
     # Whether it is off by a quarter of a pixel or more: features are then measured in the images
     # themselves

@@ -11,7 +11,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 
 from recon.core.geometry.se3 import angle_rad, apply, invert
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, Rectified, RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, freeze
 from recon.core.values.camera import project
 from recon.places.keyframe import Keyframe, coarse_of, coarse_points, make_keyframe, words_of
@@ -141,7 +141,7 @@ class LoopDetector:
     def add(
         self,
         frame: int,
-        pair: RectifiedPair,
+        pair: Rectified,
         disparity: Disparity,
         T_world_camera: Float64,
         *,

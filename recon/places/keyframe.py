@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import ShapeError
 from recon.core.kernels.voxels import distinct_keys
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, Rectified, RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
 from recon.core.values.camera import depth_from_disparity, unproject
 
@@ -73,7 +73,7 @@ def feature_sigma_px(camera: RectifiedCamera) -> float:
     return _SIGMA_PX * max(1.0, math.sqrt(camera.width_px * camera.height_px) / _SIZE_PX)
 
 
-def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyframe:
+def make_keyframe(frame: int, pair: Rectified, disparity: Disparity) -> Keyframe:
     """Describe a frame for recognition.
 
     Features are SIFT's, which are found again from other distances and directions. Of a descriptor

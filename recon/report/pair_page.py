@@ -21,8 +21,8 @@ from recon.core.values import (
     DisparityTruth,
     PointCloud,
     Reason,
+    Rectified,
     RectifiedCamera,
-    RectifiedPair,
     TriangleMesh,
 )
 from recon.core.values.arrays import UInt8
@@ -41,7 +41,7 @@ class PairRun:
 
     name: str  # display name of the pair
     config: StereoSettings  # the configuration
-    pair: RectifiedPair  # the rectified images
+    pair: Rectified  # the rectified images
     disparity: Disparity  # their disparity
     summary: dict[str, Any]  # the figures of ``summary.json``
     #: The points in camera axes, or None if only the disparity was requested.
@@ -108,7 +108,7 @@ def is_wide(shape: tuple[int, ...]) -> bool:
     return shape[1] >= _WIDE_ASPECT * shape[0]
 
 
-def stereo_figures(pair: RectifiedPair, disparity: Disparity) -> dict[str, Any]:
+def stereo_figures(pair: Rectified, disparity: Disparity) -> dict[str, Any]:
     """Draw a pair and the results for its pixels; also return what their captions need."""
     return {
         "pair": pair_figure(pair),
@@ -123,18 +123,18 @@ def stereo_figures(pair: RectifiedPair, disparity: Disparity) -> dict[str, Any]:
 
 
 @style.styled
-def pair_figure(pair: RectifiedPair) -> bytes:
-    """Draw both rectified images: stacked if they are wide, else side by side."""
-    height, width = pair.left.shape
-    rows, columns = (2, 1) if is_wide(pair.left.shape) else (1, 2)
+def pair_figure(pair: Rectified) -> bytes:
+    """Draw the rectified images: stacked if they are wide, else side by side."""
+    (height, width), views = pair.left.shape, pair.views
+    rows, columns = (len(views), 1) if is_wide(pair.left.shape) else (1, len(views))
     height_in = (style.WIDE_IN / columns * height / width + 0.3) * rows
-    figure, both = style.subplots(style.WIDE_IN, height_in, rows, columns)
-    right = pair.right if pair.right_rgb is None else pair.right_rgb
-    for axes, side, image in zip(both, ("Left", "Right"), (pair.colours, right), strict=True):
-        style.show_image(axes, image, f"{side}, rectified")
-    grey = " and ".join(f"{image.mean():.0f}" for image in (pair.left, pair.right))
+    figure, axes = style.subplots(style.WIDE_IN, height_in, rows, columns, squeeze=False)
+    sides = ("left", "right")[: len(views)]
+    for below, side, (_, image) in zip(axes.flat, sides, views, strict=True):
+        style.show_image(below, image, f"{side.capitalize()}, rectified")
+    grey = " and ".join(f"{grey.mean():.0f}" for grey, _ in views)
     size = f"{width} by {height} pixels, with mean grey levels of {grey}"
-    return style.to_png(figure, f"Left and right image, {size}")
+    return style.to_png(figure, f"{' and '.join(sides).capitalize()} image, {size}")
 
 
 @style.styled

@@ -21,7 +21,7 @@ from recon.look.sample import QUICK, THOROUGH, Inspected
 from recon.look.settings import AuditedSettings
 from recon.rig.written import form_of, nearest_of_kalibr, write_rig
 from recon.sources.one_pair import OnePair, PairInput
-from recon.sources.source import StereoSource
+from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.rectify.rectifier import turns_of
 from recon.stereo.rectify.row_alignment import RowAlignment, correct_rig
@@ -80,6 +80,7 @@ class Audit:
 
 def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool = False) -> Audit:
     """Check a drive before a long run; ``quick``: as much as `recon map` looks at."""
+    check_source(source, stereo=True)
     stage("audit")
     return audit_of(look_at(source, config, effort=QUICK if quick else THOROUGH), config)
 

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.core.errors import SourceError
-from recon.core.values import ImuRecord, RectifiedCamera, StereoPair, check_size
+from recon.core.values import ImuRecord, Recorded, RectifiedCamera, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
@@ -51,7 +51,7 @@ class ImageSource(Recording):
     def read_imu(self) -> ImuRecord | None:
         return None if self.imu is None else self.imu()
 
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
         for index in range(start, len(self.images)):
             frame = self.images[index]
             left, right = (self._read(path) for path in (frame.left, frame.right))

@@ -22,6 +22,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -46,13 +47,15 @@ _IMU: Final = "imu0"
 _TRUTHS: Final = "state_groundtruth_estimate0", "mocap0"  # of EuRoC, and of TUM VI
 
 
-def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
+def open_tum(
+    folder: Path, settings: SourceSettings, make: Callable[..., ImageSource] = ImageSource
+) -> ImageSource:
     """Open a drive with two lists; its images are paired by timestamp."""
     paths = _find_lists(folder, settings)
     frames, listing = pair_listed([_read_tum_list(path) for path in paths], settings, folder)
     rig, texts = read_rig(settings, folder, image_size(frames[0].left, settings))
     truth, note = read_tum_truth(folder, stamps_of(frames))
-    return ImageSource(
+    return make(
         name=resolved(folder).name,
         description=f"TUM drive, {paths[0].name} and {paths[1].name}, "
         f"paired by stamps{listing}{note}",

@@ -12,7 +12,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.text import counted
-from recon.core.values import StereoPair
+from recon.core.values import Recorded
 from recon.sources.source import DerivedSource, StereoSource
 
 # Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
@@ -41,7 +41,7 @@ class LiveSource(DerivedSource):
             self.description += f", played at {rate:g} times its speed"
         self.rate = rate
         self._stopped = stopped
-        self._waiting: deque[tuple[StereoPair, float]] = deque()
+        self._waiting: deque[tuple[Recorded, float]] = deque()
         self._news = Condition()
         self._ended = False
         self._error: BaseException | None = None
@@ -53,7 +53,7 @@ class LiveSource(DerivedSource):
     def __len__(self) -> int:
         return len(self.source)
 
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
         Thread(target=self._play, args=(start,), name="live", daemon=True).start()
         try:
             while (pair := self._take()) is not None:
@@ -114,7 +114,7 @@ class LiveSource(DerivedSource):
                 self._ended = True
                 self._news.notify()
 
-    def _put(self, pair: StereoPair, due_s: float) -> None:
+    def _put(self, pair: Recorded, due_s: float) -> None:
         with self._news:
             if len(self._waiting) == _WAITING:
                 self._waiting.popleft()
@@ -122,7 +122,7 @@ class LiveSource(DerivedSource):
             self._waiting.append((pair, due_s))
             self._news.notify()
 
-    def _take(self) -> StereoPair | None:
+    def _take(self) -> Recorded | None:
         with self._news:
             while not (self._waiting or self._ended or self._stopped()):
                 self._news.wait(_PATIENCE_S)

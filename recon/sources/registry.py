@@ -18,6 +18,7 @@ from recon.sources.folders import find_views, open_folders
 from recon.sources.kitti import open_kitti, open_kitti_raw
 from recon.sources.listed import is_euroc, list_files, open_euroc, open_tum
 from recon.sources.one_pair import open_middlebury
+from recon.sources.rgbd import DEPTH, open_rgbd
 from recon.sources.settings import SourceSettings
 from recon.sources.source import Recording, StereoSource
 from recon.sources.video import list_videos, open_video_source
@@ -41,6 +42,7 @@ KINDS: Final = (
     Kind("folders", _PLAIN, open_folders, lambda at, _: (at / FRAMES).is_file()),
     Kind("middlebury", "a Middlebury scene", open_middlebury, lambda at, _: find_layout(at)),
     Kind("kitti", _KITTI, open_kitti, lambda at, _: any(at.glob("image_[0-3]"))),
+    Kind("rgbd", "an RGB-D folder", open_rgbd, lambda at, _: (at / DEPTH).is_file()),
     Kind("tum", "a TUM folder", open_tum, lambda at, _: list_files(at)),
     Kind("video", "videos", open_video_source, lambda at, _: list_videos(at), VIDEOS),
     Kind("folders", _PLAIN, open_folders, find_views),

@@ -58,6 +58,9 @@ class SourceSettings(Settings):
     """By how many frames the right camera is late: the left image of a frame is paired with the
     right one of so many frames later. Times, ground truth and known poses stay those of the left
     images. Negative = the left camera is late."""
+    depth_per_metre: float = Field(5000.0, ge=1.0, le=1e6)
+    """Value of a metre in the images of an RGB-D folder: 5000 in TUM's, 1000 where they are in
+    millimetres."""
     poses_of: Literal["rectified", "raw"] = "rectified"
     """Which left camera known poses are of: the rectified one, as all that recon writes, or the one
     in front of the lens, as motion capture and other programs have it."""

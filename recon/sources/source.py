@@ -16,9 +16,9 @@ from recon.core.text import counted, is_count
 from recon.core.values import (
     ImuRecord,
     OccupancyTruth,
+    Recorded,
     Rig,
     SequenceTruth,
-    StereoPair,
     Trajectory,
 )
 from recon.core.values.arrays import Float64
@@ -64,6 +64,7 @@ class StereoSource(ABC):
     def calibration(self) -> Rig:
         """A `RectifiedCamera` if the images are already rectified."""
 
+    stereo: bool = True  # whether two cameras were recorded; else frames bring their disparity
     rigid: bool = True  # whether both cameras are rigid to each other; else frames are distrusted
 
     @cached_property
@@ -91,7 +92,7 @@ class StereoSource(ABC):
         """Return the number of pairs."""
 
     @abstractmethod
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
         """Yield the pairs in order, one in memory at a time, from pair ``start`` on.
 
         Earlier pairs are skipped as cheaply as the input allows: image files are not read, a bag
@@ -102,7 +103,7 @@ class StereoSource(ABC):
             CalibrationError: An image has another size than the calibration.
         """
 
-    def __iter__(self) -> Iterator[StereoPair]:
+    def __iter__(self) -> Iterator[Recorded]:
         return self.frames()
 
     def with_calibration(self, calibration: Rig, *, rigid: bool = True) -> StereoSource:
@@ -177,12 +178,14 @@ class StereoSource(ABC):
         """Note that there is no time to match a pair that was yielded."""
 
 
-def check_source(source: object) -> None:
-    """Refuse what is not a `StereoSource`, such as a path."""
+def check_source(source: object, *, stereo: bool = False) -> None:
+    """Refuse what is not a `StereoSource`, such as a path; or what is not of two cameras."""
     if not isinstance(source, StereoSource):
         what = "not a source of stereo pairs"
         expected = "what recon.open_source returns, or a subclass of recon.StereoSource"
         raise SourceError(what, got=type(source).__name__, expected=expected)
+    if stereo and not source.stereo:
+        raise SourceError("this needs two cameras, not one with depth", where=source.name)
 
 
 _SAMPLES: Final = 32  # of a file: a change over a 31st of it is seen, and all of up to 128 KiB
@@ -230,9 +233,8 @@ class Recording(StereoSource):
         return None if self.again is None else self.again(self.shift_of(pairs))
 
     def warnings(self) -> list[str]:
-        out = self.left_out
-        left_out = [f"{counted(out, 'image')} without a partner: left out"] if out else []
-        return [*left_out, *self.notes]
+        out = f"{counted(self.left_out, 'image')} without a partner: left out"
+        return [out, *self.notes] if self.left_out else [*self.notes]
 
     def figures(self) -> dict[str, Any]:
         return {"frames_left_out": self.left_out}
@@ -249,7 +251,7 @@ class DerivedSource(StereoSource):
     def __init__(self, source: StereoSource) -> None:
         check_source(source)
         self.source, self.name, self.description = source, source.name, source.description
-        self.calibration, self.files = source.calibration, source.files
+        self.calibration, self.files, self.stereo = source.calibration, source.files, source.stereo
 
 
 class SourcePart(DerivedSource):
@@ -271,7 +273,7 @@ class SourcePart(DerivedSource):
     def read_imu(self) -> ImuRecord | None:
         return self.source.read_imu()
 
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
         return islice(self.source.frames(self.first + start), len(self) - start)
 
 
@@ -296,9 +298,8 @@ class FrameList:
     shift: int = 0  # by how many frames the right images were taken later than the left ones
 
     def __str__(self) -> str:
-        text = (
-            f", right images {counted(self.shift, 'frame', form='+d')} later" if self.shift else ""
-        )
+        later = counted(self.shift, "frame", form="+d")
+        text = f", right images {later} later" if self.shift else ""
         if any(self.alone):
             text += f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
         if self.chosen is None:
@@ -340,7 +341,7 @@ class FrameList:
     def _lines_of_all(self, count: int) -> list[int] | None:
         if count == len(self.paired):
             return list(range(count))
-        names = [self.names[k] for k in self.paired]
+        names = (self.names[k] for k in self.paired)
         numbers = [int(name) if is_count(name) else count for name in names]
         if max(numbers) < count:
             return numbers

@@ -2,6 +2,7 @@
 
 `frame.py` takes one pair through all of it, stage by stage, and makes points of disparities:
 
+- `observe.py`: what was recorded becomes a view with a disparity; of two images, by:
 - `rectify/rectifier.py`: both images are warped so that matching pixels share a row;
 - `match/registry.py`: the matchers by name; ours are `match/sad.py`, `match/sgm.py` and
   `match/fine.py`.

@@ -22,6 +22,8 @@ from recon.core.values import (
     PointCloud,
     RayCloud,
     Reason,
+    Recorded,
+    Rectified,
     RectifiedCamera,
     RectifiedPair,
     Rig,
@@ -32,26 +34,20 @@ from recon.core.work import Stopwatch
 from recon.stereo import open3d_clouds
 from recon.stereo.kernels import points
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.registry import MatchingSettings, check_matcher, make_matcher, searched
-from recon.stereo.match.sad import HalfSizeMatcher
-from recon.stereo.rectify.features import (
-    INSPECTED,
-    check_inspection,
-    inspect_features,
-    inspect_pair,
-    match_features,
-)
+from recon.stereo.match.registry import MatchingSettings, check_matcher
+from recon.stereo.observe import Effort, Inspected, Matching, MeasuredDepth, Observer
+from recon.stereo.rectify.features import inspect_pair
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
-from recon.stereo.support import Support, measure_support
+from recon.stereo.support import Support
 
 _INSPECT_EVERY: Final = 50  # frames: swapped cameras and rows that are off do not change
 
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedFrame:
-    """The results of one stereo pair."""
+    """The results of one frame."""
 
-    pair: RectifiedPair  # the rectified images
+    pair: Rectified  # the rectified images
     disparity: Disparity  # its disparity, with flying edges removed
     cloud: PointCloud  # its points in camera axes, filtered
     warnings: tuple[str, ...] = ()  # problems of the images that did not prevent a result
@@ -65,7 +61,7 @@ class ReconstructedFrame:
 
 
 class FrameReconstructor:
-    """Reconstructs pairs: rectify, inspect, match, remove edges, back-project, filter."""
+    """Reconstructs frames: rectify, inspect, observe, remove edges, back-project, filter."""
 
     def __init__(
         self,
@@ -76,75 +72,56 @@ class FrameReconstructor:
         stopwatch: Stopwatch | None = None,
         check_rows: bool = False,  # of every frame: the cameras move against each other
     ) -> None:
-        self._config, self._threads, self._check_rows = config, threads, check_rows
+        self._config, self._check_rows = config, check_rows
         self._stopwatch = stopwatch or Stopwatch()
-        self._rectifier = Rectifier(calibration, config.rectification)
-        matching = config.matching
-        self._matcher = make_matcher(matching.matcher, matching, threads)
-        self._keyframe_matcher = None
-        if matching.keyframe_matcher is not None:
-            self._keyframe_matcher = make_matcher(matching.keyframe_matcher, matching, threads)
-        self._rough_matcher = HalfSizeMatcher(searched(matching), threads=1)
+        rectifier = Rectifier(calibration, config.rectification)
+        self.camera = rectifier.camera  # the rectified camera of all frames
+        self._matching = Matching(rectifier, config.matching, threads)
+        self._depth = MeasuredDepth()
+        # Whether views that show something new are matched by a matcher of their own.
+        self.matches_keyframes = "match_keyframes" in self._matching.matchers
 
-    @property
-    def camera(self) -> RectifiedCamera:
-        """The rectified camera of all frames."""
-        return self._rectifier.camera
-
-    def rectify(self, pair: StereoPair) -> RectifiedPair:
+    def rectify(self, pair: Recorded) -> Rectified:
         with self._stopwatch.stage("rectify"):
-            return self._rectifier.rectify(pair)
+            return self._observer(pair).rectify(pair)
 
-    def match(self, pair: StereoPair) -> tuple[RectifiedPair, Disparity]:
+    def match(self, pair: Recorded) -> tuple[Rectified, Disparity]:
         """Rectify and match one pair, and remove flying edges."""
         rectified = self.rectify(pair)
-        return rectified, self._match(rectified)
+        return rectified, self._observe(rectified)
 
-    def match_roughly(self, pair: StereoPair) -> tuple[RectifiedPair, Disparity]:
+    def match_roughly(self, pair: Recorded) -> tuple[Rectified, Disparity]:
         """Rectify one pair, and match it at half size; flying edges stay."""
         rectified = self.rectify(pair)
         with self._stopwatch.stage("match_roughly"):
-            return rectified, self._rough_matcher.match(rectified)
+            return rectified, self._observer(rectified).observe(rectified, "match_roughly")
 
-    def inspect(self, pair: RectifiedPair) -> tuple[tuple[str, ...], Support | None]:
+    def inspect(self, pair: Rectified) -> Inspected:
         """Return warnings about a pair, and what supports that its images belong together."""
         with self._stopwatch.stage("inspect"):
-            features = match_features(pair.left, pair.right, INSPECTED)
-            found = inspect_features(features, pair.camera.doffs_px)
-            warnings = check_inspection(found, where=f"frame {pair.index}")
-            search = searched(self._config.matching)
-            support = measure_support(pair, features, search, self._threads)
-        return (*warnings, *(() if support is None else support.warnings())), support
+            return self._observer(pair).inspect(pair)
 
-    def reconstruct(self, pair: StereoPair) -> ReconstructedFrame:
+    def reconstruct(self, pair: Recorded) -> ReconstructedFrame:
         """Reconstruct one pair, and inspect it."""
         rectified = self.rectify(pair)
-        return self._frame_of(rectified, self._match(rectified), *self.inspect(rectified))
+        return self._frame_of(rectified, self._observe(rectified), *self.inspect(rectified))
 
-    def reconstruct_rectified(self, rectified: RectifiedPair) -> ReconstructedFrame:
+    def reconstruct_rectified(self, rectified: Rectified) -> ReconstructedFrame:
         """Reconstruct one pair of a drive that is rectified; every 50th is inspected."""
         inspected = ((), None) if rectified.index % _INSPECT_EVERY else self.inspect(rectified)
-        frame = self._frame_of(rectified, self._match(rectified), *inspected)
-        if not self._check_rows:
+        frame = self._frame_of(rectified, self._observe(rectified), *inspected)
+        if not (self._check_rows and isinstance(rectified, RectifiedPair)):
             return frame
         return replace(frame, rows_px=inspect_pair(rectified).row_error_px)
 
-    @property
-    def matches_keyframes(self) -> bool:
-        """Whether there is a matcher for keyframes alone."""
-        return self._keyframe_matcher is not None
-
     def reconstruct_keyframe(self, frame: ReconstructedFrame) -> ReconstructedFrame:
         """Reconstruct a frame again, by the matcher of keyframes."""
-        if self._keyframe_matcher is None:
-            return frame
-        with self._stopwatch.stage("match_keyframes"):
-            disparity = self._keyframe_matcher.match(frame.pair)
-        return self._frame_of(frame.pair, self._without_edges(disparity), frame.warnings)
+        disparity = self._observe(frame.pair, "match_keyframes")
+        return self._frame_of(frame.pair, disparity, frame.warnings)
 
     def _frame_of(
         self,
-        rectified: RectifiedPair,
+        rectified: Rectified,
         disparity: Disparity,
         warnings: tuple[str, ...],
         support: Support | None = None,
@@ -156,7 +133,7 @@ class FrameReconstructor:
             cloud = filter_cloud(cloud, config.filters)
         return ReconstructedFrame(rectified, disparity, cloud, warnings, support=support)
 
-    def unmatched(self, rectified: RectifiedPair) -> ReconstructedFrame:
+    def unmatched(self, rectified: Rectified) -> ReconstructedFrame:
         """Return a frame in which nothing is matched: no disparity, no point."""
         return replace(self._nothing, pair=rectified)
 
@@ -169,12 +146,13 @@ class FrameReconstructor:
         cloud = back_project(disparity, black, self._config.cloud)
         return ReconstructedFrame(black, disparity, cloud)
 
-    def _match(self, rectified: RectifiedPair) -> Disparity:
-        with self._stopwatch.stage("match"):
-            disparity = self._matcher.match(rectified)
-        return self._without_edges(disparity)
+    def _observer(self, one: Recorded | Rectified) -> Observer:
+        return self._matching if isinstance(one, StereoPair | RectifiedPair) else self._depth
 
-    def _without_edges(self, disparity: Disparity) -> Disparity:
+    def _observe(self, rectified: Rectified, effort: Effort = "match") -> Disparity:
+        """Return the disparity of a view, without flying edges."""
+        with self._stopwatch.stage(effort):
+            disparity = self._observer(rectified).observe(rectified, effort)
         if not self._config.cloud.remove_flying_edges:
             return disparity
         with self._stopwatch.stage("edges"):
@@ -202,7 +180,7 @@ class CloudSettings(Settings):
 
 
 def back_project(
-    disparity: Disparity, pair: RectifiedPair, settings: CloudSettings, *, normals: bool = True
+    disparity: Disparity, pair: Rectified, settings: CloudSettings, *, normals: bool = True
 ) -> PointCloud:
     """Return points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``, in row order.
 

@@ -193,6 +193,5 @@ class KeyframeViews:
             return [*lines, f"no images: {error}"], None
         shares = disparity.reason_shares.items()
         lines.append(", ".join(f"{REASON_LABELS[r]} {100 * share:.0f} %" for r, share in shares))
-        left = np.dstack([pair.left] * 3) if pair.left_rgb is None else pair.left_rgb
         coloured = colour_disparity(disparity.values), colour_reasons(disparity.reason)
-        return lines, np.concatenate([left, *coloured])
+        return lines, np.concatenate([pair.colours, *coloured])

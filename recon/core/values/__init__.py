@@ -31,6 +31,9 @@ from recon.core.values.grid import OccupancyVoxels as OccupancyVoxels
 from recon.core.values.grid import join_voxels as join_voxels
 from recon.core.values.image import Disparity as Disparity
 from recon.core.values.image import Reason as Reason
+from recon.core.values.image import Recorded as Recorded
+from recon.core.values.image import Rectified as Rectified
+from recon.core.values.image import RectifiedImage as RectifiedImage
 from recon.core.values.image import RectifiedPair as RectifiedPair
 from recon.core.values.image import StereoPair as StereoPair
 from recon.core.values.imu import ImuRecord as ImuRecord

@@ -1,4 +1,4 @@
-"""Stereo pairs, as recorded and rectified, and their disparity."""
+"""Stereo pairs, as recorded and rectified, their disparity, and images that come with theirs."""
 
 from __future__ import annotations
 
@@ -67,12 +67,37 @@ def join_pair(
 ) -> StereoPair:
     """Join two images of equal size; if only one is in colour, the other is converted."""
     if left.ndim != right.ndim:
-        left, right = (p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in (left, right))
+        left, right = in_colour(left), in_colour(right)
     return StereoPair(left, right, timestamp_s, index, name)
 
 
-@dataclass(frozen=True, eq=False)
-class RectifiedPair:
+class Rectified:
+    """The left view of a frame: what all but the matcher needs of a `RectifiedPair`."""
+
+    left: UInt8
+    camera: RectifiedCamera
+    left_rgb: UInt8 | None
+    valid: NDArray[np.bool_] | None
+    timestamp_s: float
+    index: int
+
+    def __repr__(self) -> str:
+        kind = "grey" if self.left_rgb is None else "colour"
+        return f"{type(self).__name__}({kind}, frame {self.index}, {self.camera})"
+
+    @property
+    def colours(self) -> UInt8:
+        """uint8 (H, W, 3): the left view in colour, or its grey values in all three channels."""
+        return in_colour(self.left if self.left_rgb is None else self.left_rgb)
+
+    @property
+    def views(self) -> tuple[tuple[UInt8, UInt8], ...]:
+        """The views there are images of, the left one first: in grey, and as they are shown."""
+        return ((self.left, self.colours),)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RectifiedPair(Rectified):
     """Two grey images with aligned rows.
 
     Slices of other images are copied: kernels would be compiled anew for their layout.
@@ -94,27 +119,28 @@ class RectifiedPair:
     index: int = 0
 
     def __post_init__(self) -> None:
-        size = (self.camera.height_px, self.camera.width_px)
-        for name in ("left", "right", "left_rgb", "right_rgb", "valid"):
-            image = getattr(self, name)
-            if isinstance(image, np.ndarray):
-                object.__setattr__(self, name, np.ascontiguousarray(image))
-        freeze(self, "left", np.uint8, size)
-        freeze(self, "right", np.uint8, size)
-        freeze(self, "left_rgb", np.uint8, (*size, 3))
-        freeze(self, "right_rgb", np.uint8, (*size, 3))
-        freeze(self, "valid", np.bool_, size)
-
-    def __repr__(self) -> str:
-        kind = "grey" if self.left_rgb is None else "colour"
-        return f"RectifiedPair({kind}, frame {self.index}, {self.camera})"
+        _freeze_view(self, "left", "left_rgb")
+        _freeze_view(self, "right", "right_rgb")
 
     @property
-    def colours(self) -> UInt8:
-        """uint8 (H, W, 3): the left view in colour, or its grey values in all three channels."""
-        if self.left_rgb is not None:
-            return self.left_rgb
-        return np.repeat(self.left[:, :, None], 3, axis=2)
+    def views(self) -> tuple[tuple[UInt8, UInt8], ...]:
+        right = self.right if self.right_rgb is None else self.right_rgb
+        return (*super().views, (self.right, right))
+
+
+def _freeze_view(view: Any, grey: str, rgb: str) -> None:
+    size = (view.camera.height_px, view.camera.width_px)
+    fields = {grey: (np.uint8, size), rgb: (np.uint8, (*size, 3)), "valid": (np.bool_, size)}
+    for name, (dtype, shape) in fields.items():
+        image = getattr(view, name)
+        if isinstance(image, np.ndarray):
+            object.__setattr__(view, name, np.ascontiguousarray(image))
+        freeze(view, name, dtype, shape)
+
+
+def in_colour(image: UInt8) -> UInt8:
+    """Return an image (H, W, 3), grey values in all three channels."""
+    return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
 ASSUMED_CONFIDENCE: Final = 0.9  # confidence of matches whose matcher gives none
@@ -233,6 +259,33 @@ class Disparity(Shown):
             sigma_px=_put(self.sigma_px, drop, np.nan),
             reason=_put(self.reason, drop, int(reason)),
         )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RectifiedImage(Rectified):
+    """A grey image, without lens distortion, that comes with its disparity: of a camera with depth.
+
+    The other fields are those of the left view of a `RectifiedPair`. The disparity is that to a
+    right view, a baseline of the camera beside it, of which there is no image.
+    """
+
+    left: UInt8
+    disparity: Disparity
+    camera: RectifiedCamera
+    left_rgb: UInt8 | None = None
+    valid: NDArray[np.bool_] | None = None
+    timestamp_s: float = 0.0
+    index: int = 0
+
+    def __post_init__(self) -> None:
+        _freeze_view(self, "left", "left_rgb")
+        if self.disparity.values.shape != self.left.shape:
+            got, expected = size_text(self.disparity.values), size_text(self.left)
+            raise ShapeError("disparity and image differ in size", got=got, expected=expected)
+
+
+Recorded = StereoPair | RectifiedImage
+"""What a source delivers of a frame."""
 
 
 def _where(mask: Bool, inside: Float32, outside: float) -> Float32:

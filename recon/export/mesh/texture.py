@@ -11,6 +11,7 @@ import numpy as np
 from recon.core.errors import MeshingError
 from recon.core.text import counted
 from recon.core.values import Texture, TriangleMesh
+from recon.core.values.image import in_colour
 from recon.export.images import DriveImages, open_images
 from recon.export.mesh.charts import make_atlas
 from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product
@@ -95,8 +96,7 @@ def posed_images(drives: Sequence[DriveImages]) -> Iterator[PosedImage]:
     first = 0
     for drive in drives:
         for frame, pair in drive.pairs():
-            left = drive.rectifier.warp(pair)[0]
-            colours = left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2)
+            colours = in_colour(drive.rectified(pair)[0])
             camera, T_map_camera = drive.session.camera, drive.T_map_camera[frame]
             yield PosedImage(first + frame, colours, camera, T_map_camera)
         first += len(drive.placed)
@@ -109,5 +109,5 @@ def _photos(order: Order, drives: Sequence[DriveImages]) -> Iterator[Photo]:
         for frame, pair in drive.pairs():
             if frame in keyframes:
                 path = order.run.path(f"{_FOLDER}/images/{drive.file('left', frame)}")
-                write_image(path, drive.rectifier.warp(pair)[0])
+                write_image(path, drive.rectified(pair)[0])
                 yield Photo(path, drive.session.camera, drive.T_map_camera[frame])

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import FormatError, ReconError, RegistrationError
-from recon.core.values import RectifiedPair, Trajectory
+from recon.core.values import Rectified, Trajectory
 from recon.core.values.arrays import tree_of
 from recon.core.versions import versions
 from recon.core.work import Stopwatch, look_ahead, work_in_background
@@ -110,10 +110,10 @@ class Drive:
         self._views.last = LastView(coarse_of(anew.disparity), T)
         return anew
 
-    def _map_behind(self, pair: RectifiedPair, found: OdometryResult, matched: bool) -> None:
+    def _map_behind(self, pair: Rectified, found: OdometryResult, matched: bool) -> None:
         self._add(self._reconstruct(pair) if matched else self.reconstructor.unmatched(pair), found)
 
-    def _reconstruct(self, pair: RectifiedPair) -> ReconstructedFrame:
+    def _reconstruct(self, pair: Rectified) -> ReconstructedFrame:
         return self._with_rays(self.reconstructor.reconstruct_rectified(pair))
 
     def _with_rays(self, frame: ReconstructedFrame) -> ReconstructedFrame:
@@ -207,8 +207,8 @@ _MOST_WAITING: Final = 20
 disk hangs."""
 
 
-_Registered = tuple[RectifiedPair, OdometryResult]
-MapFrame = Callable[[RectifiedPair, OdometryResult, bool], None]
+_Registered = tuple[Rectified, OdometryResult]
+MapFrame = Callable[[Rectified, OdometryResult, bool], None]
 """Puts a frame that has its pose into the map, matched or not."""
 
 

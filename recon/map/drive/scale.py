@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import ReconError
-from recon.core.values import Rig, StereoPair
+from recon.core.values import Recorded, Rig
 from recon.map.fusion import FusionSettings
 from recon.map.settings import SCALES
 from recon.stereo.frame import FrameReconstructor, StereoSettings
@@ -31,7 +31,7 @@ class Scene:
     depth_m: float | None = None  # typical depth; None = nothing was matched, or looked at
 
 
-def measure_scene(pairs: Iterable[StereoPair], rig: Rig, settings: StereoSettings) -> Scene:
+def measure_scene(pairs: Iterable[Recorded], rig: Rig, settings: StereoSettings) -> Scene:
     """Measure how large what a drive shows is, on a few of its pairs."""
     depths = list(_depths(pairs, rig, settings))
     if not depths:
@@ -57,7 +57,7 @@ def scale_of(depth_m: float, sigma_m: float) -> float:
 
 
 def _depths(
-    pairs: Iterable[StereoPair], rig: Rig, settings: StereoSettings
+    pairs: Iterable[Recorded], rig: Rig, settings: StereoSettings
 ) -> Iterator[tuple[float, float]]:
     """Yield depth of the mean disparity of some frames, and its standard deviation, metres.
 

@@ -239,7 +239,9 @@ def map_sequence(
     up = None if guide is None else guide.up
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch, up)
     checked = odometry.odometry if isinstance(odometry, CheckedOdometry) else None
-    tracks = LiveTracks(checked) if source.live and isinstance(checked, VisualOdometry) else None
+    tracks = None
+    if source.live and source.stereo and isinstance(checked, VisualOdometry):
+        tracks = LiveTracks(checked)
     drive = Drive(source, reconstructor, mapper, watch, config, work)
     if isinstance(odometry, FoundOdometry) and not len(mapper):
         drive.begin_at(int(odometry.found.models[0].frames[0]))

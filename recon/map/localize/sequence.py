@@ -13,7 +13,7 @@ import numpy as np
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.progress import series, stage
 from recon.core.text import counted
-from recon.core.values import OccupancyGrid, StereoPair, Trajectory
+from recon.core.values import OccupancyGrid, Recorded, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import look_ahead, serial_algebra
 from recon.map.drive.drive import Workspace
@@ -185,7 +185,7 @@ def localize_sequence(
         source.calibration, config, threads=workspace.threads, stopwatch=watch
     )
 
-    def match(pair: StereoPair) -> OdometryFrame:
+    def match(pair: Recorded) -> OdometryFrame:
         if source.live:
             return OdometryFrame(*reconstructor.match_roughly(pair), rough=True)
         return OdometryFrame(*reconstructor.match(pair))

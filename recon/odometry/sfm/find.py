@@ -20,12 +20,13 @@ from recon.core.text import counted
 from recon.core.work import Stopwatch
 from recon.odometry.sfm.colmap import Colmap, load_colmap
 from recon.odometry.sfm.found import FoundPoses
-from recon.sources.source import StereoSource
+from recon.sources.source import StereoSource, check_source
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 
 
 def check_sfm(source: StereoSource) -> None:
     """Refuse what structure from motion cannot work with, and say which package is missing."""
+    check_source(source, stereo=True)
     load_colmap()
     if source.live:
         what = "structure from motion needs all pairs before it begins"

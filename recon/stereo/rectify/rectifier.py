@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from recon.core.errors import CalibrationError
+from recon.core.errors import CalibrationError, ShapeError
 from recon.core.geometry.se3 import angle_rad
 from recon.core.settings import Settings
 from recon.core.values import (
     CameraIntrinsics,
+    Recorded,
     RectifiedCamera,
     RectifiedPair,
     Rig,
@@ -85,7 +86,7 @@ class Rectifier:
                 hint="check the distortion and the pose of the right camera",
             )
 
-    def rectify(self, pair: StereoPair) -> RectifiedPair:
+    def rectify(self, pair: Recorded) -> RectifiedPair:
         left, right = self.warp(pair)
         return RectifiedPair(
             left=to_grey(left),
@@ -98,8 +99,10 @@ class Rectifier:
             index=pair.index,
         )
 
-    def warp(self, pair: StereoPair) -> tuple[UInt8, UInt8]:
-        """Rectify both images of a pair, without grey conversion."""
+    def warp(self, pair: Recorded) -> tuple[UInt8, UInt8]:
+        """Rectify both images of a pair, without grey conversion; one without two is refused."""
+        if not isinstance(pair, StereoPair):
+            raise ShapeError("there is no right image", where=f"frame {pair.index}")
         height_px, width_px = pair.left.shape[:2]
         check_size(self.camera, width_px, height_px, pair.name or f"frame {pair.index}")
         if self._views is None:
