@@ -38,8 +38,8 @@ import checkout  # noqa: F401 - what is measured
 import psutil
 from distributed import Client, LocalCluster
 
+from recon.core.machine import available_cores
 from recon.core.values import RectifiedCamera
-from recon.core.work import available_cores
 from recon.io.images.image import write_image
 from recon.run.batch.cluster import Cluster, local_cluster
 from recon.run.batch.job import Job, Outcome

@@ -32,8 +32,9 @@ from altered_drives import alterations, write_kitti
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.demo import demo_source
+from recon.core.machine import available_cores
 from recon.core.values import Trajectory
-from recon.core.work import available_cores, serial_algebra
+from recon.core.work import serial_algebra
 from recon.evaluation.trajectory import associate, evaluate_trajectory
 from recon.io.trajectory import read_tum
 from recon.odometry.protocol import OdometryFrame

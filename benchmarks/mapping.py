@@ -33,9 +33,9 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import make_transform
+from recon.core.machine import available_cores
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
-from recon.core.work import available_cores
 from recon.map.builders import OccupancyBuilder, OccupancySettings
 from recon.sources.registry import open_source
 

@@ -21,8 +21,8 @@ from typing import Final
 
 from recon.core.errors import DISTRIBUTION
 from recon.core.kernels.cache import cache_parent
+from recon.core.machine import available_cores
 from recon.core.progress import stage, tracked
-from recon.core.work import available_cores
 
 _ROOMS: Final = Path(__file__).parents[1]
 _COMPILE_TIMEOUT_S: Final = 600.0

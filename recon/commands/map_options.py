@@ -19,8 +19,8 @@ from typing_extensions import Self
 from recon.commands.config import Changes, ReconConfig, load_config
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.geometry.se3 import make_transform
+from recon.core.machine import versions
 from recon.core.values import Trajectory
-from recon.core.versions import versions
 from recon.export.make import USUAL
 from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_trajectory

@@ -8,6 +8,6 @@
 - `plugins.py`: parts that others write, registered by packages or given as objects;
 - `text.py`: numbers read from text and written with words and units;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
-  `memory.py`: what the process takes, and its limit; `versions.py`: of what results depend on;
+  `memory.py`: what the process takes, and its limit; `machine.py`: cores, and versions;
 - `least_squares.py`: the loop of every non-linear fit.
 """

@@ -15,15 +15,10 @@ from typing import Final, TypeVar
 import cv2
 from threadpoolctl import threadpool_limits
 
+from recon.core.machine import available_cores
+
 _NICER: Final = 5
 """How much nicer background threads are: beside another on one core they get a quarter."""
-
-
-def available_cores() -> int:
-    """Return cores that this process may use; in a container, fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 FEW: Final = min(2, available_cores())

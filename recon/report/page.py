@@ -20,8 +20,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
+from recon.core.machine import versions
 from recon.core.text import counted, metres, with_unit
-from recon.core.versions import versions
 from recon.io.atomic import write_text
 from recon.report import style
 from recon.report.still import draw_still

@@ -14,9 +14,9 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.core import progress
+from recon.core.machine import versions
 from recon.core.memory import peak_memory_mb
 from recon.core.settings import Settings
-from recon.core.versions import versions
 from recon.core.work import Stopwatch, use_threads
 from recon.io.fields import write_yaml
 from recon.io.files import StrPath, fingerprint, resolved

@@ -33,6 +33,8 @@ def imported(trees):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.add(node.module.split(".")[0])
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Lazy":
+                names.add(ast.literal_eval(node.args[0]))
     providers = packages_distributions()
     return {
         name: {_normal(provider) for provider in providers.get(name, [name])}

@@ -21,9 +21,10 @@ from recon.core import memory as memory_file
 from recon.core import work as work_file
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
+from recon.core.machine import available_cores
 from recon.core.memory import MemorySettings, parse_size_mb, peak_memory_mb
 from recon.core.values import PointCloud, join_clouds, join_voxels
-from recon.core.work import OneBehind, available_cores, look_ahead, side_by_side, use_threads
+from recon.core.work import OneBehind, look_ahead, side_by_side, use_threads
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.store.records import Store

@@ -15,12 +15,13 @@ from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.machine import available_cores
 from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32, Int64
 from recon.core.values.cloud import Frame
-from recon.core.work import available_cores, side_by_side
+from recon.core.work import side_by_side
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import (
     Plane,

@@ -18,9 +18,9 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import FormatError, ReconError, RegistrationError
+from recon.core.machine import versions
 from recon.core.values import Rectified, Trajectory
 from recon.core.values.arrays import tree_of
-from recon.core.versions import versions
 from recon.core.work import Stopwatch, look_ahead, work_in_background
 from recon.io.files import reading
 from recon.look.tracks import LiveTracks

@@ -14,6 +14,7 @@ import numpy as np
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert, transform_cloud
+from recon.core.machine import available_cores
 from recon.core.progress import series, stage
 from recon.core.text import counted, metres
 from recon.core.values import (
@@ -27,7 +28,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import depth_from_disparity
-from recon.core.work import available_cores, serial_algebra
+from recon.core.work import serial_algebra
 from recon.look.tracks import LiveTracks, StereoTracks
 from recon.map.drive.drive import Drive, Workspace
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch

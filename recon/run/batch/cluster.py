@@ -14,7 +14,7 @@ from typing import Any, Final
 from uuid import uuid4
 
 from recon.core.errors import ClusterError, ReconError, SettingsError, require
-from recon.core.work import available_cores
+from recon.core.machine import available_cores
 from recon.run.batch.job import Job, Outcome, last_outcome, run_job
 
 EXTRA: Final = "cluster"

@@ -1,7 +1,8 @@
-"""Versions of the packages that results depend on."""
+"""Cores of this machine, and versions of the packages that results depend on."""
 
 from __future__ import annotations
 
+import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from typing import Final
@@ -13,6 +14,13 @@ _RECORDED: Final = (
     "numpy", "scipy", "numba", "llvmlite", "opencv-python-headless", "open3d", "kiss-icp",
     "pymeshlab",
 )  # fmt: skip
+
+
+def available_cores() -> int:
+    """Return cores that this process may use; in a container, fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def versions() -> dict[str, str]:
