@@ -8,5 +8,6 @@
 - `text.py`: numbers read from text and written with words and units;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
   `memory.py`: what the process takes, and its limit; `versions.py`: of what results depend on;
+- `shown.py`: how values show themselves, by rooms above;
 - `least_squares.py`: the loop of every non-linear fit.
 """
