@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shutil import copyfile
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
@@ -11,11 +12,14 @@ from recon.core.errors import FormatError, SettingsError
 from recon.export.control import locate
 from recon.export.images import open_images
 from recon.export.make import PRODUCTS, known_products, make, need_rays
-from recon.export.pair import export_pair, finish_cloud_run, mesh_cloud
+from recon.export.mesh.pieces import LAYER, WHOLE
+from recon.export.pair import PAIR_CLOUD, mesh_cloud, write_surface
 from recon.export.product import Order
-from recon.io.files import StrPath, resolved
+from recon.io.atomic import atomic_path
+from recon.io.files import StrPath, naming, reading, resolved
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
+from recon.io.models.ply import read_ply, write_ply
 from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.placed import PlacedMap, place_map, place_map_on
@@ -24,7 +28,6 @@ from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,
     MAPPED_BY,
-    PAIR_CLOUD,
     camera_of_pair,
     command_of_map,
     is_pair_run,
@@ -92,7 +95,8 @@ def run_export(
     settings = config or ran
     if mapped_by is None:
         with Run(command, out, settings, threads=threads) as run:
-            return export_pair(source, settings.mesh, wanted, run, formats)
+            more = {"run": str(source), "warnings": []}
+            return _of_cloud(source, run, settings, formats, more, wanted)
     check_changes(ran, settings, (*(REMADE if need_rays(wanted) else ()), "mesh"))
     with Map.open(source) as map_, Run(command, out, settings, threads=threads) as run:
         if any(PRODUCTS[name].needs_images for name in wanted):
@@ -103,7 +107,8 @@ def run_export(
         if survey is not None:
             with run.stage("survey"):
                 there = locate(map_, survey, images, run.threads)
-        made = make(Order(map_, placed, run, settings.mesh, formats, there, images), wanted)
+        order = Order(map_, placed, settings.mesh, formats, run.threads, there, images)
+        made = make(order, run.content, wanted, run.watch)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
         figures = {
             "run": str(source),
@@ -141,17 +146,46 @@ def run_mesh(
     removed.
     """
     check_mesh_formats(formats)
-    cloud, camera = source, None
     if source.is_dir():
         refuse_as_target(source, out)
         if not is_pair_run(source):
             settings = run_settings(source).model_copy(update={"mesh": config.mesh})
             how: Any = {"out": out, "threads": threads, "command": "mesh"}
             return run_export(source, settings, products=["mesh"], formats=formats, **how)
-        cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
     with Run("mesh", out, config, threads=threads) as run:
-        figures = mesh_cloud(cloud, camera, config.mesh, run, formats)
-        return finish_cloud_run(source, cloud, run, figures)
+        return _of_cloud(source, run, config, formats)
+
+
+def _of_cloud(
+    source: Path,
+    run: Run,
+    config: ReconConfig,
+    formats: Sequence[str],
+    more: Mapping[str, Any] = {},
+    products: Sequence[str] = ("mesh",),
+) -> dict[str, Any]:
+    """Make products of a cloud file, or of the cloud in a run of `recon pair`, and end the run.
+
+    There are ``more`` figures to its summary.
+    """
+    camera = camera_of_pair(source) if source.is_dir() else None
+    cloud = source / PAIR_CLOUD if source.is_dir() else source
+    figures = {"cloud": str(cloud), **more}
+    if "cloud" in products:
+        with reading(cloud):
+            cloud.stat()
+        with atomic_path(run.path(PAIR_CLOUD)) as temporary:
+            copyfile(cloud, temporary)
+    if "mesh" in products:
+        with run.stage("read"):
+            points, layer = read_ply(cloud), run.path(LAYER)
+            write_ply(layer, points)
+        with run.stage("mesh"), naming(cloud):
+            mesh, made = mesh_cloud(points, camera, config.mesh, source)
+        write_surface(mesh, camera, layer, formats, run.path(WHOLE))
+        figures |= made
+    run.finish(figures, source=str(source), inputs=[cloud])
+    return figures
 
 
 def run_occupancy(

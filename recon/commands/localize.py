@@ -14,7 +14,8 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.progress import Silent, showing, stage
 from recon.core.values import StereoPair
-from recon.export.trajectories import begin_states, export_localized
+from recon.export.trajectories import begin_states, export_localized, write_states
+from recon.io.fields import write_json
 from recon.io.files import StrPath
 from recon.io.models.nav2 import read_nav2
 from recon.map.drive.drive import Workspace
@@ -25,7 +26,8 @@ from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
 from recon.rig.audit.audit import quick_warnings
-from recon.run.finished import GRID, figure_of, refuse_as_target
+from recon.run.finished import GRID, STATES, figure_of, refuse_as_target
+from recon.run.run import SUMMARY
 from recon.sources.live import LiveSource
 from recon.sources.source import DerivedSource, StereoSource
 
@@ -69,7 +71,8 @@ def run_localize(
         workspace = Workspace(map_, run.watch, run.threads)
         T_map_world = map_.first.T_map_world.tolist()
         where = {"map_run": str(map_path), "T_map_world": T_map_world}
-        how: Any = {"start": start, "note": begin_states(where, run)}
+        write_json(run.state(SUMMARY), where)
+        how: Any = {"start": start, "note": begin_states(run.state(STATES))}
         options.begun(run.folder)
         drive = localize_sequence(source, workspace, config, **how)
         has_grid = folder is not None and (folder / GRID).is_file()
@@ -82,7 +85,8 @@ def run_localize(
         made.summary.update(source.figures())
         with run.stage("write"):
             height_m = None if folder is None else figure_of(folder, "camera_height_m")
-            export_localized(drive, height_m, run)
+            export_localized(drive, height_m, run.content)
+            write_states(run.path(STATES), drive.frames)
         with run.report(made.summary):
             write_localize_page(made, run)
         run.finish(made.summary, source=source.name, inputs=inputs)

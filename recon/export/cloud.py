@@ -23,20 +23,19 @@ _GROWTH: Final = 1.25
 _MUCH: Final = 0.02  # share of the points left out without a word; a busy street has less
 
 
-def cloud_product(order: Order) -> Made:
-    """Write ``map/cloud.ply``, and ``map/removed.ply`` with what moved."""
-    files = [order.run.path(f"map/{name}.ply") for name in ("cloud", "removed")]
-    return export_cloud(order.placed.tiles, *files)
+def cloud_product(order: Order, path: Path) -> Made:
+    """Write the fused cloud, and ``removed.ply`` beside it with what moved."""
+    return export_cloud(order.placed.tiles, path, path.with_name("removed.ply"))
 
 
-def pcd_product(order: Order) -> Made:
-    """Write ``map/cloud.pcd``, the fused cloud for PCL."""
+def pcd_product(order: Order, path: Path) -> Made:
+    """Write the fused cloud for PCL."""
     clouds = (tile.cloud for tile in order.placed.tiles)
-    return Made({"points": write_pcd(order.run.path("map/cloud.pcd"), filter(len, clouds))})
+    return Made({"points": write_pcd(path, filter(len, clouds))})
 
 
-def arrays_product(order: Order) -> Made:
-    """Write ``map/map.npz``: the fields of the fused cloud, and the paths of the drives.
+def arrays_product(order: Order, path: Path) -> Made:
+    """Write an archive of NumPy: the fields of the fused cloud, and the paths of the drives.
 
     ``xyz`` and the other fields of `PointCloud` that the map has; and for each frame ``times_s``,
     ``T_map_camera`` (F, 4, 4), ``placed`` (whether it has a place in the map) and ``session``.
@@ -50,7 +49,7 @@ def arrays_product(order: Order) -> Made:
         "session": [np.full(len(drive), drive.number) for drive in drives],
     }
     points = write_npz(
-        order.run.path("map/map.npz"),
+        path,
         (_fields(tile.cloud) for tile in order.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
