@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile
 from typing import Any, Final
 
-from recon.commands.config import ReconConfig, check_changes, run_settings
+from recon.commands.config import (
+    Changes,
+    ReconConfig,
+    check_changes,
+    load_config,
+    run_settings,
+)
 from recon.core.errors import FormatError, SettingsError
+from recon.core.work import available_cores
 from recon.export.control import locate
 from recon.export.images import open_images
-from recon.export.make import PRODUCTS, known_products, make, need_rays
+from recon.export.make import PRODUCTS, check_target, known_products, make, need_rays, write_product
 from recon.export.mesh.pieces import LAYER, WHOLE
 from recon.export.pair import PAIR_CLOUD, mesh_cloud, write_surface
-from recon.export.product import Order
+from recon.export.product import Made, Order
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, naming, reading, resolved
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
 from recon.io.models.ply import read_ply, write_ply
+from recon.map.drive.sequence import MappedSequence
 from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.placed import PlacedMap, place_map, place_map_on
@@ -129,6 +138,60 @@ def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | 
     with workers.connect() as cluster:
         folder = resolved(run.state("tiles"))
         return place_map_on(map_, settings, folder, cluster.each, cluster.at_once)
+
+
+def export_map(
+    map_: Map | MappedSequence,
+    product: str,
+    path: StrPath,
+    changes: Changes | Mapping[str, Any] = (),
+    *,
+    images: Sequence[StrPath] = (),
+    threads: int | None = None,
+) -> Made:
+    """Write one product of a map to a file or a folder, without a run.
+
+    Args:
+        map_: The map: of a file that is open, or of a drive that was just mapped, in memory.
+        product: Which of `PRODUCTS`, such as ``grid``.
+        path: The file, with the suffix of the product, which is replaced if it exists; or the
+            folder, which is new or empty. A grid or costmap has an image beside its YAML file.
+        changes: Changed settings, as those of `load_config`, such as ``{"grid.max_height_m": 3}``;
+            all others are those of the map.
+        images: Where drives are now whose images are needed, if not where they were mapped.
+        threads: Threads to use; None = all cores.
+
+    Returns:
+        Its ``figures``, as in the summary of a run, ``warnings``, and its ``value`` if it is one.
+        All is in map axes; `run_export` writes products in the coordinates of a survey.
+
+    Raises:
+        ReconError: There is no such product, the path is of another kind, the map is damaged or
+            lacks what the product is made from, a setting has no effect, or the file cannot be
+            written; what was at the path is left as it was.
+    """
+    opened: object = map_.map if isinstance(map_, MappedSequence) else map_
+    if not isinstance(opened, Map):
+        expected = "Map.open(folder), or what map_sequence returns"
+        raise SettingsError("not a map", got=type(map_).__name__, expected=expected)
+    [product], path = known_products([product], pair=False), Path(path)
+    moved, kept = [*map(Path, images)], opened.store.path
+    check_target(product, path, () if kept is None else [kept])
+    known = opened.first.info.config
+    ran = load_config({name: known[name] for name in ReconConfig.model_fields if name in known})
+    ran = ran.at_scale(ran.scale)
+    settings = load_config(ran, changes)
+    check_changes(ran, settings, (*(REMADE if need_rays([product]) else ()), "mesh"))
+    if PRODUCTS[product].needs_images:
+        open_images(opened, moved)
+    cores = threads or available_cores()
+    if isinstance(map_, MappedSequence) and settings == ran:
+        placed = map_.placed
+    else:
+        placed = place_map(opened, settings, cores)
+    order = Order(opened, placed, settings.mesh, threads=cores, images=moved)
+    made = write_product(order, product, path)
+    return replace(made, warnings=(*opened.doubts, *made.warnings))
 
 
 def run_mesh(

@@ -17,7 +17,7 @@ from recon.core.values import StereoPair
 from recon.export.trajectories import begin_states, export_localized, write_states
 from recon.io.fields import write_json
 from recon.io.files import StrPath
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.map.drive.drive import Workspace
 from recon.map.drive.scale import look_at_scene
 from recon.map.drive.sequence import map_sequence
@@ -76,7 +76,7 @@ def run_localize(
         options.begun(run.folder)
         drive = localize_sequence(source, workspace, config, **how)
         has_grid = folder is not None and (folder / GRID).is_file()
-        grid = read_nav2(map_path / GRID) if has_grid else None
+        grid = read_grid(map_path / GRID) if has_grid else None
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, **where, **drive.figures())
         seen = [*findings, *rig.warnings(findings), *drive.warnings(), *source.warnings()]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, cast
 
-from recon.core.errors import MeshingError, SettingsError
+from recon.core.errors import MappingError, MeshingError, OutputError, SettingsError
 from recon.core.progress import stage
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 from recon.core.work import Stopwatch
@@ -23,6 +24,7 @@ from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import Made, Order, Product
 from recon.export.rasters import RASTERS, raster_product
 from recon.export.survey import copc_product, e57_product, las_product
+from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
 from recon.map.sessions.placed import has_occupancy
 from recon.map.store.finished import check_rays
@@ -119,6 +121,40 @@ def _written(order: Order, name: str, path: Path) -> Made:
         check_rays(order.map.first, order.placed.tiles.config)
     path.parent.mkdir(parents=True, exist_ok=True)
     return PRODUCTS[name].write(order, path)
+
+
+def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:
+    """Refuse to write a product to a path of another kind, or to one that would replace an input.
+
+    A folder may exist if there is nothing in it, a file if it is a regular one.
+    """
+    product = PRODUCTS[name]
+    stem, end = product.stem_and_suffix(path)
+    if product.suffix:
+        check_targets((path.with_name(stem + one) for one in (*product.parts, end)), inputs)
+    elif path.is_symlink() or (path.exists() and not (path.is_dir() and not any(path.iterdir()))):
+        what, expected = "the folder exists already", "an empty folder, or none yet"
+        raise OutputError(what, where=path, expected=expected)
+
+
+def write_product(order: Order, name: str, path: Path) -> Made:
+    """Write a product to a file or a folder of any name: all of it, or nothing.
+
+    What it has beside it in a run, besides files that belong to it, is not kept.
+    """
+    product = PRODUCTS[name]
+    stem, end = product.stem_and_suffix(path)
+    with writing_to(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+            staged = (Path(folder) / product.name).with_name(stem + product.suffix)
+            made = _written(replace(order, formats=(end[1:].lower(),)), name, staged)
+            for one in (*product.parts, end):
+                file = staged.with_name(stem + one.lower())
+                if not file.exists():  # the largest OctoMaps are not written
+                    raise MappingError("; ".join(made.warnings), where=path)
+                file.replace(path.with_name(stem + one))
+    return made
 
 
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.core.errors import OutputError
 from recon.core.values.arrays import Float64
 from recon.export.mesh.poisson import MeshSettings
 from recon.map.map import Map
@@ -60,3 +61,17 @@ class Product:
     needs_occupancy: bool = False  # whether it is made of what is free and occupied
     surveyed: bool = False  # whether it can be in the coordinates of a survey
     needs_images: bool = False  # whether it is made of the images of the drives, too
+
+    @property
+    def suffix(self) -> str:
+        """That of the name; empty = it is a folder."""
+        return "".join(Path(self.name).suffixes)
+
+    def stem_and_suffix(self, path: Path) -> tuple[str, str]:
+        """Return how the name of a file begins and ends; `OutputError` if it is of another kind."""
+        for end in (self.suffix, *self.others):
+            cut = len(path.name) - len(end)
+            if cut > 0 and path.name[cut:].lower() == end:
+                return path.name[:cut], path.name[cut:]
+        expected = " or ".join((self.suffix, *self.others))
+        raise OutputError("the product is another kind of file", where=path, expected=expected)

@@ -18,7 +18,7 @@ from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
 from recon.export.occupancy import make_grid
 from recon.export.product import Order
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.map.drive import mapper
 from recon.map.drive.sequence import MappedSequence, map_sequence
@@ -96,7 +96,7 @@ def test_the_vehicle_frees_its_own_track_alone(mapped, folder):
     narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
     seen = write_products(replace(mapped, config=narrow), folder).grid
     grid = write_products(mapped, folder).grid
-    np.testing.assert_array_equal(read_nav2(folder.path("map/grid.yaml")).cells, grid.cells)
+    np.testing.assert_array_equal(read_grid(folder.path("map/grid.yaml")).cells, grid.cells)
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)[:, :2]
     columns, rows = np.floor((path_m - grid.origin_m) / 0.2).astype(int).T
     assert (seen.cells[rows, columns] == UNKNOWN).sum() >= 2  # the camera does not see its start

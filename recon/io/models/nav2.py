@@ -90,7 +90,7 @@ def _placed(stem: Path, grid: OccupancyGrid) -> dict[str, Any]:
 
 
 @reader
-def read_nav2(path: StrPath) -> OccupancyGrid:
+def read_grid(path: StrPath) -> OccupancyGrid:
     """Read a map, given by its YAML file, as Nav2 does in mode ``trinary``."""
     path = Path(path)
     fields = _fields(path)
