@@ -16,7 +16,7 @@ from recon.io.models.octomap import read_octomap
 from recon.sources import synthetic
 from tests.map import walls
 
-STREET = {"frames": 6, "width_px": 192, "height_px": 72, "focal_px": 110.0}
+STREET = {"frames": 8, "width_px": 192, "height_px": 72, "focal_px": 110.0}
 CONFIG = recon.load_config(
     {"street": STREET}, {"fusion.min_count": 1, "mesh.depth": 5, "mesh.min_component_faces": 10}
 )
