@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -67,15 +68,7 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
     A report shows an even sample of the cloud; all points of a small one. Frame ``map``.
     """
     sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
-
-    def clouds() -> Iterator[PointCloud]:
-        for tile in tiles:
-            cloud = tile.cloud
-            if len(cloud):
-                sample.add(cloud)
-                yield cloud
-
-    points = write_ply_tiles(path, clouds(), frame="map")
+    points = write_ply_tiles(path, sample.passing(tiles), frame="map")
     left_out = 0
     if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
@@ -87,8 +80,7 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
 def even_sample(tiles: Tiles) -> PointCloud:
     """Return an even sample of the cloud of a map, all points of a small one; frame ``map``."""
     sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
-    for cloud in filter(len, (tile.cloud for tile in tiles)):
-        sample.add(cloud)
+    deque(sample.passing(tiles), maxlen=0)
     return sample.cloud()
 
 
@@ -118,6 +110,12 @@ class CloudSample:
         self._kept.append(self._thinned(cloud))
         if sum(map(len, self._kept)) > self._limit:
             self._kept = [self._within_the_limit(join_clouds(self._kept))]
+
+    def passing(self, tiles: Tiles) -> Iterator[PointCloud]:
+        """Yield the clouds of tiles that have points, which are added."""
+        for cloud in filter(len, (tile.cloud for tile in tiles)):
+            self.add(cloud)
+            yield cloud
 
     def cloud(self) -> PointCloud:
         """Return the sample."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from recon.core.errors import ShapeError
-from recon.core.kernels.voxels import KEY_LIMIT, distinct_keys, find_keys, pack_keys
+from recon.core.kernels.voxels import KEY_LIMIT, find_keys, pack_keys
 from recon.core.values import FREE, OCCUPIED, UNKNOWN
 from recon.core.values.arrays import Float32, Float64, Int8, Int64, freeze
 from recon.map.ground.grid import drop_undecided
@@ -24,7 +24,6 @@ class MapPlaces:
         xyz: float64 (N, 3), the places, map axes.
         state: int8 (N,), FREE, OCCUPIED or UNKNOWN, as in an OctoMap of the map.
         nearest: float32 (N, 3), the nearest point of the fused cloud to each; NaN = it is empty.
-        distance_m: float32 (N,), from these; inf = the cloud is empty.
         sightings: int64 (S, 4), by frame: number of a place, drive and frame, and 1 where the
             frame hit the voxel of the place, -1 where it looked through; None = a drive kept no
             rays, so nobody knows.
@@ -33,14 +32,12 @@ class MapPlaces:
     xyz: Float64
     state: Int8
     nearest: Float32
-    distance_m: Float32
     sightings: Int64 | None
 
     def __post_init__(self) -> None:
         freeze(self, "xyz", np.float64, (None, 3))
         freeze(self, "state", np.int8, (len(self.xyz),))
         freeze(self, "nearest", np.float32, (len(self.xyz), 3))
-        freeze(self, "distance_m", np.float32, (len(self.xyz),))
         freeze(self, "sightings", np.int64, (None, 4))
 
     def __len__(self) -> int:
@@ -50,6 +47,11 @@ class MapPlaces:
         named = (("occupied", OCCUPIED), ("free", FREE), ("unknown", UNKNOWN))
         counts = ", ".join(f"{int((self.state == value).sum())} {name}" for name, value in named)
         return f"MapPlaces({counts})"
+
+    @property
+    def distance_m(self) -> Float64:
+        """float64 (N,), from the nearest points; NaN = the cloud is empty."""
+        return np.asarray(np.linalg.norm(self.xyz - self.nearest, axis=1))
 
     def seen_by(self, number: int) -> list[tuple[int, int]]:
         """Return drive and frame of all that saw a place: hit its voxel, or looked through."""
@@ -69,19 +71,15 @@ def look_up(tiles: Tiles, xyz: ArrayLike) -> MapPlaces:
     cells = cells[known].astype(np.int64)
     state = np.full(len(places), UNKNOWN, np.int8)
     state[known] = _states(tiles, cells)
-    nearest, distance_m = _nearest(tiles, places)
-    seen = None if tiles.looks is None else np.zeros((0, 4), np.int64)
-    if tiles.looks is not None and len(known):
-        keys = pack_keys(cells)
-        among = distinct_keys(keys)
-        home, found = np.searchsorted(among, keys), []
-        for number, look in tiles.looks.by_frame(among):
+    seen = None if tiles.looks is None else [np.zeros((0, 4), np.int64)]
+    if tiles.looks is not None and seen is not None and len(known):
+        keys, home = np.unique(pack_keys(cells), return_inverse=True)
+        for number, look in tiles.looks.by_frame(keys):
             rows = np.flatnonzero(look[home])
-            drive, frame = tiles.looks.frames[number]
-            one = np.broadcast_to([drive, frame], (len(rows), 2))
-            found.append(np.column_stack([known[rows], one, look[home[rows]]]))
-        seen = np.concatenate([seen, *found]).astype(np.int64)
-    return MapPlaces(places, state, nearest, distance_m, seen)
+            frame = np.tile(tiles.looks.frames[number], (len(rows), 1))
+            seen.append(np.column_stack([known[rows], frame, look[home[rows]]]))
+    sightings = None if seen is None else np.concatenate(seen)
+    return MapPlaces(places, state, _nearest(tiles, places), sightings)
 
 
 def _checked(xyz: ArrayLike) -> Float64:
@@ -110,8 +108,8 @@ def _states(tiles: Tiles, cells: Int64) -> Int8:
     return states
 
 
-def _nearest(tiles: Tiles, places: Float64) -> tuple[Float32, Float32]:
-    """Return the nearest points (N, 3), and their distances; the nearest tiles come first."""
+def _nearest(tiles: Tiles, places: Float64) -> Float32:
+    """Return the nearest points (N, 3); the nearest tiles come first, and others seldom matter."""
     nearest, distance_m = np.full(places.shape, np.nan), np.full(len(places), np.inf)
     gaps = []
     for tile in tiles:
@@ -125,4 +123,4 @@ def _nearest(tiles: Tiles, places: Float64) -> tuple[Float32, Float32]:
             closer = to_m < distance_m[rows]
             distance_m[rows[closer]] = to_m[closer]
             nearest[rows[closer]] = tile.cloud.xyz[point[closer]]
-    return nearest.astype(np.float32), distance_m.astype(np.float32)
+    return nearest.astype(np.float32)
