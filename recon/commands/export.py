@@ -185,8 +185,10 @@ def export_map(
     if PRODUCTS[product].needs_images:
         open_images(opened, moved)
     cores = threads or available_cores()
-    cut = isinstance(map_, MappedSequence) and settings == ran
-    placed = map_.placed if cut else place_map(opened, settings, cores)
+    if isinstance(map_, MappedSequence) and settings == ran:
+        placed = map_.placed
+    else:
+        placed = place_map(opened, settings, cores)
     order = Order(opened, placed, settings.mesh, threads=cores, images=moved)
     made = write_product(order, product, path)
     return replace(made, warnings=(*opened.doubts, *made.warnings))

@@ -83,9 +83,8 @@ def _describe(image: Path, mode: str, grid: OccupancyGrid, thresholds: tuple[flo
         "occupied_thresh": thresholds[0],
         "free_thresh": thresholds[1],
     }
-    write_text(
-        description := image.with_suffix(".yaml"), yaml.safe_dump(described, sort_keys=False)
-    )
+    description = image.with_suffix(".yaml")
+    write_text(description, yaml.safe_dump(described, sort_keys=False))
     return description
 
 
