@@ -67,7 +67,8 @@ def build(folder: Path, sessions: int) -> Path:
         links = [link for ends, both in pairs for link in walls.links_between(*ends, both)]
         join_sessions(map_, links)
         map_.commit()
-        make(Order(map_, place_map(map_, config), run, config.mesh), ("cloud", "octomap", "grid"))
+        order = Order(map_, place_map(map_, config), config.mesh)
+        make(order, run.content, ("cloud", "octomap", "grid"))
         record = {"T_map_world": map_.first.T_map_world.tolist()}
         run.finish({"warnings": []}, source="wall", inputs=(), record=record)
     return folder

@@ -35,7 +35,7 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.trajectory import evaluate_trajectory
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_trajectory
 from recon.map.map import Map
@@ -124,7 +124,7 @@ def compare_halves(folder: Path, middle: int, truth: Trajectory | None) -> dict[
     poses = [parts[0].T_world_camera, parts[1].T_world_camera[behind:]]
     merged = Trajectory(np.concatenate(poses), whole.timestamps_s)
     apart_m = np.linalg.norm(merged.positions_m - whole.positions_m, axis=1)
-    grids = [read_nav2(folder / name / "map/grid.yaml") for name in ("whole", "merged")]
+    grids = [read_grid(folder / name / "map/grid.yaml") for name in ("whole", "merged")]
     return {
         "frames": [len(whole), *map(len, parts)],
         "path_apart_m": round(float(apart_m.max()), 3),

@@ -17,6 +17,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from recon.core.shown import SHOWN_BY
+
 __version__ = "0.1.0"
 
 _NAMES = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
@@ -32,6 +34,14 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME_OF:
         raise AttributeError(f"module 'recon' has no attribute {name!r}")
     return getattr(import_module(_HOME_OF[name]), name)
+
+
+# What draws is imported when a value is asked to show itself.
+SHOWN_BY.update(
+    plot=lambda value: import_module("recon.report.notebook").plot(value),
+    html=lambda value: import_module("recon.report.notebook").html(value),
+    to_open3d=lambda value: import_module("recon.io.models.open3d_meshes").to_open3d(value),
+)
 
 
 def __dir__() -> list[str]:

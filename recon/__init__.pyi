@@ -4,6 +4,7 @@ from recon.commands.cameras import run_audit as run_audit
 from recon.commands.config import ReconConfig as ReconConfig
 from recon.commands.config import load_config as load_config
 from recon.commands.evaluate_middlebury import run_middlebury as run_middlebury
+from recon.commands.export import export_map as export_map
 from recon.commands.export import run_export as run_export
 from recon.commands.export import run_occupancy as run_occupancy
 from recon.commands.localize import run_live as run_live
@@ -41,6 +42,7 @@ from recon.evaluation.middlebury.score import evaluate_middlebury as evaluate_mi
 from recon.evaluation.trajectory import evaluate_trajectory as evaluate_trajectory
 from recon.export.mesh.poisson import reconstruct_mesh as reconstruct_mesh
 from recon.io.cameras.calibration import read_calibration as read_calibration
+from recon.io.cameras.calibration import write_calibration as write_calibration
 from recon.io.images.disparity import read_pfm as read_pfm
 from recon.io.images.disparity import write_pfm as write_pfm
 from recon.io.images.image import read_image as read_image
@@ -48,12 +50,15 @@ from recon.io.middlebury import MiddleburyScene as MiddleburyScene
 from recon.io.middlebury import read_middlebury_scene as read_middlebury_scene
 from recon.io.models.mesh import read_mesh as read_mesh
 from recon.io.models.mesh import write_mesh as write_mesh
+from recon.io.models.nav2 import read_grid as read_grid
 from recon.io.models.ply import read_ply as read_ply
 from recon.io.models.ply import write_ply as write_ply
 from recon.io.trajectory import read_trajectory as read_trajectory
+from recon.io.trajectory import write_trajectory as write_trajectory
 from recon.map.drive.sequence import MappedSequence as MappedSequence
 from recon.map.drive.sequence import map_sequence as map_sequence
 from recon.map.map import Map as Map
+from recon.map.query import MapPlaces as MapPlaces
 from recon.map.sessions.measured import Survey as Survey
 from recon.odometry.protocol import Odometry as Odometry
 from recon.odometry.protocol import OdometryFrame as OdometryFrame

@@ -157,7 +157,7 @@ def run_rectify(
                 left_image, right_image = plan.warp(pair)
                 write_image(run.path(f"left/{_rectified_name(left_file)}"), left_image)
                 write_image(run.path(f"right/{_rectified_name(right_file)}"), right_image)
-        plan.write(run)
+        plan.write(run.content)
         first = read_pair(*images.pairs[0])
         result = measure_rows(plan, first)
         summary = result.summary

@@ -53,7 +53,7 @@ from recon.io.atomic import check_targets
 from recon.io.files import naming
 from recon.io.images.disparity import read_disparity, read_pfm
 from recon.io.images.image import read_grey_levels, write_image
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
@@ -274,7 +274,7 @@ def run_evaluate_occupancy(
         raise EvaluationError(what, where=folder, got=got, expected=expected, hint=hint)
     stage("compare")
     source, map_ = demo_source(config), map_of_run(folder)
-    voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
+    voxels, grid = read_octomap(folder / OCTOMAP), read_grid(folder / GRID)
     truth = source.occupancy_truth(**occupancy_view(config, map_.T_map_world, least_frames))
     metrics = evaluate_occupancy(voxels, grid, truth)
     if image is not None:

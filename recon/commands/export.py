@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from typing import Any, Final
 
-from recon.commands.config import ReconConfig, check_changes, run_settings
+from recon.commands.config import (
+    Changes,
+    ReconConfig,
+    check_changes,
+    load_config,
+    run_settings,
+)
 from recon.core.errors import FormatError, SettingsError
+from recon.core.machine import available_cores
 from recon.export.control import locate
 from recon.export.images import open_images
-from recon.export.make import PRODUCTS, known_products, make, need_rays
-from recon.export.pair import export_pair, finish_cloud_run, mesh_cloud
-from recon.export.product import Order
-from recon.io.files import StrPath, resolved
+from recon.export.make import PRODUCTS, check_target, known_products, make, need_rays, write_product
+from recon.export.mesh.pieces import LAYER, WHOLE
+from recon.export.pair import PAIR_CLOUD, mesh_cloud, write_surface
+from recon.export.product import Made, Order
+from recon.io.atomic import atomic_path
+from recon.io.files import StrPath, naming, reading, resolved
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
+from recon.io.models.ply import read_ply, write_ply
+from recon.map.drive.sequence import MappedSequence
 from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.placed import PlacedMap, place_map, place_map_on
@@ -24,7 +37,6 @@ from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,
     MAPPED_BY,
-    PAIR_CLOUD,
     camera_of_pair,
     command_of_map,
     is_pair_run,
@@ -92,7 +104,8 @@ def run_export(
     settings = config or ran
     if mapped_by is None:
         with Run(command, out, settings, threads=threads) as run:
-            return export_pair(source, settings.mesh, wanted, run, formats)
+            more = {"run": str(source), "warnings": []}
+            return _of_cloud(source, run, settings, formats, more, wanted)
     check_changes(ran, settings, (*(REMADE if need_rays(wanted) else ()), "mesh"))
     with Map.open(source) as map_, Run(command, out, settings, threads=threads) as run:
         if any(PRODUCTS[name].needs_images for name in wanted):
@@ -103,7 +116,8 @@ def run_export(
         if survey is not None:
             with run.stage("survey"):
                 there = locate(map_, survey, images, run.threads)
-        made = make(Order(map_, placed, run, settings.mesh, formats, there, images), wanted)
+        order = Order(map_, placed, settings.mesh, formats, run.threads, there, images)
+        made = make(order, run.content, wanted, run.watch)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
         figures = {
             "run": str(source),
@@ -126,6 +140,60 @@ def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | 
         return place_map_on(map_, settings, folder, cluster.each, cluster.at_once)
 
 
+def export_map(
+    map_: Map | MappedSequence,
+    product: str,
+    path: StrPath,
+    changes: Changes | Mapping[str, Any] = (),
+    *,
+    images: Sequence[StrPath] = (),
+    threads: int | None = None,
+) -> Made:
+    """Write one product of a map to a file or a folder, without a run.
+
+    Args:
+        map_: The map: of a file that is open, or of a drive that was just mapped, in memory.
+        product: Which of `PRODUCTS`, such as ``grid``.
+        path: The file, with the suffix of the product, which is replaced if it exists; or the
+            folder, which is new or empty. A grid or costmap has an image beside its YAML file.
+        changes: Changed settings, as those of `load_config`, such as ``{"grid.max_height_m": 3}``;
+            all others are those of the map.
+        images: Where drives are now whose images are needed, if not where they were mapped.
+        threads: Threads to use; None = all cores.
+
+    Returns:
+        Its ``figures``, as in the summary of a run, ``warnings``, and its ``value`` if it is one.
+        All is in map axes; `run_export` writes products in the coordinates of a survey.
+
+    Raises:
+        ReconError: There is no such product, the path is of another kind, the map is damaged or
+            lacks what the product is made from, a setting has no effect, or the file cannot be
+            written; what was at the path is left as it was.
+    """
+    opened: object = map_.map if isinstance(map_, MappedSequence) else map_
+    if not isinstance(opened, Map):
+        expected = "Map.open(folder), or what map_sequence returns"
+        raise SettingsError("not a map", got=type(map_).__name__, expected=expected)
+    [product], path = known_products([product], pair=False), Path(path)
+    moved, kept = [*map(Path, images)], opened.store.path
+    check_target(product, path, () if kept is None else [kept])
+    known = opened.first.info.config
+    ran = load_config({name: known[name] for name in ReconConfig.model_fields if name in known})
+    ran = ran.at_scale(ran.scale)
+    settings = load_config(ran, changes)
+    check_changes(ran, settings, (*(REMADE if need_rays([product]) else ()), "mesh"))
+    if PRODUCTS[product].needs_images:
+        open_images(opened, moved)
+    cores = threads or available_cores()
+    if isinstance(map_, MappedSequence) and settings == ran:
+        placed = map_.placed
+    else:
+        placed = place_map(opened, settings, cores)
+    order = Order(opened, placed, settings.mesh, threads=cores, images=moved)
+    made = write_product(order, product, path)
+    return replace(made, warnings=(*opened.doubts, *made.warnings))
+
+
 def run_mesh(
     source: Path,
     config: ReconConfig,
@@ -141,17 +209,46 @@ def run_mesh(
     removed.
     """
     check_mesh_formats(formats)
-    cloud, camera = source, None
     if source.is_dir():
         refuse_as_target(source, out)
         if not is_pair_run(source):
             settings = run_settings(source).model_copy(update={"mesh": config.mesh})
             how: Any = {"out": out, "threads": threads, "command": "mesh"}
             return run_export(source, settings, products=["mesh"], formats=formats, **how)
-        cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
     with Run("mesh", out, config, threads=threads) as run:
-        figures = mesh_cloud(cloud, camera, config.mesh, run, formats)
-        return finish_cloud_run(source, cloud, run, figures)
+        return _of_cloud(source, run, config, formats)
+
+
+def _of_cloud(
+    source: Path,
+    run: Run,
+    config: ReconConfig,
+    formats: Sequence[str],
+    more: Mapping[str, Any] = {},
+    products: Sequence[str] = ("mesh",),
+) -> dict[str, Any]:
+    """Make products of a cloud file, or of the cloud in a run of `recon pair`, and end the run.
+
+    There are ``more`` figures to its summary.
+    """
+    camera = camera_of_pair(source) if source.is_dir() else None
+    cloud = source / PAIR_CLOUD if source.is_dir() else source
+    figures = {"cloud": str(cloud), **more}
+    if "cloud" in products:
+        with reading(cloud):
+            cloud.stat()
+        with atomic_path(run.path(PAIR_CLOUD)) as temporary:
+            copyfile(cloud, temporary)
+    if "mesh" in products:
+        with run.stage("read"):
+            points, layer = read_ply(cloud), run.path(LAYER)
+            write_ply(layer, points)
+        with run.stage("mesh"), naming(cloud):
+            mesh, made = mesh_cloud(points, camera, config.mesh, source)
+        write_surface(mesh, camera, layer, formats, run.path(WHOLE))
+        figures |= made
+    run.finish(figures, source=str(source), inputs=[cloud])
+    return figures
 
 
 def run_occupancy(

@@ -14,9 +14,10 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.progress import Silent, showing, stage
 from recon.core.values import Recorded
-from recon.export.trajectories import begin_states, export_localized
+from recon.export.trajectories import begin_states, export_localized, write_states
+from recon.io.fields import write_json
 from recon.io.files import StrPath
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.look.look import look_at
 from recon.map.drive.drive import Workspace
 from recon.map.drive.scale import measure_scene
@@ -25,7 +26,8 @@ from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequenc
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
-from recon.run.finished import GRID, figure_of, refuse_as_target
+from recon.run.finished import GRID, STATES, figure_of, refuse_as_target
+from recon.run.run import SUMMARY
 from recon.sources.live import LiveSource
 from recon.sources.source import DerivedSource, SourcePart, StereoSource
 
@@ -66,11 +68,12 @@ def run_localize(
         workspace = Workspace(map_, run.watch, run.threads)
         T_map_world = map_.first.T_map_world.tolist()
         where = {"map_run": str(map_path), "T_map_world": T_map_world}
-        how: Any = {"start": start, "note": begin_states(where, run)}
+        write_json(run.state(SUMMARY), where)
+        how: Any = {"start": start, "note": begin_states(run.state(STATES))}
         options.begun(run.folder)
         drive = localize_sequence(source, workspace, config, **how)
         has_grid = folder is not None and (folder / GRID).is_file()
-        grid = read_nav2(map_path / GRID) if has_grid else None
+        grid = read_grid(map_path / GRID) if has_grid else None
         made = LocalizeRun(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, **where, **drive.figures())
         seen = [
@@ -84,7 +87,8 @@ def run_localize(
         made.summary.update(source.figures())
         with run.stage("write"):
             height_m = None if folder is None else figure_of(folder, "camera_height_m")
-            export_localized(drive, height_m, run)
+            export_localized(drive, height_m, run.content)
+            write_states(run.path(STATES), drive.frames)
         with run.report(made.summary):
             write_localize_page(made, run)
         run.finish(made.summary, source=source.name, inputs=inputs)

@@ -133,7 +133,8 @@ def run_map(
         rig = _shown_live(mapped, source, config, run) if source.live else found
         with run.stage("cloud"):
             check_map(mapped, source.name, (*seen.first, *findings))
-        made = make(Order(map_, mapped.placed, run, config.mesh), options.products)
+        order = Order(map_, mapped.placed, config.mesh, threads=run.threads)
+        made = make(order, run.content, options.products, run.watch)
         with run.stage("compare"):
             given = options.known_poses is not None
             true = found.true_path(source, config.rectification)
@@ -149,7 +150,7 @@ def run_map(
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         result.summary["typical_depth_m"] = scene.depth_m
         with run.stage("write"):
-            export_paths(map_.first, mapped.joined, made.camera_height_m, run)
+            export_paths(map_.first, mapped.joined, made.camera_height_m, run.content)
             keep_map(map_, run.path(MAP_FILE))
         with run.report(result.summary):
             # Its figures take long to load, and the drive is mapped without them.

@@ -164,11 +164,12 @@ def _make_joined(
         map_.commit()
         with run.stage("map"):
             placed = place_map(map_, settings, run.threads)
-        made = make(Order(map_, placed, run, settings.mesh), options.products)
+        order = Order(map_, placed, settings.mesh, threads=run.threads)
+        made = make(order, run.content, options.products, run.watch)
         axes = {"T_map_world": map_.first.T_map_world.tolist()}
         summary = {**_figures(map_), **made.figures, **axes}
         summary["warnings"] = [*left_out, *_warnings(map_), *_of_rigs(map_, new), *made.warnings]
-        export_sessions(map_, run)
+        export_sessions(map_, run.content)
         with run.report(summary):
             write_joined_page(map_, made, summary, run)
         map_.close()

@@ -77,8 +77,8 @@ def run_pair(
         with run.stage("mesh"):
             mesh, coverage, unmeshed = mesh_frame(frame, config.mesh)
         with run.stage("write"):
-            scale = write_disparity_files(frame.disparity, run)
-            write_cloud_files(frame, mesh, formats, run)
+            scale = write_disparity_files(frame.disparity, run.content)
+            write_cloud_files(frame, mesh, formats, run.content)
         figures = {
             **_cloud_figures(frame),
             "faces": 0 if mesh is None else len(mesh.faces),
@@ -116,7 +116,7 @@ def run_disparity(
         inspected, support = reconstructor.inspect(pair)
         found = check_found(disparity, given.pair.name, support, faults)
         with run.stage("write"):
-            figures = {"disparity_png_scale": write_disparity_files(disparity, run)}
+            figures = {"disparity_png_scale": write_disparity_files(disparity, run.content)}
         warnings = (*given.notes, *found, *inspected)
         result = _compared(given, config, (pair, disparity), figures, warnings)
         with run.report(result.summary):

@@ -11,7 +11,7 @@ from typing import Final
 
 from recon.core.text import with_unit
 from recon.io.files import read_text, reading
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply
 from recon.map.store.database import check_format, connect
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
@@ -90,5 +90,5 @@ def read_products(run: Path) -> Scene:
         lines = [f"{n} {with_unit(format(v, _FORMATS[type(v)]), n)}" for n, v in known.items()]
     cloud, grid, spacing_m = run / CLOUD, run / GRID, voxel_m or 0.1  # merged: unsaid
     points = cut(read_ply(cloud), spacing_m) if cloud.is_file() else ()
-    grids = ((read_nav2(grid), ground_m),) if grid.is_file() else ()
+    grids = ((read_grid(grid), ground_m),) if grid.is_file() else ()
     return Scene([str(run), *lines], points, spacing_m, grids)

@@ -9,5 +9,6 @@
 - `text.py`: numbers read from text and written with words and units;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
   `memory.py`: what the process takes, and its limit; `machine.py`: cores, and versions;
+- `shown.py`: how values show themselves, by rooms above;
 - `least_squares.py`: the loop of every non-linear fit.
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -22,20 +23,19 @@ _GROWTH: Final = 1.25
 _MUCH: Final = 0.02  # share of the points left out without a word; a busy street has less
 
 
-def cloud_product(order: Order) -> Made:
-    """Write ``map/cloud.ply``, and ``map/removed.ply`` with what moved."""
-    files = [order.run.path(f"map/{name}.ply") for name in ("cloud", "removed")]
-    return export_cloud(order.placed.tiles, *files)
+def cloud_product(order: Order, path: Path) -> Made:
+    """Write the fused cloud, and ``removed.ply`` beside it with what moved."""
+    return export_cloud(order.placed.tiles, path, path.with_name("removed.ply"))
 
 
-def pcd_product(order: Order) -> Made:
-    """Write ``map/cloud.pcd``, the fused cloud for PCL."""
+def pcd_product(order: Order, path: Path) -> Made:
+    """Write the fused cloud for PCL."""
     clouds = (tile.cloud for tile in order.placed.tiles)
-    return Made({"points": write_pcd(order.run.path("map/cloud.pcd"), clouds)})
+    return Made({"points": write_pcd(path, clouds)})
 
 
-def arrays_product(order: Order) -> Made:
-    """Write ``map/map.npz``: the fields of the fused cloud, and the paths of the drives.
+def arrays_product(order: Order, path: Path) -> Made:
+    """Write an archive of NumPy: the fields of the fused cloud, and the paths of the drives.
 
     ``xyz`` and the other fields of `PointCloud` that the map has; and for each frame ``times_s``,
     ``T_map_camera`` (F, 4, 4), ``placed`` (whether it has a place in the map) and ``session``.
@@ -49,7 +49,7 @@ def arrays_product(order: Order) -> Made:
         "session": [np.full(len(drive), drive.number) for drive in drives],
     }
     points = write_npz(
-        order.run.path("map/map.npz"),
+        path,
         (tile.cloud.arrays for tile in order.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
@@ -62,13 +62,7 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
     A report shows an even sample of the cloud; all points of a small one. Frame ``map``.
     """
     sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
-
-    def clouds() -> Iterator[PointCloud]:
-        for tile in tiles:
-            sample.add(cloud := tile.cloud)
-            yield cloud
-
-    points = write_ply_tiles(path, clouds(), frame="map")
+    points = write_ply_tiles(path, sample.passing(tiles), frame="map")
     left_out = 0
     if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
@@ -80,8 +74,7 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
 def even_sample(tiles: Tiles) -> PointCloud:
     """Return an even sample of the cloud of a map, all points of a small one; frame ``map``."""
     sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
-    for tile in tiles:
-        sample.add(tile.cloud)
+    deque(sample.passing(tiles), maxlen=0)
     return sample.cloud()
 
 
@@ -111,6 +104,12 @@ class CloudSample:
         self._kept += [self._thinned(cloud)] if len(cloud) else []
         if sum(map(len, self._kept)) > self._limit:
             self._kept = [self._within_the_limit(join_clouds(self._kept))]
+
+    def passing(self, tiles: Tiles) -> Iterator[PointCloud]:
+        """Yield the clouds of tiles that have points, which are added."""
+        for cloud in filter(len, (tile.cloud for tile in tiles)):
+            self.add(cloud)
+            yield cloud
 
     def cloud(self) -> PointCloud:
         """Return the sample."""

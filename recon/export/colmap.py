@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -19,20 +20,20 @@ from recon.places.closure import Closure, DrivePath
 from recon.sources.source import check_source
 
 
-def colmap_product(order: Order) -> Made:
-    """Write ``colmap/images`` and ``colmap/sparse/0``, in map axes.
+def colmap_product(order: Order, folder: Path) -> Made:
+    """Write a folder with ``images`` and ``sparse/0``, in map axes.
 
     Cameras are those of the rectified images: pinholes without distortion, the right one a baseline
     beside the left one, which is the reference of the rig. The points are features of keyframes.
     """
     images = points = 0
-    with write_colmap(order.run.path("colmap/sparse/0/points3D.txt").parent) as model:
+    with write_colmap(folder / "sparse" / "0") as model:
         for drive in open_images(order.map, order.images):
             check_source(drive.source, stereo=True)
             written = _Written(drive, model, first=points + 1)
             for names, pair in written.frames():
                 for name, image in zip(names, pair, strict=True):
-                    write_image(order.run.path(f"colmap/images/{name}"), image)
+                    write_image(folder / "images" / name, image)
                     images += 1
             points += written.add_points()
     warnings = [] if points else ["no points in the COLMAP model: no keyframes share any"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from recon.core.errors import MappingError
@@ -23,10 +25,10 @@ from recon.map.map import Map
 from recon.map.sessions.placed import PlacedMap
 
 
-def costmap_product(order: Order) -> Made:
-    """Write ``map/costmap.*``: Nav2's mode ``scale``."""
+def costmap_product(order: Order, path: Path) -> Made:
+    """Write costs in Nav2's mode ``scale``, given the path of their YAML file."""
     grid, warnings = make_costmap(order.map, order.placed)
-    write_nav2_costs(order.run.path("map/costmap"), grid)
+    write_nav2_costs(path.with_suffix(""), grid)
     named = {"free": FREE, "lethal": OCCUPIED, "unseen": UNKNOWN, "uncertain": UNSURE}
     figures = {f"costmap_{name}_cells": int((grid.cells == v).sum()) for name, v in named.items()}
     return Made(figures, warnings, grid)

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64
 from recon.export.costmap import make_costmap
-from recon.export.occupancy import export_grid, grounds
+from recon.export.occupancy import grounds, make_grid
 from recon.export.product import Made, Order
 from recon.export.rasters import ground_slopes
 from recon.io.models.ros_bag import Message, header, pose, write_bag
 from recon.map.ground.surface import GroundSurface
 
 
-def gridmap_product(order: Order) -> Made:
-    """Write ``gridmap/gridmap.mcap``, with one message: height and slope of the ground, and cells.
+def gridmap_product(order: Order, folder: Path) -> Made:
+    """Write a folder with a bag of one message: height and slope of the ground, and cells.
 
     Layers are ``elevation`` [m] and ``slope`` [rad] of the ground in the middle of a cell,
     ``occupancy`` (0 to 100) of the flat grid, and ``traversability`` (1 to 0) by the costs of the
     robot of the settings; NaN = unknown.
     """
-    flat, _, _ = export_grid(order.placed, None)
+    flat, _, _ = make_grid(order.placed)
     costs, warnings = make_costmap(order.map, order.placed)
     heights, slopes = np.full((2, *flat.cells.shape), np.nan)
     x_m, y_m = (
@@ -42,7 +44,7 @@ def gridmap_product(order: Order) -> Made:
         "traversability": 1.0 - _known(costs) / 100.0,
     }
     time_ns = round(1e9 * float(order.map.first.trajectory.timestamps_s[0]))
-    with write_bag(order.run.path("gridmap")) as bag:
+    with write_bag(folder) as bag:
         bag.write("/grid_map", time_ns, _message(time_ns, flat, layers), kept=True)
     return Made({"gridmap_layers": [*layers]}, warnings)
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, cast
 
-from recon.core.errors import MeshingError, SettingsError
+from recon.core.errors import MappingError, MeshingError, OutputError, SettingsError
+from recon.core.progress import stage
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
+from recon.core.work import Stopwatch
 from recon.export.cloud import arrays_product, cloud_product, pcd_product
 from recon.export.colmap import colmap_product
 from recon.export.costmap import costmap_product
@@ -19,32 +23,37 @@ from recon.export.nerfstudio import nerfstudio_product
 from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import Made, Order, Product
 from recon.export.rasters import RASTERS, raster_product
-from recon.export.survey import survey_product
+from recon.export.survey import copc_product, e57_product, las_product
+from recon.io.atomic import check_targets, writing_to
+from recon.io.models.mesh import MESH_SUFFIXES
 from recon.map.sessions.placed import has_occupancy
 from recon.map.store.finished import check_rays
 
 # In the order in which they are made.
 PRODUCTS: Final[Mapping[str, Product]] = {
-    "cloud": Product(cloud_product),
-    "octomap": Product(octomap_product, needs_occupancy=True),
-    "grid": Product(grid_product, needs_occupancy=True),
-    "costmap": Product(costmap_product, needs_occupancy=True),
-    "mesh": Product(mesh_product, surveyed=True),
-    "texture": Product(texture_product, needs_images=True, surveyed=True),
+    "cloud": Product("map/cloud.ply", cloud_product),
+    "octomap": Product("map/octomap.bt", octomap_product, (".ot",), needs_occupancy=True),
+    "grid": Product("map/grid.yaml", grid_product, parts=(".pgm", ".wld"), needs_occupancy=True),
+    "costmap": Product(
+        "map/costmap.yaml", costmap_product, parts=(".png", ".wld"), needs_occupancy=True
+    ),
+    "mesh": Product("mesh/mesh.ply", mesh_product, MESH_SUFFIXES[1:], surveyed=True),
+    "texture": Product("texture/mesh.glb", texture_product, needs_images=True, surveyed=True),
     # Their cells, and the ground far from the path, are those of the voxels.
     **{
-        name: Product(raster_product(name), needs_occupancy=True, surveyed=True) for name in RASTERS
+        name: Product(f"map/{name}.tif", raster_product(name), needs_occupancy=True, surveyed=True)
+        for name in RASTERS
     },
-    "las": Product(survey_product("las"), surveyed=True),
-    "laz": Product(survey_product("laz"), surveyed=True),
-    "copc": Product(survey_product("copc.laz"), surveyed=True),
-    "e57": Product(survey_product("e57"), surveyed=True),
-    "pcd": Product(pcd_product),
-    "npz": Product(arrays_product),
-    "mcap": Product(mcap_product, needs_occupancy=True, surveyed=True),
-    "gridmap": Product(gridmap_product, needs_occupancy=True),
-    "colmap": Product(colmap_product, needs_images=True),
-    "nerfstudio": Product(nerfstudio_product, needs_images=True),
+    "las": Product("map/cloud.las", las_product, surveyed=True),
+    "laz": Product("map/cloud.laz", las_product, surveyed=True),
+    "copc": Product("map/cloud.copc.laz", copc_product, surveyed=True),
+    "e57": Product("map/cloud.e57", e57_product, surveyed=True),
+    "pcd": Product("map/cloud.pcd", pcd_product),
+    "npz": Product("map/map.npz", arrays_product),
+    "mcap": Product("bag", mcap_product, needs_occupancy=True, surveyed=True),
+    "gridmap": Product("gridmap", gridmap_product, needs_occupancy=True),
+    "colmap": Product("colmap", colmap_product, needs_images=True),
+    "nerfstudio": Product("nerfstudio", nerfstudio_product, needs_images=True),
 }
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")
@@ -83,28 +92,69 @@ class Products:
         return self.made["mesh"].value if "mesh" in self.made else None
 
 
-def make(order: Order, products: Sequence[str] = USUAL) -> Products:
-    """Make any of `PRODUCTS` of a map, and write them into the folder of a run.
+def make(
+    order: Order, folder: Path, products: Sequence[str] = USUAL, watch: Stopwatch | None = None
+) -> Products:
+    """Make any of `PRODUCTS` of a map, and write them into a folder, under their names.
 
     A surface that cannot be made is a warning where something else is asked for.
     """
     made: dict[str, Made] = {}
     warnings: list[str] = []
     for name in (name for name in PRODUCTS if name in products):
-        product, run, settings = PRODUCTS[name], order.run, order.placed.tiles.config
-        if product.needs_occupancy and not has_occupancy(order.map):
-            check_rays(order.map.first, settings)
+        stage(name)
         try:
-            with run.stage(name):
-                made[name] = product.write(order)
+            with (watch or Stopwatch()).stage(name):
+                made[name] = _written(order, name, folder / PRODUCTS[name].name)
         except MeshingError as error:
             if len(products) == 1:
                 raise
             warnings.append(f"no mesh: {error}")
         else:
             warnings += made[name].warnings
-        settings.memory.check(name)
+        order.placed.tiles.config.memory.check(name)
     return Products(made, tuple(dict.fromkeys(warnings)))  # two may say the same
+
+
+def _written(order: Order, name: str, path: Path) -> Made:
+    if PRODUCTS[name].needs_occupancy and not has_occupancy(order.map):
+        check_rays(order.map.first, order.placed.tiles.config)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return PRODUCTS[name].write(order, path)
+
+
+def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:
+    """Refuse to write a product to a path of another kind, or to one that would replace an input.
+
+    A folder may exist if there is nothing in it, a file if it is a regular one.
+    """
+    product = PRODUCTS[name]
+    stem, end = product.stem_and_suffix(path)
+    if product.suffix:
+        check_targets((path.with_name(stem + one) for one in (*product.parts, end)), inputs)
+    elif path.is_symlink() or (path.exists() and not (path.is_dir() and not any(path.iterdir()))):
+        what, expected = "the folder exists already", "an empty folder, or none yet"
+        raise OutputError(what, where=path, expected=expected)
+
+
+def write_product(order: Order, name: str, path: Path) -> Made:
+    """Write a product to a file or a folder of any name: all of it, or nothing.
+
+    What it has beside it in a run, besides files that belong to it, is not kept.
+    """
+    product = PRODUCTS[name]
+    stem, end = product.stem_and_suffix(path)
+    with writing_to(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+            staged = (Path(folder) / product.name).with_name(stem + product.suffix)
+            made = _written(replace(order, formats=(end[1:].lower(),)), name, staged)
+            for one in (*product.parts, end):
+                file = staged.with_name(stem + one.lower())
+                if not file.exists():  # the largest OctoMaps are not written
+                    raise MappingError("; ".join(made.warnings), where=path)
+                file.replace(path.with_name(stem + one))
+    return made
 
 
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:

@@ -14,7 +14,7 @@ from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
 from recon.export.images import DriveImages, open_images
-from recon.export.occupancy import export_grid
+from recon.export.occupancy import make_grid
 from recon.export.product import Made, Order
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
@@ -27,14 +27,14 @@ from recon.places.places import spread_over
 _LAYOUT: Final = Path(__file__).with_name("foxglove.json")
 
 
-def mcap_product(order: Order) -> Made:
-    """Write ``bag/bag.mcap``: transforms, odometry, what each frame saw, cloud, grid, images.
+def mcap_product(order: Order, folder: Path) -> Made:
+    """Write a folder with a bag: transforms, odometry, what each frame saw, cloud, grid, images.
 
     Images are there if they can be read again. Beside it is a layout for Foxglove. Coordinates of
     a survey are a frame, ``survey``, in which that of the map lies.
     """
     warnings = []
-    grid, height_m, _ = export_grid(order.placed, None)
+    grid, height_m, _ = make_grid(order.placed)
     images: dict[int, DriveImages] = {}
     try:
         images = {one.session.number: one for one in open_images(order.map, order.images)}
@@ -46,7 +46,7 @@ def mcap_product(order: Order) -> Made:
     fixed = [] if order.survey is None else [("survey", "map", order.T_survey_map)]
     fixed += [edge for drive in drives for edge in drive.mounted()]
     start_ns, frames = min(drive.times_ns[0] for drive in drives), 0
-    with write_bag(order.run.path("bag")) as bag:
+    with write_bag(folder) as bag:
         bag.write("/tf_static", start_ns, _transforms(start_ns, fixed), kept=True)
         bag.write("/map/grid", start_ns, _grid(start_ns, grid), kept=True)
         cloud = points(header("map", start_ns), even_sample(order.placed.tiles))
@@ -56,7 +56,7 @@ def mcap_product(order: Order) -> Made:
                 drive.write(bag, frame, views)
                 frames += 1
     layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", drives[0].name)
-    write_text(order.run.path("bag/foxglove.json"), layout)
+    write_text(folder / "foxglove.json", layout)
     return Made({"bag_frames": frames}, warnings)
 
 

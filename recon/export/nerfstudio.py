@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from pathlib import Path
 from typing import Any, Final
 
 import cv2
@@ -21,6 +22,7 @@ from recon.core.values.camera import project
 from recon.export.cloud import even_sample
 from recon.export.images import DriveImages, open_images
 from recon.export.product import Made, Order
+from recon.io.fields import write_json
 from recon.io.images.image import write_image
 from recon.io.models.colmap import PIXEL_CENTRE
 from recon.io.models.ply import write_ply
@@ -28,15 +30,14 @@ from recon.map.sessions.placed import settings_of
 from recon.map.tiles import Tiles
 from recon.stereo.frame import FrameReconstructor, back_project
 
-_FOLDER: Final = "nerfstudio"
 _OPENGL: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, looking along -z
 _FARTHEST_M: Final = 65.535  # in 16 bits of millimetres
 _NAMES: Final = {"images": "file_path", "depths": "depth_file_path", "masks": "mask_path"}
 _POINTS: Final = "sparse_pc.ply"
 
 
-def nerfstudio_product(order: Order) -> Made:
-    """Write ``nerfstudio/transforms.json`` and what it names, in map axes.
+def nerfstudio_product(order: Order, folder: Path) -> Made:
+    """Write a folder with ``transforms.json`` and what it names, in map axes.
 
     Frames are left images; all are matched again, as they were mapped, for their depth.
     """
@@ -50,10 +51,10 @@ def nerfstudio_product(order: Order) -> Made:
         for frame, images in _frames(order, drive, masked):
             named = {_NAMES[kind]: f"{kind}/{drive.file('left', frame)}" for kind in images}
             for image, name in zip(images.values(), named.values(), strict=True):
-                write_image(order.run.path(f"{_FOLDER}/{name}"), image)
+                write_image(folder / name, image)
             pose = drive.T_map_camera[frame] @ _OPENGL
             frames.append({**named, "transform_matrix": pose.tolist(), **camera})
-    write_ply(order.run.path(f"{_FOLDER}/{_POINTS}"), even_sample(order.placed.tiles))
+    write_ply(folder / _POINTS, even_sample(order.placed.tiles))
     content = {
         "camera_model": "OPENCV",
         **(_intrinsics(drives[0].session.camera) if len(drives) == 1 else {}),
@@ -61,7 +62,7 @@ def nerfstudio_product(order: Order) -> Made:
         "ply_file_path": _POINTS,
         "frames": frames,
     }
-    order.run.write_json(f"{_FOLDER}/transforms.json", content)
+    write_json(folder / "transforms.json", content)
     return Made({"nerfstudio_frames": len(frames)})
 
 
@@ -77,7 +78,7 @@ def _frames(
 ) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
     """Yield number, image, depth [mm] and perhaps mask of each frame."""
     settings, voxel_m = settings_of(drive.session), order.placed.tiles.config.fusion.voxel_m
-    reconstructor = FrameReconstructor(drive.rig, settings, threads=order.run.threads)
+    reconstructor = FrameReconstructor(drive.rig, settings, threads=order.threads)
     for frame, pair in drive.pairs():
         rectified, disparity = reconstructor.match(pair)
         xyz = back_project(disparity, rectified, settings.cloud, normals=False).xyz

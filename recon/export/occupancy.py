@@ -42,12 +42,13 @@ GROUND_SHARE: Final = 0.95
 # Least distance, on a road, from the path to the edge of the grid: a footprint must fit in at the
 # start.
 _MARGIN_M: Final = 5.0
-WrittenGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
+MadeGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
 
 
-def grid_product(order: Order) -> Made:
-    """Write ``map/grid.*``."""
-    grid, height_m, warnings = export_grid(order.placed, order.run.path("map/grid"))
+def grid_product(order: Order, path: Path) -> Made:
+    """Write the flat grid as Nav2 reads it, given the path of its YAML file."""
+    grid, height_m, warnings = make_grid(order.placed)
+    write_nav2(path.with_suffix(""), grid)
     rows, columns = grid.cells.shape
     figures = {
         "resolution_m": grid.resolution_m,
@@ -61,17 +62,14 @@ def grid_product(order: Order) -> Made:
     return Made(figures, warnings, grid)
 
 
-def export_grid(placed: PlacedMap, stem: Path | None) -> WrittenGrid:
-    """Flatten the voxels of a map above its ground, and perhaps write ``stem.pgm``, ``stem.yaml``.
+def make_grid(placed: PlacedMap) -> MadeGrid:
+    """Flatten the voxels of a map above its ground.
 
     Returns:
         The grid, the height at which something carried the camera above the ground (None = unknown,
         or not at one height), and what a user of the grid should know.
     """
-    written = Flattening(placed).grid()
-    if stem is not None:
-        write_nav2(stem, written[0])
-    return written
+    return Flattening(placed).grid()
 
 
 def grounds(placed: PlacedMap) -> Iterator[tuple[Rectangle, GroundSurface]]:
@@ -101,7 +99,7 @@ class Flattening:
         self._margin_m = max(around_m, self._width_m / 2 + self._resolution_m)
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
-    def grid(self) -> WrittenGrid:
+    def grid(self) -> MadeGrid:
         if self._tiles.extent[0] == self._tiles.extent[1]:
             raise MappingError("nothing was observed: there is no map to flatten")
         settings, driven = self._along_the_path()
@@ -259,12 +257,12 @@ def _paste(
     cells[y0:y1, x0:x1] = part.cells[v0:v1, u0:u1]
 
 
-def octomap_product(order: Order) -> Made:
-    """Write ``map/octomap.bt`` and ``.ot`` with the voxels that are occupied or free.
+def octomap_product(order: Order, path: Path) -> Made:
+    """Write OctoMaps ``.bt`` and ``.ot`` with the voxels that are occupied or free.
 
     The figure is the number of observed voxels, undecided ones included. A map may be too large.
     """
-    tiles, stem, warnings = order.placed.tiles, order.run.path("map/octomap"), []
+    tiles, stem, warnings = order.placed.tiles, path.with_suffix(""), []
     known = (drop_undecided(tile.voxels) for tile in tiles)
     try:
         write_octomap_tiles(stem, known, tiles.edge_cells.bit_length() - 1, tiles.resolution_m)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from shutil import copyfile
 from typing import Any, Final
 
 import numpy as np
@@ -17,20 +16,16 @@ from recon.core.values.camera import depth_from_disparity, project
 from recon.core.values.cloud import Frame
 from recon.core.values.image import in_colour
 from recon.export.mesh.grid import check_coverage, mesh_coverage, mesh_grid
-from recon.export.mesh.pieces import LAYER, WHOLE
+from recon.export.mesh.pieces import WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
-from recon.io.atomic import atomic_path
-from recon.io.files import naming, reading
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
 from recon.io.images.image import read_image, write_image
 from recon.io.models.mesh import write_mesh
 from recon.io.models.mlp import Photo, write_mlp
-from recon.io.models.ply import read_ply, write_ply
-from recon.run.directory import RunDirectory
-from recon.run.finished import PAIR_CLOUD, camera_of_pair
-from recon.run.run import Run
+from recon.io.models.ply import write_ply
 from recon.stereo.frame import ReconstructedFrame
 
+PAIR_CLOUD: Final = "clouds/cloud.ply"
 _PHOTO: Final = "left.png"  # the left image, beside the mesh
 
 
@@ -67,13 +62,13 @@ def _surface(
     return replace(mesh, texture=Texture(image, inside, _PHOTO))
 
 
-def write_disparity_files(disparity: Disparity, run: RunDirectory) -> float:
+def write_disparity_files(disparity: Disparity, folder: Path) -> float:
     """Write disparity, confidence, reasons; return grey levels per pixel in ``disparity.png``."""
-    path, scale = run.path, fitting_scale(disparity.values)
-    write_pfm(path("disparity/disparity.pfm"), disparity.values)
-    write_disparity_png(path("disparity/disparity.png"), disparity.values, scale=scale)
-    write_pfm(path("disparity/confidence.pfm"), disparity.confidence)
-    write_image(path("disparity/reason.png"), disparity.reason)
+    folder, scale = folder / "disparity", fitting_scale(disparity.values)
+    write_pfm(folder / "disparity.pfm", disparity.values)
+    write_disparity_png(folder / "disparity.png", disparity.values, scale=scale)
+    write_pfm(folder / "confidence.pfm", disparity.confidence)
+    write_image(folder / "reason.png", disparity.reason)
     return scale
 
 
@@ -81,55 +76,48 @@ def write_cloud_files(
     frame: ReconstructedFrame,
     mesh: TriangleMesh | None,
     formats: Sequence[str],
-    run: RunDirectory,
+    folder: Path,
 ) -> None:
     """Write depth, cloud and mesh (PLY and ``formats``), and a project with the left image."""
     depth_m = depth_from_disparity(frame.disparity.values, frame.pair.camera)
-    write_pfm(run.path("disparity/depth.pfm"), depth_m)
-    write_ply(run.path(PAIR_CLOUD), frame.cloud)
+    write_pfm(folder / "disparity" / "depth.pfm", depth_m)
+    write_ply(folder / PAIR_CLOUD, frame.cloud)
     if mesh is not None:
-        _write_surface(mesh, frame.pair.camera, run.path(PAIR_CLOUD), formats, run)
+        write_surface(mesh, frame.pair.camera, folder / PAIR_CLOUD, formats, folder / WHOLE)
 
 
-def _write_surface(
+def write_surface(
     mesh: TriangleMesh,
     camera: RectifiedCamera | None,
     cloud: Path,
     formats: Sequence[str],
-    run: RunDirectory,
+    path: Path,
 ) -> None:
     """Write a mesh, with its texture if it is that of a camera, and a project with both."""
     frame: Frame | None = None if camera is None else "camera"
     for suffix in dict.fromkeys(("ply", *formats)):
-        write_mesh(run.path(f"mesh/mesh.{suffix}"), mesh, frame)
+        write_mesh(path.with_suffix(f".{suffix}"), mesh, frame)
     photos = []
     if camera is not None and mesh.texture is not None:
-        photos = [Photo(run.path(f"mesh/{mesh.texture.name}"), camera)]
-    write_mlp(run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": cloud}, frame, photos)
+        photos = [Photo(path.with_name(mesh.texture.name), camera)]
+    write_mlp(path.with_suffix(".mlp"), {"mesh": path, "cloud": cloud}, frame, photos)
 
 
 def mesh_cloud(
-    path: Path,
-    camera: RectifiedCamera | None,
-    settings: MeshSettings,
-    run: Run,
-    formats: Sequence[str] = ("ply",),
-) -> dict[str, Any]:
-    """Mesh a cloud file in one piece, as its camera saw it if it is that of a pair; its figures."""
-    with run.stage("read"):
-        cloud = read_ply(path)
-        write_ply(run.path(LAYER), cloud)
-    with run.stage("mesh"), naming(path):
-        if camera is None:
-            mesh, coverage = reconstruct_mesh(cloud, settings), None
-        else:
-            mesh = _surface(cloud, camera, settings, _photo_of(path.parents[1], camera))
-            coverage = mesh_coverage(mesh, cloud)
-    _write_surface(mesh, camera, run.path(LAYER), formats, run)
-    figures = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    if coverage is None:
-        return {**figures, "warnings": []}
-    return {**figures, "mesh_coverage": coverage, "warnings": list(check_coverage(coverage))}
+    cloud: PointCloud, camera: RectifiedCamera | None, settings: MeshSettings, run: Path
+) -> tuple[TriangleMesh, dict[str, Any]]:
+    """Mesh a cloud in one piece, as its camera saw it if it is that of a pair; with figures.
+
+    ``run`` is the folder of the pair, in which its left image may be.
+    """
+    if camera is None:
+        mesh, covered = reconstruct_mesh(cloud, settings), {}
+    else:
+        mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
+        covered = {"mesh_coverage": mesh_coverage(mesh, cloud)}
+    sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    warnings = [line for share in covered.values() for line in check_coverage(share)]
+    return mesh, {**sizes, **covered, "warnings": warnings}
 
 
 def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:
@@ -144,28 +132,3 @@ def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:
         got = f"{image.shape[1]}x{image.shape[0]}"
         raise FormatError(what, where=path, got=got, expected=expected)
     return in_colour(image)
-
-
-def export_pair(
-    source: Path, settings: MeshSettings, products: Sequence[str], run: Run, formats: Sequence[str]
-) -> dict[str, Any]:
-    """Write cloud and mesh of a run of `recon pair`, or one of them; the figures of the summary."""
-    cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
-    figures: dict[str, Any] = {"run": str(source), "warnings": []}
-    if "cloud" in products:
-        with reading(cloud):
-            cloud.stat()
-        with atomic_path(run.path(PAIR_CLOUD)) as temporary:
-            copyfile(cloud, temporary)
-    if "mesh" in products:
-        figures |= mesh_cloud(cloud, camera, settings, run, formats)
-    return finish_cloud_run(source, cloud, run, figures)
-
-
-def finish_cloud_run(
-    source: Path, cloud: Path, run: Run, figures: dict[str, Any]
-) -> dict[str, Any]:
-    """Complete a run that made something of a cloud file."""
-    figures = {"cloud": str(cloud), **figures}
-    run.finish(figures, source=str(source), inputs=[cloud])
-    return figures

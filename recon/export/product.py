@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from recon.core.errors import OutputError
 from recon.core.values.arrays import Float64
 from recon.export.mesh.poisson import MeshSettings
 from recon.map.map import Map
 from recon.map.sessions.georeference import Georeference
 from recon.map.sessions.placed import PlacedMap
-from recon.run.run import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +23,9 @@ class Order:
 
     map: Map
     placed: PlacedMap
-    run: Run  # the run, whose folder they go to
     mesh: MeshSettings  # settings of the mesh
     formats: Sequence[str] = ("ply",)  # formats of the mesh
+    threads: int = 1
     # Where the map is in a survey, as products of surveys are written; None = in its own axes
     survey: Georeference | None = None
     images: Sequence[Path] = ()  # where drives are now, if not where the map says
@@ -52,9 +52,26 @@ class Made:
 
 @dataclass(frozen=True)
 class Product:
-    """A kind of file."""
+    """A kind of file, or of folder."""
 
-    write: Callable[[Order], Made]
+    name: str  # of the file, or of the folder, in that of a run
+    write: Callable[[Order, Path], Made]  # to a path with the suffix of the name
+    others: tuple[str, ...] = ()  # other suffixes, of which each can be asked for
+    parts: tuple[str, ...] = ()  # suffixes of the files beside it that belong to it
     needs_occupancy: bool = False  # whether it is made of what is free and occupied
     surveyed: bool = False  # whether it can be in the coordinates of a survey
     needs_images: bool = False  # whether it is made of the images of the drives, too
+
+    @property
+    def suffix(self) -> str:
+        """That of the name; empty = it is a folder."""
+        return "".join(Path(self.name).suffixes)
+
+    def stem_and_suffix(self, path: Path) -> tuple[str, str]:
+        """Return how the name of a file begins and ends; `OutputError` if it is of another kind."""
+        for end in (self.suffix, *self.others):
+            cut = len(path.name) - len(end)
+            if cut > 0 and path.name[cut:].lower() == end:
+                return path.name[:cut], path.name[cut:]
+        expected = " or ".join((self.suffix, *self.others))
+        raise OutputError("the product is another kind of file", where=path, expected=expected)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import product
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import UNKNOWN, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
-from recon.export.occupancy import export_grid, grounds
+from recon.export.occupancy import grounds, make_grid
 from recon.export.product import Made, Order
 from recon.io.models.geotiff import RasterFile, RasterPlace, write_geotiff
 from recon.map.ground.surface import GroundSurface
@@ -25,14 +26,13 @@ _CORNERS: Final = np.array([*product((0.0, 1.0), repeat=2)])
 Fill = Callable[[Order, RasterFile, Float64], None]
 
 
-def raster_product(name: str) -> Callable[[Order], Made]:
-    """Return what writes ``map/<name>.tif``, one of `RASTERS`, perhaps in survey coordinates."""
+def raster_product(name: str) -> Callable[[Order, Path], Made]:
+    """Return what writes one of `RASTERS`, perhaps in survey coordinates."""
     fill, colours = RASTERS[name]
 
-    def write(order: Order) -> Made:
+    def write(order: Order, path: Path) -> Made:
         T_file_map = order.T_survey_map
         place = _place(order, T_file_map)
-        path = order.run.path(f"map/{name}.tif")
         with write_geotiff(path, place, colours=colours, crs=order.crs) as file:
             fill(order, file, T_file_map)
         return Made({f"{name}_size": [place.columns, place.rows]})
@@ -125,7 +125,7 @@ def ground_slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
 
 def _occupancy(order: Order, file: RasterFile, T_file_map: Float64) -> None:
     """Write what the flat grid has at the middle of each cell: 0 = free, 100 = occupied."""
-    grid, T_map_file, place = export_grid(order.placed, None)[0], invert(T_file_map), file.place
+    grid, T_map_file, place = make_grid(order.placed)[0], invert(T_file_map), file.place
     for row in range(0, place.rows, _ROWS):
         shape = min(_ROWS, place.rows - row), place.columns
         middles = place.centres(row, 0, shape).reshape(-1, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -18,24 +19,24 @@ from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
 from recon.map.sessions.placed import PlacedMap
 
 
-def survey_product(suffix: str) -> Callable[[Order], Made]:
-    """Return what writes ``map/cloud.`` and a suffix, perhaps where a survey says."""
-    write_points = write_copc if suffix.startswith("copc") else write_las
+def las_product(order: Order, path: Path, write: Callable[..., int] = write_las) -> Made:
+    """Write the cloud as LAS or LAZ, with the ground as a class, perhaps where a survey says."""
+    clouds = (tile.cloud for tile in order.placed.tiles)
+    # A hundredth of a voxel, as a decimal: a millimetre on a road.
+    step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
+    how = {"step_m": step_m, "ground": _ground_of(order.placed)}
+    return Made({"points": write(path, clouds, order.T_survey_map, order.crs, **how)})
 
-    def write(order: Order) -> Made:
-        T_file_map = order.T_survey_map
-        clouds = (tile.cloud for tile in order.placed.tiles)
-        path = order.run.path(f"map/cloud.{suffix}")
-        if suffix == "e57":
-            points = write_e57(path, clouds, T_file_map, order.crs)
-        else:
-            # A hundredth of a voxel, as a decimal: a millimetre on a road.
-            step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
-            ground = _ground_of(order.placed)
-            points = write_points(path, clouds, T_file_map, order.crs, step_m=step_m, ground=ground)
-        return Made({"points": points})
 
-    return write
+def copc_product(order: Order, path: Path) -> Made:
+    """Write the cloud as COPC, as `las_product` does."""
+    return las_product(order, path, write_copc)
+
+
+def e57_product(order: Order, path: Path) -> Made:
+    """Write the cloud as E57, perhaps where a survey says."""
+    clouds = (tile.cloud for tile in order.placed.tiles)
+    return Made({"points": write_e57(path, clouds, order.T_survey_map, order.crs)})
 
 
 def _ground_of(placed: PlacedMap) -> AreGround:

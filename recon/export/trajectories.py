@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,6 +14,7 @@ from recon.core.geometry.se3 import invert, quaternion_from_rotation
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.atomic import write_text
+from recon.io.fields import write_json
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map.ground.axes import base_axes
 from recon.map.localize.sequence import LocalizedDrive, LocalizedFrame
@@ -22,9 +23,6 @@ from recon.map.store.session import Session
 from recon.map.store.trees import loop_in
 from recon.odometry.health import stretches
 from recon.places.loop import Loop
-from recon.run.directory import RunDirectory
-from recon.run.finished import STATES
-from recon.run.run import SUMMARY
 
 _AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 _POSE: Final = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -40,7 +38,7 @@ _HEADING: Final = ",".join(HEADER) + "\n"
 
 
 def export_paths(
-    session: Session, joined: Bool, camera_height_m: float | None, run: RunDirectory
+    session: Session, joined: Bool, camera_height_m: float | None, folder: Path
 ) -> None:
     """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed.
 
@@ -50,17 +48,17 @@ def export_paths(
     stretch = stretches(session.health)
     for number in np.unique(stretch[~joined & (stretch >= 0)]).tolist():
         apart = session.trajectory.select(stretch == number)
-        write_tum(run.path(f"sessions/{number}/trajectory_tum.txt"), apart)
+        write_tum(folder / f"sessions/{number}/trajectory_tum.txt", apart)
     path = session.trajectory.select(joined)
-    write_kitti_poses(run.path("trajectory_kitti.txt"), path)
-    write_tum(run.path("trajectory_tum.txt"), path)
+    write_kitti_poses(folder / "trajectory_kitti.txt", path)
+    write_tum(folder / "trajectory_tum.txt", path)
     based = _of_base(path, session.T_map_world, camera_height_m)
-    write_tum(run.path("trajectory_map_base_tum.txt"), based)
+    write_tum(folder / "trajectory_map_base_tum.txt", based)
     if session.loops.get("closed"):
-        write_tum(run.path("trajectory_odometry_tum.txt"), session.odometry.select(joined))
+        write_tum(folder / "trajectory_odometry_tum.txt", session.odometry.select(joined))
         kinds = ("closed", "refused")
         loops = {kind: [*map(_edge, map(loop_in, session.loops[kind]))] for kind in kinds}
-        run.write_json("loops.json", loops)
+        write_json(folder / "loops.json", loops)
 
 
 def _edge(loop: Loop) -> dict[str, Any]:
@@ -73,31 +71,28 @@ def _edge(loop: Loop) -> dict[str, Any]:
     }
 
 
-def export_sessions(map_: MapFile, run: RunDirectory) -> None:
+def export_sessions(map_: MapFile, folder: Path) -> None:
     """Write ``sessions/<number>/trajectory_*.txt`` of the linked drives, in the map's world."""
     for number, path in map_.paths.items():
-        write_kitti_poses(run.path(f"sessions/{number}/trajectory_kitti.txt"), path)
-        write_tum(run.path(f"sessions/{number}/trajectory_tum.txt"), path)
+        write_kitti_poses(folder / f"sessions/{number}/trajectory_kitti.txt", path)
+        write_tum(folder / f"sessions/{number}/trajectory_tum.txt", path)
 
 
-def export_localized(
-    drive: LocalizedDrive, camera_height_m: float | None, run: RunDirectory
-) -> None:
-    """Write ``trajectory_tum.txt``, ``trajectory_map_base_tum.txt`` and ``states.csv``."""
-    write_tum(run.path("trajectory_tum.txt"), drive.trajectory)
+def export_localized(drive: LocalizedDrive, camera_height_m: float | None, folder: Path) -> None:
+    """Write ``trajectory_tum.txt`` and ``trajectory_map_base_tum.txt``."""
+    write_tum(folder / "trajectory_tum.txt", drive.trajectory)
     based = _of_base(drive.trajectory, drive.T_map_world, camera_height_m)
-    write_tum(run.path("trajectory_map_base_tum.txt"), based)
-    write_text(run.path(STATES), "".join([_HEADING, *map(_line, drive.frames)]))
+    write_tum(folder / "trajectory_map_base_tum.txt", based)
 
 
-def begin_states(summary: Mapping[str, Any], run: RunDirectory) -> Callable[[LocalizedFrame], None]:
-    """Return what adds a frame to ``states.csv`` in the state of a run, for those who look on.
+def write_states(path: Path, frames: Iterable[LocalizedFrame]) -> None:
+    """Write a table with the state and the pose of each frame of a drive that was located."""
+    write_text(path, "".join([_HEADING, *map(_line, frames)]))
 
-    Beside it is ``summary.json``, with what the summary will say of the map.
-    """
-    write_text(run.state(SUMMARY), json.dumps(summary))
-    path = run.state(STATES)
-    write_text(path, _HEADING)
+
+def begin_states(path: Path) -> Callable[[LocalizedFrame], None]:
+    """Begin such a table, and return what adds a frame to it, for those who look on."""
+    write_states(path, ())
 
     def add(frame: LocalizedFrame) -> None:
         # It is no result: that the disk is full is said when there is one.

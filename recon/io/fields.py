@@ -1,7 +1,8 @@
-"""YAML and TOML files, and typed access to their fields, in errors that name the field."""
+"""YAML, TOML and JSON files, and typed access to their fields, in errors that name the field."""
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Mapping
@@ -155,6 +156,12 @@ def _count(value: Any, known: dict[int, int]) -> int:
         parts = value.values() if isinstance(value, dict) else value
         known[id(value)] = 1 + sum(_count(part, known) for part in parts)
     return known[id(value)]
+
+
+def write_json(path: StrPath, values: Mapping[str, Any]) -> None:
+    """Write a JSON file atomically; NaN is refused, since it is not valid JSON."""
+    text = json.dumps(values, indent=2, allow_nan=False, ensure_ascii=False)
+    write_text(path, text + "\n")
 
 
 def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:

@@ -6,11 +6,11 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, OutputError
 from recon.core.geometry.se3 import (
     make_transform,
     orthonormalise,
@@ -47,6 +47,7 @@ _STEP_S: Final = 3600.0  # more is not between poses of one drive
 # Vehicles slip sideways by less; an order that is wrong gives twice the angle that they turn by.
 _WANDERS_RAD: Final = np.radians(5.0)
 _MUCH: Final = 3.0
+_NAMES: Final = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 ORDER_HINT: Final = "a first line '# timestamp tx ty tz qw qx qy qz' tells the order of a file"
 FRAMES: Final = "frames.csv"
 HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
@@ -90,15 +91,37 @@ def read_tum(path: StrPath) -> Trajectory:
     return _from_tum(_read_rows(path, (8, _EUROC_COLUMNS)), path)
 
 
+def write_trajectory(
+    path: StrPath, trajectory: Trajectory, form: Literal["tum", "kitti"] = "tum"
+) -> None:
+    """Write a trajectory atomically, as TUM has it or, without times, KITTI.
+
+    `read_trajectory` reads it back; a first line of TUM's names the columns, as in `read_tum`.
+
+    Raises:
+        OutputError: There is no such format, the trajectory has no pose, or the file cannot be
+            written.
+    """
+    if form not in ("tum", "kitti"):
+        what, expected = "unknown format of a trajectory", "tum or kitti"
+        raise OutputError(what, where=path, got=form, expected=expected)
+    if not len(trajectory):
+        raise OutputError("the trajectory has no pose", where=path)
+    if form == "kitti":
+        write_kitti_poses(path, trajectory)
+    else:
+        write_tum(path, trajectory, f"# timestamp {' '.join(_NAMES)}\n")
+
+
 def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
     """Write poses in KITTI's format, 13 digits, atomically; it has no timestamps."""
     rows = trajectory.T_world_camera[:, :3, :].reshape(-1, 12)
     write_text(path, "".join(" ".join(f"{value:.12e}" for value in row) + "\n" for row in rows))
 
 
-def write_tum(path: StrPath, trajectory: Trajectory) -> None:
+def write_tum(path: StrPath, trajectory: Trajectory, head: str = "") -> None:
     """Write poses in TUM's format, 12 decimals (9 for the time), ``qw ≥ 0``, atomically."""
-    lines = []
+    lines = [head]
     for T, time_s in zip(trajectory.T_world_camera, trajectory.timestamps_s, strict=True):
         numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
         text = " ".join(f"{number:.12f}" for number in numbers)

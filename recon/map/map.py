@@ -1,9 +1,12 @@
-"""`recon.Map`: a map file with what is done with it: merge, cut into tiles, find a pair."""
+"""`recon.Map`: a map file with what is done with it: merge, cut, ask, find a pair."""
 
 from __future__ import annotations
 
+from numpy.typing import ArrayLike
+
 from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.map.localize.localizer import Located, localize_pair
+from recon.map.query import MapPlaces, look_up
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.joining import join_new
 from recon.map.sessions.placed import place_map, settings_of
@@ -18,6 +21,8 @@ class Map(MapFile):
 
     Begin one with `create` or `temporary`; `MapFile` has what is in it.
     """
+
+    _cut: tuple[object, Tiles] | None = None
 
     def merge(self, other: Map) -> list[Session]:
         """Add the drives of another finished map, and place those that saw the same places.
@@ -43,6 +48,23 @@ class Map(MapFile):
             SettingsError: The settings need finer or longer rays than were kept.
         """
         return place_map(self, settings or settings_of(self.first)).tiles
+
+    def at(self, xyz: ArrayLike) -> MapPlaces:
+        """Return what the map knows of places (3,) or (N, 3), map axes: is there anything?
+
+        Whether each is occupied, free or unknown, the nearest point of the cloud, and which frames
+        saw it. Map axes are metres, x forward, y left, z up; ``first.T_map_world`` leads to them
+        from the world of trajectories. The first call cuts the map as `tiles` does, and may take
+        as long as a product; the tiles are kept until drives or links change.
+
+        Raises:
+            ShapeError: They are no such numbers, or not finite.
+            FormatError: The map is damaged, or has no drive.
+        """
+        state = [(session.number, len(session)) for session in self.linked], len(self.links)
+        if self._cut is None or self._cut[0] != state:
+            self._cut = state, self.tiles()
+        return look_up(self._cut[1], xyz)
 
     def localize(
         self,

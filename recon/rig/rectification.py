@@ -20,7 +20,6 @@ from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.fields import write_yaml
 from recon.io.files import naming
 from recon.rig.uncalibrated import rectify_images
-from recon.run.directory import RunDirectory
 from recon.sources.image_names import ImagePairs
 from recon.sources.one_pair import read_pair
 from recon.stereo.rectify.features import map_pixels, match_exactly
@@ -44,7 +43,7 @@ class RectifyPlan:
     # maps (N, 2) pixels of the left and right image to the rectified ones
     place: Callable[[Float64, Float64], tuple[Float64, Float64]]
     lines: Callable[[Float64, Float64], Lines]  # their epipolar lines in the images as recorded
-    write: Callable[[RunDirectory], None]  # writes the calibration, or the homographies
+    write: Callable[[Path], None]  # writes the calibration, or the homographies, into a folder
     figures: dict[str, Any]  # figures of the plan for ``summary.json``
 
 
@@ -81,7 +80,7 @@ def plan_by_calibration(
         warp=rectifier.warp,
         place=lambda a, b: (turns.place(rig, a), turns.place(rig, b, right=True)),
         lines=lambda a, b: epipolar_curves(rig, a, b),
-        write=lambda run: write_recon_calibration(run.path("calibration.yaml"), camera),
+        write=lambda folder: write_recon_calibration(folder / "calibration.yaml", camera),
         figures={
             "method": "calibration",
             "up_to_scale": False,
@@ -130,8 +129,8 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
         warp=warp,
         place=lambda a, b: (map_pixels(result.H_left, a), map_pixels(result.H_right, b)),
         lines=lambda a, b: epipolar_lines(result.fundamental, a, b, size),
-        write=lambda run: write_yaml(
-            run.path("homographies.yaml"),
+        write=lambda folder: write_yaml(
+            folder / "homographies.yaml",
             {
                 "note": "rectified = H * raw, up to scale; depth has no unit",
                 "width_px": width,

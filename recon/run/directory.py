@@ -23,7 +23,8 @@ from typing import Any, ClassVar, Final
 from typing_extensions import Self
 
 from recon.core.errors import ClusterError, FormatError, MemoryLimitError, OutputError
-from recon.io.atomic import check_targets, exchange, take_lock, write_text
+from recon.io.atomic import check_targets, exchange, take_lock
+from recon.io.fields import write_json
 from recon.io.files import read_text, reading, refuse_links, resolved
 
 RECORD: Final = "run.json"
@@ -73,7 +74,7 @@ class RunDirectory:
 
     def path(self, name: str) -> Path:
         """Return the path to write the file ``name`` to; its parent folder is created."""
-        target = self._content / name
+        target = self.content / name
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
@@ -83,13 +84,12 @@ class RunDirectory:
 
     def files(self) -> list[str]:
         """Return sorted names of the files written so far, without those of the state."""
-        written = (p.relative_to(self._content) for p in self._content.rglob("*") if p.is_file())
+        written = (p.relative_to(self.content) for p in self.content.rglob("*") if p.is_file())
         return sorted(p.as_posix() for p in written if p.parts[0] not in (_STATE, _LOCK))
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file; NaN is refused, since it is not valid JSON."""
-        text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-        write_text(self.path(name), text + "\n")
+        write_json(self.path(name), content)
 
     def __enter__(self) -> Self:
         _refuse_address(self.folder)
@@ -127,9 +127,9 @@ class RunDirectory:
     def _clear(self) -> None:
         """Remove partial files of an earlier run; a resumed run keeps its state."""
         if self.whole:  # of one that was killed
-            if self._content.is_symlink():
-                self._content.unlink()
-            shutil.rmtree(self._content, ignore_errors=True)
+            if self.content.is_symlink():
+                self.content.unlink()
+            shutil.rmtree(self.content, ignore_errors=True)
         kept = {_LOCK, _STATE} if self.resumes else {_LOCK}
         for path in self._partial.iterdir():
             if path.name not in kept:
@@ -146,7 +146,7 @@ class RunDirectory:
         return self.folder / _PARTIAL
 
     @property
-    def _content(self) -> Path:
+    def content(self) -> Path:
         """Where the files of this run are written."""
         if self.whole:
             folder = resolved(self.folder)
@@ -176,9 +176,9 @@ class RunDirectory:
     def _swap(self) -> None:
         """Put the new folder in the place of the old one, with files in it that are of no run."""
         try:
-            shutil.rmtree(self._content / _STATE, ignore_errors=True)
+            shutil.rmtree(self.content / _STATE, ignore_errors=True)
             self._keep_others()
-            exchange(self._content, resolved(self.folder))
+            exchange(self.content, resolved(self.folder))
         finally:  # the old folder, or a new one that was interrupted before it took its place
             self._withdraw()
 
@@ -186,13 +186,13 @@ class RunDirectory:
         """Copy files that are of no run into the new folder."""
         ours = {self.folder / name for name in self._earlier}
         for path in self.folder.rglob("*"):
-            target = self._content / path.relative_to(self.folder)
+            target = self.content / path.relative_to(self.folder)
             if path.is_file() and path not in ours and self._partial not in path.parents:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(path, target, follow_symlinks=False)
 
     def _withdraw(self) -> None:
-        for partial in {self._partial, self._content}:
+        for partial in {self._partial, self.content}:
             shutil.rmtree(partial, ignore_errors=True)
         for folder in self._made:
             with suppress(OSError):  # not empty: files of others, which stay

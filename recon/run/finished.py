@@ -21,7 +21,6 @@ STATES: Final = "states.csv"  # of the frames of a drive that was located
 GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
 CLOUD: Final = "map/cloud.ply"
-PAIR_CLOUD: Final = "clouds/cloud.ply"
 # Record keys of a run made from another run: the command that mapped the drive; of one without a
 # map of its own, what was doubted there.
 MAPPED_BY: Final = "mapped_by"

@@ -8,7 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import grimp
+import numpy as np
 import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 NO_NAMES = {"utils", "common", "helpers", "misc"}
 MAX_LINES = (400, 600)  # of a file; of one with tests
@@ -192,6 +196,27 @@ def _defined(tree: ast.Module) -> set[str]:
     made = {n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef)}
     imports = (n for n in tree.body if isinstance(n, ast.ImportFrom | ast.Import))
     return stored | made | {a.asname or a.name for node in imports for a in node.names}
+
+
+def test_no_files_import_each_other_in_a_circle():
+    """But those of the command line: a batch checks its jobs as command lines of the program."""
+    graph = grimp.build_graph("recon", exclude_type_checking_imports=True)
+    names = sorted(graph.modules)
+    edges = [
+        (row, names.index(imported))
+        for row, name in enumerate(names)
+        for imported in graph.find_modules_directly_imported_by(name)
+    ]
+    ends = coo_matrix((np.ones(len(edges)), np.array(edges).T), shape=(len(names),) * 2)
+    _, circle = connected_components(ends, connection="strong")
+    met = [name for name, one in zip(names, circle, strict=True) if (circle == one).sum() > 1]
+    assert len(edges) > 1000
+    assert [name for name in met if not name.startswith("recon.cli")] == []
+
+
+def test_no_contract_has_an_exemption(pyproject):
+    contracts = pyproject["tool"]["importlinter"]["contracts"]
+    assert [one["name"] for one in contracts if "ignore_imports" in one] == []
 
 
 COMMANDS = ("ruff check --output-format concise", "ruff format --check", "mypy", "lint-imports")

@@ -177,7 +177,7 @@ def written(store, folder, settings=SETTINGS, threads=None):
     with RunDirectory(folder) as directory:
         layer = directory.path("mesh/cloud.ply")
         write_ply(layer, street())
-        found = export_mesh(store, settings, directory, layer, threads)
+        found = export_mesh(store, settings, directory.path("mesh/mesh.ply"), layer, threads)
         directory.write_json("run.json", {"files": directory.files()})
     tiles = [*map(read_mesh, sorted((folder / "mesh" / "tiles").glob("*.ply")))]
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)

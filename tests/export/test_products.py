@@ -16,9 +16,9 @@ from recon.core.values.arrays import Float64
 from recon.export.cloud import CloudSample
 from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
-from recon.export.occupancy import export_grid
+from recon.export.occupancy import make_grid
 from recon.export.product import Order
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.map.drive import mapper
 from recon.map.drive.sequence import MappedSequence, map_sequence
@@ -41,8 +41,8 @@ def mapped():
 
 
 def write_products(mapped: MappedSequence, run: Run) -> Products:
-    order = Order(mapped.map, mapped.placed, run, load_config().mesh)
-    return make(order, ("cloud", "octomap", "grid"))
+    order = Order(mapped.map, mapped.placed, load_config().mesh)
+    return make(order, run.content, ("cloud", "octomap", "grid"))
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_the_vehicle_frees_its_own_track_alone(mapped, folder):
     narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
     seen = write_products(replace(mapped, config=narrow), folder).grid
     grid = write_products(mapped, folder).grid
-    np.testing.assert_array_equal(read_nav2(folder.path("map/grid.yaml")).cells, grid.cells)
+    np.testing.assert_array_equal(read_grid(folder.path("map/grid.yaml")).cells, grid.cells)
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)[:, :2]
     columns, rows = np.floor((path_m - grid.origin_m) / 0.2).astype(int).T
     assert (seen.cells[rows, columns] == UNKNOWN).sum() >= 2  # the camera does not see its start
@@ -132,7 +132,7 @@ def test_a_scene_of_any_size_has_a_grid_and_a_vehicle_only_where_it_fits(scale, 
     small = replace(drive.calibration, baseline_m=scale * drive.calibration.baseline_m)
     config = load_config(None, ["fusion.min_count=1", f"grid.vehicle_width_m={width_m}"])
     made = map_sequence(drive.with_calibration(small), config.at_scale(scale))
-    grid, _, warnings = export_grid(made.placed, None)
+    grid, _, warnings = make_grid(made.placed)
     assert (grid.cells == FREE).any() == (scale == 0.08)  # heights are those of robots
     if said is not None:
         assert any(said in text for text in warnings)
@@ -178,8 +178,7 @@ def test_an_empty_height_band_and_a_grid_that_a_far_pose_makes_too_large_are_ref
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
     path_m[-1] = (1e4, 1e4, 0.0)
     with pytest.raises(MappingError, match="grid would be too large"):
-        export_grid(PlacedMap(mapped.tiles, path_m, np.ones(len(path_m), bool)), tmp_path / "grid")
-    assert not [*tmp_path.glob("grid*")]
+        make_grid(PlacedMap(mapped.tiles, path_m, np.ones(len(path_m), bool)))
 
 
 def _random_cloud(seed: int, points: int) -> PointCloud:
@@ -221,7 +220,8 @@ def test_tiles_in_one_file_are_read_as_one_cloud_and_an_error_leaves_none(tmp_pa
 
 
 def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, folder):
-    made = make(Order(mapped.map, mapped.placed, folder, load_config().mesh), ("costmap", "grid"))
+    order = Order(mapped.map, mapped.placed, load_config().mesh)
+    made = make(order, folder.content, ("costmap", "grid"))
     costs, grid = made.made["costmap"].value, made.grid
     assert (costs.cells.shape, costs.origin_m) == (grid.cells.shape, grid.origin_m)
     # What is free for a robot of the usual height is free in the grid, too.

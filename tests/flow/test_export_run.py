@@ -24,7 +24,7 @@ from recon.core.errors import EvaluationError, FormatError, ReconError, Settings
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_tum
@@ -197,7 +197,7 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     assert np.abs(at_points("dtm", places=driven) - driven[:, 2]).max() < 0.1
     assert np.nanmedian(at_points("slope")) < 3
     assert (at_points("occupancy", places=driven) == 0).all()
-    grid = read_nav2(small_demo / "map/grid.yaml")
+    grid = read_grid(small_demo / "map/grid.yaml")
     i, j = np.argwhere(grid.cells == OCCUPIED).T
     xy_m = grid.origin_m + grid.resolution_m * (np.column_stack([j, i]) + 0.5)
     placed = np.column_stack([xy_m, np.zeros(len(i))]) @ R.T + origin
@@ -328,7 +328,7 @@ def test_another_height_band_changes_the_grid_alone(small_demo, tmp_path):
     _remake(small_demo, out, "grid.min_height_m=2.2", "grid.max_height_m=6")
     same = "map/octomap.bt"
     assert (out / same).read_bytes() == (small_demo / same).read_bytes()
-    low, high = (read_nav2(f / "map/grid.yaml") for f in (small_demo, out))
+    low, high = (read_grid(f / "map/grid.yaml") for f in (small_demo, out))
     assert low.cells.shape == high.cells.shape
     parked = (low.cells == OCCUPIED) & (high.cells != OCCUPIED)
     assert parked.sum() > 10  # cars are lower than the band
@@ -342,7 +342,7 @@ def test_another_height_band_changes_the_grid_alone(small_demo, tmp_path):
 def test_another_resolution_is_right_too(small_demo, tmp_path, resolution_m, precision, recall):
     out = tmp_path / "out"
     summary = _remake(small_demo, out, f"occupancy.resolution_m={resolution_m}")
-    grid, voxels = read_nav2(out / "map/grid.yaml"), read_octomap(out / "map/octomap.ot")
+    grid, voxels = read_grid(out / "map/grid.yaml"), read_octomap(out / "map/octomap.ot")
     found = run_evaluate_occupancy(out).metrics
     sizes_m = {summary["resolution_m"], grid.resolution_m, voxels.resolution_m, found.resolution_m}
     assert sizes_m == {resolution_m}
@@ -424,7 +424,7 @@ def test_what_cannot_be_compared_with_its_truth_is_refused(copy):
 
 
 def test_grids_that_others_drew_larger_are_compared_too(small_demo, copy):
-    grid = read_nav2(copy / "map" / "grid.yaml")
+    grid = read_grid(copy / "map" / "grid.yaml")
     rows, columns = grid.cells.shape
     image = np.full((rows + 7, columns + 5), 205, np.uint8)
     original = cv2.imread(str(copy / "map" / "grid.pgm"), cv2.IMREAD_GRAYSCALE)

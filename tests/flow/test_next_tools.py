@@ -25,7 +25,7 @@ from recon.core.values.camera import unproject
 from recon.export import nerfstudio
 from recon.io.images.image import read_image, read_levels
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_nav2
+from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_tum
 from recon.map.map import Map
@@ -183,7 +183,7 @@ def test_a_grid_map_has_its_layers_where_the_map_has_them(small_demo, tmp_path):
         y = info.pose.position.y + info.length_y / 2 - (j + 0.5) * info.resolution
         return x, y, values.reshape(columns.size, rows.size).T
 
-    grid = read_nav2(tmp_path / "map/grid.yaml")
+    grid = read_grid(tmp_path / "map/grid.yaml")
     x, y, occupancy = layer("occupancy")
     at = [np.floor((xy - o) / 0.2).astype(int) for xy, o in zip((x, y), grid.origin_m, strict=True)]
     expected = grid.cells[np.ix_(at[1], at[0])].T

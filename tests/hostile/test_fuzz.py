@@ -23,7 +23,7 @@ from recon.io.images.disparity import read_disparity_png, read_pfm, write_pfm
 from recon.io.images.image import read_image
 from recon.io.images.video import open_video
 from recon.io.models.mesh import read_mesh, write_mesh
-from recon.io.models.nav2 import read_nav2, write_nav2
+from recon.io.models.nav2 import read_grid, write_nav2
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import read_frames, read_trajectory
@@ -149,8 +149,8 @@ KINDS: Final[dict[str, Kind]] = {
         lambda p: match(p, pair_of(30, 10, (8, 12))),
     ),
     "octomap ot": Kind("o.ot", _octomap, read_octomap),
-    "nav2": Kind("g.yaml", _grid, read_nav2),
-    "nav2 image": Kind("g.pgm", _grid, lambda p: read_nav2(p.with_suffix(".yaml"))),
+    "nav2": Kind("g.yaml", _grid, read_grid),
+    "nav2 image": Kind("g.pgm", _grid, lambda p: read_grid(p.with_suffix(".yaml"))),
     "map": Kind("map.recon", write_map, read_map, 4),
     "video": Kind("v.avi", lambda p: write_video(p, [_IMAGE[..., 0]] * 3, "MJPG"), _read_video),
 }

@@ -22,7 +22,7 @@ from recon.io.images.disparity import read_pfm
 from recon.io.images.image import read_image
 from recon.io.middlebury import read_middlebury_calib
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_nav2, write_nav2
+from recon.io.models.nav2 import read_grid, write_nav2
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_frames, read_trajectory
@@ -168,7 +168,7 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
         ],
     ),
     "grid.yaml": (
-        read_nav2,
+        read_grid,
         [(b"", "file is empty"), (b"a: [", "not a YAML"), (b"image: x.pgm", "no 'resolution'")],
     ),
 }
@@ -221,7 +221,7 @@ VALID: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         lambda path: write_nav2(
             path.with_suffix(""), OccupancyGrid(np.full((2, 3), FREE, np.int8), 0.2, (0.0, 1.0))
         ),
-        read_nav2,
+        read_grid,
     ),
 }
 

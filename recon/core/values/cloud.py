@@ -9,10 +9,10 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.shown import Shape
 from recon.core.text import counted
 from recon.core.values.arrays import Float32, Int32, UInt8, extent_text, freeze
 from recon.core.values.attributes import ATTRIBUTES, Attribute
-from recon.core.values.shown import Shape
 
 Frame = Literal["camera", "world", "map"]
 

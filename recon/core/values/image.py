@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
+from recon.core.shown import Shown
 from recon.core.values.arrays import (
     Bool,
     Float32,
@@ -23,7 +24,6 @@ from recon.core.values.arrays import (
     size_text,
 )
 from recon.core.values.camera import RectifiedCamera
-from recon.core.values.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
+from recon.core.shown import Shown
 from recon.core.text import counted
 from recon.core.values.arrays import Float64, freeze
-from recon.core.values.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)

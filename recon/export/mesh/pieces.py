@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,6 @@ from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32, Int64
-from recon.core.values.cloud import Frame
 from recon.core.work import side_by_side
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import (
@@ -43,10 +41,9 @@ from recon.map.cut import Rectangle
 from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
-from recon.run.directory import RunDirectory
 
 WHOLE: Final = "mesh/mesh.ply"
-LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where the run has no other cloud
+LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where there is no other cloud
 SAMPLE_FACES: Final = 2_000_000  # most triangles of a mesh that is loaded whole for images
 _MOST_AT_ONCE: Final = 4
 _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))  # of a piece: axis, 1 for the far side
@@ -71,65 +68,61 @@ class Border(NamedTuple):
     components: Int64
 
 
-def mesh_product(order: Order) -> Made:
-    """Write ``mesh/``: the surface in its formats, and a MeshLab project beside the cloud.
+def mesh_product(order: Order, path: Path) -> Made:
+    """Write the surface, with other formats, its pieces and a MeshLab project beside it.
 
-    With a survey, ``mesh/survey/`` has the surface in its coordinates.
+    The cloud of the project is that of the folder two levels up, else it is made. With a survey,
+    ``survey/`` has the surface in its coordinates.
     """
-    tiles, run, cloud = order.placed.tiles, order.run, order.run.path("map/cloud.ply")
+    tiles, cloud = order.placed.tiles, path.parents[1] / "map" / "cloud.ply"
     if not cloud.is_file():
-        cloud = run.path(LAYER)
+        cloud = path.with_name(Path(LAYER).name)
         export_cloud(tiles, cloud)
     # Each piece being meshed takes memory of its own.
-    at_once = run.threads if tiles.config.memory.limit_mb is None else 1
-    made = export_mesh(tiles, order.mesh, run, cloud, at_once)
-    in_other_formats(run, order.formats, "map")
+    at_once = order.threads if tiles.config.memory.limit_mb is None else 1
+    made = export_mesh(tiles, order.mesh, path, cloud, at_once)
+    for suffix in dict.fromkeys(order.formats):
+        if suffix != "ply":
+            write_mesh(path.with_suffix(f".{suffix}"), read_mesh(path), "map")
     warnings = [*made.warnings]
     if order.mesh.free_space and not has_occupancy(order.map):
         warnings.append("the map kept no rays: which faces lie in free space is not known")
     small = made.figures["faces"] <= SAMPLE_FACES
-    mesh = read_mesh(run.path(WHOLE)) if small or order.survey is not None else None
-    there = {} if mesh is None else write_surveyed(order, mesh, "mesh/survey", order.formats)
+    mesh = read_mesh(path) if small or order.survey is not None else None
+    survey = path.with_name("survey")
+    there = {} if mesh is None else write_surveyed(order, mesh, survey, order.formats)
     return Made({**made.figures, **there}, warnings, mesh if small else None)
-
-
-def in_other_formats(run: RunDirectory, formats: Sequence[str], frame: Frame | None) -> None:
-    """Write ``mesh/mesh.ply`` again in other formats."""
-    for suffix in dict.fromkeys(formats):
-        if suffix != "ply":
-            write_mesh(run.path(f"mesh/mesh.{suffix}"), read_mesh(run.path(WHOLE)), frame)
 
 
 def export_mesh(
     tiles: Tiles,
     settings: MeshSettings,
-    run: RunDirectory,
+    path: Path,
     cloud: Path,
     threads: int | None = None,
 ) -> Made:
-    """Write ``mesh/mesh.ply``, its pieces if there are several, and ``mesh/mesh.mlp``.
+    """Write the surface of a map, its pieces if there are several, and a MeshLab project.
 
     Args:
         tiles: The map; without voxels no space is known to be free.
         settings: Settings of the mesh; ``target_faces`` is the total over all pieces.
-        run: The run.
-        cloud: A PLY file in it, for the MeshLab project.
+        path: The PLY file; pieces go to ``tiles/`` beside it.
+        cloud: A PLY file, for the MeshLab project.
         threads: Pieces made at a time, at most four: each needs memory; None = one per core.
     """
     at_once = min(threads or available_cores(), _MOST_AT_ONCE)
     points = _count(tiles, settings)
-    pieces, warnings = _Mesher(tiles, settings, run, at_once, points).written()
+    pieces, warnings = _Mesher(tiles, settings, path.with_name("tiles"), at_once, points).written()
     if not pieces:
         small = f"no component of {counted(settings.min_component_faces, 'face')}"
         got = "; ".join(warnings) or (small if points else "no point")
         raise MeshingError("no part of the map gives a surface", got=got)
-    whole = run.path(WHOLE)
-    join_meshes(whole, pieces)
+    join_meshes(path, pieces)
     layers = {piece.path.stem: piece.path for piece in pieces}
     if len(pieces) == 1:
         pieces[0].path.unlink()
-        layers = {"mesh": whole}
-    write_mlp(run.path("mesh/mesh.mlp"), {**layers, "cloud": cloud}, "map")
+        layers = {"mesh": path}
+    write_mlp(path.with_suffix(".mlp"), {**layers, "cloud": cloud}, "map")
     vertices, faces = (sum(numbers) for numbers in [*zip(*pieces, strict=True)][1:])
     figures = {"points": points.total(), "vertices": vertices, "faces": faces}
     return Made({**figures, "tiles": len(pieces)}, warnings)
@@ -159,7 +152,7 @@ class _Mesher:
 
     tiles: Tiles
     settings: MeshSettings
-    run: RunDirectory
+    folder: Path
     threads: int
     points: Counter[PieceKey]
     borders: dict[tuple[PieceKey, Plane], Border] = field(default_factory=dict)
@@ -178,7 +171,7 @@ class _Mesher:
                 continue
             mesh = self._joined(key, surface)
             if len(mesh.faces):
-                paths.append(self.run.path(f"mesh/tiles/tile_{key[0]}_{key[1]}.ply"))
+                paths.append(self.folder / f"tile_{key[0]}_{key[1]}.ply")
                 write_mesh(paths[-1], mesh)
         ends = np.cumsum([*map(len, self.sizes)], dtype=np.int64)
         kept = np.split(self._large_enough(), ends)[: len(paths)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -22,9 +23,9 @@ _ROUND_M: Final = 100.0
 
 
 def write_surveyed(
-    order: Order, mesh: TriangleMesh, folder: str, formats: Sequence[str]
+    order: Order, mesh: TriangleMesh, folder: Path, formats: Sequence[str]
 ) -> dict[str, Any]:
-    """Write a mesh, map axes, once more into ``folder`` of the run; return its figures.
+    """Write a mesh, map axes, once more into a folder; return its figures.
 
     Its axes are east, north and up. ``offset.xyz`` has what is to be added to its coordinates:
     hundreds of metres to the east and north; ``mesh.prj`` the coordinate system, if it is known.
@@ -43,10 +44,10 @@ def write_surveyed(
         normals=None if normals is None else normals.astype(np.float32),
     )
     for suffix in dict.fromkeys(formats):
-        write_mesh(order.run.path(f"{folder}/mesh.{suffix}"), moved, "map")
+        write_mesh(folder / f"mesh.{suffix}", moved, "map")
     text = " ".join(f"{metres:.0f}" for metres in offset_m)
-    write_text(order.run.path(f"{folder}/offset.xyz"), f"{text}\n")
+    write_text(folder / "offset.xyz", f"{text}\n")
     if order.crs is not None:
         wkt = check_crs(order.crs).to_wkt("WKT1_ESRI")
-        write_text(order.run.path(f"{folder}/mesh.prj"), f"{wkt}\n")
+        write_text(folder / "mesh.prj", f"{wkt}\n")
     return {"mesh_offset_m": offset_m.tolist()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -24,20 +25,20 @@ from recon.io.models.mlp import Photo, write_mlp
 from recon.map.fusion import fusion_range_m
 from recon.map.sessions.placed import settings_of
 
-_FOLDER: Final = "texture"
 _WITH_TEXTURE: Final = ("glb", "obj", "ply")
 Views = Callable[[], Iterable[PosedImage]]
 """Gives the same images again each time it is called, one in memory at a time."""
 
 
-def texture_product(order: Order) -> Made:
-    """Write ``texture/``: the surface and its picture, and a MeshLab project with the keyframes.
+def texture_product(order: Order, path: Path) -> Made:
+    """Write the surface and its picture, and beside it a MeshLab project with the keyframes.
 
-    The formats are those of the mesh that hold a texture, GLB if there is none.
+    The formats are those of the mesh that hold a texture, GLB if there is none. The surface is that
+    of the folder two levels up, which is made if it is not there.
     """
-    drives, run = open_images(order.map, order.images), order.run
-    made = None if run.path(WHOLE).is_file() else mesh_product(order)
-    mesh = read_mesh(run.path(WHOLE))
+    drives, whole = open_images(order.map, order.images), path.parents[1] / WHOLE
+    made = None if whole.is_file() else mesh_product(order, whole)
+    mesh = read_mesh(whole)
     if len(mesh.faces) > SAMPLE_FACES:
         what, hint = "the mesh is too large for one texture", "--set mesh.target_faces=1000000"
         raise MeshingError(what, got=counted(len(mesh.faces), "face"), hint=hint)
@@ -49,10 +50,10 @@ def texture_product(order: Order) -> Made:
     chosen = [name for name in order.formats if name in _WITH_TEXTURE]
     named = [name for name in chosen if chosen != ["ply"]] or ["glb"]
     for suffix in dict.fromkeys(named):
-        write_mesh(run.path(f"{_FOLDER}/mesh.{suffix}"), textured, "map")
-    photos = [*_photos(order, drives)]
-    write_mlp(run.path(f"{_FOLDER}/mesh.mlp"), {"mesh": run.path(WHOLE)}, "map", photos)
-    there = write_surveyed(order, textured, f"{_FOLDER}/survey", named)
+        write_mesh(path.with_suffix(f".{suffix}"), textured, "map")
+    photos = [*_photos(path.with_name("images"), drives)]
+    write_mlp(path.with_suffix(".mlp"), {"mesh": whole}, "map", photos)
+    there = write_surveyed(order, textured, path.with_name("survey"), named)
     return Made({**figures, **there}, () if made is None else made.warnings)
 
 
@@ -102,12 +103,12 @@ def posed_images(drives: Sequence[DriveImages]) -> Iterator[PosedImage]:
         first += len(drive.placed)
 
 
-def _photos(order: Order, drives: Sequence[DriveImages]) -> Iterator[Photo]:
+def _photos(folder: Path, drives: Sequence[DriveImages]) -> Iterator[Photo]:
     """Write the left images of the keyframes, and yield them."""
     for drive in drives:
         keyframes = {*np.asarray(drive.session.keyframes.frames).tolist()}
         for frame, pair in drive.pairs():
             if frame in keyframes:
-                path = order.run.path(f"{_FOLDER}/images/{drive.file('left', frame)}")
+                path = folder / drive.file("left", frame)
                 write_image(path, drive.rectified(pair)[0])
                 yield Photo(path, drive.session.camera, drive.T_map_camera[frame])

@@ -9,10 +9,15 @@ from zipfile import is_zipfile
 
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.text import parse_number
-from recon.core.values import Rig, StereoCalibration, check_side_by_side, check_size
+from recon.core.values import (
+    Rig,
+    StereoCalibration,
+    check_side_by_side,
+    check_size,
+)
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import INSTEAD, read_opencv_calibration
-from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
+from recon.io.cameras.recon_yaml import MARK, read_recon_calibration, write_recon_calibration
 from recon.io.cameras.ros import in_options, read_camera_info, read_kalibr
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury import read_middlebury_calib
@@ -94,6 +99,18 @@ def read_calibration(
     if size is not None:
         check_size(rig, *size, path)
     return rig
+
+
+def write_calibration(path: StrPath, calibration: Rig) -> None:
+    """Write a calibration in our own YAML, atomically; `read_calibration` reads it back.
+
+    Raises:
+        CalibrationError: It cannot give depth, such as one with left and right swapped.
+        OutputError: The file cannot be written.
+    """
+    if isinstance(calibration, StereoCalibration):
+        check_side_by_side(calibration.T_right_left[:3, 3], path)
+    write_recon_calibration(path, calibration)
 
 
 def _refuse_numbers(text: str) -> None:

@@ -37,8 +37,7 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s
 
 def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
     """Write ``path.pgm``, ``path.wld`` for a GIS and ``path.yaml``, each atomically."""
-    stem = Path(path)
-    image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
+    image = Path(f"{Path(path)}.pgm")
     rows, columns = grid.cells.shape
     with atomic_path(image) as temporary, temporary.open("wb") as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode())
@@ -48,10 +47,7 @@ def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
             for cell, value in _GREY.items():
                 grey[cells == cell] = value
             file.write(grey.tobytes())
-    thresholds = {"occupied_thresh": _OCCUPIED_THRESH, "free_thresh": _FREE_THRESH}
-    described = {"image": image.name, "mode": "trinary", **_placed(stem, grid), **thresholds}
-    write_text(description, yaml.safe_dump(described, sort_keys=False))
-    return image, description
+    return image, _describe(image, "trinary", grid, (_OCCUPIED_THRESH, _FREE_THRESH))
 
 
 def write_nav2_costs(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
@@ -59,8 +55,7 @@ def write_nav2_costs(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
 
     Cells below 0 are unknown: transparent, grey 205 if they are UNKNOWN, else 127.
     """
-    stem = Path(path)
-    image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("png", "yaml"))
+    image = Path(f"{Path(path)}.png")
     cells = grid.cells[::-1].astype(np.int16)
     # Two levels for a unit: Nav2 divides by 255, and rounds to units again.
     grey = np.where(cells < 0, np.where(cells == UNKNOWN, _GREY[UNKNOWN], 127), 255 - 2 * cells)
@@ -69,28 +64,32 @@ def write_nav2_costs(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
     pixels = np.dstack([alpha, grey, grey, grey]).astype(np.uint8)
     write_bytes(image, encode_image(pixels, ".png", image))
     # Just beside 0 and 100, as a cost at a threshold is not beyond it.
-    thresholds = {"occupied_thresh": 2 * OCCUPIED / 255 - 1e-6, "free_thresh": 1e-6}
-    described = {"image": image.name, "mode": "scale", **_placed(stem, grid), **thresholds}
-    write_text(description, yaml.safe_dump(described, sort_keys=False))
-    return image, description
+    return image, _describe(image, "scale", grid, (2 * OCCUPIED / 255 - 1e-6, 1e-6))
 
 
-def _placed(stem: Path, grid: OccupancyGrid) -> dict[str, Any]:
-    """Write ``stem.wld``, and return where the cells are."""
+def _describe(image: Path, mode: str, grid: OccupancyGrid, thresholds: tuple[float, float]) -> Path:
+    """Write YAML, which is returned, and ``.wld`` of an image with the cells of a grid."""
     # Size and turn of a pixel, and the centre of the first one: gdal.org, raster/wld.html.
     side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
     world = (side_m, 0, 0, -side_m, x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
     text = "".join(f"{_shortest(number)}\n" for number in world)
-    write_text(stem.with_name(f"{stem.name}.wld"), text)
-    return {
+    write_text(image.with_suffix(".wld"), text)
+    described = {
+        "image": image.name,
+        "mode": mode,
         "resolution": float(_shortest(grid.resolution_m)),
         "origin": [*(float(_shortest(place)) for place in grid.origin_m), 0.0],
         "negate": 0,
+        "occupied_thresh": thresholds[0],
+        "free_thresh": thresholds[1],
     }
+    description = image.with_suffix(".yaml")
+    write_text(description, yaml.safe_dump(described, sort_keys=False))
+    return description
 
 
 @reader
-def read_nav2(path: StrPath) -> OccupancyGrid:
+def read_grid(path: StrPath) -> OccupancyGrid:
     """Read a map, given by its YAML file, as Nav2 does in mode ``trinary``."""
     path = Path(path)
     fields = _fields(path)

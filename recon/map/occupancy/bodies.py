@@ -14,7 +14,7 @@ Ref: P. A. P. Moran, "The interpretation of statistical maps", J. R. Statist. So
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import product
 from typing import Final, NamedTuple
@@ -171,13 +171,17 @@ class Looks:
     """The frames of all drives of a map, in order, taken at ``T_map_camera`` (F, 4, 4).
 
     ``rays`` gives the kept rays of a frame by its number here, ``settings`` how they become
-    occupancy.
+    occupancy; ``frames`` are drive and frame of each, where they are asked for.
     """
 
     def __init__(
-        self, settings: OccupancySettings, T_map_camera: Float64, rays: Callable[[int], RayCloud]
+        self,
+        settings: OccupancySettings,
+        T_map_camera: Float64,
+        rays: Callable[[int], RayCloud],
+        frames: Sequence[tuple[int, int]] = (),
     ) -> None:
-        self.settings, self.T_map_camera = settings, T_map_camera
+        self.settings, self.T_map_camera, self.frames = settings, T_map_camera, frames
         self._read = lru_cache(_KEPT_FRAMES)(rays)
 
     def at(self, keys: Int64) -> Iterator[Int8]:
@@ -185,21 +189,21 @@ class Looks:
 
         1 where it hit something, -1 where it looked through, 0 where it saw neither.
         """
-        return (look for _, look in self.from_poses(keys))
+        return (look for _, look in self.by_frame(keys))
 
-    def from_poses(self, keys: Int64) -> Iterator[tuple[Float64, Int8]]:
-        """Yield the same as `at`, after the ``T_map_camera`` of each frame."""
+    def by_frame(self, keys: Int64) -> Iterator[tuple[int, Int8]]:
+        """Yield the same as `at`, after the number of each frame here."""
         cells = unpack_keys(keys).astype(np.int64)
         centres = (cells + 0.5) * self.settings.resolution_m
         reach_m = self.settings.max_range_m + self.settings.resolution_m
-        for frame in self._near(centres.min(axis=0), centres.max(axis=0), reach_m):
+        for frame in self._near(centres.min(axis=0), centres.max(axis=0), reach_m).tolist():
             T = self.T_map_camera[frame]
             ahead = apply(invert(T), centres)
             seen = (ahead[:, 2] > 0) & (np.linalg.norm(ahead, axis=1) < reach_m)
             if seen.any():
-                cloud = self._read(int(frame)).cloud()
+                cloud = self._read(frame).cloud()
                 chosen = _towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
-                yield T, self._cast(cloud.select(chosen), T, cells)
+                yield frame, self._cast(cloud.select(chosen), T, cells)
 
     @cached_property
     def finest(self) -> Looks:

@@ -102,7 +102,8 @@ def find_moved(
     if moved.any():
         free = keys[moved]
         reaches = Reaches(free, voxels.resolution_m, looks.disagreement)
-        seen = reaches.noting(looks.from_poses(free))
+        frames = looks.by_frame(free)
+        seen = reaches.noting((looks.T_map_camera[frame], look) for frame, look in frames)
         body = came_or_went(free, _among(home, counted & placed)[moved], seen)
         moved[moved], by_error = body, reaches.cells[body]
         for sigmas in _SIGMAS:

@@ -204,7 +204,8 @@ def _looks(map_: MapFile, settings: DriveSettings) -> Looks | None:
         session, frame = seen[number]
         return session.rays(frame)[0]
 
-    return Looks(settings.occupancy, np.concatenate(poses), rays)
+    names = [(session.number, frame) for session, frame in seen]
+    return Looks(settings.occupancy, np.concatenate(poses), rays, names)
 
 
 def _no_evidence(map_: MapFile, session: Session) -> frozenset[int]:

@@ -44,7 +44,7 @@ from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
 from recon.io.models.geotiff import RasterPlace, write_geotiff
 from recon.io.models.las import check_crs, check_inside, write_las
-from recon.io.models.nav2 import read_nav2, write_nav2, write_nav2_costs
+from recon.io.models.nav2 import read_grid, write_nav2, write_nav2_costs
 from recon.io.models.npz import write_npz
 from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
 from recon.io.models.pcd import write_pcd
@@ -399,7 +399,7 @@ GRID = OccupancyGrid(CELLS, 0.2, (-3.4, 1.25))
 def test_a_grid_is_written_as_nav2_and_a_gis_ask_and_read_back(tmp_path):
     image, description = write_nav2(tmp_path / "map" / "grid", GRID)
     assert (image.name, description.name) == ("grid.pgm", "grid.yaml")
-    back = read_nav2(description)
+    back = read_grid(description)
     np.testing.assert_array_equal(back.cells, GRID.cells)
     assert (back.resolution_m, back.origin_m) == (GRID.resolution_m, GRID.origin_m)
     # The first row of the image has the largest y.
@@ -465,12 +465,12 @@ def test_negated_maps_are_read_and_the_origin_is_written_as_it_is_meant(tmp_path
     fields = {"image": "a.pgm", "resolution": 0.5, "origin": [0, 0, 0], "negate": 1}
     fields |= {"occupied_thresh": 0.65, "free_thresh": 0.196}
     (tmp_path / "a.yaml").write_text(yaml.safe_dump(fields))
-    assert read_nav2(tmp_path / "a.yaml").cells.tolist() == [[OCCUPIED, FREE]]
+    assert read_grid(tmp_path / "a.yaml").cells.tolist() == [[OCCUPIED, FREE]]
     origin_m = (-646 * 0.1, 3 * 0.1)
     assert origin_m == (-64.60000000000001, 0.30000000000000004)
     _, path = write_nav2(tmp_path / "grid", OccupancyGrid(np.zeros((2, 2), np.int8), 0.1, origin_m))
     assert "-64.6\n" in path.read_text()
-    assert read_nav2(path).origin_m == (-64.6, 0.3)
+    assert read_grid(path).origin_m == (-64.6, 0.3)
 
 
 def random_voxels(seed: int, reach: int, number: int) -> OccupancyVoxels:

@@ -1,8 +1,12 @@
-"""What values show of themselves, by rooms above that are imported when they are asked."""
+"""What values show of themselves, by rooms above, which `recon` names when it is imported."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Final
+
+SHOWN_BY: Final[dict[str, Callable[[Any], Any]]] = {}
+"""What makes each view of a value."""
 
 
 class Shown:
@@ -10,14 +14,10 @@ class Shown:
 
     def plot(self) -> Any:
         """Return a matplotlib figure of it; nothing is shown or written by this."""
-        from recon.report import notebook  # noqa: PLC0415
-
-        return notebook.plot(self)
+        return SHOWN_BY["plot"](self)
 
     def _repr_html_(self) -> str:
-        from recon.report import notebook  # noqa: PLC0415
-
-        return notebook.html(self)
+        return str(SHOWN_BY["html"](self))
 
 
 class Shape(Shown):
@@ -25,6 +25,4 @@ class Shape(Shown):
 
     def to_open3d(self) -> Any:
         """Return a copy as Open3D's legacy geometry, with colours and normals if it has them."""
-        from recon.io.models import open3d_meshes  # noqa: PLC0415
-
-        return open3d_meshes.to_open3d(self)
+        return SHOWN_BY["to_open3d"](self)
