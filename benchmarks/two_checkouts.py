@@ -76,7 +76,31 @@ def run(checkout: Path, drive: Path) -> dict[str, float]:
         "run_folder_mb": size / 1e6,
         "config_lines": config_lines,
         "help_processor_s": call([*program, "--help"], checkout),
+        **first_frame(drive, checkout),
     }
+
+
+def first_frame(drive: Path, checkout: Path) -> dict[str, float]:
+    """Seconds, and those of a processor, until a drive has its first frame mapped."""
+    with tempfile.TemporaryDirectory() as folder:
+        map_drive = [sys.executable, "-m", "recon", "map", str(drive.resolve())]
+        environment = {**os.environ, "PYTHONPATH": str(checkout)}
+        start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        with subprocess.Popen(
+            [*map_drive, "--out", str(Path(folder) / "run"), "--json", "--verbose"],
+            cwd=checkout,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        ) as process:
+            for line in process.stdout or ():
+                if line.startswith(b'{"event": "frame"'):
+                    break
+            seconds = time.perf_counter() - start
+            process.kill()
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"first_frame_s": seconds, "first_frame_processor_s": used_s}
 
 
 def call(command: Sequence[str], checkout: Path) -> float:
