@@ -170,13 +170,13 @@ def run_live(
 
 
 class _Beginning(DerivedSource):
-    """The first two seconds of a source, read once: a camera takes them not again."""
+    """The first two seconds of a recording; of cameras, which take no pair again, a few pairs."""
 
     def __init__(self, source: StereoSource) -> None:
         super().__init__(source)
         self._pairs = list[Recorded]()
         begun_s = None
-        for pair in islice(source.frames(), _MOST):
+        for pair in islice(source.frames(), _FIRST if source.live else _MOST):
             self._pairs.append(replace(pair, timestamp_s=len(self._pairs) * _PACE_S))
             begun_s = pair.timestamp_s if begun_s is None else begun_s
             if len(self._pairs) >= _FIRST and pair.timestamp_s - begun_s >= _LOOK_S:

@@ -32,7 +32,7 @@ from recon.map.store.records import Store
 from recon.report.style import GRID_ERRORS, GRID_NOT_COUNTED
 from recon.run.batch.cluster import BatchOptions, Cluster
 from recon.sources.one_pair import PairInput
-from recon.stereo import frame
+from recon.stereo import observe
 from tests.flow.runs import summary_of
 from tests.hostile.refusals import assert_refused, run
 
@@ -45,7 +45,7 @@ def assert_equal(one: Path, other: Path, *names: str) -> None:
 
 
 def test_all_products_come_in_one_go_and_nothing_is_matched(small_demo, tmp_path, monkeypatch):
-    monkeypatch.delattr(frame, "make_matcher")
+    monkeypatch.delattr(observe, "make_matcher")
     config = run_settings(small_demo, None, ["mesh.depth=5", "mesh.min_component_faces=10"])
     summary = run_export(small_demo, config, formats=("ply", "glb"), out=tmp_path / "out")
     assert_equal(tmp_path / "out", small_demo, "map/cloud.ply", *MAPS)

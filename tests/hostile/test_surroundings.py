@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import pytest
 
 import recon
@@ -19,7 +20,9 @@ from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, MemoryLimitError
+from recon.core.values import PointCloud
 from recon.io.files import reading
+from recon.io.models.ply import write_ply
 from recon.map.store.records import Store
 from recon.run.run import Run
 from recon.stereo.match import registry
@@ -261,6 +264,7 @@ def test_a_command_names_the_package_that_it_lacks(command, here):
         f"sys.argv = ['recon', *{words!r}]; main()"
     )
     (here / "drive").mkdir()
+    write_ply(here / "cloud.ply", PointCloud(np.random.default_rng(0).random((200, 3))))
     done = subprocess.run([sys.executable, "-c", lacking], capture_output=True, check=False)
     assert_refused(Ended(done.returncode, done.stdout.decode(), done.stderr.decode()), package)
 
