@@ -63,7 +63,7 @@ class Window(NamedTuple):
 def plan_windows(frames: int, effort: Effort) -> list[Window]:
     """Return the windows of a look at a drive, around its tracked parts; of a short one, all."""
     parts = tracked_parts(frames)
-    if effort.whole and frames > REACH:
+    if effort.whole and frames - REACH >= effort.frames // 2:
         after = np.linspace(REACH, frames, 2 * len(parts) + 1)[1::2].astype(int).tolist()
         parts += [(middle, middle) for middle in after]
     if frames <= effort.frames:

@@ -264,7 +264,7 @@ def test_a_command_names_the_package_that_it_lacks(command, here):
         f"sys.argv = ['recon', *{words!r}]; main()"
     )
     (here / "drive").mkdir()
-    write_ply(here / "cloud.ply", PointCloud(np.random.default_rng(0).random((200, 3))))
+    write_ply(here / "cloud.ply", PointCloud(np.random.default_rng(0).random((200, 3), np.float32)))
     done = subprocess.run([sys.executable, "-c", lacking], capture_output=True, check=False)
     assert_refused(Ended(done.returncode, done.stdout.decode(), done.stderr.decode()), package)
 
