@@ -143,8 +143,8 @@ def test_a_turn_that_only_motion_shows_is_mended(
 @pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
 def test_planted_faults_alone_are_found_on_real_drives(recon_data, tmp_path, drive):
     source = open_source(recon_data / "driven" / drive)
-    assert codes(source) == {"rig"}  # lenses of KITTI: 0.6 px over the image
-    assert codes(source, quick=True) == set()
+    # Lenses of KITTI: 0.6 px over the image. A quick look tracks the same windows.
+    assert codes(source) == codes(source, quick=True) == {"rig"}
     for code, plant in faults.FAULTS.values():
         assert code in codes(plant(source))
     assert_aligned(faults.turned(source, pitch_deg=0.3), tmp_path)
