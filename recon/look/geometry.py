@@ -124,13 +124,16 @@ class Rigidity:
 
     frames: tuple[int, ...]
     rows_px: Float64  # (N,), mean of the features of each pair
+    # (N,), median of what is left when the rotation that all pairs show is taken away: with a roll
+    # alone, rows depend on where features are
+    apart_px: Float64
 
     @property
     def spread_px(self) -> float:
         """Robust standard deviation; 0 where too few pairs show it."""
         if len(self.frames) < _LEAST_PAIRS:
             return 0.0
-        return _SIGMAS * float(np.median(np.abs(self.rows_px - np.median(self.rows_px))))
+        return _SIGMAS * float(np.median(np.abs(self.apart_px - np.median(self.apart_px))))
 
     @property
     def kept(self) -> bool:
@@ -147,12 +150,22 @@ class Rigidity:
         )
 
 
-def measure_rigidity(sample: Sample, camera: RectifiedCamera) -> Rigidity:
-    """Measure the epipolar error of each pair of which most features agree on one."""
-    found: dict[int, float] = {}
+def measure_rigidity(
+    sample: Sample, camera: RectifiedCamera, common: RowAlignment | None
+) -> Rigidity:
+    """Measure the epipolar error of each pair of which most features agree on one.
+
+    ``common`` is the rotation that all pairs together show, None = none.
+    """
+    found: dict[int, tuple[float, float]] = {}
     for one in sample.pairs:
         seen = one.features
         aligned = align_rows(seen.left_uv, seen.right_uv, camera)
         if aligned is not None and 2 * aligned.agreeing > len(seen):
-            found[one.index] = aligned.mean_px
-    return Rigidity(tuple(found), np.array([*found.values()]))
+            right = (
+                seen.right_uv[:, 1] if common is None else common.turned_rows(seen.right_uv, camera)
+            )
+            left_px = float(np.median(right - seen.left_uv[:, 1]))
+            found[one.index] = (aligned.mean_px, left_px)
+    rows_px, apart_px = np.array([*found.values()]).reshape(-1, 2).T
+    return Rigidity(tuple(found), rows_px, apart_px)

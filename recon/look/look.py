@@ -136,7 +136,9 @@ def _looked(
         tracking = FrameReconstructor(used, config)
     how = _Reading(rectifier, tracking, effort, shared=used is given)
     sample, tracks = _read(source, windows, how)
-    found = replace(begun, rigidity=measure_rigidity(sample, rectifier.camera))
+    geometry = measure_geometry(sample, rectifier.camera)
+    rigidity = measure_rigidity(sample, rectifier.camera, geometry.alignment)
+    found = replace(begun, rigidity=rigidity)
     if tracking is not None and sample.broken is None and not found.not_rigid:
 
         def again(other: Rig) -> list[StereoTracks]:
@@ -145,7 +147,6 @@ def _looked(
         found = refine(found, Tracked(tracks, used, turn, again), config, known)
         if not rig.refine:
             found = replace(found, calibration=given)
-    geometry = measure_geometry(sample, rectifier.camera)
     return Look(source, rectifier.camera, sample, geometry, found, gaps)
 
 

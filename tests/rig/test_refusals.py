@@ -124,7 +124,7 @@ def test_cameras_that_move_against_each_other_are_found_and_keep_their_calibrati
 def test_a_rig_that_is_only_turned_or_one_odd_pair_is_rigid(street, fault):
     plant = {
         "none": lambda s: s,
-        "a turn": lambda s: faults.turned(s, pitch_deg=0.6, roll_deg=0.5),
+        "a turn": lambda s: faults.turned(s, pitch_deg=0.6, roll_deg=1.5),
         "one wrong pair": lambda s: loose(s, (0,) * (FRAMES - 1) + (20,)),
     }[fault]
     found = look_at(plant(street), CONFIG).rig.rigidity
@@ -134,8 +134,10 @@ def test_a_rig_that_is_only_turned_or_one_odd_pair_is_rigid(street, fault):
 
 
 def test_too_few_pairs_say_nothing_of_the_rig():
-    assert Rigidity((0, 9), np.array([-9.0, 9.0])).kept
-    assert not Rigidity((0, 5, 9), np.array([-9.0, 0.0, 9.0])).kept
+    rows_px = np.array([-9.0, 0.0, 9.0])
+    assert Rigidity((0, 9), rows_px[::2], rows_px[::2]).kept
+    assert not Rigidity((0, 5, 9), rows_px, rows_px).kept
+    assert Rigidity((0, 5, 9), rows_px, 0 * rows_px).kept
 
 
 def test_a_drive_of_two_drives_is_refused_and_one_in_the_dark_is_not_for_that(street, tmp_path):
