@@ -22,7 +22,7 @@ from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.geometry import Geometry, measure_geometry, measure_rigidity
 from recon.look.measures import Gaps, align_features, find_gaps
 from recon.look.rig import LEAST_FRAMES, KnownRig, RefinedRig, Tracked, refine, turned_to_meet
-from recon.look.sample import QUICK, THOROUGH, Effort, Sample, Sampler, Window, choose, plan_windows
+from recon.look.sample import QUICK, THOROUGH, Extent, Sample, Sampler, Window, choose, plan_windows
 from recon.look.tracks import StereoTracks, Tracking
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource, check_source
@@ -83,7 +83,7 @@ def look_at(
     rig: RigSettings | None = None,
     *,
     known: KnownRig | None = None,
-    effort: Effort = QUICK,
+    extent: Extent = QUICK,
 ) -> Look:
     """Look at a drive before it is mapped, localized or audited.
 
@@ -96,7 +96,7 @@ def look_at(
         rig: Whether the rig that the motion shows is used. Drives of less than 36 frames, and those
             whose cameras move against each other, show none. None = it is.
         known: What an earlier drive of the rig showed of it.
-        effort: How many frames are read. An audit reads more, but tracks the same.
+        extent: How many frames are read. An audit reads more, but tracks the same.
 
     Raises:
         ReconError: The calibration cannot rectify. An image that cannot be read ends the look, and
@@ -104,15 +104,15 @@ def look_at(
     """
     check_source(source)
     looked = partial(_looked, config=config, rig=rig or RigSettings(), known=known)
-    found = looked(source, effort=effort)
-    if found.geometry.out_of_step and effort is QUICK:
+    found = looked(source, extent=extent)
+    if found.geometry.out_of_step and extent is QUICK:
         # A few pairs do not tell whole frames from half a frame, or chance.
-        found = looked(source, effort=THOROUGH)
+        found = looked(source, extent=THOROUGH)
     lag = found.geometry.lag
     shifted = source.shifted(lag) if lag else None
     if shifted is None:
         return found
-    again = looked(shifted, effort=effort)
+    again = looked(shifted, extent=extent)
     return found if again.geometry.out_of_step else replace(again, shifted=lag)
 
 
@@ -122,19 +122,19 @@ def _looked(
     config: StereoSettings,
     rig: RigSettings,
     known: KnownRig | None,
-    effort: Effort,
+    extent: Extent,
 ) -> Look:
     given, known = source.calibration, known if rig.refine else None
     rectifier, gaps = Rectifier(given, config.rectification), find_gaps(source)
     begun = RefinedRig(given, given, rectifier.camera, period_s=gaps.usual_s)
     if known is not None:
         begun = replace(known.begun(config.rectification), period_s=gaps.usual_s)
-    windows = [] if source.live else plan_windows(len(source), effort)
+    windows = [] if source.live else plan_windows(len(source), extent)
     used, turn, tracking = begun.calibration, np.zeros(0), None
     if windows and source.stereo and len(source) >= LEAST_FRAMES:
         used, turn = _rows_met(source, used, config, windows)
         tracking = FrameReconstructor(used, config)
-    how = _Reading(rectifier, tracking, effort, shared=used is given)
+    how = _Reading(rectifier, tracking, extent, shared=used is given)
     sample, tracks = _read(source, windows, how)
     geometry = measure_geometry(sample, rectifier.camera)
     rigidity = measure_rigidity(sample, rectifier.camera, geometry.alignment)
@@ -175,7 +175,7 @@ class _Reading:
 
     rectifier: Rectifier  # by the calibration given
     tracking: FrameReconstructor | None  # with the rig that is to be refined
-    effort: Effort
+    extent: Extent
     shared: bool  # whether both rectify alike
 
 
@@ -183,10 +183,10 @@ def _read(
     source: StereoSource, windows: Sequence[Window], how: _Reading
 ) -> tuple[Sample, list[StereoTracks]]:
     """Read windows, side by side in threads: measure their pairs, and track features."""
-    chosen = choose(windows, how.effort)
+    chosen = choose(windows, how.extent)
 
     def read(window: Window) -> tuple[Sample, list[StereoTracks]]:
-        sampler = Sampler(window, how.rectifier, how.effort, chosen)
+        sampler = Sampler(window, how.rectifier, how.extent, chosen)
         tracking = None if how.tracking is None else Tracking(how.tracking)
         try:
             for number, pair in _pairs(source, window.start, window.stop):

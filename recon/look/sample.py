@@ -34,7 +34,7 @@ BLANK_DN: Final = 4.0  # an image counts as blank below this standard deviation,
 
 
 @dataclass(frozen=True)
-class Effort:
+class Extent:
     """How much of a drive is looked at."""
 
     frames: int  # that are read in all
@@ -46,9 +46,9 @@ class Effort:
     whole: bool  # whether a drive is looked at that is longer than what is tracked
 
 
-QUICK: Final = Effort(TRACKED, pairs=6, features=800, lag=3, lag_pairs=2, margin=2, whole=False)
+QUICK: Final = Extent(TRACKED, pairs=6, features=800, lag=3, lag_pairs=2, margin=2, whole=False)
 # In a short window, several pairs with a few lags are better than one pair with all.
-THOROUGH: Final = Effort(300, pairs=12, features=1500, lag=4, lag_pairs=4, margin=3, whole=True)
+THOROUGH: Final = Extent(300, pairs=12, features=1500, lag=4, lag_pairs=4, margin=3, whole=True)
 
 
 class Window(NamedTuple):
@@ -60,21 +60,21 @@ class Window(NamedTuple):
     centres: tuple[int, ...]  # frames in which features are matched
 
 
-def plan_windows(frames: int, effort: Effort) -> list[Window]:
+def plan_windows(frames: int, extent: Extent) -> list[Window]:
     """Return the windows of a look at a drive, around its tracked parts; of a short one, all."""
     parts = tracked_parts(frames)
-    if effort.whole and frames - REACH >= effort.frames // 2:
+    if extent.whole and frames - REACH >= extent.frames // 2:
         after = np.linspace(REACH, frames, 2 * len(parts) + 1)[1::2].astype(int).tolist()
         parts += [(middle, middle) for middle in after]
-    if frames <= effort.frames:
+    if frames <= extent.frames:
         spans = list(pairwise([0, *(sum(at) // 2 for at in _between(parts)), frames]))
     else:
-        half = effort.frames // len(parts) // 2
+        half = extent.frames // len(parts) // 2
         starts = [min(max(0, sum(part) // 2 - half), frames - 2 * half) for part in parts]
         spans = [(start, start + 2 * half) for start in starts]
-    many = max(1, effort.pairs // len(parts))
+    many = max(1, extent.pairs // len(parts))
     return [
-        Window(start, stop, part, _centres(start, stop, many, effort))
+        Window(start, stop, part, _centres(start, stop, many, extent))
         for (start, stop), part in zip(spans, parts, strict=True)
     ]
 
@@ -84,15 +84,15 @@ def _between(parts: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return [(before[1], after[0]) for before, after in pairwise(parts)]
 
 
-def _centres(start: int, stop: int, many: int, effort: Effort) -> tuple[int, ...]:
+def _centres(start: int, stop: int, many: int, extent: Extent) -> tuple[int, ...]:
     """Return frames, evenly spread, with a margin for the lags."""
-    margin = min(effort.lag, (stop - start - 1) // effort.margin)
+    margin = min(extent.lag, (stop - start - 1) // extent.margin)
     places = np.rint(np.linspace(start + margin, stop - 1 - margin, many)).astype(int)
     return tuple(np.unique(places).tolist())
 
 
 class Lagged(NamedTuple):
-    """A pair at a lag: its matched features, their `Inspected.flow`, how many agree on a turn."""
+    """A pair at a lag: its matched features, their flow, how many agree on one rotation."""
 
     features: PairFeatures
     flow: Float64
@@ -100,7 +100,7 @@ class Lagged(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Inspected:
+class PairMeasures:
     """What was measured in one pair."""
 
     index: int  # number of the pair
@@ -130,7 +130,7 @@ class Sample:
 
     frames: int = 0  # number of pairs that were read
     repeats: RepeatCounter = field(default_factory=RepeatCounter)
-    pairs: list[Inspected] = field(default_factory=list)
+    pairs: list[PairMeasures] = field(default_factory=list)
     recorded: list[Recorded] = field(default_factory=list)  # a few pairs, as recorded
     broken: ReconError | None = None  # the error that ended the sampling, if any
 
@@ -187,11 +187,11 @@ class Chosen(NamedTuple):
     lagged: Container[int]  # that are compared at other lags, if need be
 
 
-def choose(windows: Sequence[Window], effort: Effort) -> Chosen:
+def choose(windows: Sequence[Window], extent: Extent) -> Chosen:
     """Choose centres of a look, evenly spread."""
     all_ = [centre for window in windows for centre in window.centres]
     shown = {all_[n] for n in (0, len(all_) // 2, -1)} if all_ else set()
-    kept, lagged = (set(all_[:: max(1, len(all_) // n)]) for n in (_KEPT, effort.lag_pairs))
+    kept, lagged = (set(all_[:: max(1, len(all_) // n)]) for n in (_KEPT, extent.lag_pairs))
     return Chosen(shown, kept, lagged)
 
 
@@ -199,10 +199,10 @@ class Sampler:
     """Measures the pairs of one window, given in order."""
 
     def __init__(
-        self, window: Window, rectifier: Rectifier, effort: Effort, chosen: Chosen
+        self, window: Window, rectifier: Rectifier, extent: Extent, chosen: Chosen
     ) -> None:
         self.sample = Sample()
-        self._window, self._rectifier, self._effort = window, rectifier, effort
+        self._window, self._rectifier, self._effort = window, rectifier, extent
         self._chosen = chosen
         self._waiting = list(window.centres)
         self._recent: dict[int, RectifiedPair] = {}
@@ -233,7 +233,7 @@ class Sampler:
     def _measure(self, centre: int) -> None:
         pair = self._recent[centre]
         sides = (pair.left, pair.right)
-        seen = Inspected(
+        seen = PairMeasures(
             index=centre,
             contrast_dn=(float(pair.left.std()), float(pair.right.std())),
             brightness_dn=(float(pair.left.mean()), float(pair.right.mean())),

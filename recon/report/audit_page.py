@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.core.text import counted
 from recon.core.values import RectifiedPair
-from recon.look.sample import Inspected
+from recon.look.sample import PairMeasures
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import disparity_figure, is_wide, pair_figure
@@ -42,7 +42,7 @@ def write_audit_page(
     )
 
 
-def _pair(look: Inspected, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
+def _pair(look: PairMeasures, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
     disparity = matcher.match(pair)
     return {
         "index": look.index,
@@ -55,7 +55,7 @@ def _pair(look: Inspected, pair: RectifiedPair, matcher: Matcher) -> dict[str, A
 
 
 @style.styled
-def rows_figure(look: Inspected, pair: RectifiedPair) -> bytes:
+def rows_figure(look: PairMeasures, pair: RectifiedPair) -> bytes:
     """Draw the left image with the row error of each feature."""
     height, width = pair.left.shape
     size_in = style.WIDE_IN if is_wide(pair.left.shape) else style.WIDE_IN / 2
@@ -74,7 +74,7 @@ def rows_figure(look: Inspected, pair: RectifiedPair) -> bytes:
 
 
 @style.styled
-def frames_figure(looks: Sequence[Inspected]) -> bytes:
+def frames_figure(looks: Sequence[PairMeasures]) -> bytes:
     """Draw brightness, sharpness and row error of the measured pairs."""
     labels = ("mean grey level", "sharpness (0 to 1)", "row error (px)\nmedian, middle half")
     figure, (brightness, sharpness, rows) = style.stacked(6.4, "frame", labels)

@@ -17,7 +17,7 @@ from recon.core.values.camera import depth_sigma
 from recon.look.findings import Finding, Verdict, find_faults, verdict_of
 from recon.look.look import Look, look_at
 from recon.look.rig import RefinedRig
-from recon.look.sample import QUICK, THOROUGH, Inspected
+from recon.look.sample import QUICK, THOROUGH, PairMeasures
 from recon.look.settings import AuditedSettings
 from recon.rig.written import form_of, nearest_of_kalibr, write_rig
 from recon.sources.one_pair import OnePair, PairInput
@@ -60,7 +60,7 @@ class Audit:
     figures: dict[str, Any]
     alignment: RowAlignment | None
     rig: RefinedRig
-    pairs: tuple[Inspected, ...] = ()
+    pairs: tuple[PairMeasures, ...] = ()
     corrected: dict[str, Any] | None = None
 
     def __repr__(self) -> str:
@@ -82,7 +82,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     """Check a drive before a long run; ``quick``: as much as `recon map` looks at."""
     check_source(source, stereo=True)
     stage("audit")
-    return audit_of(look_at(source, config, effort=QUICK if quick else THOROUGH), config)
+    return audit_of(look_at(source, config, extent=QUICK if quick else THOROUGH), config)
 
 
 def audit_of(look: Look, config: AuditedSettings) -> Audit:

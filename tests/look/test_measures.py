@@ -151,18 +151,18 @@ def test_repeats_are_counted_apart_from_frozen_cameras_and_the_worst_finding_dec
     assert verdict_of([small, large, small]) == "not usable"
 
 
-@given(frames=st.integers(1, 5000), effort=st.sampled_from([QUICK, THOROUGH]))
-def test_what_is_looked_at_lies_within_the_drive(frames, effort):
-    windows = plan_windows(frames, effort)
+@given(frames=st.integers(1, 5000), extent=st.sampled_from([QUICK, THOROUGH]))
+def test_what_is_looked_at_lies_within_the_drive(frames, extent):
+    windows = plan_windows(frames, extent)
     assert windows[0].start >= 0
     assert windows[-1].stop <= frames
     assert all(before.stop <= after.start for before, after in pairwise(windows))
-    assert sum(window.stop - window.start for window in windows) <= effort.frames
+    assert sum(window.stop - window.start for window in windows) <= extent.frames
     for window in windows:
         assert window.centres
         assert all(window.start <= centre < window.stop for centre in window.centres)
         assert window.start <= window.tracked[0] <= window.tracked[1] <= window.stop
-    if effort is QUICK:  # a video is decoded up to each of them
+    if extent is QUICK:  # a video is decoded up to each of them
         assert windows[-1].stop <= REACH
     tracked = [window.tracked for window in plan_windows(frames, QUICK)]
     assert [window.tracked for window in windows][: len(tracked)] == tracked
