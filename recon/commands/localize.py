@@ -83,7 +83,7 @@ def run_localize(
             *drive.warnings(),
             *source.warnings(),
         ]
-        warnings = [*before.first, *map_.doubts, *seen]
+        warnings = [*before.look.first, *map_.doubts, *seen]
         made.summary["warnings"], made.summary["rig"] = warnings, rig.figures()
         made.summary.update(source.figures())
         with run.stage("write"):

@@ -132,7 +132,7 @@ def run_map(
         mapped = map_drive(source, config, options, run, map_)
         rig = _shown_live(mapped, source, config, run) if source.live else found
         with run.stage("cloud"):
-            check_map(mapped, source.name, (*seen.first, *findings))
+            check_map(mapped, source.name, (*seen.look.first, *findings))
         order = Order(map_, mapped.placed, config.mesh, threads=run.threads)
         made = make(order, run.content, options.products, run.watch)
         with run.stage("compare"):
@@ -145,7 +145,7 @@ def run_map(
         breaks = break_warnings(mapped)
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
         known = [*first, *breaks, *findings]
-        warnings = [*seen.first, *known, *doubts, *made.warnings, *errors.warnings]
+        warnings = [*seen.look.first, *known, *doubts, *made.warnings, *errors.warnings]
         result = MapRun(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         result.summary["typical_depth_m"] = scene.depth_m
@@ -202,11 +202,6 @@ class Seen:
     look: Look
     rig: RefinedRig  # with the baseline that measured lengths show, if there are any
     findings: tuple[str, ...]  # what is wrong with the recording
-
-    @property
-    def first(self) -> tuple[str, ...]:
-        """What to know first of all; else empty."""
-        return self.look.first
 
     @property
     def drive(self) -> StereoSource:

@@ -110,7 +110,7 @@ def run_map_into(
             images = options.images_of(seen.look.source)
             drive.begin(session_info(seen.look.source, drive_settings, images))
             mapped = map_drive(seen.drive, drive_settings, options, run, drive)
-            check_map(mapped, source.name, seen.first)
+            check_map(mapped, source.name, seen.look.first)
             if settings.rig.refine:
                 mapped.session.set_rig(rig)
             keep_map(drive, kept)
