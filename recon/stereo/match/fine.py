@@ -15,7 +15,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
-import cv2
 import numpy as np
 
 from recon.core.values import Disparity, Reason, RectifiedPair
@@ -36,7 +35,7 @@ from recon.stereo.kernels.similarity import Blend, add_unlikeness
 from recon.stereo.match import search as common
 from recon.stereo.match import sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network, rows_at_once
-from recon.stereo.match.fill import outside, spread
+from recon.stereo.match.fill import outside
 from recon.stereo.match.plane_search import search_planes
 from recon.stereo.match.segments import SAME_SURFACE_PX
 
@@ -62,22 +61,20 @@ _BLEND: Final = Blend(
     top=float(int(_LARGEST * _LEVELS)),
 )
 # Fitted on MiddEval3 at quarter and half size: of what planes and paths agree on, at least and by
-# the square of the confidence of the paths, and of what only planes explain.
+# the square of the confidence of the paths.
 _AGREED_CONFIDENCE: Final = (0.53, 0.46)
-_FILLED_CONFIDENCE: Final = np.float32(0.43)
-_SHADOW_PX: Final = 5  # what is hidden fills the larger part of such a square
 _VOLUME_BYTES: Final = 448 << 20  # at most; larger images are matched in strips of rows
 _OVERLAP_ROWS: Final = 64  # of strips
 
 
-class FineSettings(common.MeasuredSettings):
+class FineSettings(common.MeasuredSettings, common.FillableSettings):
     """Settings of the fine matcher."""
 
 
 class FineMatcher:
     """Matches for quality, in seconds per megapixel; a `Matcher`.
 
-    Pixels that only planes around them explain are FILLED. ``threads`` (None = all cores) has no
+    A pixel is matched where paths and planes agree on it. ``threads`` (None = all cores) has no
     effect on the result.
     """
 
@@ -183,31 +180,21 @@ def _rows(pair: RectifiedPair, start: int, end: int) -> RectifiedPair:
 def _judged(pair: RectifiedPair, seen: Disparity, values: Float32, beyond: Bool) -> Disparity:
     """Return the disparity with reasons, confidence and uncertainty.
 
-    That a plane and what was seen agree makes both more probable than either. A disparity that
-    only planes explain may as well be that of any surface around it. What planes lead to ``beyond``
-    the range is not found.
+    That a plane and what was seen agree makes both more probable than either. What planes alone
+    lead to is not measured: it keeps the reason why nothing was found, or is AMBIGUOUS where a
+    plane contradicts what was.
     """
-    hidden = np.empty(values.shape, np.bool_)
-    kernels.mark_hidden(values, SAME_SURFACE_PX, 0, len(values), hidden)
-    border = outside(values)
-    if pair.valid is not None:
-        border |= ~pair.valid
     with np.errstate(invalid="ignore"):
         agree = seen.valid & (np.abs(values - seen.values) <= SAME_SURFACE_PX)
-    # What both views agree on is not hidden, though a plane beside it may reach too far.
-    shadow = (seen.reason == np.uint8(Reason.OCCLUDED)).astype(np.uint8)
-    # Single pixels are noise, of what is plain.
-    hidden = (hidden | (cv2.medianBlur(shadow, _SHADOW_PX) > 0)) & ~agree
-    reason = np.where(agree, np.uint8(Reason.VALID), np.uint8(Reason.FILLED))
-    reason[beyond], reason[hidden] = np.uint8(Reason.OUT_OF_RANGE), np.uint8(Reason.OCCLUDED)
-    reason[border] = np.uint8(Reason.BORDER)
+    agree &= ~(beyond | outside(values))
+    if pair.valid is not None:
+        agree &= pair.valid
     least, more = _AGREED_CONFIDENCE
     sure = np.float32(least) + np.float32(more) * seen.confidence**2
-    none, nan = hidden | border | beyond, np.float32(np.nan)
-    spread_px = spread(np.where(agree & ~none, values, nan))
+    nan, contradicted = np.float32(np.nan), seen.valid & ~agree
     return Disparity(
-        values=np.where(none, nan, values),
-        confidence=np.where(none, np.float32(0), np.where(agree, sure, _FILLED_CONFIDENCE)),
-        sigma_px=np.where(none, nan, np.where(agree, seen.sigma_px, spread_px)),
-        reason=reason,
+        values=np.where(agree, values, nan),
+        confidence=np.where(agree, sure, np.float32(0)),
+        sigma_px=np.where(agree, seen.sigma_px, nan),
+        reason=np.where(contradicted, np.uint8(Reason.AMBIGUOUS), seen.reason),
     )

@@ -67,7 +67,7 @@ def make_matcher(
     own = getattr(settings, field_of(matcher))
     made = MATCHERS[matcher](own, threads)
     if isinstance(own, FillableSettings) and own.fill:
-        made = FillingMatcher(made, threads)
+        made = FillingMatcher(made, own.reach_px, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.
     if getattr(own, "ndisp", 0) is not None:
         return made

@@ -56,6 +56,10 @@ class SadSettings(common.MeasuredSettings, common.FillableSettings):
     where texture is weak."""
     uniqueness_percent: common.UniquenessPercent = 2
 
+    @property
+    def reach_px(self) -> int:
+        return self.window_px // 2
+
 
 class SadMatcher:
     """Compares windows of gradients and checks what it finds; a `Matcher`.

@@ -82,9 +82,15 @@ class FillableSettings(SearchSettings):
     """Settings of the matchers that leave out what they do not find."""
 
     fill: bool = False
-    """Fill what is not found, or not surely, with planes of the segments of the image around it,
-    marked as filled: more is covered where walls are plain, in some tenths of a second more per
-    megapixel. Turn it off to have only what was measured."""
+    """Settle by the look of the image what windows cannot: take back what they gave to the wrong
+    side of a step of depth, and infer what lies in a gap of a plane, marked as filled and kept
+    apart from what was measured. Takes some tenths of a second per megapixel. Turn it off to have
+    what the windows found."""
+
+    @property
+    def reach_px(self) -> int:
+        """How far from a step of depth windows mix its sides; 0 = they do not."""
+        return 0
 
 
 class MeasuredSettings(SearchSettings):

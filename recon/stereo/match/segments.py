@@ -29,13 +29,17 @@ _Known = tuple[Float32, Float32, Int64, Int64, Int64, Float64, float]
 _TRIES: Final = 150  # planes through three pixels: one of them is right where a third lies on it
 
 
-def fit_segments(guide: UInt8, seen: Disparity, to: Float32, pool: Executor, threads: int) -> None:
+def fit_segments(
+    guide: UInt8, seen: Disparity, to: Float32, pool: Executor, threads: int
+) -> Float32:
     """Write the planes of the pixels in segments that have one, (SEGMENTATIONS, 3, H, W).
 
     ``guide``, uint8 (H, W, 3), are smoothed colours. What was seen counts by its confidence.
+    Returns which share of the segment of a pixel lies on its plane, float32 (SEGMENTATIONS, H, W).
     """
+    shares = np.zeros((SEGMENTATIONS, *guide.shape[:2]), np.float32)
     steps, draws = _steps(guide), np.random.default_rng(0).random((_TRIES, 3))
-    for edge, planes in zip(_EDGES, to, strict=True):
+    for edge, planes, share in zip(_EDGES, to, shares, strict=True):
         alike = (steps <= edge).view(np.uint8)
         _, labels, stats, _ = cv2.connectedComponentsWithStats(alike, connectivity=4)
         sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
@@ -45,11 +49,13 @@ def fit_segments(guide: UInt8, seen: Disparity, to: Float32, pool: Executor, thr
         wanted = wanted[wanted > 0]  # 0 are edges
         if len(wanted):
             known = seen.values, seen.confidence, order, starts, wanted, draws, SAME_SURFACE_PX
-            common.in_strips(pool, threads, partial(_fit, known, planes), len(wanted))
+            fit = partial(_fit, known, planes, share)
+            common.in_strips(pool, threads, fit, len(wanted))
+    return shares
 
 
-def _fit(known: _Known, to: Float32, segments: range) -> None:
-    kernels.fit_segments(*known, segments.start, segments.stop, to)
+def _fit(known: _Known, to: Float32, shares: Float32, segments: range) -> None:
+    kernels.fit_segments(*known, segments.start, segments.stop, to, shares)
 
 
 def smooth_colours(pair: RectifiedPair) -> UInt8:

@@ -60,6 +60,10 @@ class SgmSettings(common.MeasuredSettings, common.FillableSettings):
     """Penalty of a larger step along a path, as a mean cost of one pixel. Larger is smoother, and
     fills more of what is plain; smaller keeps thin things."""
 
+    @property
+    def reach_px(self) -> int:
+        return self.window_px - 1  # paths carry on what windows say, about as far again
+
     @model_validator(mode="after")
     def _penalties_fit(self) -> Self:
         if self.p1 > self.p2:

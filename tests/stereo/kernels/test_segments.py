@@ -22,7 +22,7 @@ def fitted(values, labels, wanted, weights=None):
     planes = np.full((3, *values.shape), NONE, np.float32)
     order, starts = sorted_by_label(labels)
     given_ = values, weights, order, starts, np.array(wanted, np.int64), DRAWS, 1.0
-    segments.fit_segments(*given_, 0, len(wanted), planes)
+    segments.fit_segments(*given_, 0, len(wanted), planes, np.empty_like(values))
     return planes
 
 
