@@ -99,7 +99,7 @@ def test_any_matcher_fills_what_is_plain_and_leaves_the_half_shadow(matcher):
     without = make_matcher(matcher, unfilled).match(pair)
     plain = np.s_[40:80, 135:205]
     right_now, before = ((np.abs(found.values[plain] - 4) < 1).mean() for found in (one, without))
-    assert right_now > 0.9
+    assert right_now > 0.85
     assert right_now >= before
     shadow = np.s_[35:85, 48:58]  # of the wall, behind the square in the right view
     occluded = without.reason[shadow] == Reason.OCCLUDED
