@@ -12,11 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair
+from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair, StereoPair
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import disparity_from_depth
 from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
+from recon.stereo.rectify.rectifier import Rectifier
 from recon.street.materials import GAMMA
 from recon.street.render import Sample, Stage, View, make_stage, stereo_views, take_image
 from recon.street.shapes import merge
@@ -54,9 +55,8 @@ class HardPair:
 
     @property
     def pair(self) -> RectifiedPair:
-        """Both images in grey."""
-        left, right = (cv2.cvtColor(k, cv2.COLOR_RGB2GRAY) for k in (self.left, self.right))
-        return RectifiedPair(left, right, self.camera)
+        """Both images, as matchers take them."""
+        return Rectifier(self.camera).rectify(StereoPair(self.left, self.right))
 
 
 class _LitStage(Stage):
