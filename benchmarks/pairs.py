@@ -29,7 +29,7 @@ import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tuned_on import LEGEND, mark
+from tuned_on import LEGEND, TUNED_ON, mark
 
 from recon.core.values import (
     Disparity,
@@ -45,7 +45,7 @@ from recon.evaluation.middlebury.bench import find_scenes, read_scored_scene
 from recon.io.images.disparity import read_disparity
 from recon.io.images.image import read_image
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.match.registry import MatchingSettings, field_of, make_matcher, settings_of
+from recon.stereo.match.registry import MatchingSettings, field_of, make_matcher
 from recon.stereo.rectify.rectifier import Rectifier
 from recon.street.render import StreetCamera
 from recon.street.settings import StreetScene
@@ -79,10 +79,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = {}
     for name, load in chosen(options):
         scene = load()
-        found[name] = dict(results(name, scene, options.matchers))
+        found[name] = dict(results(scene, options.matchers))
         if not options.json:
             print("\n".join(lines(name, found[name])), flush=True)
-    print(json.dumps(found) if options.json else LEGEND)
+    tuned = {name: TUNED_ON[name] for name in found if name in TUNED_ON}
+    print(json.dumps({"scenes": found, "tuned_on": tuned}) if options.json else LEGEND)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -124,19 +125,21 @@ def real_scenes() -> Iterator[tuple[str, Callable[[], Scene]]]:
 
 def tartan_air_scene(folder: Path) -> Scene:
     """The first pair of a drive of TartanAir, whose sky is at the least disparity of its file."""
-    image = cv2.imread(str(folder / "truth" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    image = np.asarray(cv2.imread(str(folder / "truth" / "000000.png"), cv2.IMREAD_UNCHANGED))
     sky = np.asarray(image <= image.min())
     truth = np.where(sky, np.nan, image / 256.0).astype(np.float32)
+    height, width = image.shape
     left, right = (read_image(folder / side / "000000.png") for side in ("left", "right"))
-    camera = RectifiedCamera(320.0, 320.0, 320.0, 320.0, 0.25, *image.shape[::-1])
+    camera = RectifiedCamera(320.0, 320.0, 320.0, 320.0, 0.25, width, height)
     return scene_of(left, right, camera, DisparityTruth.from_values(truth), sky)
 
 
 def sceneflow_scene(folder: Path) -> Scene:
     left, right = (read_image(folder / f"{side}.png") for side in ("left", "right"))
     truth = DisparityTruth.from_values(np.abs(read_disparity(folder / "disp.pfm")))
-    none = np.zeros(truth.values.shape, np.bool_)
-    return scene_of(left, right, stand_in_camera(*none.shape[::-1]), truth, none)
+    height, width = truth.values.shape
+    none = np.zeros((height, width), np.bool_)
+    return scene_of(left, right, stand_in_camera(width, height), truth, none)
 
 
 def middlebury_scene(name: str, folder: Path) -> Scene:
@@ -175,7 +178,7 @@ def scene_of(
     return Scene(Rectifier(camera).rectify(StereoPair(left, right)), truth, sky, sky)
 
 
-def results(name: str, scene: Scene, matchers: Sequence[str]) -> Iterator[tuple[str, Figures]]:
+def results(scene: Scene, matchers: Sequence[str]) -> Iterator[tuple[str, Figures]]:
     """Yield the figures of each matcher, with and without filling where it has that setting."""
     for matcher in matchers:
         for filled in fillings(matcher):
@@ -188,12 +191,12 @@ def results(name: str, scene: Scene, matchers: Sequence[str]) -> Iterator[tuple[
             found = made.match(scene.pair)
             seconds = time.perf_counter() - start
             label = f"`{matcher}`" + (", filled" if filled else "")
-            yield label + mark(label, name), {**figures(found, scene), "seconds": seconds}
+            yield label, {**figures(found, scene), "seconds": seconds}
 
 
 def fillings(matcher: str) -> tuple[bool | None, ...]:
-    has = "fill" in type(settings_of(matcher, MatchingSettings())).model_fields
-    return (False, True) if has else (None,)
+    own = getattr(MatchingSettings(), field_of(matcher))
+    return (False, True) if hasattr(own, "fill") else (None,)
 
 
 def first_rows(pair: RectifiedPair) -> RectifiedPair:
@@ -281,7 +284,7 @@ def lines(name: str, found: dict[str, Figures]) -> Iterator[str]:
         if not number:
             yield f"{name}\n{'':24}" + " ".join(f"{SHORT.get(k, k):>8}" for k in one)
         cells = ("" if value is None else f"{value:.3g}" for value in one.values())
-        yield f"{label:24}" + " ".join(f"{cell:>8}" for cell in cells)
+        yield f"{label + mark(label, name):24}" + " ".join(f"{cell:>8}" for cell in cells)
 
 
 SHORT: Final = {

@@ -11,7 +11,7 @@ from typing import Final
 MIDD_EVAL3: Final = (
     "ArtL", "Jadeplant", "Motorcycle", "Piano", "Pipes", "Playroom", "Recycle", "Teddy"
 )  # fmt: skip
-CONSTANTS, WEIGHTS = "*", "†"
+CONSTANTS, WEIGHTS = "¹", "²"
 _OURS: Final = {"sad": CONSTANTS, "sgm": CONSTANTS, "fine": CONSTANTS}
 _OLDER: Final = ("Books", "Dolls", "Aloe", "Baby1", "Cloth1")
 LEGEND: Final = (
