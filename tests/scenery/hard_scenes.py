@@ -255,6 +255,7 @@ def _cave(rng: np.random.Generator) -> HardScene:
     hills += 0.12 * value_noise(flat / 0.19, rock.part + 2)
     radius = np.maximum(1.5 + 0.55 * hills.reshape(x.shape), 0.5)
     rings = np.stack([x, radius * np.cos(a) + bend, 1.3 + 0.8 * radius * np.sin(a)], axis=-1)
+    rings[:, -1] = rings[:, 0]
     walls = np.concatenate([band(near, far) for near, far in pairwise(rings)])
     parts = [painted(walls, walls[..., :2].copy(), rock)]
     for _ in range(4):

@@ -129,7 +129,8 @@ def hard_pair(name: str, seed: int, scale: float = 1.0) -> HardPair:
     kind[depth != _depth(stage, views[0], in_mirrors=False)] = Kind.MIRROR
     dark = 255.0 * light[0].max(axis=2) ** (1 / GAMMA) < _DARK_DN
     kind[dark] = Kind.DARK
-    kind[np.isnan(_depth(stage, views[0], in_mirrors=False)) & ~dark] = Kind.SKY
+    outside = np.isnan(_depth(stage, views[0], in_mirrors=False))
+    kind[outside] = Kind.DARK if scene.lamps else Kind.SKY
     left, right = (_record(one, [seed, 7, side]) for side, one in enumerate(light))
     return HardPair(name, left, right, camera, _truth(stage, views, camera, depth, kind), kind)
 
@@ -146,7 +147,7 @@ def _exposed(stage: Stage, view: View) -> Float64:
     cx, cy = view.centre_px
     size = 2 * view.width_px, 2 * view.height_px
     fine = View(view.T_scene_camera, 2 * view.focal_px, (2 * cx + 0.5, 2 * cy + 0.5), *size)
-    light = take_image(stage, fine, smooth_edges=True) ** GAMMA
+    light = take_image(stage, fine, smooth_edges=False) ** GAMMA
     blurred = cv2.GaussianBlur(light, (0, 0), 2 * _BLUR_PX)
     return np.asarray(blurred.reshape(view.height_px, 2, view.width_px, 2, 3).mean(axis=(1, 3)))
 
