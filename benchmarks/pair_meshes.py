@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,12 @@ import open3d as o3d
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.core.open3d_raycasting import RayScene
-from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair, TriangleMesh
+from recon.core.values import RectifiedCamera, StereoCalibration, TriangleMesh
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import unproject
-from recon.export.mesh.grid import mesh_coverage, mesh_grid
+from recon.core.values.image import Recorded
+from recon.export.mesh.coverage import mesh_coverage
+from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.poisson import reconstruct_mesh
 from recon.io.images.disparity import read_disparity
 from recon.sources.one_pair import read_pair_input
@@ -80,10 +83,11 @@ def compare(scene: Path, only: str | None = None) -> dict[str, dict[str, Any]]:
     frame = FrameReconstructor(rig, config).reconstruct(pair)
     camera = frame.pair.camera
     found = {}
-    for name, make in {
+    ways: dict[str, Callable[[], TriangleMesh]] = {
         "grid": lambda: mesh_grid(frame.cloud, camera, config.mesh),
         "poisson": lambda: reconstruct_mesh(frame.cloud, config.mesh, (0.0, 0.0, 0.0)),
-    }.items():
+    }
+    for name, make in ways.items():
         if only not in (None, name):
             continue
         start = time.perf_counter()
@@ -101,7 +105,7 @@ def compare(scene: Path, only: str | None = None) -> dict[str, dict[str, Any]]:
     return found
 
 
-def read_scene(folder: Path) -> tuple[StereoPair, RectifiedCamera | StereoCalibration, Any]:
+def read_scene(folder: Path) -> tuple[Recorded, RectifiedCamera | StereoCalibration, Any]:
     """The pair of a folder, its cameras, and the true disparity (H, W) if that is known."""
     if (folder / "im0.png").is_file():
         given = read_pair_input(*(folder / name for name in ("im0.png", "im1.png", "calib.txt")))

@@ -228,10 +228,12 @@ TABLES: Final[dict[str, Table]] = {
             "scenes": "python benchmarks/pair_meshes.py --json "
             + " ".join(
                 f"$RECON_DATA/middlebury/MiddEval3/trainingQ/{name}"
-                for name in ("Motorcycle", "Playroom", "Piano", "Recycle")
+                for name in ("Motorcycle", "Playroom", "Piano", "Recycle", "Pipes")
             )
+            + f" {D13} $RECON_DATA/rendered/yard"
         },
         {"covered": SHARE, "within 1 px": SHARE, "mean": "{:.2f} px", "95 %": "{:.1f} px"}
+        | {"on points": SHARE, "over 10 %": PERCENT, "over 20 %": PERCENT}
         | {"faces": "{:,}", "not manifold": "{}", "seconds": "{:.1f}"},
         pair_rows_of.pair_meshes,
         timed=True,

@@ -6,7 +6,6 @@ fitted to windows, and triangulated: the fewer triangles the flatter the surface
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,16 +17,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
-from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Bool, Float64, Int32, Int64
 from recon.export.mesh.cut import renumbered, vertex_normals
 from recon.export.mesh.poisson import MeshSettings, simplified, usable
-
-# A point is covered if the mesh is no farther from it than this share of its depth.
-COVERED_WITHIN: Final = 0.005
-LEAST_COVERAGE: Final = 0.8  # share of the points of a pair that its mesh should cover
-_COVERAGE_SAMPLES: Final = 100_000
+from recon.export.mesh.solid import closed_behind
 
 _SQUARE: Final = 64
 """Grid steps along the legs of the largest triangles; a power of two."""
@@ -79,7 +73,7 @@ def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
     Args:
         cloud: At most one point of each pixel, in camera axes, as of `FrameReconstructor`.
         camera: Saw it.
-        settings: Of `min_component_faces`: a pixel counts as two.
+        settings: Of `min_component_faces`: a pixel counts as two. `pair_solid_m` closes the mesh.
 
     Returns:
         A manifold mesh in camera axes, with unit normals towards the camera, and colours if the
@@ -101,26 +95,10 @@ def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
     x, y = (k * z / camera.focal_px for k in (grid.u[column], grid.v[row]))
     vertices = np.stack([x, y, z], axis=1).astype(np.float32)
     rgb = None if cloud.rgb is None else cloud.rgb[grid.point[row, column]]
-    return simplified(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb), settings)
-
-
-def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
-    """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
-
-    Of more than 100,000 points, every n-th is used.
-    """
-    xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
-    distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
-    return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))
-
-
-def check_coverage(coverage: float) -> tuple[str, ...]:
-    """Return a warning if the mesh of a pair leaves out much of its cloud."""
-    if coverage >= LEAST_COVERAGE:
-        return ()
-    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
-    advice = "lower mesh.min_component_faces, or use the cloud"
-    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
+    mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
+    if settings.pair_solid_m is not None:
+        return closed_behind(mesh, settings.pair_solid_m)
+    return simplified(mesh, settings)
 
 
 def _sorted(cloud: PointCloud, camera: RectifiedCamera) -> _Grid:
