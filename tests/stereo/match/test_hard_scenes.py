@@ -95,3 +95,16 @@ def test_what_is_measured_on_hard_scenes_is_right(matcher, name):
     error, measured, _ = errors(matcher, name)
     assert measured.mean() > 0.15
     assert (error[measured] <= 3).mean() > RIGHT[matcher]
+
+
+@pytest.mark.parametrize("matcher", MATCHERS)
+@pytest.mark.parametrize("name", SCENES)
+def test_what_is_inferred_is_right_and_not_of_sky_or_darkness(matcher, name):
+    one, found = scene(name), matched(matcher, name)
+    inferred = found.valid & ~found.measured
+    none = np.isin(one.kind, (Kind.SKY, Kind.DARK))
+    assert inferred[none].sum() <= 0.02 * none.sum()
+    error, _, judged = errors(matcher, name)
+    # A single plane may be wrong where hardly anything is inferred.
+    if judged.sum() > 0.01 * judged.size:
+        assert (error[judged] <= 3).mean() >= 0.85
