@@ -1,16 +1,17 @@
 """What matchers measure and infer on pairs beside those of MiddEval3, and where there is nothing.
 
-The scenes are rendered (sky, plain walls, wires, glass, a cave, shelves, a floor; a street; rooms),
-and, where RECON_DATA has them, a yard and a pair of SceneFlow. A disparity is measured, or inferred
-from planes around it; figures are shares of pixels, in per cent. Of those whose truth is known:
-`measured` and `inferred`, whose errors are `bad 2` and `off by 3` (in pixels, of those given), and
-whose confidence is compared with the share within a pixel (`ece`). `in none` are the pixels of sky
-and of what is dark that have a disparity all the same. `other side`: of the pixels given within
-5 px of a step of depth, those with the disparity of the other side.
+The scenes are rendered (sky, plain walls, wires, glass, a cave, shelves, a floor, some with the
+right image in other light; a street; rooms), and, where RECON_DATA has them, a yard and a pair of
+SceneFlow. A disparity is measured, or inferred from planes around it; figures are shares of pixels,
+in per cent. Of those whose truth is known: `measured` and `inferred`, whose errors are `off by 2`
+and `off by 3` (in pixels, of those given), and whose confidence is compared with the share within a
+pixel (`ece`). `in none` are the pixels of sky and of what is dark that have a disparity all the
+same. `other side`: of the pixels given within 5 px of a step of depth, those with the disparity of
+the other side.
 
 Examples:
     python benchmarks/pairs.py --json
-    python benchmarks/pairs.py --scenes yard cave0 --matchers sad fine --middlebury trainingQ
+    python benchmarks/pairs.py --scenes yard 'cave 0' --matchers sad fine --middlebury trainingQ
 """
 
 from __future__ import annotations
@@ -51,10 +52,12 @@ from recon.street.render import StreetCamera
 from recon.street.settings import StreetScene
 from recon.street.street import build_street
 from tests.scenery.hard_scenes import HARD_SCENES
-from tests.scenery.pairs import Kind, hard_pair
+from tests.scenery.pairs import Kind, hard_pair, relit
 
 MATCHERS: Final = ("sad", "sgm", "fine", "opencv-bm", "opencv-sgbm")
 SEEDS: Final = (0, 1)
+RELIT: Final = (("corner", "gradient"), ("shelves", "gamma"), ("floor", "spot"))
+"""Scenes that are also matched with the right image in another light."""
 NEAR_PX: Final = 5
 """Of a step: pixels at most so far from it are near it."""
 STEP_PX: Final = 2.0
@@ -103,6 +106,10 @@ def chosen(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], Scen
             every[name] = partial(middlebury_scene, name, folder)
     for seed in SEEDS:
         every |= {f"{name} {seed}": partial(hard_scene, name, seed) for name in HARD_SCENES}
+        every |= {
+            f"{name}, {light} {seed}": partial(hard_scene, name, seed, light)
+            for name, light in RELIT
+        }
         every[f"street {seed}"] = partial(street_scene, {"seed": seed, "frames": 12}, 11)
         every[f"room {seed}"] = partial(
             street_scene, {"seed": seed, "path": "room", "frames": 60, "shutter": 0.0}, 59
@@ -150,8 +157,11 @@ def middlebury_scene(name: str, folder: Path) -> Scene:
     return scene_of(scored.pair.left, scored.pair.right, scored.camera, scored.truth, none)
 
 
-def hard_scene(name: str, seed: int) -> Scene:
+def hard_scene(name: str, seed: int, light: str | None = None) -> Scene:
+    """A rendered scene, of which the right image may be in another light."""
     one = hard_pair(name, seed)
+    if light is not None:
+        one = replace(one, right=relit(one.right, light, np.random.default_rng(seed)))
     sky, dark = one.kind == Kind.SKY, one.kind == Kind.DARK
     return Scene(one.pair, one.truth, sky | dark, sky)
 
