@@ -63,6 +63,8 @@ NEAR_PX: Final = 5
 STEP_PX: Final = 2.0
 """Between neighbours of which the true disparity differs by more there is a step."""
 RIGHT_PX: Final = 1.0
+LEAST_NONE: Final = 0.01
+"""Of an image: a smaller sky is rather the rim of something else."""
 WARM_UP_ROWS: Final = 64
 Figures = dict[str, float | None]
 
@@ -220,13 +222,14 @@ def figures(found: Disparity, scene: Scene) -> Figures:
     known = np.isfinite(scene.truth.values)
     error = np.abs(found.values - scene.truth.values)
     figured: Figures = {}
+    judged = scene.none.mean() > LEAST_NONE
     for kind, limit, other in (("measured", 2.0, "inferred"), ("inferred", 3.0, "measured")):
         given = masks(found)[kind]
         ours = found.reject(masks(found)[other], Reason.AMBIGUOUS)
         figured |= {
             f"{kind}": percent(given, known),
             f"{kind}, off by {limit:g}": percent(error > limit, given & known),
-            f"{kind}, in none": percent(given, scene.none),
+            f"{kind}, in none": percent(given, scene.none) if judged else None,
             f"{kind}, confidence": mean(found.confidence[given & known]),
             f"{kind}, ece": ece(ours, scene.truth),
             **{f"{kind}, {name}": each for name, each in at_steps(ours, scene).items()},
