@@ -55,6 +55,7 @@ def test_measured_and_inferred_are_counted_apart_and_so_is_what_lies_in_the_sky(
     assert found["measured"] == pytest.approx(100 * (known - 120 - 300) / known)
     assert found["inferred"] == pytest.approx(100 * 300 / known)
     assert found["measured, off by 2"] == 0
+    assert found["off by 2"] == pytest.approx(100 * 200 / (known - 120))
     assert found["inferred, off by 3"] == pytest.approx(100 * 2 / 3)
     assert found["inferred, in none"] == pytest.approx(25)
     assert found["measured, in none"] == pytest.approx(10)
