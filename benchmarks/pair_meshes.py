@@ -2,9 +2,13 @@
 
 Of every pixel with a known disparity, the ray is followed to the surface. ``covered`` is the share
 of the rays that meet it, ``within 1 px`` the share of all that meet it where it is, as a disparity;
-mean and 95 % are of those that meet it.
+mean and 95 % are of those that meet it. ``on points`` is the share of the points that lie on it.
+Triangles within which the depth changes much are curtains between surfaces, or surfaces that are
+seen along themselves: ``over 10 %`` and ``over 20 %`` are their shares of the area.
 
-Example: python benchmarks/pair_meshes.py scenes/Motorcycle scenes/Piano --json
+Of a drive, the first pair is taken; without a truth, there are fewer figures.
+
+Example: python benchmarks/pair_meshes.py scenes/Motorcycle drives/kitti --json
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +26,16 @@ import open3d as o3d
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.core.open3d_raycasting import RayScene
-from recon.core.values import RectifiedCamera, TriangleMesh
+from recon.core.values import RectifiedCamera, StereoCalibration, TriangleMesh
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import unproject
+from recon.core.values.image import Recorded
+from recon.export.mesh.coverage import mesh_coverage
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.poisson import reconstruct_mesh
 from recon.io.images.disparity import read_disparity
 from recon.sources.one_pair import read_pair_input
+from recon.sources.registry import open_source
 from recon.stereo.frame import FrameReconstructor
 
 
@@ -46,9 +54,16 @@ def measure(mesh: TriangleMesh, camera: RectifiedCamera, truth_px: Float64) -> d
         "within 1 px": float((off < 1).sum() / len(face)),
         "mean": float(off.mean()),
         "95 %": float(np.quantile(off, 0.95)),
-        "faces": len(mesh.faces),
-        "not manifold": sum(not_manifold(mesh)),
     }
+
+
+def changes(mesh: TriangleMesh) -> dict[str, float]:
+    """Shares of the area of a mesh whose triangles change depth by more than 10 and 20 %."""
+    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    depth_m = np.stack([a[:, 2], b[:, 2], c[:, 2]])
+    change = depth_m.max(axis=0) / depth_m.min(axis=0) - 1
+    return {f"over {n} %": float(100 * area[change > n / 100].sum() / area.sum()) for n in (10, 20)}
 
 
 def not_manifold(mesh: TriangleMesh) -> tuple[int, int]:
@@ -61,29 +76,52 @@ def not_manifold(mesh: TriangleMesh) -> tuple[int, int]:
     return len(edges), len(surface.get_non_manifold_vertices())
 
 
-def compare(scene: Path) -> dict[str, dict[str, Any]]:
-    """Mesh a scene of Middlebury in both ways."""
+def compare(scene: Path, only: str | None = None) -> dict[str, dict[str, Any]]:
+    """Mesh a scene of Middlebury, or the first pair of a drive, in both ways."""
     config = load_config(defaults=PAIR_DEFAULTS)
-    given = read_pair_input(*(scene / name for name in ("im0.png", "im1.png", "calib.txt")))
-    frame = FrameReconstructor(given.calibration, config).reconstruct(given.pair)
-    truth_px, camera = read_disparity(scene / "disp0GT.pfm").astype(np.float64), frame.pair.camera
-    start = time.perf_counter()
-    of_pixels = mesh_grid(frame.cloud, camera, config.mesh)
-    middle = time.perf_counter()
-    of_meshlab = reconstruct_mesh(frame.cloud, config.mesh, (0.0, 0.0, 0.0))
-    end = time.perf_counter()
-    return {
-        "grid": {"seconds": middle - start, **measure(of_pixels, camera, truth_px)},
-        "poisson": {"seconds": end - middle, **measure(of_meshlab, camera, truth_px)},
+    pair, rig, truth_px = read_scene(scene)
+    frame = FrameReconstructor(rig, config).reconstruct(pair)
+    camera = frame.pair.camera
+    found = {}
+    ways: dict[str, Callable[[], TriangleMesh]] = {
+        "grid": lambda: mesh_grid(frame.cloud, camera, config.mesh),
+        "poisson": lambda: reconstruct_mesh(frame.cloud, config.mesh, (0.0, 0.0, 0.0)),
     }
+    for name, make in ways.items():
+        if only not in (None, name):
+            continue
+        start = time.perf_counter()
+        mesh = make()
+        seconds = time.perf_counter() - start
+        figures = {} if truth_px is None else measure(mesh, camera, truth_px)
+        found[name] = {
+            **figures,
+            "on points": mesh_coverage(mesh, frame.cloud),
+            **changes(mesh),
+            "faces": len(mesh.faces),
+            "not manifold": sum(not_manifold(mesh)),
+            "seconds": seconds,
+        }
+    return found
+
+
+def read_scene(folder: Path) -> tuple[Recorded, RectifiedCamera | StereoCalibration, Any]:
+    """The pair of a folder, its cameras, and the true disparity (H, W) if that is known."""
+    if (folder / "im0.png").is_file():
+        given = read_pair_input(*(folder / name for name in ("im0.png", "im1.png", "calib.txt")))
+        truth_px = read_disparity(folder / "disp0GT.pfm").astype(np.float64)
+        return given.pair, given.calibration, truth_px
+    source = open_source(folder)
+    return next(iter(source.frames())), source.calibration, None
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--only", choices=("grid", "poisson"), help="only this surface")
     given = parser.parse_args()
-    found = {scene.name: compare(scene) for scene in given.scenes}
+    found = {scene.name: compare(scene, given.only) for scene in given.scenes}
     if given.json:
         print(json.dumps(found))
         return

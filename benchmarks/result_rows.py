@@ -153,14 +153,6 @@ def rig_intervals(found: Found) -> Rows:
     }
 
 
-def pair_meshes(found: Found) -> Rows:
-    return {
-        f"{scene}, `{way}`": figures
-        for scene, ways in found["scenes"].items()
-        for way, figures in ways.items()
-    }
-
-
 def drive_meshes(found: Found) -> Rows:
     return {
         f"{drive}, `{way}`": figures
@@ -189,29 +181,6 @@ def traversability(found: Found) -> Rows:
 def thirds(cells: dict[str, int]) -> str | None:
     counted = [cells.get(state, 0) for state in ("free", "obstacle", "unknown")]
     return " / ".join(f"{100 * n / sum(counted):.0f}" for n in counted) if any(counted) else None
-
-
-def middlebury(found: Found) -> Rows:
-    rows: Rows = {}
-    for size, columns in found.items():
-        for name, one in columns["matchers"].items():
-            dense = one["weighted"]["nonocc"]["dense"]
-            bad = {f"bad {limit}": dense["bad"][limit] for limit in ("1", "2", "4")}
-            rows[f"`{name}`{size}"] = {**bad, "mean error": dense["avgerr"]}
-    return rows
-
-
-def confidence(found: Found) -> Rows:
-    return {
-        f"{folder}, `{name}`": {
-            "calibration error": one["weighted"]["confidence"]["ece"],
-            "AUSE": one["weighted"]["confidence"]["ause"],
-            "within one sigma": 100 * one["weighted"]["confidence"]["within_1_sigma"],
-            "within two": 100 * one["weighted"]["confidence"]["within_2_sigma"],
-        }
-        for folder, scenes in found.items()
-        for name, one in scenes["matchers"].items()
-    }
 
 
 def loops(found: Found) -> Rows:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import result_pair_rows as pair_rows_of
 import result_rows as rows_of
 from result_commands import (
     D06,
@@ -42,6 +43,7 @@ class Table:
     # What makes the cells of the printed JSON of all commands, by label and heading.
     rows: Callable[[dict[str, Any]], Rows]
     timed: bool = False  # whether it depends on what else the machine does
+    scenes: str = ""  # what the rows that name no scene are of, as in `tuned_on.py`
 
     def lacking(self) -> str:
         """What is needed and not there; empty if nothing is."""
@@ -196,7 +198,16 @@ TABLES: Final[dict[str, Table]] = {
             ", half size, padded": scored(HALF_SIZE, "half-padded", "opencv-sgbm", PADDED),
         },
         {"bad 1": "{:.1f} %", "bad 2": "{:.1f} %", "bad 4": "{:.1f} %", "mean error": "{:.1f} px"},
-        rows_of.middlebury,
+        pair_rows_of.middlebury,
+        scenes="MiddEval3",
+    ),
+    "pairs": Table(
+        {"": "python benchmarks/pairs.py --json"},
+        dict.fromkeys(pair_rows_of.PAIRS, "{:.1f} %")
+        | {"ECE": "{}", "AUSE at steps": SHARE}
+        | {"seconds": "{:.1f}"},
+        pair_rows_of.pairs,
+        timed=True,
     ),
     "confidence": Table(
         {
@@ -210,19 +221,21 @@ TABLES: Final[dict[str, Table]] = {
         },
         {"calibration error": SHARE, "AUSE": SHARE}
         | {"within one sigma": "{:.0f} %", "within two": "{:.0f} %"},
-        rows_of.confidence,
+        pair_rows_of.confidence,
     ),
     "pair-meshes": Table(
         {
             "scenes": "python benchmarks/pair_meshes.py --json "
             + " ".join(
                 f"$RECON_DATA/middlebury/MiddEval3/trainingQ/{name}"
-                for name in ("Motorcycle", "Playroom", "Piano", "Recycle")
+                for name in ("Motorcycle", "Playroom", "Piano", "Recycle", "Pipes")
             )
+            + f" {D13} $RECON_DATA/rendered/yard"
         },
         {"covered": SHARE, "within 1 px": SHARE, "mean": "{:.2f} px", "95 %": "{:.1f} px"}
+        | {"on points": SHARE, "over 10 %": PERCENT, "over 20 %": PERCENT}
         | {"faces": "{:,}", "not manifold": "{}", "seconds": "{:.1f}"},
-        rows_of.pair_meshes,
+        pair_rows_of.pair_meshes,
         timed=True,
     ),
     "drive-meshes": Table(

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from result_tables import TABLES, Table
+from tuned_on import LEGEND, mark
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 FILE: Final = ROOT / "docs" / "results.json"
@@ -206,9 +207,11 @@ def lines(name: str, record: Record | None) -> Iterator[str]:
     columns = record["columns"]
     yield f"| | {' | '.join(columns)} |"
     yield "|---" * (len(columns) + 1) + "|"
+    scenes = TABLES[name].scenes if name in TABLES else ""
+    marks = {label: mark(label, scenes) for label in record["rows"]}
     for label, row in record["rows"].items():
         cells = (columns[c].format(row[c]) if c in row else "" for c in columns)
-        yield f"| {label} | {' | '.join(cells)} |"
+        yield f"| {label}{marks[label]} | {' | '.join(cells)} |"
     machine = record["machine"]
     where = [f"commit {record['commit']}", record["date"], machine["cpu"]]
     where += [f"{machine['cores']} cores"]
@@ -216,6 +219,7 @@ def lines(name: str, record: Record | None) -> Iterator[str]:
         [f"load {record['load']:g} at the start"] if record["timed"] and "load" in record else []
     )
     where += [record["note"]] if "note" in record else []
+    where += [LEGEND] if any(marks.values()) else []
     yield ""
     yield f"<sub>{how}: {', '.join(where)}</sub>"
 

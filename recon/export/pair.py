@@ -15,7 +15,8 @@ from recon.core.values.arrays import UInt8
 from recon.core.values.camera import depth_from_disparity, project
 from recon.core.values.cloud import Frame
 from recon.core.values.image import in_colour
-from recon.export.mesh.grid import check_coverage, mesh_coverage, mesh_grid
+from recon.export.mesh.coverage import check_coverage, mesh_coverage
+from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.pieces import WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm

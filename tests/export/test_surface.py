@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
+import trimesh
 
 from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project
-from recon.export.mesh.grid import mesh_coverage, mesh_grid
+from recon.export.mesh.coverage import mesh_coverage
+from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.poisson import MeshSettings, _fitting_depth, reconstruct_mesh
 from recon.export.pymeshlab import screened_poisson
 
@@ -230,6 +232,46 @@ def test_noise_is_smoothed_within_surfaces_small_gaps_are_filled_and_larger_ones
     rays = RayScene(mesh.vertices[mesh.faces])
     seen = rays.first_hit(np.zeros(3), hall().xyz[(np.hypot(column - 110, row - 30) < 9)])
     assert (seen < 0).all()
+
+
+def changes(mesh: TriangleMesh) -> np.ndarray:
+    """By how much of its least the depth changes within each triangle."""
+    z = mesh.vertices[mesh.faces][..., 2].astype(np.float64)
+    return np.asarray(z.max(axis=1) / z.min(axis=1) - 1)
+
+
+@pytest.mark.parametrize(("every", "most"), [(1, 0.1), (2, 0.21)])
+def test_within_no_triangle_the_depth_changes_by_more_than_a_tenth_a_pixel(every, most):
+    points = np.arange(len(hall())).reshape(CAMERA.height_px, CAMERA.width_px)
+    mesh = mesh_grid(hall().select(points[::every, ::every].ravel()), CAMERA, SETTINGS)
+    # The ground, which is seen from 3 to 12 m, is there all the same.
+    assert 0.5 * most < changes(mesh).max() <= most + 1e-5
+    ground = mesh.vertices[mesh.vertices[:, 1] > 0.99][:, 2]
+    assert ground.min() < 3.1
+    assert ground.max() > 11
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_step_that_matching_blurs_is_no_surface_however_uncertain_it_is(axis, sign):
+    row, column = np.mgrid[:100, :160].astype(np.float64)
+    along = sign * (column - 80 if axis == 0 else row - 50)
+    # From 40 to 12 px of disparity within 9 px, of which each is off by up to 8.
+    disparity = np.interp(along, [-4.5, 4.5], [12, 40])
+    z = CAMERA.focal_px * CAMERA.baseline_m / disparity
+    x, y = (column - CAMERA.cx_px) / CAMERA.focal_px, (row - CAMERA.cy_px) / CAMERA.focal_px
+    xyz = np.stack([x * z, y * z, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    sigma_m = (8 * z**2 / (CAMERA.focal_px * CAMERA.baseline_m)).ravel().astype(np.float32)
+    mesh = mesh_grid(PointCloud(xyz, sigma_m=sigma_m), CAMERA, SETTINGS)
+    assert changes(mesh).max() <= 0.1 + 1e-5
+    # Both walls are there, and nothing joins them.
+    near, far = (30 / d for d in (40, 12))
+    corners = mesh.vertices[mesh.faces][..., 2]
+    assert {near, far} <= {round(float(z), 4) for z in mesh.vertices[:, 2]}
+    between = (corners.min(axis=1) > 1.2 * near) & (corners.max(axis=1) < 0.8 * far)
+    assert not between.any()
+    pieces = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).body_count
+    assert pieces == 2
 
 
 def test_surfaces_that_touch_in_a_pixel_have_a_vertex_each():

@@ -13,7 +13,7 @@ from recon.core.errors import FormatError, MappingError, MatchingError, Settings
 from recon.core.geometry.se3 import make_transform
 from recon.core.progress import Silent, showing
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
-from recon.export.mesh.grid import check_coverage
+from recon.export.mesh.coverage import check_coverage
 from recon.sources.one_pair import PairInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

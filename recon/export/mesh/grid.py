@@ -6,8 +6,9 @@ fitted to windows, and triangulated: the fewer triangles the flatter the surface
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import cv2
@@ -16,16 +17,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
-from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Bool, Float64, Int32, Int64
 from recon.export.mesh.cut import renumbered, vertex_normals
 from recon.export.mesh.poisson import MeshSettings, simplified, usable
-
-# A point is covered if the mesh is no farther from it than this share of its depth.
-COVERED_WITHIN: Final = 0.005
-LEAST_COVERAGE: Final = 0.8  # share of the points of a pair that its mesh should cover
-_COVERAGE_SAMPLES: Final = 100_000
+from recon.export.mesh.solid import closed_behind
 
 _SQUARE: Final = 64
 """Grid steps along the legs of the largest triangles; a power of two."""
@@ -36,6 +32,9 @@ in which the errors of disparities are alike, and as much again."""
 
 _EDGE_SIGMAS: Final = 3.0  # a step of so many standard deviations between neighbours is an edge
 _MOST_SIGMAS: Final = 0.5  # a triangle may be off by so many
+_MOST_CHANGE: Final = 0.1
+"""Of the depth within a triangle, for each pixel of a grid step: a surface that changes by as much
+is seen along itself, at 700 px of focal length to less than a degree."""
 _LEAST_SIGMA_PX: Final = 1 / 64  # disparities are rarely written more finely
 _LEAST_SPREAD: Final = 1e-6  # of coordinates in a window, square steps: next to nothing
 
@@ -56,6 +55,17 @@ class _Grid:
     def valid(self) -> Bool:
         return np.asarray(self.point >= 0)
 
+    @cached_property
+    def changes(self) -> Float64:
+        """(R, C), logarithm of the disparity, in units of the largest change; NaN = no point."""
+        known = np.where(self.valid, self.disparity, np.nan)
+        return np.asarray(np.log(known) / (self.step_px * np.log1p(_MOST_CHANGE)))
+
+    @property
+    def step_px(self) -> float:
+        """Between neighbours."""
+        return float(self.u[1] - self.u[0])
+
 
 def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings) -> TriangleMesh:
     """Triangulate the surface that one stereo pair sees.
@@ -63,11 +73,12 @@ def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
     Args:
         cloud: At most one point of each pixel, in camera axes, as of `FrameReconstructor`.
         camera: Saw it.
-        settings: Of `min_component_faces`: a pixel counts as two.
+        settings: Of `min_component_faces`: a pixel counts as two. `pair_solid_m` closes the mesh.
 
     Returns:
         A manifold mesh in camera axes, with unit normals towards the camera, and colours if the
-        cloud has any. No triangle is across a step of disparity.
+        cloud has any. No triangle is across a step of disparity, and within none the depth changes
+        by more than a tenth (a fifth in a cloud of every second pixel), before ``target_faces``.
 
     Raises:
         MeshingError: There are too few points, or none next to one another.
@@ -84,26 +95,10 @@ def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
     x, y = (k * z / camera.focal_px for k in (grid.u[column], grid.v[row]))
     vertices = np.stack([x, y, z], axis=1).astype(np.float32)
     rgb = None if cloud.rgb is None else cloud.rgb[grid.point[row, column]]
-    return simplified(TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb), settings)
-
-
-def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
-    """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
-
-    Of more than 100,000 points, every n-th is used.
-    """
-    xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
-    distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
-    return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))
-
-
-def check_coverage(coverage: float) -> tuple[str, ...]:
-    """Return a warning if the mesh of a pair leaves out much of its cloud."""
-    if coverage >= LEAST_COVERAGE:
-        return ()
-    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
-    advice = "lower mesh.min_component_faces, or use the cloud"
-    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
+    mesh = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
+    if settings.pair_solid_m is not None:
+        return closed_behind(mesh, settings.pair_solid_m)
+    return simplified(mesh, settings)
 
 
 def _sorted(cloud: PointCloud, camera: RectifiedCamera) -> _Grid:
@@ -209,33 +204,38 @@ def _window(values: Float64) -> Float64:
 def _edges(grid: _Grid) -> tuple[Bool, Bool]:
     """Return bool (R, C - 1) and (R - 1, C): what no triangle may cross between neighbours.
 
-    One of them has no point, or neither lies on the plane of the other. A surface that falls off
-    to the right by a pixel per pixel hides itself from the right camera.
+    One of them has no point, neither lies on the plane of the other, or the depth changes too much.
+    On a plane at h baselines from the camera disparities change by at most 1 / h pixels per pixel:
+    two are a step that matching has blurred; one to the right hides itself from the right camera.
     """
-    step_px = float(grid.u[1] - grid.u[0])
 
-    def between(d: Float64, slope: Float64, sigma: Float64, valid: Bool) -> Bool:
+    def between(d: Float64, slope: Float64, sigma: Float64, changes: Float64) -> Bool:
         off = np.minimum(*(np.abs(np.diff(d) - k) for k in (slope[:, :-1], slope[:, 1:])))
         edge = off > _EDGE_SIGMAS * np.hypot(sigma[:, :-1], sigma[:, 1:])
-        return np.asarray(edge | ~(valid[:, :-1] & valid[:, 1:]))
+        edge |= np.abs(np.diff(d)) >= 2 * grid.step_px
+        return np.asarray(edge | ~(np.abs(np.diff(changes)) <= 1))  # nor where there is none
 
-    right = between(grid.disparity, grid.right, grid.sigma, grid.valid)
-    right |= np.diff(grid.disparity) >= step_px
-    return right, between(grid.disparity.T, grid.down.T, grid.sigma.T, grid.valid.T).T
+    right = between(grid.disparity, grid.right, grid.sigma, grid.changes)
+    right |= np.diff(grid.disparity) >= grid.step_px
+    return right, between(grid.disparity.T, grid.down.T, grid.sigma.T, grid.changes.T).T
 
 
 def _errors(grid: _Grid, edges: tuple[Bool, Bool]) -> Float64:
     """Return (R, C): by how many sigmas triangles are off that are not split at a pixel.
 
     A triangle is split in the middle of its longest side, and with it its neighbour there. What is
-    off in one of the parts counts for the whole.
+    off in one of the parts counts for the whole. It is always split where the depth changes too
+    much within.
     """
     error = np.where(_torn(grid.valid, edges), np.inf, 0.0)
     size = 2
     while size <= _SQUARE:
         for view in (np.asarray, np.transpose):
             _add_sides(view(error), view(grid.disparity), view(grid.sigma), size)
+            _split_sides(view(error), view(grid.changes), size)
         _add_middles(error, grid.disparity, grid.sigma, size)
+        corners = [grid.changes[rows, columns] for rows, columns in _corners(size)]
+        error[size // 2 :: size, size // 2 :: size][_span(corners) > 1] = np.inf
         size *= 2
     return error
 
@@ -264,6 +264,19 @@ def _add_sides(error: Float64, d: Float64, sigma: Float64, size: int) -> None:
         inner = np.maximum(inner[:, ::2], inner[:, 1::2])
         np.maximum(here[:-1], inner[::2], out=here[:-1])
         np.maximum(here[1:], inner[1::2], out=here[1:])
+
+
+def _split_sides(error: Float64, changes: Float64, size: int) -> None:
+    """Split the triangles at the same sides within which the depth changes too much."""
+    half = size // 2
+    ends, apex = (changes[::size, :-1:size], changes[::size, size::size]), changes[half::size]
+    apexes = np.pad(apex[:, half::size], ((1, 1), (0, 0)), constant_values=np.nan)
+    error[::size, half::size][_span([*ends, apexes[1:], apexes[:-1]]) > 1] = np.inf
+
+
+def _span(values: Sequence[Float64]) -> Float64:
+    """Return by how much values differ, place by place, of those that are known."""
+    return np.asarray(np.fmax.reduce(values) - np.fmin.reduce(values))
 
 
 def _add_middles(error: Float64, d: Float64, sigma: Float64, size: int) -> None:
@@ -315,8 +328,8 @@ def _triangles(error: Float64) -> Int64:
 
 
 def _whole(faces: Int64, grid: _Grid, edges: tuple[Bool, Bool]) -> Int64:
-    """The triangles (F, 3) that have points at their corners, and no edge between them."""
-    faces = faces[grid.valid.ravel()[faces].all(axis=1)]
+    """The triangles (F, 3) with points at their corners, and no edge or change between them."""
+    faces = faces[np.ptp(grid.changes.ravel()[faces], axis=1) <= 1]  # NaN without a point
     width = grid.point.shape[1]
     right = np.pad(edges[0], ((0, 0), (0, 1))).ravel()
     down = np.pad(edges[1], ((0, 1), (0, 0))).ravel()

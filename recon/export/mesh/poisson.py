@@ -8,7 +8,8 @@ from dataclasses import replace
 from typing import Final, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from recon.core.errors import MeshingError
 from recon.core.settings import Length, Settings
@@ -39,6 +40,9 @@ class MeshSettings(Settings):
     pair_surface: Literal["grid", "poisson"] = "grid"
     """How the surface of a pair is made: from the grid of its pixels, in a second; or by MeshLab's
     Poisson reconstruction, as those of clouds."""
+    pair_solid_m: float | None = Field(None, gt=0, le=100_000.0)
+    """Thickness of the surface of a pair, in metres behind it, as a closed body for printing; none
+    = an open surface."""
     map_surface: Literal["voxels", "poisson"] = "voxels"
     """How the surface of a map is made: through the points of its voxels, in seconds; or by
     MeshLab's Poisson reconstruction, which closes wider holes and is smoother."""
@@ -70,6 +74,15 @@ class MeshSettings(Settings):
     free_space: bool = True
     """Remove surfaces in space that the cameras of a drive saw to be free. Off keeps what moved
     through."""
+
+    @model_validator(mode="after")
+    def _check_solid(self) -> Self:
+        if self.pair_solid_m is not None:
+            if self.pair_surface != "grid":
+                raise ValueError("pair_solid_m: only a surface with pair_surface=grid is closed")
+            if self.target_faces is not None:
+                raise ValueError("pair_solid_m: a simplified surface has gaps; no target_faces")
+        return self
 
 
 def reconstruct_mesh(
