@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from contextlib import suppress
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,9 @@ from recon.core.values.arrays import Bool, Float32, Float64, float_map
 from recon.core.values.camera import depth_from_disparity
 
 THRESHOLDS_PX: Final = (0.5, 1.0, 2.0, 4.0)
+Kind = Literal["all", "measured", "inferred"]
+KINDS: Final[tuple[Kind, ...]] = ("measured", "inferred")
+WRONG_PX: Final = 3.0  # errors above say that another surface was found
 _QUANTILES: Final = (50, 90, 95, 99)
 _D1_PX, _D1_SHARE = 3.0, 0.05
 _DEPTH_SHARE: Final = 0.05
@@ -32,6 +36,7 @@ def evaluate_disparity(
     *,
     occluded: bool = False,
     scale: float = 1.0,
+    kind: Kind = "all",
 ) -> DisparityMetrics:
     """Compare a disparity map with the truth, over the pixels whose truth is known.
 
@@ -46,14 +51,16 @@ def evaluate_disparity(
         occluded: Whether to include pixels that only the left camera sees.
         scale: Factor from pixels of the map to pixels of the results: 4 reports a quarter-size
             map in full-size pixels.
+        kind: Compare pixels of one kind alone, of which none is invalid: "measured" or "inferred".
+            Values that come without their kinds are measured.
 
     Raises:
-        EvaluationError: The sizes differ, or no pixel has a known truth.
+        EvaluationError: The sizes differ, there is no such kind, or no pixel has a known truth.
 
     Ref: Scharstein et al., Middlebury Stereo Evaluation SDK 1.6, ``evaldisp``; A. Geiger et al.,
     KITTI stereo development kit (2015), ``d1``.
     """
-    values, true = _compared(estimate, truth, occluded=occluded)
+    values, true = _compared(estimate, truth, occluded=occluded, kind=kind)
     pixels, known = len(values), np.isfinite(values)
     error, true = scale * np.abs(values - true)[known], scale * true[known]
     outlier = (error > _D1_PX) & (error > _D1_SHARE * np.abs(true))
@@ -66,6 +73,20 @@ def evaluate_disparity(
         quantiles_px={q: _quantile(error, q) for q in _QUANTILES},
         d1=100 * float(np.sum(outlier)) / pixels,
     )
+
+
+def evaluate_kinds(
+    estimate: Disparity, truth: DisparityTruth | ArrayLike, *, occluded: bool = False
+) -> dict[Kind, DisparityMetrics]:
+    """Compare measured and inferred pixels each alone; a kind that cannot be compared is left out.
+
+    The arguments are those of `evaluate_disparity`.
+    """
+    found = {}
+    for kind in KINDS:
+        with suppress(EvaluationError):
+            found[kind] = evaluate_disparity(estimate, truth, occluded=occluded, kind=kind)
+    return found
 
 
 def evaluate_depth(
@@ -107,12 +128,29 @@ def truth_of(truth: DisparityTruth | ArrayLike) -> DisparityTruth:
 
 
 def _compared(
-    estimate: Disparity | ArrayLike, truth: DisparityTruth | ArrayLike, *, occluded: bool
+    estimate: Disparity | ArrayLike,
+    truth: DisparityTruth | ArrayLike,
+    *,
+    occluded: bool,
+    kind: Kind = "all",
 ) -> tuple[Float64, Float64]:
     """Return float64 (N,) twice, values and truth of the compared pixels."""
     values, known = values_of(estimate), truth_of(truth)
     counted = compared_pixels(values, known, occluded=occluded)
+    if kind != "all":
+        counted &= _of_kind(estimate, kind)
+        if not counted.any():
+            raise EvaluationError(f"no {kind} pixel has a known truth to compare with")
     return values[counted].astype(np.float64), known.values[counted].astype(np.float64)
+
+
+def _of_kind(estimate: Disparity | ArrayLike, kind: Kind) -> Bool:
+    if kind not in KINDS:
+        what, expected = "there is no such kind of pixel", ", ".join(("all", *KINDS))
+        raise EvaluationError(what, got=kind, expected=expected)
+    if isinstance(estimate, Disparity):
+        return estimate.measured if kind == "measured" else estimate.inferred
+    return np.isfinite(values_of(estimate)) & (kind == "measured")
 
 
 def compared_pixels(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:

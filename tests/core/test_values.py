@@ -234,8 +234,10 @@ ZEROS = np.zeros((500, 3), np.float32)
 CELLS = np.full((30, 20), -1, np.int8)
 CELLS[:3], CELLS[3:6] = 0, 100
 SHOWN = {
-    Disparity.from_values([[1, 2], [0, 5]]): "Disparity(2x2, 1 to 5 px, 75.0 % measured)",
-    Disparity.from_values([[NAN]]): "Disparity(1x1, 0.0 % measured)",
+    Disparity.from_values(
+        [[1, 2], [0, 5]]
+    ): "Disparity(2x2, 1 to 5 px, 75.0 % measured, 0.0 % inferred)",
+    Disparity.from_values([[NAN]]): "Disparity(1x1, 0.0 % measured, 0.0 % inferred)",
     BOTH: "Disparity(2x2, 1 to 3 px, 25.0 % measured, 50.0 % inferred)",
     DisparityTruth.from_values([[1, 2.5, np.inf, 0]], [[True, False, True, True]]): (
         "DisparityTruth(4x1, 1 to 2.5 px, 50.0 % known, 25.0 % not occluded)"

@@ -233,10 +233,9 @@ class Disparity(Shown):
         )
 
     def __repr__(self) -> str:
-        share = f"{100 * self.measured.mean():.1f} % measured"
-        if self.inferred.any():
-            share += f", {100 * self.inferred.mean():.1f} % inferred"
-        return f"Disparity({size_text(self.values)}, {range_text(self.values)}{share})"
+        shares = (100 * kind.mean() for kind in (self.measured, self.inferred))
+        text = "{:.1f} % measured, {:.1f} % inferred".format(*shares)
+        return f"Disparity({size_text(self.values)}, {range_text(self.values)}{text})"
 
     @cached_property
     def valid(self) -> Bool:
@@ -261,10 +260,13 @@ class Disparity(Shown):
     def only_measured(self) -> Disparity:
         """Return what was measured alone; itself where nothing is inferred.
 
-        Inferred pixels have no value then, and reason AMBIGUOUS: why the matcher had found nothing
-        there, or nothing sure, is not kept.
+        Inferred pixels have no value then, and reason AMBIGUOUS: why nothing was found is not kept.
         """
         return self.reject(self.inferred, Reason.AMBIGUOUS) if self.inferred.any() else self
+
+    def only_inferred(self) -> Disparity:
+        """Return what was inferred alone; measured pixels have no value then, and AMBIGUOUS."""
+        return self.reject(self.measured, Reason.AMBIGUOUS)
 
     @property
     def reason_shares(self) -> dict[Reason, float]:
