@@ -60,8 +60,11 @@ def evaluate_disparity(
     Ref: Scharstein et al., Middlebury Stereo Evaluation SDK 1.6, ``evaldisp``; A. Geiger et al.,
     KITTI stereo development kit (2015), ``d1``.
     """
-    values, true = _compared(estimate, truth, occluded=occluded, kind=kind)
-    pixels, known = len(values), np.isfinite(values)
+    values, true = _compared(_alone(estimate, kind), truth, occluded=occluded)
+    known = np.isfinite(values)
+    pixels = len(values) if kind == "all" else int(known.sum())
+    if not pixels:
+        raise EvaluationError(f"no {kind} pixel has a known truth to compare with")
     error, true = scale * np.abs(values - true)[known], scale * true[known]
     outlier = (error > _D1_PX) & (error > _D1_SHARE * np.abs(true))
     return DisparityMetrics(
@@ -75,17 +78,12 @@ def evaluate_disparity(
     )
 
 
-def evaluate_kinds(
-    estimate: Disparity, truth: DisparityTruth | ArrayLike, *, occluded: bool = False
-) -> dict[Kind, DisparityMetrics]:
-    """Compare measured and inferred pixels each alone; a kind that cannot be compared is left out.
-
-    The arguments are those of `evaluate_disparity`.
-    """
+def evaluate_kinds(estimate: Disparity, truth: DisparityTruth) -> dict[Kind, DisparityMetrics]:
+    """Compare each kind of pixel alone; a kind that cannot be compared is left out."""
     found = {}
     for kind in KINDS:
         with suppress(EvaluationError):
-            found[kind] = evaluate_disparity(estimate, truth, occluded=occluded, kind=kind)
+            found[kind] = evaluate_disparity(estimate, truth, kind=kind)
     return found
 
 
@@ -128,29 +126,22 @@ def truth_of(truth: DisparityTruth | ArrayLike) -> DisparityTruth:
 
 
 def _compared(
-    estimate: Disparity | ArrayLike,
-    truth: DisparityTruth | ArrayLike,
-    *,
-    occluded: bool,
-    kind: Kind = "all",
+    estimate: Disparity | ArrayLike, truth: DisparityTruth | ArrayLike, *, occluded: bool
 ) -> tuple[Float64, Float64]:
     """Return float64 (N,) twice, values and truth of the compared pixels."""
     values, known = values_of(estimate), truth_of(truth)
     counted = compared_pixels(values, known, occluded=occluded)
-    if kind != "all":
-        counted &= _of_kind(estimate, kind)
-        if not counted.any():
-            raise EvaluationError(f"no {kind} pixel has a known truth to compare with")
     return values[counted].astype(np.float64), known.values[counted].astype(np.float64)
 
 
-def _of_kind(estimate: Disparity | ArrayLike, kind: Kind) -> Bool:
-    if kind not in KINDS:
+def _alone(estimate: Disparity | ArrayLike, kind: Kind) -> Disparity | ArrayLike:
+    """Return an estimate without the values of the other kind."""
+    if kind not in ("all", *KINDS):
         what, expected = "there is no such kind of pixel", ", ".join(("all", *KINDS))
         raise EvaluationError(what, got=kind, expected=expected)
-    if isinstance(estimate, Disparity):
-        return estimate.measured if kind == "measured" else estimate.inferred
-    return np.isfinite(values_of(estimate)) & (kind == "measured")
+    if isinstance(estimate, Disparity) and kind != "all":
+        return estimate.only_measured() if kind == "measured" else estimate.only_inferred()
+    return np.full_like(values_of(estimate), np.nan) if kind == "inferred" else estimate
 
 
 def compared_pixels(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:

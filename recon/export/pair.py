@@ -72,12 +72,9 @@ def _coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
 def write_disparity_files(
     disparity: Disparity, folder: Path, camera: RectifiedCamera | None = None
 ) -> float:
-    """Write disparity, confidence, reasons and, of a camera, depth.
+    """Write disparity, confidence, reasons; return grey levels per pixel in ``disparity.png``.
 
-    What was inferred is in files of its own, if there is any; the reasons are those of both.
-
-    Returns:
-        Grey levels per pixel in ``disparity.png``.
+    What was inferred is in files of its own, if there is any. With a camera, depth is written, too.
     """
     folder, measured = folder / "disparity", disparity.only_measured()
     kinds = [("disparity", "", measured)]

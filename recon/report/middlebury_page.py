@@ -214,8 +214,9 @@ def _kind_table(title: str, matchers: Figures, mask: str) -> Table:
     for name, kind in product(matchers, KINDS):
         found = matchers[name]["weighted"]
         cells = (_at(found, (mask, kind, *path)) for path in (("share",), ("bad", "2"), ("wrong",)))
-        ece = number(_at(found, ("confidence", f"ece_{kind}")), 3)
-        rows.append((f"{name}, {kind}", *map(number, cells), ece))
+        # Of all pixels, occluded ones too.
+        ece = _at(found, ("confidence", f"ece_{kind}")) if mask == "all" else None
+        rows.append((f"{name}, {kind}", *map(number, cells), number(ece, 3)))
     return Table(title, ("matcher", "share (%)", "bad 2 (%)", "wrong (%)", "ece"), rows)
 
 

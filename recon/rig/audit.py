@@ -249,17 +249,16 @@ def check_found(
         "the calibration is theirs, and the range (--ndisp)"
     )
     if disparity.measured.any():
-        found = f"only {100 * measured:.2g} % of the pixels were measured"
-        others = f"{100 * inferred:.2g} % inferred from planes around" if inferred else ""
-        found += f" ({', '.join(filter(None, (others, _reasons(disparity))))})"
         if support is not None:  # which shows that the images belong together
             advice = f"plain or dark surfaces need more light, or texture; else {advice}"
+        found = f"only {100 * measured:.2g} % of the pixels were measured ({_reasons(disparity)})"
         return (*known, f"{found}; {advice}")
     what, got = "no pixel has a match in the other image", _reasons(disparity)
     raise MatchingError(what, where=name or None, got=got, hint=fatal or advice)
 
 
 def _reasons(disparity: Disparity) -> str:
-    shares = {r: 100 * share for r, share in disparity.reason_shares.items() if share >= 0.01}
-    most = [one for one in shares.items() if one[0] not in (Reason.VALID, Reason.FILLED)][:2]
-    return ", ".join(f"{share:.0f} % {r.name.lower().replace('_', ' ')}" for r, share in most)
+    shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
+    names = {r: r.name.lower().replace("_", " ") for r in shares}
+    names[Reason.FILLED] = "inferred from planes around"
+    return ", ".join(f"{share:.0f} % {names[r]}" for r, share in list(shares.items())[:2])

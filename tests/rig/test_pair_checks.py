@@ -142,8 +142,14 @@ def kinds(measured: int, inferred: int) -> Disparity:
 @pytest.mark.parametrize(
     ("disparity", "words"),
     [
-        (kinds(4, 35), "only 4 % of the pixels were measured (35 % inferred from planes around, "),
-        (kinds(30, 50), "only 30 % of the pixels were measured (50 % inferred from planes around"),
+        (
+            kinds(4, 35),
+            "only 4 % of the pixels were measured (61 % low texture, 35 % inferred from ",
+        ),
+        (
+            kinds(30, 50),
+            "only 30 % of the pixels were measured (50 % inferred from planes around, ",
+        ),
         (kinds(20, 0), "only 20 % of the pixels were measured (80 % low texture); "),
     ],
 )

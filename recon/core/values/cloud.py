@@ -32,8 +32,7 @@ class PointCloud(Shape):
             points that it replaces.
         time_s: float32 (N,), when in its drive it was seen, seconds.
         session: int32 (N,), number of the drive that saw it.
-        inferred: uint8 (N,), 1 = its disparity is that of planes around its pixel, 0 = measured;
-            None = all are measured.
+        inferred: uint8 (N,), 1 = from planes around its pixel, 0 = measured; None = all measured.
         frame: Frame of ``xyz``: camera (x right, y down, z forward), world (the first rectified
             left camera) or map (x forward, y left, z up).
     """

@@ -168,8 +168,7 @@ class Disparity(Shown):
 
     A pixel is *measured* (a match was found in the right view), *inferred* (nothing was found, or
     nothing sure, and it is given that of planes around it), or has no disparity. ``values`` and
-    ``valid`` have both kinds; ``measured`` and ``inferred`` tell them apart, and `only_measured`
-    leaves the second out.
+    ``valid`` have both kinds; ``measured`` and ``inferred`` are masks, `only_measured` has one.
 
     Attributes:
         values: float32 (H, W), ``x_left - x_right`` in pixels, measured or inferred; NaN = neither.

@@ -115,14 +115,13 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
     known = np.isfinite(truth.values)
     if not (sized.valid & known).any():
         return None
-    limit_px = _RIGHT_PX / step
     ece = {
-        f"ece_{kind}": errors.measure_reliability(alone, truth, limit_px).calibration_error
+        f"ece_{kind}": errors.measure_reliability(alone, truth, _RIGHT_PX / step).calibration_error
         for kind, alone in kinds_of(sized).items()
         if (alone.valid & known).any()
     }
     shares = {f"within_{n}_sigma": errors.share_within_sigma(sized, truth, n) for n in (1, 2)}
-    return {**curve_figures(sized, truth, limit_px), **ece, **shares}
+    return {**curve_figures(sized, truth, _RIGHT_PX / step), **ece, **shares}
 
 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
