@@ -22,7 +22,10 @@ def main(folder: Path) -> None:
     frame = recon.reconstruct(pair.left, pair.right, source.calibration)
 
     disparity = frame.disparity
-    print(f"{disparity.valid.mean():.0%} of the pixels have a disparity; the others say why not:")
+    measured, inferred = disparity.measured.mean(), disparity.inferred.mean()
+    print(
+        f"{measured:.0%} of the pixels were measured, {inferred:.0%} inferred from planes around:"
+    )
     for reason in recon.Reason:
         print(f"  {(disparity.reason == reason).mean():6.1%}  {reason.name.lower()}")
 

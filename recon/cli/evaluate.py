@@ -60,7 +60,8 @@ def middlebury(
     """Score matchers on Middlebury scenes with the measures of the benchmark.
 
     Several matchers, separated by commas, are compared in one run, and with
-    --results those of other programs beside them.
+    --results those of other programs beside them. Measured and inferred
+    pixels are scored together, and each kind alone.
 
     Examples:
       recon evaluate middlebury MiddEval3/trainingQ --matcher sad,sgm,opencv-sgbm

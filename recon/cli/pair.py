@@ -82,7 +82,9 @@ def pair(
 
     The images may be raw or rectified; the calibration tells which. Without
     one they must be rectified, and the focal length is that of --focal or of
-    the EXIF data. Pixels without a disparity have a reason code.
+    the EXIF data. Pixels without a disparity have a reason code. What planes
+    around say where nothing was measured is in files of its own; --set
+    cloud.inferred=true makes points and surface of it, too.
 
     Examples:
       recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
@@ -126,7 +128,8 @@ def disparity(
 ) -> None:
     """Compute the disparity of one pair: PFM, 16-bit PNG, confidence, reason codes.
 
-    Unlike recon pair it needs no calibration if the pair is rectified.
+    Unlike recon pair it needs no calibration if the pair is rectified. What
+    planes around say where nothing was measured is in files of its own.
 
     Examples:
       recon disparity left.png right.png --ndisp 128

@@ -20,7 +20,6 @@ from recon.core.values import (
     OccupancyGrid,
     OccupancyMetrics,
     OccupancyTruth,
-    Reason,
     Trajectory,
 )
 from recon.core.values.arrays import Float32
@@ -40,6 +39,7 @@ from recon.evaluation.map_comparison import (
     possible_frames,
     read_mapped_cloud,
 )
+from recon.evaluation.middlebury.bench import unrated
 from recon.evaluation.middlebury.score import curve_figures, dense_map, named_figures
 from recon.evaluation.occupancy import evaluate_occupancy
 from recon.evaluation.trajectory import (
@@ -237,12 +237,7 @@ def _rated(values: Float32, path: Path) -> Disparity:
         raise EvaluationError(what, where=path, got=got, expected=values.shape)
     if not ((confidence[known] >= 0) & (confidence[known] <= 1)).all():
         raise EvaluationError("confidence is not between 0 and 1", where=path)
-    return Disparity(
-        values=values,
-        confidence=np.where(known, confidence, np.float32(0)),
-        sigma_px=np.full(values.shape, np.nan, np.float32),
-        reason=np.where(known, np.uint8(Reason.VALID), np.uint8(Reason.AMBIGUOUS)),
-    )
+    return replace(unrated(values), confidence=np.where(known, confidence, np.float32(0)))
 
 
 @dataclass(frozen=True, eq=False)

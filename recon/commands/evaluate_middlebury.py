@@ -92,7 +92,10 @@ def run_middlebury(
                 return None
             figures = {}
             for one in bench.results(scene):
-                write_pfm(run.path(f"disparity/{one.matcher}/{name}.pfm"), one.values)
+                stem, found = f"disparity/{one.matcher}/{name}", one.disparity
+                write_pfm(run.path(f"{stem}.pfm"), found.only_measured().values)
+                if found.inferred.any():
+                    write_pfm(run.path(f"{stem}_inferred.pfm"), found.only_inferred().values)
                 draw_result(one, run)
                 figures[one.matcher] = one.figures
             for other in others:

@@ -23,7 +23,7 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import UInt8
-from recon.evaluation.disparity import evaluate_disparity
+from recon.evaluation.disparity import evaluate_disparity, evaluate_kinds
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.cameras.calibration import read_calibration
 from recon.io.files import StrPath, naming
@@ -52,7 +52,8 @@ def run_pair(
 
     The images are checked as `recon audit` checks a recording, rectified and matched. The points
     that their disparity gives are filtered, and meshed as the camera saw them; without a mesh the
-    run goes on. Disparity, depth, reasons, cloud, mesh and a report go to the result folder.
+    run goes on. Disparity, depth, reasons, cloud, mesh and a report go to the result folder. Cloud
+    and mesh have what was measured; with ``cloud.inferred``, what planes around a pixel say, too.
 
     Args:
         given: The images, their calibration and ground truth.
@@ -77,7 +78,7 @@ def run_pair(
         with run.stage("mesh"):
             mesh, coverage, unmeshed = mesh_frame(frame, config.mesh)
         with run.stage("write"):
-            scale = write_disparity_files(frame.disparity, run.content)
+            scale = write_disparity_files(frame.disparity, run.content, frame.pair.camera)
             write_cloud_files(frame, mesh, formats, run.content)
         figures = {
             **_cloud_figures(frame),
@@ -135,16 +136,17 @@ def _compared(
     """Return the results of a run, compared with the truth if it is known."""
     (pair, disparity), name = matched, given.pair.name
     metrics = None if given.truth is None else evaluate_disparity(disparity, given.truth)
+    by_kind = {} if given.truth is None else evaluate_kinds(disparity, given.truth)
     summary = {
         "pair": name,
         **_disparity_figures(disparity),
-        **({} if metrics is None else {"disparity": plain(metrics)}),
+        **({} if metrics is None else {"disparity": {**plain(metrics), **plain(by_kind)}}),
         **_network_figures(config.matching),
         **figures,
         "warnings": list(warnings),
     }
-    made: Any = {"truth": given.truth, "metrics": metrics, "warnings": warnings}
-    return PairRun(name, config, pair, disparity, summary, **made)
+    made: Any = {"truth": given.truth, "metrics": metrics, "by_kind": by_kind}
+    return PairRun(name, config, pair, disparity, summary, warnings=warnings, **made)
 
 
 def _reconstructor(given: PairInput, config: ReconConfig, run: Run) -> FrameReconstructor:
@@ -166,6 +168,10 @@ def match(
     **settings: Any,
 ) -> Disparity:
     """Match two images: return their disparity.
+
+    It has what was measured, and what planes around a pixel say where nothing was found, or nothing
+    sure: ``.measured`` and ``.inferred`` tell them apart, ``.only_measured()`` has the first alone,
+    as has ``fill=False`` of `sad` and `sgm`.
 
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
@@ -199,6 +205,9 @@ def reconstruct(
 ) -> ReconstructedFrame:
     """Reconstruct two images: rectified pair, disparity and cloud (camera axes, metres).
 
+    The disparity is as `match` gives it; the cloud has what was measured alone, unless the settings
+    ask for what was inferred (``cloud.inferred``), which its attribute ``inferred`` marks then.
+
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
         right: The same shape as ``left``.
@@ -213,7 +222,7 @@ def reconstruct(
     settings = (config or load_config(defaults=PAIR_DEFAULTS)).with_matcher(matcher)
     pair = StereoPair(left, right)
     frame = FrameReconstructor(_rig_of(calibration, pair), settings).reconstruct(pair)
-    if frame.support is not None and frame.disparity.valid.any():
+    if frame.support is not None and frame.disparity.measured.any():
         frame.support.check(None)
     return frame
 
@@ -239,15 +248,16 @@ def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[s
 def _disparity_figures(disparity: Disparity) -> dict[str, Any]:
     """Return size, share of pixels for each reason, and median of a disparity, ready for JSON.
 
-    What was measured and what was filled are counted apart; the median is of the former.
+    What was measured and what was inferred are counted apart; the median is of the former.
+    ``filled_percent`` is what ``inferred_percent`` was called.
     """
     found = disparity.values[disparity.measured]
-    shares = disparity.reason_shares
+    shares, inferred = disparity.reason_shares, 100.0 * float(disparity.inferred.mean())
     return {
         "width_px": disparity.values.shape[1],
         "height_px": disparity.values.shape[0],
         "valid_percent": 100.0 * float(disparity.measured.mean()),
-        "filled_percent": 100.0 * shares.get(Reason.FILLED, 0.0),
+        **dict.fromkeys(("inferred_percent", "filled_percent"), inferred),
         "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
         "disparity_median_px": float(np.median(found)) if len(found) else None,
     }
@@ -260,8 +270,10 @@ def _network_figures(settings: MatchingSettings) -> dict[str, Any]:
 def _cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:
     """Return the number of points, median depth and camera of a frame, ready for JSON."""
     camera, z = frame.pair.camera, frame.cloud.xyz[:, 2]
+    inferred = frame.cloud.inferred
     return {
         "points": len(frame.cloud),
+        **({} if inferred is None else {"inferred_points": int(inferred.sum())}),
         "depth_median_m": float(np.median(z)) if len(z) else None,
         "focal_px": camera.focal_px,
         "field_of_view_deg": camera.field_of_view_deg,

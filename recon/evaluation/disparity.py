@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from contextlib import suppress
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,9 @@ from recon.core.values.arrays import Bool, Float32, Float64, float_map
 from recon.core.values.camera import depth_from_disparity
 
 THRESHOLDS_PX: Final = (0.5, 1.0, 2.0, 4.0)
+Kind = Literal["all", "measured", "inferred"]
+KINDS: Final[tuple[Kind, ...]] = ("measured", "inferred")
+WRONG_PX: Final = 3.0  # errors above say that another surface was found
 _QUANTILES: Final = (50, 90, 95, 99)
 _D1_PX, _D1_SHARE = 3.0, 0.05
 _DEPTH_SHARE: Final = 0.05
@@ -32,6 +36,7 @@ def evaluate_disparity(
     *,
     occluded: bool = False,
     scale: float = 1.0,
+    kind: Kind = "all",
 ) -> DisparityMetrics:
     """Compare a disparity map with the truth, over the pixels whose truth is known.
 
@@ -46,15 +51,20 @@ def evaluate_disparity(
         occluded: Whether to include pixels that only the left camera sees.
         scale: Factor from pixels of the map to pixels of the results: 4 reports a quarter-size
             map in full-size pixels.
+        kind: Compare pixels of one kind alone, of which none is invalid: "measured" or "inferred".
+            Values that come without their kinds are measured.
 
     Raises:
-        EvaluationError: The sizes differ, or no pixel has a known truth.
+        EvaluationError: The sizes differ, there is no such kind, or no pixel has a known truth.
 
     Ref: Scharstein et al., Middlebury Stereo Evaluation SDK 1.6, ``evaldisp``; A. Geiger et al.,
     KITTI stereo development kit (2015), ``d1``.
     """
-    values, true = _compared(estimate, truth, occluded=occluded)
-    pixels, known = len(values), np.isfinite(values)
+    values, true = _compared(_alone(estimate, kind), truth, occluded=occluded)
+    known = np.isfinite(values)
+    pixels = len(values) if kind == "all" else int(known.sum())
+    if not pixels:
+        raise EvaluationError(f"no {kind} pixel has a known truth to compare with")
     error, true = scale * np.abs(values - true)[known], scale * true[known]
     outlier = (error > _D1_PX) & (error > _D1_SHARE * np.abs(true))
     return DisparityMetrics(
@@ -66,6 +76,15 @@ def evaluate_disparity(
         quantiles_px={q: _quantile(error, q) for q in _QUANTILES},
         d1=100 * float(np.sum(outlier)) / pixels,
     )
+
+
+def evaluate_kinds(estimate: Disparity, truth: DisparityTruth) -> dict[Kind, DisparityMetrics]:
+    """Compare each kind of pixel alone; a kind that cannot be compared is left out."""
+    found = {}
+    for kind in KINDS:
+        with suppress(EvaluationError):
+            found[kind] = evaluate_disparity(estimate, truth, kind=kind)
+    return found
 
 
 def evaluate_depth(
@@ -113,6 +132,16 @@ def _compared(
     values, known = values_of(estimate), truth_of(truth)
     counted = compared_pixels(values, known, occluded=occluded)
     return values[counted].astype(np.float64), known.values[counted].astype(np.float64)
+
+
+def _alone(estimate: Disparity | ArrayLike, kind: Kind) -> Disparity | ArrayLike:
+    """Return an estimate without the values of the other kind."""
+    if kind not in ("all", *KINDS):
+        what, expected = "there is no such kind of pixel", ", ".join(("all", *KINDS))
+        raise EvaluationError(what, got=kind, expected=expected)
+    if isinstance(estimate, Disparity) and kind != "all":
+        return estimate.only_measured() if kind == "measured" else estimate.only_inferred()
+    return np.full_like(values_of(estimate), np.nan) if kind == "inferred" else estimate
 
 
 def compared_pixels(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:

@@ -210,7 +210,7 @@ def apply_method(
     if method == CORRECTED:
         rebuilt = FrameReconstructor(experiment.camera, config, threads=threads)
         frame = rebuilt.reconstruct(experiment.pair)
-        pair, disparity, cloud = frame.pair, frame.disparity, frame.cloud
+        pair, disparity, cloud = frame.pair, frame.disparity.only_measured(), frame.cloud
     else:
         pair = _printed_pair(experiment)
         disparity = PrintedMatcher(_PATCH_PX, method == AS_PRINTED).match(pair)

@@ -134,7 +134,7 @@ class _Images:
             raise EvaluationError("no such pixel", where=self._where, got=got, expected=expected)
         if (number, frame) not in self._matched:
             pair = next(drive.source.frames(frame))
-            self._matched[number, frame] = self._matchers[number].match(pair)[1]
+            self._matched[number, frame] = self._matchers[number].match(pair)[1].only_measured()
         seen = self._matched[number, frame]
         row, column = round(float(v)), round(float(u))
         uvd = np.array([u, v, seen.values[row, column]], np.float64)

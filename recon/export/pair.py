@@ -36,11 +36,12 @@ def mesh_frame(
     """Mesh the cloud of a frame as its camera saw it.
 
     Returns:
-        The surface in camera axes, or None; the share of the points that lie on it; warnings.
+        The surface in camera axes, or None; the share of the measured points that lie on it;
+        warnings.
     """
     try:
         mesh = _surface(frame.cloud, frame.pair.camera, settings, frame.pair.colours)
-        coverage = mesh_coverage(mesh, frame.cloud)
+        coverage = _coverage(mesh, frame.cloud)
     except MeshingError as error:
         return None, None, (f"no mesh: {error}",)
     return mesh, coverage, check_coverage(coverage)
@@ -63,12 +64,30 @@ def _surface(
     return replace(mesh, texture=Texture(image, inside, _PHOTO))
 
 
-def write_disparity_files(disparity: Disparity, folder: Path) -> float:
-    """Write disparity, confidence, reasons; return grey levels per pixel in ``disparity.png``."""
-    folder, scale = folder / "disparity", fitting_scale(disparity.values)
-    write_pfm(folder / "disparity.pfm", disparity.values)
-    write_disparity_png(folder / "disparity.png", disparity.values, scale=scale)
-    write_pfm(folder / "confidence.pfm", disparity.confidence)
+def _coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
+    """Return the share of the measured points that lie on a mesh; of all, if none is measured."""
+    measured = cloud.only_measured()
+    return mesh_coverage(mesh, measured if len(measured) else cloud)
+
+
+def write_disparity_files(
+    disparity: Disparity, folder: Path, camera: RectifiedCamera | None = None
+) -> float:
+    """Write disparity, confidence, reasons; return grey levels per pixel in ``disparity.png``.
+
+    What was inferred is in files of its own, if there is any. With a camera, depth is written, too.
+    """
+    folder, measured = folder / "disparity", disparity.only_measured()
+    kinds = [("disparity", "", measured)]
+    if disparity.inferred.any():
+        kinds.append(("inferred", "inferred_", disparity.only_inferred()))
+    for name, prefix, kind in kinds:
+        write_pfm(folder / f"{name}.pfm", kind.values)
+        write_pfm(folder / f"{prefix}confidence.pfm", kind.confidence)
+        if camera is not None:
+            write_pfm(folder / f"{prefix}depth.pfm", depth_from_disparity(kind.values, camera))
+    scale = fitting_scale(measured.values)
+    write_disparity_png(folder / "disparity.png", measured.values, scale=scale)
     write_image(folder / "reason.png", disparity.reason)
     return scale
 
@@ -79,9 +98,7 @@ def write_cloud_files(
     formats: Sequence[str],
     folder: Path,
 ) -> None:
-    """Write depth, cloud and mesh (PLY and ``formats``), and a project with the left image."""
-    depth_m = depth_from_disparity(frame.disparity.values, frame.pair.camera)
-    write_pfm(folder / "disparity" / "depth.pfm", depth_m)
+    """Write cloud and mesh (PLY and ``formats``), and a project with the left image."""
     write_ply(folder / PAIR_CLOUD, frame.cloud)
     if mesh is not None:
         write_surface(mesh, frame.pair.camera, folder / PAIR_CLOUD, formats, folder / WHOLE)
@@ -115,7 +132,7 @@ def mesh_cloud(
         mesh, covered = reconstruct_mesh(cloud, settings), {}
     else:
         mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
-        covered = {"mesh_coverage": mesh_coverage(mesh, cloud)}
+        covered = {"mesh_coverage": _coverage(mesh, cloud)}
     sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     warnings = [line for share in covered.values() for line in check_coverage(share)]
     return mesh, {**sizes, **covered, "warnings": warnings}

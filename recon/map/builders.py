@@ -284,13 +284,13 @@ def ray_grain(settings: OccupancySettings) -> RayGrain:
 
 
 def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
-    """Average the points of a frame in cubes; points without confidence are dropped.
+    """Average the measured points of a frame in cubes; those without confidence are dropped.
 
     A point out of the map's range is moved along its ray to just beyond it: it is still no hit, and
     frees the same space. ``cloud`` is as for `OccupancyBuilder.integrate`.
     """
     _check_cloud(cloud, "camera", "the occupancy map")
-    grain = ray_grain(settings)
+    cloud, grain = cloud.only_measured(), ray_grain(settings)
     sigma_m, sure = sigma_and_confidence(cloud)
     xyz, sigma_m = raycast.limit_points(
         cloud.xyz, sigma_m, settings.max_range_m, _beyond_m(settings), FREE_MARGIN_SIGMAS

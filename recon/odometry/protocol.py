@@ -16,10 +16,13 @@ class OdometryFrame:
     """What an odometry is given of one frame."""
 
     pair: Rectified  # the rectified images
-    disparity: Disparity  # their disparity
+    disparity: Disparity  # what was measured of their disparity; what was inferred is left out
     # Whether it is off by a quarter of a pixel or more: features are then measured in the images
     # themselves
     rough: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "disparity", self.disparity.only_measured())
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ class LoopDetector:
         that did, or another stretch of the drive begins; not one that was not matched, or with a
         pose that is not trusted, of stretch -1. ``path_m`` is the path up to it, by `path_lengths`.
         """
-        seen = stretch >= 0 and bool(disparity.valid.any())
+        seen = stretch >= 0 and bool(disparity.measured.any())
         if not seen or not self._views.is_new(disparity, T_world_camera, stretch):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)

@@ -84,6 +84,7 @@ def make_keyframe(frame: int, pair: Rectified, disparity: Disparity) -> Keyframe
     and Zisserman, "Three things everyone should know to improve object retrieval", CVPR 2012;
     Charikar, "Similarity estimation techniques from rounding algorithms", STOC 2002.
     """
+    disparity = disparity.only_measured()
     sift = cv2.SIFT.create(contrastThreshold=_CONTRAST)
     image, zoom = _reduced(pair.left)
     corners, sifts = sift.detectAndCompute(image, None)
@@ -97,9 +98,9 @@ def make_keyframe(frame: int, pair: Rectified, disparity: Disparity) -> Keyframe
 
 
 def coarse_of(disparity: Disparity) -> Float32:
-    """Return every n-th disparity of every n-th row."""
-    sampled = np.s_[_COARSE_PX // 2 :: _COARSE_PX]
-    return np.ascontiguousarray(disparity.values[sampled, sampled])
+    """Return every n-th disparity of every n-th row; NaN where none was measured."""
+    sampled = (slice(_COARSE_PX // 2, None, _COARSE_PX),) * 2
+    return np.where(disparity.measured[sampled], disparity.values[sampled], np.float32(np.nan))
 
 
 def coarse_grid(coarse: Float32, camera: RectifiedCamera) -> tuple[int, int]:

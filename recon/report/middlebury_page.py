@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 
 from recon.core.text import counted
 from recon.core.values.arrays import UInt8
+from recon.evaluation.disparity import KINDS
 from recon.evaluation.middlebury.bench import SceneResult
 from recon.evaluation.middlebury.score import MASKS, error_map
 from recon.io.atomic import write_text
@@ -30,11 +32,12 @@ _LEAST_SHARE: Final = 0.001
 
 def draw_result(result: SceneResult, run: RunDirectory) -> None:
     """Write disparity, in colours of the range of the truth, and error of a result as images."""
-    scene, values = result.scene, result.values
+    scene, values = result.scene, result.disparity.values
     scale = round(4 * values.shape[1] / scene.truth.values.shape[1]) / 4
     low, high = style.value_range(scene.truth.values)
     stem = f"pictures/{result.matcher}/{scene.name}"
     disparity = style.colour_disparity(values, (low * scale, high * scale))
+    disparity = style.hatch(disparity, result.disparity.inferred)
     write_image(run.path(f"{stem}_disparity.png"), disparity)
     error = style.colour_error(error_map(scene, values), ERROR_LIMIT_PX)
     write_image(run.path(f"{stem}_error.png"), error)
@@ -138,6 +141,7 @@ def middlebury_tables(summary: Figures) -> list[Table]:
     tables = [
         _weighted_table(f"{mean}, {', '.join(kind)} ({_UNITS})", matchers, kind) for kind in _KINDS
     ]
+    tables += [_kind_table(f"{mean}, {mask}, of each kind alone", matchers, mask) for mask in MASKS]
     for name, path in _ERRORS.items():
         title = f"{name} of each scene, nonocc, dense"
         tables.append(_scene_table(title, matchers, ("nonocc", "dense", *path)))
@@ -203,6 +207,17 @@ def _weighted_table(title: str, matchers: Figures, kind: tuple[str, str]) -> Tab
         cells = [number(_at(figures, path)) for path in columns.values()]
         rows.append((name, *cells, shown, number(figures["seconds"], 3)))
     return Table(title, ("matcher", *columns, "depth error", "seconds"), rows, best="columns")
+
+
+def _kind_table(title: str, matchers: Figures, mask: str) -> Table:
+    rows = []
+    for name, kind in product(matchers, KINDS):
+        found = matchers[name]["weighted"]
+        cells = (_at(found, (mask, kind, *path)) for path in (("share",), ("bad", "2"), ("wrong",)))
+        # Of all pixels, occluded ones too.
+        ece = _at(found, ("confidence", f"ece_{kind}")) if mask == "all" else None
+        rows.append((f"{name}, {kind}", *map(number, cells), number(ece, 3)))
+    return Table(title, ("matcher", "share (%)", "bad 2 (%)", "wrong (%)", "ece"), rows)
 
 
 def _scene_table(title: str, matchers: Figures, path: Path, digits: int = 2) -> Table:

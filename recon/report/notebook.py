@@ -49,6 +49,10 @@ def _draw_disparity(figure: Figure, disparity: Disparity) -> None:
     axes.grid(visible=False)
     look: dict[str, Any] = {"cmap": style.DISPARITY_SCALE, "vmin": limits[0], "vmax": limits[1]}
     figure.colorbar(axes.imshow(disparity.values, **look), label="disparity (px)", shrink=0.8)
+    if disparity.inferred.any():
+        colours = style.colour_disparity(disparity.values, limits)
+        axes.imshow(style.hatch(colours, disparity.inferred))
+        axes.legend(handles=[style.hatch_key()], loc="lower left")
 
 
 def _draw_grid(figure: Figure, grid: OccupancyGrid) -> None:

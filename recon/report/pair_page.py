@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,13 +20,13 @@ from recon.core.values import (
     DisparityMetrics,
     DisparityTruth,
     PointCloud,
-    Reason,
     Rectified,
     RectifiedCamera,
     TriangleMesh,
 )
-from recon.core.values.arrays import UInt8
+from recon.core.values.arrays import Bool, UInt8
 from recon.core.values.camera import depth_from_disparity, disparity_from_depth
+from recon.evaluation.disparity import Kind
 from recon.io.images.image import write_image
 from recon.report import style
 from recon.report.page import write_page
@@ -49,6 +49,8 @@ class PairRun:
     mesh: TriangleMesh | None = None  # the surface in camera axes, or None
     truth: DisparityTruth | None = None  # true disparity, or None
     metrics: DisparityMetrics | None = None  # errors against it, or None
+    #: Errors of measured and of inferred pixels alone, as far as there are such.
+    by_kind: Mapping[Kind, DisparityMetrics] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()  # problems that did not stop the run
 
     def __repr__(self) -> str:
@@ -64,12 +66,12 @@ def write_pair_page(result: PairRun, run: RunDirectory) -> None:
 
 
 def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
-    """Write disparity, confidence and reasons of a pair as colour images."""
-    disparity = result.disparity
+    """Write measured disparity, its confidence, and the reasons of a pair as colour images."""
+    measured = result.disparity.only_measured()
     for name, image in (
-        ("disparity", style.colour_disparity(disparity.values)),
-        ("confidence", style.colour_confidence(disparity.confidence)),
-        ("reason", style.colour_reasons(disparity.reason)),
+        ("disparity", style.colour_disparity(measured.values)),
+        ("confidence", style.colour_confidence(measured.confidence)),
+        ("reason", style.colour_reasons(result.disparity.reason)),
     ):
         write_image(run.path(f"disparity/{name}_colour.png"), image)
 
@@ -78,7 +80,7 @@ def pair_content(result: PairRun) -> Json:
     """Return what the page of a pair shows: disparity, accuracy and 3-D view."""
     values, truth, error = result.disparity.values, result.truth, None
     if truth is not None and truth.values.shape == values.shape:
-        error = error_figure(np.abs(values - truth.values))
+        error = error_figure(np.abs(values - truth.values), result.disparity.inferred)
     depth_m = depth_from_disparity(values, result.pair.camera)
     known = depth_m[np.isfinite(depth_m)]
     far = float(np.median(known)) if known.size else 1.0
@@ -89,8 +91,26 @@ def pair_content(result: PairRun) -> Json:
         "result": stereo_figures(result.pair, result.disparity),
         "error": error,
         "limit_px": ERROR_LIMIT_PX,
+        "errors": _error_rows(result),
         "view": plot_scene(Scene(T_UPRIGHT_CAMERA, result.cloud, result.mesh, eye_m=eye_m)),
     }
+
+
+def _error_rows(result: PairRun) -> list[tuple[str, ...]]:
+    """Return the table of errors, its head first: of all pixels, and of each of two kinds alone."""
+    if result.metrics is None:
+        return []
+    shown = {"all": result.metrics} | ({**result.by_kind} if "inferred" in result.by_kind else {})
+    found = [*shown.values()]
+    bad = {f"bad {x:g}: off by more than {x:g} px": x for x in result.metrics.bad}
+    return [
+        ("figure", *shown),
+        *((name, *(f"{one.bad[x]:.2f} %" for one in found)) for name, x in bad.items()),
+        ("without a value", *(f"{one.invalid:.2f} %" for one in found)),
+        ("mean absolute error", *(f"{one.avgerr_px:.3f} px" for one in found)),
+        ("root mean square error", *(f"{one.rms_px:.3f} px" for one in found)),
+        ("pixels compared", *(f"{one.pixels:,}" for one in found)),
+    ]
 
 
 ERROR_LIMIT_PX = 4.0  # error of the last colour: the largest threshold of Middlebury's table
@@ -110,14 +130,15 @@ def is_wide(shape: tuple[int, ...]) -> bool:
 
 def stereo_figures(pair: Rectified, disparity: Disparity) -> dict[str, Any]:
     """Draw a pair and the results for its pixels; also return what their captions need."""
+    depth_m = depth_from_disparity(disparity.values, pair.camera)
     return {
         "pair": pair_figure(pair),
         "disparity": disparity_figure(disparity, pair.camera),
-        "depth": depth_figure(depth_from_disparity(disparity.values, pair.camera)),
+        "depth": depth_figure(depth_m, disparity.inferred),
         "reasons": reasons_figure(disparity),
         "confidence": confidence_figure(disparity),
         "valid_percent": float(100 * disparity.measured.mean()),
-        "filled_percent": 100 * disparity.reason_shares.get(Reason.FILLED, 0.0),
+        "inferred_percent": float(100 * disparity.inferred.mean()),
         "wide": is_wide(disparity.values.shape),
     }
 
@@ -141,17 +162,16 @@ def pair_figure(pair: Rectified) -> bytes:
 def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
     """Draw the disparity map, with scales in pixels below it and in metres of depth above that."""
     limits = style.value_range(disparity.values)
-    figure = _image(style.colour_disparity(disparity.values, limits))
+    figure = _image(style.colour_disparity(disparity.values, limits), disparity.inferred)
     bar = _colour_bar(figure, style.DISPARITY_SCALE, limits, "disparity in pixels")
     _mark_depths(bar, limits, camera)
-    share = 100 * disparity.valid.mean()
-    return style.to_png(
-        figure, f"Disparities: {style.spread(disparity.values, ' px')}; {share:.1f} % have one"
-    )
+    shares = (100 * kind.mean() for kind in (disparity.measured, disparity.inferred))
+    seen = "Disparities: {}; {:.1f} % measured, {:.1f} % inferred"
+    return style.to_png(figure, seen.format(style.spread(disparity.values, " px"), *shares))
 
 
 @style.styled
-def depth_figure(depth_m: NDArray[Any]) -> bytes:
+def depth_figure(depth_m: NDArray[Any], inferred: Bool | None = None) -> bytes:
     """Draw a depth map (H, W) in metres, NaN = unknown; the scale is logarithmic, near is red."""
     known_m = np.where(depth_m > 0, depth_m, np.nan)
     low, high = style.value_range(known_m)
@@ -160,7 +180,7 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
     limits = (math.log(low), math.log(high))
     # Reversed, so that near has the same colour as in the disparity map.
     scale = f"{style.DISPARITY_SCALE}_r"
-    figure = _image(style.colour_values(np.log(known_m), scale, limits))
+    figure = _image(style.colour_values(np.log(known_m), scale, limits), inferred)
     bar = _colour_bar(figure, scale, limits, "depth in metres (logarithmic)")
     depths = depth_marks(low, high, math.log, limits)
     bar.set_xticks(np.log(depths).tolist(), [f"{depth:g}" for depth in depths])
@@ -169,17 +189,18 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
 
 @style.styled
 def confidence_figure(disparity: Disparity) -> bytes:
-    """Draw the confidence of each match, from 0 to 1."""
-    figure = _image(style.colour_confidence(disparity.confidence))
-    _colour_bar(figure, style.CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: no match)")
-    matched = disparity.confidence[disparity.confidence > 0]
+    """Draw the confidence of each match that was measured, from 0 to 1."""
+    sure = disparity.only_measured().confidence
+    figure = _image(style.colour_confidence(sure))
+    _colour_bar(figure, style.CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: not measured)")
+    matched = sure[sure > 0]
     return style.to_png(figure, f"Confidence of the matches: {style.spread(matched)}")
 
 
 @style.styled
-def error_figure(error_px: NDArray[Any]) -> bytes:
+def error_figure(error_px: NDArray[Any], inferred: Bool | None = None) -> bytes:
     """Draw the absolute disparity error of each pixel; NaN = not compared."""
-    figure = _image(style.colour_error(error_px, ERROR_LIMIT_PX))
+    figure = _image(style.colour_error(error_px, ERROR_LIMIT_PX), inferred)
     label = "absolute disparity error in pixels (dark: not compared)"
     _colour_bar(figure, style.ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
     return style.to_png(figure, f"Disparity errors: {style.spread(error_px, ' px')}")
@@ -219,16 +240,21 @@ def depth_marks(
     return sorted(marks)
 
 
-def _image(image: UInt8) -> Figure:
-    """Return an image over the width of its figure, with room for a scale or legend below."""
+def _image(image: UInt8, inferred: Bool | None = None) -> Figure:
+    """Return an image over the width of its figure, with room for a scale or legend below.
+
+    Pixels that were inferred are hatched, and a legend on the image says so.
+    """
     height, width = image.shape[:2]
     width_in = style.WIDE_IN if is_wide(image.shape) else style.HALF_IN
     height_in = width_in * height / width + _BELOW_IN
     # Layout engines ignore the ticks on the upper side of a scale.
     figure = style.bare_figure(width_in, height_in)
     axes = figure.add_axes((0.0, _BELOW_IN / height_in, 1.0, 1.0 - _BELOW_IN / height_in))
-    axes.imshow(image, aspect="auto")
+    axes.imshow(image if inferred is None else style.hatch(image, inferred), aspect="auto")
     axes.set_axis_off()
+    if inferred is not None and inferred.any():
+        axes.legend(handles=[style.hatch_key()], loc="lower left", frameon=True, framealpha=0.9)
     return figure
 
 

@@ -25,7 +25,7 @@ from PIL.PngImagePlugin import PngInfo
 from recon.core.errors import ShapeError
 from recon.core.text import visible
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyTruth, Reason
-from recon.core.values.arrays import UInt8
+from recon.core.values.arrays import Bool, UInt8
 from recon.evaluation.occupancy import grid_on_truth
 
 WIDE_IN: Final = 11.0  # width of a figure that fills the page
@@ -157,6 +157,8 @@ CONFIDENCE_SCALE: Final = "viridis"
 ERROR_SCALE: Final = "RdYlBu_r"
 MISSING: Final[Rgb] = (20, 22, 26)
 
+_HATCHES: Final = 90  # lines of a hatch along the longer side of an image: some 8 px in a page
+
 # Valid pixels recede and each failure stands out, also in lightness.
 REASON_COLOURS: Final[Mapping[Reason, Rgb]] = {
     Reason.VALID: (226, 232, 236),
@@ -174,7 +176,8 @@ REASON_LABELS: Final[Mapping[Reason, str]] = {
     **{reason: reason.name.lower().replace("_", " ") for reason in Reason},
     Reason.LEFT_RIGHT: "left-right check",
     Reason.EDGE: "flying edge",
-    Reason.FILLED: "filled by planes",
+    Reason.VALID: "measured",
+    Reason.FILLED: "inferred",
 }
 _GRID_IMAGE_PX: Final = 1500
 GRID_FREE: Final[Rgb] = (247, 249, 250)
@@ -195,6 +198,21 @@ GRID_NOT_COUNTED: Final[Rgb] = (120, 128, 136)
 def colour_disparity(values: NDArray[Any], limits: tuple[float, float] | None = None) -> UInt8:
     """Colour a disparity map (H, W): far is blue, near is red; None = limits of `value_range`."""
     return colour_values(values, DISPARITY_SCALE, limits or value_range(values))
+
+
+def hatch(image: UInt8, mask: Bool) -> UInt8:
+    """Return an image (H, W, 3) with diagonal lines where a mask (H, W) is set."""
+    row, column = np.ogrid[: mask.shape[0], : mask.shape[1]]
+    period = max(6, max(mask.shape) // _HATCHES)
+    place = np.where(mask, (row + column) % period / period, 1.0)[:, :, None]
+    # White beside dark is seen on every colour.
+    lines = np.where(place < 0.2, np.uint8(255), np.array(MISSING, np.uint8))
+    return np.where(place < 0.4, lines, image)
+
+
+def hatch_key() -> Patch:
+    """Return the entry of a legend for what is hatched: it was inferred."""
+    return Patch(fc="white", ec=INK, hatch="////", lw=0.5, label="inferred from planes around")
 
 
 def colour_confidence(confidence: NDArray[Any]) -> UInt8:

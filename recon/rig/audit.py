@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.errors import CalibrationError, MatchingError
 from recon.core.progress import stage
 from recon.core.text import plain
-from recon.core.values import Disparity, RectifiedCamera, Rig
+from recon.core.values import Disparity, Reason, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
 from recon.look.findings import Finding, Verdict, find_faults, verdict_of
@@ -33,7 +33,7 @@ _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth
 _BY_IMAGES: Final = frozenset({"black", "gain", "blur", "features"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 # Share of pixels with a measured disparity below which a pair is warned of: real ones, even of bare
-# walls, exceed 40 %.
+# walls, exceed 40 %. It is also warned of where more was inferred than measured.
 _FEW_MEASURED_SHARE: Final = 0.25
 # Findings with which rows and motion say nothing about the calibration.
 _NOT_OF_THE_RIG: Final = frozenset({"lag", "nonrigid", "swapped", "size", "frozen", "unreadable"})
@@ -232,30 +232,33 @@ def check_found(
 ) -> tuple[str, ...]:
     """Return the warnings of a matched pair: those of its faults, and of how little was measured.
 
-    What was filled in counts for nothing. `MatchingError`: nothing was found, or nothing supports
+    What was inferred counts for nothing. `MatchingError`: nothing was found, or nothing supports
     that both images belong together.
     """
     fatal = next((fault.text for fault in faults if fault.fatal), None)
-    if support is not None and disparity.valid.any():
+    if support is not None and disparity.measured.any():
         support.check(name or None, fatal)
     # Few features do not matter where much else matches.
     doubtful = support is None or support.doubtful
     known = tuple(one.text for one in faults if one.code != "features" or doubtful)
-    share = float(disparity.measured.mean())
-    if share >= _FEW_MEASURED_SHARE:
+    measured, inferred = (float(kind.mean()) for kind in (disparity.measured, disparity.inferred))
+    if measured >= max(_FEW_MEASURED_SHARE, inferred):
         return known
-    found = f"{100 * share:.0f} % of the pixels have a measured disparity ({_reasons(disparity)})"
     advice = (
         "check that both images show the same moment, that left and right are not swapped, that "
         "the calibration is theirs, and the range (--ndisp)"
     )
-    if disparity.valid.any():
-        return (*known, f"only {found}; {advice}")
+    if disparity.measured.any():
+        if support is not None:  # which shows that the images belong together
+            advice = f"plain or dark surfaces need more light, or texture; else {advice}"
+        found = f"only {100 * measured:.2g} % of the pixels were measured ({_reasons(disparity)})"
+        return (*known, f"{found}; {advice}")
     what, got = "no pixel has a match in the other image", _reasons(disparity)
     raise MatchingError(what, where=name or None, got=got, hint=fatal or advice)
 
 
 def _reasons(disparity: Disparity) -> str:
     shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
-    most = list(shares.items())[:2]
-    return ", ".join(f"{share:.0f} % {r.name.lower().replace('_', ' ')}" for r, share in most)
+    names = {r: r.name.lower().replace("_", " ") for r in shares}
+    names[Reason.FILLED] = "inferred from planes around"
+    return ", ".join(f"{share:.0f} % {names[r]}" for r, share in list(shares.items())[:2])

@@ -29,7 +29,7 @@ from recon.core.values import (
     Rig,
     StereoPair,
 )
-from recon.core.values.arrays import Float32, UInt8
+from recon.core.values.arrays import Float32, UInt8, frozen_array
 from recon.core.work import Stopwatch
 from recon.stereo import open3d_clouds
 from recon.stereo.kernels import points
@@ -175,6 +175,9 @@ class CloudSettings(Settings):
     max_relative_sigma: float | None = Field(0.1, ge=1e-06, le=1000000.0)
     """Largest standard deviation of a depth kept, as a share of it; none = no limit. Smaller for
     fewer, more certain points."""
+    inferred: bool = False
+    """Points also of pixels whose disparity is not measured, but that of planes around them; they
+    are marked. Turn it on where a surface without holes counts more than a true one."""
     stride: int = Field(1, ge=1, le=16)
     """Every n-th row and column is used. Raise it for speed with large images."""
 
@@ -182,10 +185,11 @@ class CloudSettings(Settings):
 def back_project(
     disparity: Disparity, pair: Rectified, settings: CloudSettings, *, normals: bool = True
 ) -> PointCloud:
-    """Return points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``, in row order.
+    """Return points of the pixels that were measured, ``Z = f·b / (d + doffs)``, in row order.
 
     The cloud is in camera axes, with colours, ``sigma_m`` (``sigma_z = Z²·sigma_d / (f·b)``),
-    confidence and, if asked for, normals towards the camera, which take as long as the rest.
+    confidence and, if asked for, normals towards the camera, which take as long as the rest. With
+    ``settings.inferred`` it has the pixels that were inferred, too, and says which they are.
     """
     if disparity.values.shape != pair.left.shape:
         raise ShapeError(
@@ -193,9 +197,11 @@ def back_project(
             got=f"disparity {disparity.values.shape}",
             expected=f"{pair.left.shape}",
         )
+    if not settings.inferred:
+        disparity = disparity.only_measured()
     maps = points.Maps(
         values=disparity.values,
-        confidence=disparity.confidence,
+        confidence=_signed(disparity) if settings.inferred else disparity.confidence,
         sigma=disparity.sigma_px,
         colours=pair.left[:, :, None] if pair.left_rgb is None else pair.left_rgb,
         usable=np.zeros((0, 0), np.bool_) if pair.valid is None else pair.valid,
@@ -206,9 +212,16 @@ def back_project(
         rgb=found.colours,
         normals=found.normals if normals else None,
         sigma_m=found.sigma,
-        confidence=found.confidence,
+        confidence=np.abs(found.confidence),
+        inferred=np.signbit(found.confidence).astype(np.uint8) if settings.inferred else None,
         frame="camera",
     )
+
+
+def _signed(disparity: Disparity) -> Float32:
+    """Return confidences whose sign says through the kernel which pixels are inferred."""
+    sure = np.where(disparity.inferred, -disparity.confidence, disparity.confidence)
+    return frozen_array("confidence", sure, np.float32, (None, None))
 
 
 def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> points.PointRules:

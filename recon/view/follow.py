@@ -29,7 +29,7 @@ from recon.map.map import Map
 from recon.map.sessions.placed import settings_of
 from recon.map.store.map_file import MapViews
 from recon.report.scene import thin_mesh
-from recon.report.style import REASON_LABELS, colour_disparity, colour_reasons
+from recon.report.style import REASON_LABELS, colour_disparity, colour_reasons, hatch
 from recon.run.directory import state_folder
 from recon.run.finished import STATES, states_of
 from recon.run.run import SUMMARY
@@ -193,5 +193,6 @@ class KeyframeViews:
             return [*lines, f"no images: {error}"], None
         shares = disparity.reason_shares.items()
         lines.append(", ".join(f"{REASON_LABELS[r]} {100 * share:.0f} %" for r, share in shares))
-        coloured = colour_disparity(disparity.values), colour_reasons(disparity.reason)
+        shown = hatch(colour_disparity(disparity.values), disparity.inferred)
+        coloured = shown, colour_reasons(disparity.reason)
         return lines, np.concatenate([pair.colours, *coloured])

@@ -39,6 +39,10 @@ DISPARITY = Disparity(
     sigma_px=np.where(np.isnan(FOUND), NAN, 0.5).astype(np.float32),
     reason=np.where(np.isnan(FOUND), Reason.BORDER, Reason.VALID).astype(np.uint8),
 )
+BOTH = replace(
+    DISPARITY,
+    reason=np.array([[Reason.VALID, Reason.BORDER], [Reason.FILLED] * 2], np.uint8),
+)
 CLOUD = PointCloud(
     np.arange(12, dtype=np.float32).reshape(4, 3),
     rgb=np.zeros((4, 3), np.uint8),
@@ -206,11 +210,35 @@ def test_what_is_no_disparity_is_refused(values, others, words):
         Disparity.from_values(values, **others)  # type: ignore[arg-type]
 
 
+def test_what_was_measured_and_what_was_inferred_are_told_apart():
+    assert BOTH.measured.tolist() == [[True, False], [False, False]]
+    assert BOTH.inferred.tolist() == [[False, False], [True, True]]
+    assert BOTH.valid.tolist() == [[True, False], [True, True]]
+    for mask in (BOTH.measured, BOTH.inferred, BOTH.valid):
+        assert not mask.flags.writeable
+
+
+def test_only_what_was_measured_has_a_value_without_what_was_inferred():
+    alone = BOTH.only_measured()
+    np.testing.assert_array_equal(alone.values, [[1, NAN], [NAN, NAN]])
+    np.testing.assert_array_equal(alone.sigma_px, [[0.5, NAN], [NAN, NAN]])
+    assert alone.confidence.tolist() == [[1, 0], [0, 0]]
+    assert alone.reason.tolist() == [[0, Reason.BORDER], [Reason.AMBIGUOUS] * 2]
+    assert DISPARITY.only_measured() is DISPARITY
+    nothing = replace(DISPARITY, reason=np.where(DISPARITY.valid, np.uint8(9), np.uint8(6)))
+    assert nothing.inferred.sum() == 3
+    assert not nothing.only_measured().valid.any()
+
+
 ZEROS = np.zeros((500, 3), np.float32)
 CELLS = np.full((30, 20), -1, np.int8)
 CELLS[:3], CELLS[3:6] = 0, 100
 SHOWN = {
-    Disparity.from_values([[1, 2], [0, 5]]): "Disparity(2x2, 1 to 5 px, 75.0 % valid)",
+    Disparity.from_values(
+        [[1, 2], [0, 5]]
+    ): "Disparity(2x2, 1 to 5 px, 75.0 % measured, 0.0 % inferred)",
+    Disparity.from_values([[NAN]]): "Disparity(1x1, 0.0 % measured, 0.0 % inferred)",
+    BOTH: "Disparity(2x2, 1 to 3 px, 25.0 % measured, 50.0 % inferred)",
     DisparityTruth.from_values([[1, 2.5, np.inf, 0]], [[True, False, True, True]]): (
         "DisparityTruth(4x1, 1 to 2.5 px, 50.0 % known, 25.0 % not occluded)"
     ),

@@ -10,6 +10,7 @@ from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedCamera
 from recon.evaluation.disparity import (
     evaluate_depth,
     evaluate_disparity,
+    evaluate_kinds,
     measure_reliability,
     measure_sparsification,
     share_within_sigma,
@@ -77,6 +78,36 @@ def test_plain_arrays_are_evaluated_like_values():
     for one in (found, found.tolist(), Disparity.from_values(found)):
         assert evaluate_disparity(one, true) == expected
         assert evaluate_middlebury(one, true.tolist()) == expected
+
+
+def test_each_kind_of_pixel_is_compared_alone():
+    # Measured: off by 0, 0.75, none with truth; inferred: off by 5, 3 (occluded); nothing.
+    values = estimate([10, 10.75, 4, 15, 13, N])
+    reason = np.array([[0, 0, 0, Reason.FILLED, Reason.FILLED, Reason.LOW_TEXTURE]], np.uint8)
+    known = np.isfinite(values)
+    both = Disparity(values, known.astype(np.float32), values, reason)
+    true = truth([10, 10, N, 10, 10, 10], [True] * 4 + [False, True])
+    measured = evaluate_disparity(both, true, kind="measured")
+    assert (measured.pixels, measured.invalid, measured.avgerr_px) == (2, 0, 0.375)
+    assert measured.bad == {0.5: 50, 1.0: 0, 2.0: 0, 4.0: 0}
+    inferred = evaluate_disparity(both, true, kind="inferred", occluded=True)
+    assert (inferred.pixels, inferred.invalid, inferred.bad[4.0]) == (2, 0, 50)
+    assert evaluate_disparity(both, true).pixels == 4
+    by_kind = evaluate_kinds(both, true)
+    assert by_kind["measured"] == measured
+    assert by_kind["inferred"].bad[4.0] == 100
+    assert [*evaluate_kinds(both.only_measured(), true)] == ["measured"]
+    assert [*evaluate_kinds(both.only_inferred(), true)] == ["inferred"]
+
+
+def test_a_kind_that_is_not_there_or_that_there_is_not_is_refused():
+    plain, true = estimate([10, N]), truth([9, 9])
+    assert evaluate_disparity(plain, true, kind="measured").pixels == 1
+    for found in (plain, Disparity.from_values(plain)):
+        with pytest.raises(EvaluationError, match="no inferred pixel has a known truth"):
+            evaluate_disparity(found, true, kind="inferred")
+        with pytest.raises(EvaluationError, match=r"no such kind.*seen.*all, measured"):
+            evaluate_disparity(found, true, kind="seen")  # type: ignore[arg-type]
 
 
 def made(error_px, confidence=0.8):

@@ -11,7 +11,7 @@ from recon.commands.evaluate_middlebury import run_middlebury
 from recon.core.errors import EvaluationError, SettingsError, ShapeError, SourceError
 from recon.core.values import Disparity, DisparityTruth, Reason, RectifiedPair
 from recon.evaluation.middlebury import bench, score
-from recon.io.images.disparity import write_pfm
+from recon.io.images.disparity import read_pfm, write_pfm
 from recon.stereo.frame import StereoSettings
 from tests.evaluation.test_disparity import made
 from tests.scenery.middlebury import square, write_scene
@@ -193,7 +193,57 @@ def test_scenes_and_results_of_a_folder_become_figures(tmp_path):
     assert summary["matchers"]["shifted"]["weighted"]["seconds"] >= 0
     assert (summary["skipped"], summary["mean_over"]) == (["Vintage"], ["Teddy"])
     assert (teddy.camera.ndisp or 0) > np.nanmax(true)
-    assert score.error_map(teddy, own.values)[np.isfinite(true)] == pytest.approx(4.0)
+    assert score.error_map(teddy, own.disparity.values)[np.isfinite(true)] == pytest.approx(4.0)
+
+
+class Both:
+    """A matcher that measures the truth at left, and infers what is 4 px off at right."""
+
+    name = "both"
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        values, middle = self.values[: pair.left.shape[0]].copy(), pair.left.shape[1] // 2
+        values[:, middle:] += 4
+        known, inferred = np.isfinite(values), np.arange(values.shape[1]) >= middle
+        reason = np.where(inferred, np.uint8(Reason.FILLED), np.uint8(Reason.VALID))
+        sure = np.where(inferred, np.float32(0.25), np.float32(1))
+        return Disparity(
+            values, np.where(known, sure, 0), values, np.where(known, reason, np.uint8(6))
+        )
+
+
+def test_what_was_measured_and_what_was_inferred_are_scored_apart(tmp_path):
+    folder, out = tmp_path / "trainingQ", tmp_path / "out"
+    write_scene(folder / "Teddy", square())
+    true = bench.read_scored_scene("Teddy", folder / "Teddy", None).truth.values
+    summary = run_middlebury(folder, matchers=[Both(true)], out=out)
+    (found,) = summary["matchers"].values()
+    for figures in (found["weighted"], found["scenes"]["Teddy"]):
+        measured, inferred = (figures["all"][kind] for kind in ("measured", "inferred"))
+        assert (measured["bad"]["2"], measured["wrong"]) == (0, 0)
+        # Four pixels of the map are sixteen full-size ones.
+        assert (inferred["bad"]["2"], inferred["wrong"]) == (100, 100)
+        assert inferred["avgerr"] == pytest.approx(16)
+        assert {*measured["bad"]} == {"0.5", "1", "2", "4"}
+        assert measured["share"] + inferred["share"] + figures["all"]["invalid"] == (
+            pytest.approx(100)
+        )
+        assert 0 < inferred["share"] < 100
+        assert figures["all"]["sparse"]["bad"]["2"] == pytest.approx(inferred["share"])
+        rated = figures["confidence"]
+        assert (rated["ece_measured"], rated["ece_inferred"]) == pytest.approx((0, 0.25))
+    text = (out / "tables.txt").read_text()
+    assert "both, inferred" in text
+    assert "both, measured" in (out / "report.html").read_text()
+    maps = [read_pfm(out / f"disparity/both/Teddy{name}.pfm") for name in ("", "_inferred")]
+    middle = true.shape[1] // 2
+    np.testing.assert_array_equal(maps[0][:, :middle], true[:, :middle])
+    np.testing.assert_array_equal(maps[1][:, middle:], true[:, middle:] + 4)
+    assert not np.isfinite(maps[0][:, middle:]).any()
+    assert not np.isfinite(maps[1][:, :middle]).any()
 
 
 def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path):

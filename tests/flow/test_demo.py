@@ -68,7 +68,7 @@ def test_path_map_and_occupancy_are_where_they_are(demo):
 
 
 EXAMPLES = {
-    "01_one_pair.py": ("% of the pixels have a disparity", ["cloud.ply"]),
+    "01_one_pair.py": ("% of the pixels were measured", ["cloud.ply"]),
     "02_map_a_drive.py": (
         "position error",
         ["trajectory_kitti.txt", "map/cloud.ply", "map/grid.yaml", "map/octomap.bt"],

@@ -77,8 +77,9 @@ def test_every_matcher_has_all_scenes_and_matches_them_nearly_everywhere(matched
         scenes = found["scenes"]
         assert len(scenes) == 4
         for mask in ("nonocc", "all"):
-            assert set(found["weighted"][mask]) == {"dense", "sparse", "invalid"}
-            for figures in (found["weighted"][mask][holes] for holes in ("dense", "sparse")):
+            kinds = {"measured", "inferred"}
+            assert set(found["weighted"][mask]) == {"dense", "sparse", "invalid", *kinds}
+            for figures in (found["weighted"][mask][n] for n in ("dense", "sparse", "measured")):
                 assert set(figures["bad"]) == {"0.5", "1", "2", "4"}
                 assert {"avgerr", "rms", "a50", "a90", "a95", "a99"} <= set(figures)
         # Only pixels at the outline of the square are hard: a tenth of the image at most.

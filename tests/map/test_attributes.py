@@ -17,6 +17,8 @@ from recon.core.values import ATTRIBUTES, Attribute, PointCloud
 from recon.io.models.columns import columns_of
 from recon.map.map import Map
 from recon.map.store import database
+from recon.map.store.finished import keep_map
+from tests.map import walls
 
 LABEL = Attribute("label", np.uint8, fused="vote", values=4)
 FUSED = [each for each in (*ATTRIBUTES, LABEL) if each.fused is not None]
@@ -79,6 +81,29 @@ def test_a_vote_is_won_by_weight(labels, weights):
     won = LABEL.of_means(mean)[0]
     votes = [float(weights[labels == label].sum()) for label in range(4)]
     assert votes[won] == max(votes)
+
+
+def test_points_of_a_map_say_which_are_inferred_where_they_were_asked_for(monkeypatch, tmp_path):
+    plain = walls.wall
+
+    def marked(T_true, seed):
+        cloud = plain(T_true, seed)  # camera axes: y is down
+        return replace(cloud, inferred=np.uint8(cloud.xyz[:, 1] < 0))
+
+    monkeypatch.setattr(walls, "wall", marked)
+    with Map.temporary() as made:
+        walls.drive(made, walls.TRUE[0], 0)
+        made.commit()
+        keep_map(made, tmp_path / "map.recon")
+    with Map.open(tmp_path / "map.recon") as map_:
+        cloud = walls.cloud_of(map_.tiles())
+        low = walls.voxels_of(map_.tiles()).keys[:, 2].max()
+    sure = np.abs(cloud.xyz[:, 2]) > 0.1  # a voxel; else one has points of both halves
+    np.testing.assert_array_equal(cloud.inferred[sure], cloud.xyz[sure, 2] > 0)
+    assert low <= 1  # what was inferred is above, and in no ray
+    monkeypatch.setattr(database, "FORMAT", 1)
+    with pytest.raises(FormatError, match="format 2"):
+        Map.open(tmp_path / "map.recon")
 
 
 def test_a_colour_is_three_columns_or_the_bits_of_one():

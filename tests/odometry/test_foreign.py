@@ -1,6 +1,7 @@
 """Odometries that are not ours: objects, and plug-ins that packages register."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,6 +34,19 @@ class Ahead:
 
     def restore(self, state: dict) -> None:
         self.frames = state["frames"]
+
+
+def test_an_odometry_is_never_given_what_was_inferred():
+    values = np.full((4, 6), 9.0, np.float32)
+    found = recon.Disparity.from_values(values)
+    reason = np.where(np.arange(6) < 2, np.uint8(recon.Reason.VALID), np.uint8(recon.Reason.FILLED))
+    both = replace(found, reason=np.tile(reason, (4, 1)))
+    grey, camera = np.zeros((4, 6), np.uint8), recon.RectifiedCamera(9.0, 3, 2, 3, 0.5, 6, 4)
+    pair = recon.RectifiedPair(grey, grey, camera)
+    given = recon.OdometryFrame(pair, both).disparity
+    assert np.isfinite(given.values).sum() == 4 * 2
+    assert given.measured.sum() == given.valid.sum() == 4 * 2
+    assert recon.OdometryFrame(pair, found).disparity is found
 
 
 def posed(**entries: float) -> recon.OdometryResult:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from recon.core.errors import ShapeError
 from recon.core.geometry import se3
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.camera import project
 from recon.places import verify as verify_file
 from recon.places.align import MIN_INLIERS, Seen, find_motion, refine
@@ -48,6 +50,18 @@ def test_an_image_without_texture_gives_a_keyframe_without_features():
     keyframe = make_keyframe(0, RectifiedPair(grey, grey, CAMERA), unknown)
     assert keyframe.uvd.shape == (0, 3)
     assert words_of(keyframe.descriptors).size == 0
+
+
+def test_a_keyframe_has_nothing_of_what_was_inferred():
+    pair, flat = _textured((800, 400))
+    reason = flat.reason.copy()
+    reason[:, 400:] = Reason.FILLED
+    both = replace(flat, reason=reason)
+    keyframe, alone = make_keyframe(0, pair, both), make_keyframe(0, pair, both.only_measured())
+    np.testing.assert_array_equal(keyframe.uvd, alone.uvd)
+    np.testing.assert_array_equal(keyframe.coarse, alone.coarse)
+    assert np.isnan(keyframe.uvd[keyframe.uvd[:, 0] > 401, 2]).all()
+    assert np.isfinite(keyframe.coarse).mean() == 0.5
 
 
 def _textured(size: tuple[int, int]) -> tuple[RectifiedPair, Disparity]:

@@ -48,6 +48,14 @@ def disparity():
 
 
 @pytest.fixture
+def both(disparity):
+    """A disparity map whose right half is inferred."""
+    reason = disparity.reason.copy()
+    reason[:, WIDTH_PX // 2 :] = Reason.FILLED
+    return replace(disparity, reason=reason)
+
+
+@pytest.fixture
 def nothing_found(disparity):
     """A disparity map without any value."""
     return disparity.reject(np.ones(disparity.values.shape, bool), Reason.LOW_TEXTURE)
@@ -153,6 +161,7 @@ def view(pair, disparity, cloud):
         mesh=None,
         truth=DisparityTruth(disparity.values + 1, disparity.valid),
         metrics=DisparityMetrics({2.0: 10.0}, 25.0, 1.0, 1.0, 1440),
+        by_kind={},
         summary={"points": 2000, "warnings": ["a warning"]},
         warnings=("a warning",),
     )

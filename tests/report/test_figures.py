@@ -119,10 +119,9 @@ def test_figures_say_in_words_what_is_seen_in_this_run(
     pair, disparity, health, grid, nothing_found
 ):
     seen, boxes = notes(pair_page.disparity_figure(disparity, pair.camera))
-    assert seen == "Disparities: 3.288 to 10 px, median 6.644 px; 75.0 % have one"
-    assert "Disparities: nothing known; 0.0 % have one" in notes(
-        pair_page.disparity_figure(nothing_found, pair.camera)
-    )
+    assert seen == "Disparities: 3.288 to 10 px, median 6.644 px; 75.0 % measured, 0.0 % inferred"
+    seen, _ = notes(pair_page.disparity_figure(nothing_found, pair.camera))
+    assert seen == "Disparities: nothing known; 0.0 % measured, 0.0 % inferred"
     assert len(boxes) == 2  # the map, and the bar with its colours
     seen, boxes = notes(figures.health_figure(health))
     assert "inlier tracks: 0 to 150, median 150. reprojection error (px): 0.2." in seen
@@ -134,7 +133,7 @@ def test_figures_say_in_words_what_is_seen_in_this_run(
     assert (
         "most in mesh 3.20 s, match 1.10 s" in notes(timing_figure({"match": 1.1, "mesh": 3.2}))[0]
     )
-    assert "valid 75.0 %, border 25.0 %" in notes(pair_page.reasons_figure(disparity))[0]
+    assert "measured 75.0 %, border 25.0 %" in notes(pair_page.reasons_figure(disparity))[0]
 
 
 def test_a_dark_page_changes_paper_and_ink_but_no_colours_of_values(pair, disparity):
@@ -161,9 +160,45 @@ def test_every_figure_of_a_pair_is_a_png(which, pair, disparity, nothing_found):
     found = pair_page.stereo_figures(pair, shown)
     assert found.pop("wide")
     assert found.pop("valid_percent") == 100 * shown.measured.mean()
-    assert found.pop("filled_percent") == 0.0
+    assert found.pop("inferred_percent") == 0.0
     for png in (*found.values(), pair_page.error_figure(shown.values)):
         picture(png)
+
+
+def test_what_was_inferred_is_hatched_and_the_legend_says_so(pair, disparity, both):
+    error_px = np.abs(both.values - 5)
+    for draw in (
+        lambda found: pair_page.disparity_figure(found, pair.camera),
+        lambda found: pair_page.depth_figure(1 / found.values, found.inferred),
+        lambda found: pair_page.error_figure(error_px, found.inferred),
+    ):
+        plain, hatched = picture(draw(disparity)), picture(draw(both))
+        rows = slice(20, plain.shape[0] - 200)  # above legend and scale
+        differs = (plain != hatched).any(axis=2)[rows]
+        middle = plain.shape[1] // 2
+        assert not differs[:, : middle - 5].any()
+        assert 0.25 < differs[:, middle + 5 :].mean() < 0.55
+        white = (hatched[rows, middle + 5 :] > 250).all(axis=2)
+        assert white.mean() > 0.1
+    with_legend = picture(pair_page.disparity_figure(both, pair.camera))
+    assert (with_legend != picture(pair_page.disparity_figure(disparity, pair.camera)))[-220:].any()
+    seen, _ = notes(pair_page.disparity_figure(both, pair.camera))
+    assert "25.0 % measured, 50.0 % inferred" in seen
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 200), (400, 7)])
+def test_a_hatch_of_nothing_changes_nothing_and_one_of_all_leaves_most(shape):
+    image = np.full((*shape, 3), 120, np.uint8)
+    np.testing.assert_array_equal(style.hatch(image, np.zeros(shape, bool)), image)
+    kept = (style.hatch(image, np.ones(shape, bool)) == 120).all(axis=2).mean()
+    assert kept == 0 if shape == (1, 1) else 0.45 < kept < 0.7
+
+
+def test_confidence_is_drawn_of_what_was_measured(both):
+    shown = picture(pair_page.confidence_figure(both))
+    alone = picture(pair_page.confidence_figure(both.only_measured()))
+    np.testing.assert_array_equal(shown, alone)
+    assert (shown[50, -50] < 40).all()
 
 
 def test_a_figure_shows_its_picture(pair, disparity):

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +49,17 @@ def test_a_picture_has_the_places_and_colours_of_the_value():
     np.testing.assert_allclose(np.stack([-left, -up, ahead], 1), XYZ, atol=1e-6)
     dots = VALUES[2].plot().axes[0].collections[0]
     np.testing.assert_allclose(dots.get_facecolor()[0, :3], 0.2)
+
+
+def test_what_was_inferred_is_hatched():
+    whole = VALUES[0]
+    reason = np.where(np.arange(10) < 5, whole.reason, np.uint8(recon.Reason.FILLED))
+    both = replace(whole.reject(~whole.valid | (np.arange(10) == 0), recon.Reason.EDGE))
+    reason = np.where(both.valid, reason, both.reason)
+    axes = replace(both, reason=reason).plot().axes[0]
+    assert len(axes.images) == 2
+    assert axes.get_legend().get_texts()[0].get_text() == "inferred from planes around"
+    assert len(whole.plot().axes[0].images) == 1
 
 
 def test_a_large_cloud_is_thinned():

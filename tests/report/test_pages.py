@@ -19,12 +19,12 @@ from jinja2 import UndefinedError
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from recon.core.values import DisparityTruth, PointCloud, Reason, Trajectory
+from recon.core.values import DisparityMetrics, DisparityTruth, PointCloud, Reason, Trajectory
 from recon.evaluation.map_comparison import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 from recon.report.map_page import map_content, write_joined_page
 from recon.report.page import command_line, page_environment, render_page, summary_rows, write_page
-from recon.report.pair_page import pair_content, write_pair_page
+from recon.report.pair_page import pair_content, write_disparity_images, write_pair_page
 from recon.report.scene import Scene, plot_scene
 from recon.report.style import REASON_COLOURS
 from recon.run.directory import RunDirectory
@@ -259,6 +259,34 @@ def test_page_of_a_pair_shows_all_that_the_run_has(view):
     assert "baseline 0.5 m" in page
     view.summary["up_to_scale"] = True
     assert "every m in this report is one baseline" in pair_html(view)
+
+
+def test_page_of_a_pair_tells_what_was_inferred_from_what_was_measured(view, both):
+    assert "inferred" not in key_figures(pair_html(view))
+    view.disparity = both
+    metrics = DisparityMetrics({2.0: 5.0}, 0.0, 0.5, 0.5, 360)
+    view.by_kind = {"measured": metrics, "inferred": replace(metrics, bad={2.0: 81.0})}
+    page = pair_html(view)
+    figures, errors = key_figures(page), rows(blocks(page)["Disparity against truth"])
+    assert (figures["Pixels measured"], figures["Pixels inferred"]) == ("25.0 %", "50.0 %")
+    assert ("bad 2: off by more than 2 px", "10.00 %", "5.00 %", "81.00 %") in errors
+    assert "Measured and inferred pixels each alone" in page
+    assert "50.0 % inferred from planes around them (hatched)" in page
+    assert "Of measured pixels alone: --set cloud.inferred=true" in page
+    view.summary["inferred_points"] = 1000
+    assert "1,000 of the points are inferred" in pair_html(view)
+
+
+def test_colour_images_of_a_pair_are_of_what_was_measured(view, both, tmp_path):
+    view.disparity = both
+    with RunDirectory(tmp_path / "pair") as directory:
+        write_disparity_images(view, directory)
+        directory.write_json("run.json", {})
+    for name in ("disparity", "confidence"):
+        image = cv2.imread(str(tmp_path / f"pair/disparity/{name}_colour.png"))
+        np.testing.assert_array_equal((image < 40).all(axis=2), ~both.measured)
+    reasons = cv2.imread(str(tmp_path / "pair/disparity/reason_colour.png"))[:, :, ::-1]
+    np.testing.assert_array_equal(reasons[0, -1], REASON_COLOURS[Reason.FILLED])
 
 
 def test_the_rig_is_tabulated_where_it_was_fitted(drive):

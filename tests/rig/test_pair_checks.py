@@ -12,9 +12,18 @@ from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.progress import Silent, showing
-from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
+from recon.core.values import (
+    CameraIntrinsics,
+    Disparity,
+    Reason,
+    RectifiedCamera,
+    StereoCalibration,
+    StereoPair,
+)
 from recon.export.mesh.coverage import check_coverage
+from recon.rig.audit import check_found
 from recon.sources.one_pair import PairInput
+from recon.stereo.support import Support
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -119,3 +128,41 @@ def test_a_run_without_a_camera_and_an_unknown_format_are_refused_before_the_wor
     with pytest.raises(SettingsError, match=r"--format: unknown mesh format .*fbx"):
         run_pair(PairInput(pair, CAMERA), out=tmp_path / "run", formats=("fbx",))
     assert not (tmp_path / "run").exists()
+
+
+def kinds(measured: int, inferred: int) -> Disparity:
+    """A hundred pixels, so many of them measured and inferred."""
+    reason = np.full((1, 100), Reason.LOW_TEXTURE, np.uint8)
+    reason[0, :measured], reason[0, measured : measured + inferred] = Reason.VALID, Reason.FILLED
+    has = np.isin(reason, (Reason.VALID, Reason.FILLED))
+    values = np.where(has, np.float32(9), np.float32(np.nan))
+    return Disparity(values, has.astype(np.float32), values, reason)
+
+
+@pytest.mark.parametrize(
+    ("disparity", "words"),
+    [
+        (
+            kinds(4, 35),
+            "only 4 % of the pixels were measured (61 % low texture, 35 % inferred from ",
+        ),
+        (
+            kinds(30, 50),
+            "only 30 % of the pixels were measured (50 % inferred from planes around, ",
+        ),
+        (kinds(20, 0), "only 20 % of the pixels were measured (80 % low texture); "),
+    ],
+)
+def test_a_pair_of_which_little_was_measured_says_what_to_do(disparity, words):
+    assert check_found(disparity, "a", None)[0].startswith(words)
+    belongs = Support(0.5, 0.0, 100, 90)
+    (warning,) = check_found(disparity, "a", belongs)
+    assert "plain or dark surfaces need more light, or texture" in warning
+
+
+def test_a_pair_that_was_measured_is_not_warned_of_and_one_inferred_alone_is_refused():
+    assert check_found(kinds(60, 30), "a", None) == ()
+    assert check_found(kinds(25, 25), "a", None) == ()
+    for nothing in (kinds(0, 90), kinds(0, 0)):
+        with pytest.raises(MatchingError, match="no pixel has a match"):
+            check_found(nothing, "a", None)

@@ -129,6 +129,59 @@ def test_normals_of_a_plane_are_exact_and_face_the_camera(normal, distance_m):
     np.testing.assert_allclose(cloud.normals, np.tile(-n, (len(cloud), 1)), atol=2e-3)
 
 
+@pytest.fixture
+def both() -> Disparity:
+    """Measured at left, inferred at right, nothing at all in the first row."""
+    values = np.tile(np.linspace(8.0, 12.0, SHAPE[1]), (SHAPE[0], 1))
+    values[0] = np.nan
+    found = as_disparity(values)
+    reason = found.reason.copy()
+    reason[1:, 40:] = Reason.FILLED
+    return replace(found, reason=reason)
+
+
+def test_what_was_inferred_becomes_points_only_where_it_is_asked_for(both):
+    cloud = back_project(both, make_pair(), ALL)
+    assert len(cloud) == 39 * 40
+    assert cloud.inferred is None
+    alone = back_project(both.only_measured(), make_pair(), ALL)
+    for name, values in cloud.arrays.items():
+        np.testing.assert_array_equal(values, alone.arrays[name])
+    assert len(back_project(inferred_alone(both), make_pair(), ALL)) == 0
+
+
+def inferred_alone(both: Disparity) -> Disparity:
+    return both.reject(both.measured, Reason.LEFT_RIGHT)
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_points_that_were_inferred_say_so(both, stride):
+    asked = ALL.model_copy(update={"inferred": True, "stride": stride})
+    cloud = back_project(both, make_pair(), asked)
+    u, _, _ = project(cloud.xyz.astype(np.float64), CAMERA)
+    np.testing.assert_array_equal(cloud.inferred, np.rint(u) >= 40)
+    np.testing.assert_allclose(cloud.confidence, 0.7, rtol=1e-6)
+    measured = back_project(both, make_pair(), ALL.model_copy(update={"stride": stride}))
+    np.testing.assert_array_equal(cloud.only_measured().xyz, measured.xyz)
+    assert set(back_project(inferred_alone(both), make_pair(), asked).inferred) == {1}
+    assert not back_project(both.only_measured(), make_pair(), asked).inferred.any()
+    nothing = back_project(as_disparity(EMPTY), make_pair(), asked)
+    assert (len(nothing), nothing.inferred.dtype) == (0, np.uint8)
+
+
+def test_an_inferred_pixel_that_is_not_believed_at_all_is_still_marked(both):
+    unsure = replace(both, confidence=np.zeros(SHAPE, np.float32))
+    cloud = back_project(unsure, make_pair(), ALL.model_copy(update={"inferred": True}))
+    assert cloud.inferred.sum() == 39 * 24
+    assert not np.signbit(cloud.confidence).any()
+
+
+def test_a_voxel_is_inferred_where_most_of_its_points_are():
+    xyz = np.float32([[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0], [5, 0, 0], [5.1, 0, 0]])
+    thin = voxel_downsample(PointCloud(xyz, inferred=np.uint8([1, 0, 1, 0, 1])), 1.0)
+    assert thin.inferred[np.argsort(thin.xyz[:, 0])].tolist() == [1, 0]
+
+
 def smeared_step(width: int) -> np.ndarray:
     """A foreground of 40 px before a background of 10 px, with a linear ramp between them."""
     row = np.full(60, 10.0)

@@ -129,7 +129,10 @@ def test_a_wall_that_was_filled_is_warned_of_by_what_was_measured():
     shares = found.disparity.reason_shares
     assert shares[Reason.VALID] < 0.25 < shares.get(Reason.FILLED, 0) + shares[Reason.VALID]
     assert found.summary["valid_percent"] == pytest.approx(100 * shares[Reason.VALID])
-    assert any("have a measured disparity" in text for text in found.warnings)
+    assert found.summary["inferred_percent"] == pytest.approx(100 * shares[Reason.FILLED])
+    (warning,) = (text for text in found.warnings if "of the pixels were measured" in text)
+    assert "inferred from planes around" in warning
+    assert "need more light, or texture" in warning
 
 
 def real(data: Path) -> Iterator[tuple[str, StereoPair, object]]:

@@ -91,13 +91,10 @@ def size_text(image: NDArray[Any]) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
 
 
-def map_text(values: Float32) -> str:
-    """Return the range and share of the finite values of a map in pixels, for a ``repr``."""
+def range_text(values: Float32) -> str:
+    """Return the range of the finite values of a map in pixels, for a ``repr``; "" = none."""
     finite = values[np.isfinite(values)]
-    if not finite.size:
-        return "0 %"
-    share = 100 * finite.size / values.size
-    return f"{finite.min():.4g} to {finite.max():.4g} px, {share:.1f} %"
+    return f"{finite.min():.4g} to {finite.max():.4g} px, " if finite.size else ""
 
 
 def extent_text(xyz: NDArray[Any]) -> str:

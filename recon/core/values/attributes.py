@@ -100,6 +100,11 @@ ATTRIBUTES: Final = (
         ply=("sigma",), pcd=("sigma",), las=("sigma",), ros=("sigma",),
         view="sigma", scale="viridis",
     ),
+    Attribute(
+        "inferred", np.uint8, fused="mean", bounds=(0, 1), about="1 = inferred, 0 = measured",
+        ply=("inferred",), pcd=("inferred",), las=("inferred",), ros=("inferred",),
+        view="inferred", scale="tab10",
+    ),
     Attribute("weight", np.float32, fused="own", ply=("weight",)),
     Attribute("count", np.int32, fused="own", ply=("count",)),
     Attribute("time_s", np.float32, unit="s", ply=("time_s",), view="age", scale="viridis"),

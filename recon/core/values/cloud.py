@@ -32,6 +32,7 @@ class PointCloud(Shape):
             points that it replaces.
         time_s: float32 (N,), when in its drive it was seen, seconds.
         session: int32 (N,), number of the drive that saw it.
+        inferred: uint8 (N,), 1 = from planes around its pixel, 0 = measured; None = all measured.
         frame: Frame of ``xyz``: camera (x right, y down, z forward), world (the first rectified
             left camera) or map (x forward, y left, z up).
     """
@@ -45,6 +46,7 @@ class PointCloud(Shape):
     count: Int32 | None = None
     time_s: Float32 | None = None
     session: Int32 | None = None
+    inferred: UInt8 | None = None
     frame: Frame = "camera"
 
     def __post_init__(self) -> None:
@@ -80,6 +82,10 @@ class PointCloud(Shape):
             name: values.take(index, axis=0) for name, values in self.arrays.items()
         }
         return replace(self, **arrays)
+
+    def only_measured(self) -> PointCloud:
+        """Return the points that were measured; itself where nothing says that some were not."""
+        return self if self.inferred is None else self.select(self.inferred == 0)
 
 
 def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointCloud:

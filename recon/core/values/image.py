@@ -20,7 +20,7 @@ from recon.core.values.arrays import (
     float_map,
     freeze,
     frozen_array,
-    map_text,
+    range_text,
     size_text,
 )
 from recon.core.values.camera import RectifiedCamera
@@ -148,7 +148,7 @@ ASSUMED_SIGMA_PX: Final = 0.25  # standard deviation of matches whose matcher gi
 
 
 class Reason(IntEnum):
-    """Why a pixel has no disparity, or how it got one: VALID, or FILLED from planes around it."""
+    """Why a pixel has no disparity, or how it got one: VALID = measured, FILLED = inferred."""
 
     VALID = 0
     LOW_TEXTURE = 1
@@ -166,12 +166,16 @@ class Reason(IntEnum):
 class Disparity(Shown):
     """Disparity map of the left view, with confidence and uncertainty.
 
+    A pixel is *measured* (a match was found in the right view), *inferred* (nothing was found, or
+    nothing sure, and it is given that of planes around it), or has no disparity. ``values`` and
+    ``valid`` have both kinds; ``measured`` and ``inferred`` are masks, `only_measured` has one.
+
     Attributes:
-        values: float32 (H, W), ``x_left - x_right`` in pixels; NaN = no match.
+        values: float32 (H, W), ``x_left - x_right`` in pixels, measured or inferred; NaN = neither.
         confidence: float32 (H, W) in [0, 1]; 0 where ``values`` is NaN.
         sigma_px: float32 (H, W), standard deviation of ``values``; NaN where ``values`` is NaN.
-        reason: uint8 (H, W), a `Reason` for each pixel; VALID or FILLED exactly where ``values`` is
-            finite.
+        reason: uint8 (H, W), a `Reason` for each pixel: VALID where it was measured, FILLED where
+            it was inferred; another exactly where ``values`` is NaN.
     """
 
     values: Float32
@@ -183,9 +187,7 @@ class Disparity(Shown):
         freeze(self, "values", np.float32, (None, None))
         for name, dtype in (("confidence", "f4"), ("sigma_px", "f4"), ("reason", "u1")):
             freeze(self, name, dtype, self.values.shape)
-        # Compared with the enum member itself, numpy would use 64 bits and take ten times as long.
-        has = self.reason == np.uint8(Reason.VALID)
-        if not np.array_equal(self.valid, has | (self.reason == np.uint8(Reason.FILLED))):
+        if not np.array_equal(self.valid, self.measured | self.inferred):
             raise ShapeError(
                 "Disparity.reason is FILLED or VALID where values is NaN, or the reverse"
             )
@@ -230,18 +232,40 @@ class Disparity(Shown):
         )
 
     def __repr__(self) -> str:
-        return f"Disparity({size_text(self.values)}, {map_text(self.values)} valid)"
+        shares = (100 * kind.mean() for kind in (self.measured, self.inferred))
+        text = "{:.1f} % measured, {:.1f} % inferred".format(*shares)
+        return f"Disparity({size_text(self.values)}, {range_text(self.values)}{text})"
 
     @cached_property
     def valid(self) -> Bool:
-        """bool (H, W), where there is a disparity; read-only."""
+        """bool (H, W), where there is a disparity, measured or inferred; read-only."""
         return frozen_array("Disparity.valid", np.isfinite(self.values), np.bool_, (None, None))
 
     @cached_property
     def measured(self) -> Bool:
-        """bool (H, W), where a match was found: ``valid`` without what was FILLED; read-only."""
-        found = self.reason == np.uint8(Reason.VALID)
-        return frozen_array("Disparity.measured", found, np.bool_, (None, None))
+        """bool (H, W), where a match was found; read-only."""
+        return self._of(Reason.VALID)
+
+    @cached_property
+    def inferred(self) -> Bool:
+        """bool (H, W), where the disparity is that of planes around the pixel; read-only."""
+        return self._of(Reason.FILLED)
+
+    def _of(self, reason: Reason) -> Bool:
+        # Compared with the enum member itself, numpy would use 64 bits and take ten times as long.
+        mask = self.reason == np.uint8(reason)
+        return frozen_array("Disparity.reason", mask, np.bool_, (None, None))
+
+    def only_measured(self) -> Disparity:
+        """Return what was measured alone; itself where nothing is inferred.
+
+        Inferred pixels have no value then, and reason AMBIGUOUS: why nothing was found is not kept.
+        """
+        return self.reject(self.inferred, Reason.AMBIGUOUS) if self.inferred.any() else self
+
+    def only_inferred(self) -> Disparity:
+        """Return what was inferred alone; measured pixels have no value then, and AMBIGUOUS."""
+        return self.reject(self.measured, Reason.AMBIGUOUS)
 
     @property
     def reason_shares(self) -> dict[Reason, float]:

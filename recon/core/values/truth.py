@@ -17,7 +17,7 @@ from recon.core.values.arrays import (
     Int32,
     float_map,
     freeze,
-    map_text,
+    range_text,
     size_text,
 )
 from recon.core.values.camera import RectifiedCamera
@@ -57,8 +57,9 @@ class DisparityTruth:
         return cls(np.where(known, found, np.float32(np.nan)), seen)
 
     def __repr__(self) -> str:
-        size, seen = size_text(self.values), 100 * float(np.mean(self.nonocc))
-        return f"DisparityTruth({size}, {map_text(self.values)} known, {seen:.1f} % not occluded)"
+        known, seen = (100 * float(np.mean(m)) for m in (np.isfinite(self.values), self.nonocc))
+        shares = f"{known:.1f} % known, {seen:.1f} % not occluded"
+        return f"DisparityTruth({size_text(self.values)}, {range_text(self.values)}{shares})"
 
 
 def _seen_by_both(mask: ArrayLike, shape: tuple[int, ...]) -> Bool:

@@ -15,7 +15,7 @@ import numpy as np
 from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.plugins import name_of
 from recon.core.text import counted, plain
-from recon.core.values import RectifiedPair
+from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32
 from recon.evaluation.middlebury.score import (
     MASKS,
@@ -55,7 +55,7 @@ class SceneResult:
 
     scene: ScoredScene
     matcher: str  # name of the matcher or of the folder of results
-    values: Float32  # (h, w), its disparity in pixels of its own size; NaN = none
+    disparity: Disparity  # in pixels of its own size; with values alone, if it has no more
     figures: Figures  # an entry of ``scenes`` in ``summary.json``
 
 
@@ -86,7 +86,7 @@ class Bench:
                     "confidence": confidence_figures(disparity, scene.truth) if rates else None,
                     "seconds": round(seconds, 4),
                 }
-                yield _scored(scene, name_of(given), disparity.values, measured)
+                yield _scored(scene, name_of(given), disparity, measured)
 
     def _matchers(self, pair: RectifiedPair) -> list[Matcher]:
         if not hasattr(self._own, "matchers"):
@@ -105,10 +105,10 @@ def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
     file = given.files.get(scene.name)
     if file is None:
         return None
-    values = read_pfm(file)
+    found = unrated(read_pfm(file))
     with naming(file):
         measured = {"ndisp": None, "confidence": None, "seconds": read_seconds(file)}
-        return _scored(scene, given.name, values, measured)
+        return _scored(scene, given.name, found, measured)
 
 
 def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
@@ -126,16 +126,23 @@ def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
     return names
 
 
-def _scored(scene: ScoredScene, name: str, values: Float32, measured: Figures) -> SceneResult:
+def unrated(values: Float32) -> Disparity:
+    """Return values (h, w), NaN = none, as a disparity that is measured and sure everywhere."""
+    known = np.isfinite(values)
+    reason = np.where(known, np.uint8(Reason.VALID), np.uint8(Reason.AMBIGUOUS))
+    return Disparity(values, known.astype(np.float32), np.full_like(values, np.nan), reason)
+
+
+def _scored(scene: ScoredScene, name: str, found: Disparity, measured: Figures) -> SceneResult:
     figures = {
-        **score_result(scene, values),
+        **score_result(scene, found),
         **measured,
         "width_px": scene.camera.width_px,
         "height_px": scene.camera.height_px,
         "full_size_factor": scene.rules.full_size_factor,
         "weight": scene_weight(scene.name),
     }
-    return SceneResult(scene, name, values, figures)
+    return SceneResult(scene, name, found, figures)
 
 
 SceneFigures = dict[str, Figures]  # Figures of one scene, by matcher

@@ -7,6 +7,7 @@ https://vision.middlebury.edu/stereo/eval3/.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -54,21 +55,38 @@ class ScoredScene:
     rules: MiddleburyRules
 
 
-def score_result(scene: ScoredScene, values: Float32) -> Figures:
-    """Return the figures of a result, float32 (h, w) in pixels, by mask."""
+def score_result(scene: ScoredScene, estimate: Disparity) -> Figures:
+    """Return the figures of a result by mask: with both kinds of pixels, and of each kind alone."""
     truth, camera, factor = scene.truth, scene.truth_camera, scene.rules.full_size_factor
+    values, true, pixels = estimate.values, truth.values, dict.fromkeys(MASKS, 0)
     figures: Figures = {mask: {} for mask in MASKS}
     # The sparse map comes last: its holes are what the matcher did not find.
     for name, holed in {"dense": dense_map(values), "sparse": values}.items():
-        compared = values_compared(holed, truth.values.shape, scene.rules)
+        compared = values_compared(holed, true.shape, scene.rules)
         for mask, occluded in MASKS.items():
             metrics = errors.evaluate_disparity(compared, truth, occluded=occluded, scale=factor)
             figures[mask][name] = named_figures(metrics)
             if camera is not None:
                 depth = errors.evaluate_depth(compared, truth, camera, occluded=occluded)
                 figures[mask][name]["depth"] = asdict(depth)
-            figures[mask]["invalid"] = metrics.invalid
+            figures[mask]["invalid"], pixels[mask] = metrics.invalid, metrics.pixels
+    limits_px = (*errors.THRESHOLDS_PX, errors.WRONG_PX * factor / _step(values.shape, true.shape))
+    for kind, alone in kinds_of(estimate).items():
+        compared = values_compared(alone.values, true.shape, scene.rules)
+        for mask, occluded in MASKS.items():
+            figures[mask][kind] = {"share": 0.0}
+            with suppress(EvaluationError):  # there is no such pixel
+                metrics = errors.evaluate_disparity(
+                    compared, truth, limits_px, occluded=occluded, scale=factor, kind="measured"
+                )
+                wrong, share = metrics.bad.pop(limits_px[-1]), 100 * metrics.pixels / pixels[mask]
+                figures[mask][kind] = {"share": share, "wrong": wrong, **named_figures(metrics)}
     return figures
+
+
+def kinds_of(estimate: Disparity) -> dict[errors.Kind, Disparity]:
+    """Return what was measured, and what was inferred, each alone."""
+    return {"measured": estimate.only_measured(), "inferred": estimate.only_inferred()}
 
 
 def named_figures(metrics: DisparityMetrics) -> Figures:
@@ -94,10 +112,16 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
         sigma_px=at_truth_size(estimate.sigma_px, shape),
         reason=_taken(estimate.reason, shape, step),
     )
-    if not (sized.valid & np.isfinite(truth.values)).any():
+    known = np.isfinite(truth.values)
+    if not (sized.valid & known).any():
         return None
+    ece = {
+        f"ece_{kind}": errors.measure_reliability(alone, truth, _RIGHT_PX / step).calibration_error
+        for kind, alone in kinds_of(sized).items()
+        if (alone.valid & known).any()
+    }
     shares = {f"within_{n}_sigma": errors.share_within_sigma(sized, truth, n) for n in (1, 2)}
-    return {**curve_figures(sized, truth, _RIGHT_PX / step), **shares}
+    return {**curve_figures(sized, truth, _RIGHT_PX / step), **ece, **shares}
 
 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:

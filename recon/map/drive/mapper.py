@@ -145,7 +145,8 @@ class Mapper:
 
     def fix_axes(self, cloud: PointCloud) -> SubmapBuilder:
         """Lay the axes of the map by the ground in a cloud, world axes; begin the first submap."""
-        config, ground = self._config, estimate_ground(cloud, self._config.scale, self._up)
+        config, cloud = self._config, cloud.only_measured()
+        ground = estimate_ground(cloud, config.scale, self._up)
         T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m, self._up)
         self.session.set_axes(T_map_world, self._camera)
         self._behind.wait()

@@ -68,8 +68,8 @@ def _depths(
     for pair in pairs:
         with suppress(ReconError):
             _, disparity = reconstructor.match(pair)
-            found = disparity.values[disparity.valid] + camera.doffs_px
+            found = disparity.values[disparity.measured] + camera.doffs_px
             if len(found) and found.mean() > 0.0:
                 depth_m = camera.focal_px * camera.baseline_m / float(found.mean())
-                sigma_px = float(np.median(disparity.sigma_px[disparity.valid]))
+                sigma_px = float(np.median(disparity.sigma_px[disparity.measured]))
                 yield depth_m, depth_m * sigma_px / float(found.mean())

@@ -63,7 +63,10 @@ def clouds(draw: st.DrawFn) -> PointCloud:
         each.name: arrays(
             each.dtype,
             each.shape(n),
-            elements={np.float32: SHARES if each.bounds else NUMBERS}.get(each.dtype),
+            elements={
+                np.float32: SHARES if each.bounds else NUMBERS,
+                np.uint8: st.integers(*map(int, each.bounds or (0, 255))),
+            }.get(each.dtype),
         )
         for each in ATTRIBUTES
     }

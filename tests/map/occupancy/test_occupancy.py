@@ -228,6 +228,13 @@ def test_there_is_one_ray_for_each_cube_and_it_counts_its_sure_points():
     assert len(thin_rays(PointCloud(far[:0]), SETTINGS)) == 0
 
 
+def test_what_was_inferred_starts_no_ray():
+    xyz = np.float32([[0.02, 0.02, 5.02], [0.32, 0.02, 5.02]])
+    rays = thin_rays(PointCloud(xyz, inferred=np.uint8([0, 1])), SETTINGS)
+    np.testing.assert_allclose(rays.cloud().xyz, xyz[:1], atol=rays.unit_m)
+    assert len(thin_rays(PointCloud(xyz, inferred=np.uint8([1, 1])), SETTINGS)) == 0
+
+
 @pytest.mark.parametrize("resolution_m", [0.2, 0.5])
 def test_a_map_of_rays_is_the_map_of_the_points(resolution_m):
     rng = np.random.default_rng(0)
