@@ -24,10 +24,9 @@ from recon.stereo.kernels.refine import SIGMA_LARGEST_PX
 from recon.stereo.match import search as common
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.segments import SAME_SURFACE_PX, SEGMENTATIONS, fit_segments, smooth_colours
-from recon.stereo.match.steps import settle_steps
+from recon.stereo.match.steps import beyond_range, settle_steps
 
 _UNLIKELY: Final = 0.5  # below this confidence a disparity is more likely wrong than right
-_NEIGHBOURS_PX: Final = 5  # a reason is that of most of such a square
 _WIDEST_GAP: Final = 3  # neighbouring directions without support: less than a half-plane
 _MOST_AGAINST: Final = 1  # directions with something behind the plane
 _LEAST_SHARE: Final = 0.3  # of a segment that lies on its plane
@@ -66,10 +65,7 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     if not sure.any():
         return seen
     planes = np.full((SEGMENTATIONS, 3, *sure.shape), np.nan, np.float32)
-    # The minima of noise lie at the limit here and there; those of the sky, most of them.
-    at_limit = (seen.reason == np.uint8(Reason.OUT_OF_RANGE)).astype(np.uint8)
-    beyond = cv2.medianBlur(at_limit, _NEIGHBOURS_PX) > 0
-    beyond |= seen.reason == np.uint8(Reason.BORDER)
+    beyond = beyond_range(seen) | (seen.reason == np.uint8(Reason.BORDER))
     filled, values = np.zeros_like(sure), seen.values.copy()
     with ThreadPoolExecutor(threads) as pool:
         shares = fit_segments(smooth_colours(pair), seen, planes, pool, threads)

@@ -62,7 +62,7 @@ class SgmSettings(common.MeasuredSettings, common.FillableSettings):
 
     @property
     def reach_px(self) -> int:
-        return self.window_px - 1  # paths carry on what windows say, about as far again
+        return self.window_px // 2 + 1  # paths carry on what windows say
 
     @model_validator(mode="after")
     def _penalties_fit(self) -> Self:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.core.values.arrays import Float32
+from recon.core.values.arrays import Bool, Float32
 from recon.stereo.kernels import steps as kernels
 from recon.stereo.match import search as common
 from recon.stereo.match.segments import SAME_SURFACE_PX
@@ -21,17 +21,20 @@ _SLOPE: Final = 0.05  # disparities per pixel, of a surface whose pixels vote al
 # Fitted on scenes of MiddEval3, the yard, dmb4 and rendered ones: by how much the logarithm of the
 # odds of a disparity is less, if none of the votes are for it.
 _DOUBT: Final = 2.5
+_BEYOND: Final = np.float32(-1e9)  # the disparity of no surface
+_NEIGHBOURS_PX: Final = 5  # a reason is that of most of such a square
 _STRIPS: Final = 8  # of rows, which threads share: one strip may have all the steps
 
 
 def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executor) -> Disparity:
     """Return a disparity without what the image says is of the other side of a step.
 
-    Within ``reach`` pixels of a step pixels vote on a disparity by how alike they look. Where
-    another surface has more votes it is rejected (`Reason.EDGE`); of what stays, the confidence
-    falls with the share of the votes against it.
+    Within ``reach`` pixels of a step pixels vote on a disparity by how alike they look; those that
+    are beyond the range, such as the sky, for none. Where another surface has more votes it is
+    rejected (`Reason.EDGE`); of what stays, the confidence falls with the share of the votes
+    against it.
     """
-    values = np.ascontiguousarray(seen.values)
+    values = np.where(beyond_range(seen), _BEYOND, seen.values)
     marked, across = np.zeros(values.shape, np.uint8), np.zeros(values.T.shape, np.uint8)
     kernels.mark_steps(values, reach, SAME_SURFACE_PX, marked)
     kernels.mark_steps(np.ascontiguousarray(values.T), reach, SAME_SURFACE_PX, across)
@@ -45,8 +48,17 @@ def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executo
         kernels.take_votes(values, grey, alike, marked, vote, rows.start, rows.stop, own)
 
     common.in_strips(pool, _STRIPS, take, len(values))
-    doubted = Disparity(values, _doubted(seen.confidence, own), seen.sigma_px, seen.reason)
+    doubted = Disparity(seen.values, _doubted(seen.confidence, own), seen.sigma_px, seen.reason)
     return doubted.reject(own < 0, Reason.EDGE)
+
+
+def beyond_range(seen: Disparity) -> Bool:
+    """Return where the costs of most pixels had their minimum at the limit of what was searched.
+
+    Minima of noise lie there now and then; those of the sky, nearly all.
+    """
+    at_limit = (seen.reason == np.uint8(Reason.OUT_OF_RANGE)).astype(np.uint8)
+    return np.asarray((cv2.medianBlur(at_limit, _NEIGHBOURS_PX) > 0) & ~seen.valid)
 
 
 def _doubted(confidence: Float32, own: Float32) -> Float32:
