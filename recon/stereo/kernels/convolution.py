@@ -24,6 +24,7 @@ from recon.stereo.kernels.simd.vectors import (
 
 SIDE: Final = 3  # of the square that a convolution is over, or 1
 STEP: Final = 2 * WIDE  # columns that are done at a time
+GROUP: Final = SUMS  # channels that are made together
 UNIT: Final = 1 << 14  # that descriptions have the length of
 _BLOCK: Final = 2 * STEP  # columns whose features stay in the nearest cache for all sums
 
@@ -31,7 +32,7 @@ _BLOCK: Final = 2 * STEP  # columns whose features stay in the nearest cache for
 class Layer(NamedTuple):
     """A convolution of C channels, to O channels."""
 
-    weights: Int32  # (O / SUMS, C / 2 · squares, SUMS), pairs of channels
+    weights: Int32  # (O / GROUP, C / 2 · squares, GROUP), pairs of channels
     scale: Float32  # (O,), that sums are multiplied by
     bias: Float32  # (O,), added then
     slope: float  # that what is negative is multiplied by, at last

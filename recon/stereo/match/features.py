@@ -8,18 +8,19 @@ from __future__ import annotations
 from concurrent.futures import Executor
 from functools import partial
 from importlib.resources import files
-from typing import Final, NamedTuple
+from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 
 from recon.core.values.arrays import Float32, Int32, UInt8
 from recon.stereo.kernels import convolution as kernels
-from recon.stereo.kernels.simd.vectors import SUMS
 from recon.stereo.match import search as common
 
-_PIXELS: Final = 1 << 18  # described at a time: 200 MB
+_PIXELS: Final = 1 << 19  # described at a time: 130 MB
 _SIZES: Final = 1, 2, 4  # divisors
+_STEP: Final = _SIZES[-1]
+_REACH: Final = 24  # pixels around one that its description depends on, a multiple of `_STEP`
 _LAYERS: Final = 5  # of each size, over 3 by 3 pixels
 _SCALE: Final = 32.0  # grey levels of one unit
 _SLOPE: Final = 0.1  # of a layer, below zero
@@ -30,16 +31,13 @@ _GREY, _BETWEEN, _LAST = 64.0, 512.0, 1024.0
 _LARGEST_SUM: Final = 65_000  # of the sizes of weights: with any features a sum fits into 32 bits
 
 
-class Network(NamedTuple):
-    """The layers for full, half and quarter size; the last of each gives its part of the sums."""
-
-    sizes: list[tuple[kernels.Layer, ...]]
+Network: TypeAlias = list[tuple[kernels.Layer, ...]]
+"""The layers of each size; the last one gives its part of the features."""
 
 
 def rows_at_once(width: int) -> int:
     """Return how many rows of an image to describe at a time: as many as memory is meant for."""
-    step = _SIZES[-1]
-    return max(_PIXELS // width // step * step, 48)
+    return max(_PIXELS // width // _STEP * _STEP, 2 * _REACH)
 
 
 class Describer:
@@ -47,21 +45,18 @@ class Describer:
 
     def __init__(self, network: Network, image: Float32, level: float) -> None:
         self._network = network
-        reach, below, beside = 24, -image.shape[0] % 4, -image.shape[1] % 4
+        below, beside = (_REACH + -length % _STEP for length in image.shape)
         whole = cv2.copyMakeBorder(
             (image - np.float32(level)) * np.float32(_GREY),
-            *(reach, reach + below, reach, reach + beside),
+            *(_REACH, below, _REACH, beside),
             cv2.BORDER_REPLICATE,
         )
         self._images = []
         for size in _SIZES:
             # The square of all layers for the first pixel, or the one before it if it is enlarged.
-            start = reach // size - _LAYERS - (size > 1)
-            grey = cv2.resize(whole, None, fx=1 / size, fy=1 / size, interpolation=cv2.INTER_AREA)[
-                start:, start:
-            ]
-            step = kernels.STEP
-            beyond = step + -grey.shape[1] % step
+            start, smaller = _REACH // size - _LAYERS - (size > 1), {"fx": 1 / size, "fy": 1 / size}
+            grey = cv2.resize(whole, None, **smaller, interpolation=cv2.INTER_AREA)[start:, start:]
+            beyond = kernels.STEP + -grey.shape[1] % kernels.STEP
             grey = cv2.copyMakeBorder(grey, 0, 0, 0, beyond, cv2.BORDER_REPLICATE)
             self._images.append((np.rint(grey).astype(np.int32) & 0xFFFF)[:, None])
 
@@ -71,8 +66,8 @@ class Describer:
         int32 (N, C / 2, at least W), each two of int16. What is around them is read as well, so
         they are the same in any pieces.
         """
-        bottom, found = end + -end % 4, []
-        for image, layers, size in zip(self._images, self._network.sizes, _SIZES, strict=True):
+        bottom, found = end + -end % _STEP, []
+        for image, layers, size in zip(self._images, self._network, _SIZES, strict=True):
             rows = (bottom - first) // size + 2 * (size > 1)
             part = image[first // size : first // size + rows + 2 * _LAYERS]
             to = np.empty((rows, layers[-1].bias.size // 2, image.shape[2]), np.int32)
@@ -95,7 +90,7 @@ def load_network() -> Network:
     """Load the network that comes with the program."""
     with files("recon.stereo.match").joinpath("features.npz").open("rb") as file:
         weights = dict(np.load(file))
-    sizes = []
+    sizes: Network = []
     parts = np.split(weights["f.weight"], len(_SIZES), axis=1)
     for number, (name, size, part) in enumerate(zip("abd", _SIZES, parts, strict=True)):
         layers, steps = [], _GREY * _SCALE / size
@@ -105,25 +100,28 @@ def load_network() -> Network:
             steps = _BETWEEN
         bias = weights["f.bias"] if number == 0 else np.zeros_like(weights["f.bias"])
         sizes.append((*layers, _layer(part, bias, steps, _LAST, 1.0)))
-    return Network(sizes)
+    return sizes
 
 
 def _layer(
     weights: Float32, bias: Float32, steps: float, steps_after: float, slope: float
 ) -> kernels.Layer:
     """Return a layer in 16 bits, from weights (O, C, S, S) and the steps of a unit around it."""
-    out, channels = weights.shape[:2]
+    (out, channels), group = weights.shape[:2], kernels.GROUP
     flat = weights.reshape(out, channels, -1)
     if channels % 2:
         flat = np.concatenate([flat, np.zeros_like(flat)], axis=1)
     fine = _LARGEST_SUM / np.abs(flat).sum(axis=(1, 2))
     fine = np.minimum(fine, 32767 / np.abs(flat).max(axis=(1, 2)))
     whole = np.rint(flat * fine[:, None, None]).astype(np.int16)
-    groups = whole.reshape(out // SUMS, SUMS, -1, 2, flat.shape[2]).transpose(0, 2, 4, 1, 3)
-    pairs = np.ascontiguousarray(groups).view(np.int32).reshape(out // SUMS, -1, SUMS)
+    groups = whole.reshape(-1, group, flat.shape[1] // 2, 2, flat.shape[2])
+    pairs = np.ascontiguousarray(groups.transpose(0, 2, 4, 1, 3)).view(np.int32)
     scale = steps_after / (fine * steps)
     return kernels.Layer(
-        pairs, scale.astype(np.float32), (bias * steps_after).astype(np.float32), slope
+        weights=pairs.reshape(len(pairs), -1, group),
+        scale=scale.astype(np.float32),
+        bias=(bias * steps_after).astype(np.float32),
+        slope=slope,
     )
 
 
