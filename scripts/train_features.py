@@ -1,9 +1,9 @@
 #!/usr/bin/env python
 """Train the network of the fine matcher, on rendered pairs and on Middlebury scenes of before 2014.
 
-    pip install torch onnx
-    scripts/train_features.py PHOTOGRAPHS MIDDLEBURY --minutes 60 --into features.onnx
-    scripts/train_features.py PHOTOGRAPHS MIDDLEBURY --start features.onnx --into better.onnx
+    pip install torch
+    scripts/train_features.py PHOTOGRAPHS MIDDLEBURY --minutes 60 --into features.npz
+    scripts/train_features.py PHOTOGRAPHS MIDDLEBURY --start features.npz --into better.npz
 
 Half of the samples are rendered: planes that hide each other, each with a photograph or with noise
 on it. PHOTOGRAPHS is a folder of pictures of any kind (the network that comes with the program saw
@@ -29,10 +29,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
-from onnx.numpy_helper import to_array
 from torch import nn
 from torch.nn import functional
 
@@ -305,12 +303,11 @@ def loss_of(network: Network, sample: Sample) -> Any:
 
 
 def started(start: Path | None) -> Network:
-    """Return a network of random weights, or of those of an ONNX file."""
+    """Return a network of random weights, or of those of a file."""
     torch.manual_seed(0)
     network = Network()
     if start is not None:
-        weights = {one.name: to_array(one) for one in onnx.load(str(start)).graph.initializer}
-        found = {name: torch.from_numpy(array.copy()) for name, array in weights.items()}
+        found = {name: torch.from_numpy(array) for name, array in np.load(start).items()}
         network.load_state_dict({**network.state_dict(), **found})
         network.t.data.fill_(TEMPERATURE)
     return network.to(memory_format=torch.channels_last)
@@ -355,21 +352,12 @@ def main() -> None:
     parser.add_argument("middlebury", type=Path)
     parser.add_argument("--start", type=Path, help="go on from this network")
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--into", type=Path, default=Path("features.onnx"))
+    parser.add_argument("--into", type=Path, default=Path("features.npz"))
     given = parser.parse_args()
     data = read_photographs(given.photographs), read_scenes(given.middlebury)
     network = train(started(given.start), data, given.minutes)
-    sizes = {2: "height", 3: "width"}
-    torch.onnx.export(
-        network.eval(),
-        (torch.zeros(1, 1, 176, 400),),
-        str(given.into),
-        dynamo=False,
-        opset_version=13,
-        input_names=["grey"],
-        output_names=["features"],
-        dynamic_axes={"grey": sizes, "features": sizes},
-    )
+    weights = {name: value.numpy() for name, value in network.state_dict().items() if name != "t"}
+    np.savez(given.into, **weights)
 
 
 if __name__ == "__main__":

@@ -19,11 +19,22 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.core.kernels.compiled import Bool, Float32, Int32, UInt8, kernel
+from recon.stereo.kernels.simd.vectors import (
+    WIDE,
+    absolute_difference,
+    broadcast_smallest,
+    load_row,
+    smaller,
+    splat,
+    splat_at,
+    store_row,
+)
 
 NODE_PX: Final = 4  # a plane is fitted in every fourth row and column
 STEEPEST: Final = 1.5  # slope of a plane at most, disparities per pixel
 _FITS: Final = 3  # each with the pixels that are near the one before
 _LEAST_WEIGHT: Final = 3.0  # below it a fit says nothing of slopes
+_COLUMNS: Final = 32  # of candidates that are written together
 _PULL: Final = 1e-3  # of slopes towards zero, where all points lie in a line
 
 
@@ -85,6 +96,8 @@ def fit_nodes(
     disparity is unknown, NaN and level.
     """
     (height, width), pull = values.shape, float(_PULL * radius * radius)
+    most = (2 * radius // stride + 1) ** 2 + WIDE
+    points, sums = np.empty((4, most), np.float32), np.empty((9, WIDE), np.float32)
     for i in range(first, end):
         for j in range(nodes.shape[2]):
             y, x = NODE_PX * i, NODE_PX * j
@@ -93,34 +106,70 @@ def fit_nodes(
                 continue
             top, bottom = max(y - radius, y % stride), min(y + radius + 1, height)
             start, stop = max(x - radius, x % stride), min(x + radius + 1, width)
-            value, across, down = float(values[y, x]), 0.0, 0.0
-            limit = 2.0 * within_px
-            for _ in range(_FITS):
-                # Sums of the weights, of columns and rows, of what is left, and of their products.
-                n, sx, sy, r, rx, ry = 1e-6, 0.0, 0.0, 0.0, 0.0, 0.0
-                sxx, sxy, syy = pull, 0.0, pull
-                for v in range(top, bottom, stride):
-                    for u in range(start, stop, stride):
-                        dx, dy = u - x, v - y
-                        rest = values[v, u] - (value + across * dx + down * dy)
-                        # Unknown values fail the comparison.
-                        if not abs(rest) < limit:
-                            continue
+            count = 0
+            for v in range(top, bottom, stride):
+                for u in range(start, stop, stride):
+                    if not np.isnan(values[v, u]):
                         apart = 0
                         for c in range(3):
                             apart += abs(np.int64(guide[v, u, c]) - np.int64(guide[y, x, c]))
-                        near = 1.0 - (rest / limit) * (rest / limit)
-                        w = alike[apart] * weights[v, u] * near
-                        n, sx, sy = n + w, sx + w * dx, sy + w * dy
-                        sxx, sxy, syy = sxx + w * dx * dx, sxy + w * dx * dy, syy + w * dy * dy
-                        r, rx, ry = r + w * rest, rx + w * rest * dx, ry + w * rest * dy
+                        points[0, count], points[1, count] = u - x, v - y
+                        points[2, count] = values[v, u] - values[y, x]
+                        points[3, count] = alike[apart] * weights[v, u]
+                        count += 1
+            points[:, count : count + WIDE] = np.float32(0)
+            value, across, down = 0.0, 0.0, 0.0
+            limit = 2.0 * within_px
+            for _ in range(_FITS):
+                _add_moments(points, count, value, across, down, limit, sums)
+                n, sx, sy = 1e-6 + sums[0].sum(), sums[1].sum(), sums[2].sum()
                 if n < _LEAST_WEIGHT:
                     break
+                r, rx, ry = sums[3].sum(), sums[4].sum(), sums[5].sum()
+                sxx, sxy, syy = pull + sums[6].sum(), sums[7].sum(), pull + sums[8].sum()
                 more, a, b = least_squares(n, sx, sy, r, rx, ry, sxx, sxy, syy)
                 value, across, down, limit = value + more, across + a, down + b, within_px
             steep = max(abs(across), abs(down))
-            if steep < STEEPEST and abs(value - values[y, x]) < limit:
-                nodes[0, i, j], nodes[1, i, j], nodes[2, i, j] = value, across, down
+            if steep < STEEPEST and abs(value) < limit:
+                nodes[0, i, j] = values[y, x] + value
+                nodes[1, i, j], nodes[2, i, j] = across, down
+
+
+@kernel
+def _add_moments(
+    points: Float32,
+    count: int,
+    value: float,
+    across: float,
+    down: float,
+    limit: float,
+    sums: Float32,
+) -> None:
+    """Add up the weights of points (4, N), lane by lane, by what `least_squares` wants: (9, WIDE).
+
+    A point weighs the less, the farther it is from the plane, and beyond ``limit`` nothing.
+    """
+    start, slope = splat(np.float32(value)), splat(np.float32(across))
+    fall, rate = splat(np.float32(down)), splat(np.float32(1 / limit**2))
+    none, one = splat(np.float32(0)), splat(np.float32(1))
+    n = sx = sy = r = rx = ry = sxx = sxy = syy = none
+    for i in range(0, count, WIDE):
+        dx, dy = load_row(points, 0, i), load_row(points, 1, i)
+        rest = load_row(points, 2, i) - start - slope * dx - fall * dy
+        w = load_row(points, 3, i) * (one - smaller(rest * rest * rate, one))
+        wx, wy, left = w * dx, w * dy, w * rest
+        n, sx, sy = n + w, sx + wx, sy + wy
+        r, rx, ry = r + left, rx + left * dx, ry + left * dy
+        sxx, sxy, syy = sxx + wx * dx, sxy + wx * dy, syy + wy * dy
+    store_row(sums, 0, 0, n)
+    store_row(sums, 1, 0, sx)
+    store_row(sums, 2, 0, sy)
+    store_row(sums, 3, 0, r)
+    store_row(sums, 4, 0, rx)
+    store_row(sums, 5, 0, ry)
+    store_row(sums, 6, 0, sxx)
+    store_row(sums, 7, 0, sxy)
+    store_row(sums, 8, 0, syy)
 
 
 @kernel
@@ -155,61 +204,87 @@ def _write_candidates(
     planes: Float32,
     costs: Float32,
 ) -> None:
-    """Write the planes (3, W, K) that the pixels of row ``y`` may take, and their costs (W, K)."""
+    """Write the planes (3, W, K) that the pixels of row ``y`` may take, and their costs (W, K).
+
+    Planes are in the unit of costs: what half a pixel of disparity costs on the way to another.
+    """
     height, width = sources.shape[2:]
     last, outside = np.float32(volume.shape[1] - 1), np.float32(changes.outside)
-    minimum = np.float32(changes.minimum)
-    for x in range(width):
+    minimum, half = np.float32(changes.minimum), np.float32(changes.per_px / 2)
+    # What is written for some columns stays in the nearest cache until all planes are.
+    for start in range(0, width, _COLUMNS):
         for k in range(table.shape[0]):
-            source = sources[table[k, 0]]
-            u = min(max(x + table[k, 1], 0), width - 1)
             v = min(max(y + table[k, 2], 0), height - 1)
-            across, down = source[1, v, u], source[2, v, u]
-            value = source[0, v, u] + across * np.float32(x - u) + down * np.float32(y - v)
-            planes[0, x, k], planes[1, x, k], planes[2, x, k] = value, across, down
-            place = value - minimum
-            if place < 0 or place >= last or np.float32(x) < value:
-                costs[x, k] = outside
-            else:
-                whole = np.int64(place)
-                part = place - np.float32(whole)
-                low, high = volume[y, whole, x], volume[y, whole + 1, x]
-                costs[x, k] = np.float32(low) + part * (np.float32(high) - np.float32(low))
+            source, beside, drop = sources[table[k, 0]], table[k, 1], np.float32(y - v)
+            values, across, down = source[0, v], source[1, v], source[2, v]
+            for x in range(start, min(start + _COLUMNS, width)):
+                u = min(max(x + beside, 0), width - 1)
+                value = values[u] + across[u] * np.float32(x - u) + down[u] * drop
+                planes[0, x, k], planes[1, x, k] = half * value, half * across[u]
+                planes[2, x, k] = half * down[u]
+                place = value - minimum
+                if place < 0 or place >= last or np.float32(x) < value:
+                    costs[x, k] = outside
+                else:
+                    whole = np.int64(place)
+                    part = place - np.float32(whole)
+                    low, high = volume[y, whole, x], volume[y, whole + 1, x]
+                    costs[x, k] = np.float32(low) + part * (np.float32(high) - np.float32(low))
 
 
-@kernel(inline="always")
-def _advance(
+@kernel
+def _follow(
     before: Float32,
     planes_before: Float32,
-    x_before: int,
+    grey_before: UInt8,
     planes: Float32,
+    grey: UInt8,
     costs: Float32,
-    x: int,
-    dx: np.float32,
-    dy: np.float32,
-    per_px: np.float32,
-    most: np.float32,
+    dx: int,
+    dy: int,
+    changes: Changes,
+    moved: Float32,
     path: Float32,
 ) -> None:
-    """Write the costs (K) of a path at a pixel, from those at the pixel before it."""
-    count, half = path.size, np.float32(0.5) * per_px
-    value, across, down = planes[0, x], planes[1, x], planes[2, x]
-    low = before[0]
-    for i in range(1, count):
-        low = min(low, before[i])
-    ceiling = low + most
-    for j in range(count):
-        path[j] = ceiling
-    for i in range(count):
-        start = planes_before[0, x_before, i]
-        here = start + planes_before[1, x_before, i] * dx + planes_before[2, x_before, i] * dy
-        cost = before[i]
-        for j in range(count):
-            there = value[j] - across[j] * dx - down[j] * dy
-            new = cost + half * (abs(here - value[j]) + abs(start - there))
-            path[j] = new if new < path[j] else path[j]
-    for j in range(count):
-        path[j] += costs[x, j] - low
+    """Write the costs (W, K) of a path at the pixels of a row, from those ``before``.
+
+    The pixel before one is ``dx`` columns and ``dy`` rows back; where it is outside the image the
+    path starts. ``moved`` is scratch (W, K).
+    """
+    width, count = path.shape
+    across, down = splat(np.float32(dx)), splat(np.float32(dy))
+    starts, slopes, falls = planes_before[0], planes_before[1], planes_before[2]
+    values, slopes_here, falls_here = planes[0], planes[1], planes[2]
+    for x in range(width):
+        for k in range(0, count, WIDE):
+            there = load_row(starts, x, k) + load_row(slopes, x, k) * across
+            store_row(moved, x, k, there + load_row(falls, x, k) * down)
+    for m in range(width):
+        x = m if dx >= 0 else width - 1 - m
+        u = x - dx
+        if u < 0 or u >= width:
+            path[x] = costs[x]
+            continue
+        low = load_row(before, u, 0)
+        for k in range(WIDE, count, WIDE):
+            low = smaller(low, load_row(before, u, k))
+        low = broadcast_smallest(low)
+        ceiling = low + splat(_most(grey[x], grey_before[u], changes))
+        for k in range(0, count, WIDE):
+            value = load_row(values, x, k)
+            there = value - load_row(slopes_here, x, k) * across
+            there = there - load_row(falls_here, x, k) * down
+            # Two at a time: neither waits for the other.
+            best = second = ceiling
+            for i in range(0, count, 2):
+                gap = absolute_difference(splat_at(moved, u, i), value)
+                gap = gap + absolute_difference(splat_at(starts, u, i), there)
+                best = smaller(best, gap + splat_at(before, u, i))
+                gap = absolute_difference(splat_at(moved, u, i + 1), value)
+                gap = gap + absolute_difference(splat_at(starts, u, i + 1), there)
+                second = smaller(second, gap + splat_at(before, u, i + 1))
+            best = smaller(best, second) + load_row(costs, x, k)
+            store_row(path, x, k, best - low)
 
 
 @kernel
@@ -226,46 +301,34 @@ def sweep(
 
     The candidates of a pixel are planes ``sources``, float32 (S, 3, H, W), each a value and two
     slopes: row ``k`` of ``table``, int32 (K, 3), is which of them and at what distance, columns and
-    rows. Paths come from the row above (below, if ``upwards``) and from the left (right).
+    rows. K is a multiple of `WIDE`. Paths come from the row above (below, if ``upwards``) and from
+    the left (right).
     """
     height, width, count = sums.shape
     rows = np.empty((2, 3, width, count), np.float32)
     ends = np.empty((2, 3, width, count), np.float32)
-    costs = np.empty((width, count), np.float32)
-    beside = np.empty((2, count), np.float32)
-    per_px, step = np.float32(changes.per_px), -1 if upwards else 1
+    scratch = np.empty((3, width, count), np.float32)
+    costs, moved, beside = scratch[0], scratch[1], scratch[2]
+    step, two, four = -1 if upwards else 1, np.float32(2), np.float32(4)
     for n in range(height):
         y = height - 1 - n if upwards else n
         previous, planes = rows[1 - n % 2], rows[n % 2]
         above, paths = ends[1 - n % 2], ends[n % 2]
         _write_candidates(sources, table, volume, changes, y, planes, costs)
-        for x in range(width):
-            sums[y, x] = np.float32(0)
-            for way in range(3):
-                dx = way - 1
-                u, path = x - dx, paths[way, x]
-                if n == 0 or u < 0 or u >= width:
-                    path[:] = costs[x]
-                else:
-                    most = _most(grey[y, x], grey[y - step, u], changes)
-                    a, b = np.float32(dx), np.float32(step)
-                    _advance(above[way, u], previous, u, planes, costs, x, a, b, per_px, most, path)
-                # Straight paths count twice, as in `recon.stereo.kernels.paths`.
-                weight = np.float32(2 if dx == 0 else 1)
-                for j in range(count):
-                    sums[y, x, j] += weight * path[j]
-        for m in range(width):
-            x = width - 1 - m if upwards else m
-            here, last = beside[m % 2], beside[1 - m % 2]
-            if m == 0:
-                here[:] = costs[x]
+        for way in range(3):
+            if n == 0:
+                paths[way] = costs
             else:
-                u = x - step
-                most = _most(grey[y, x], grey[y, u], changes)
-                a, b = np.float32(step), np.float32(0)
-                _advance(last, planes, u, planes, costs, x, a, b, per_px, most, here)
-            for j in range(count):
-                sums[y, x, j] += np.float32(4) * here[j]
+                _follow(
+                    *(above[way], previous, grey[y - step], planes, grey[y], costs),
+                    *(way - 1, step, changes, moved, paths[way]),
+                )
+        _follow(*(beside, planes, grey[y], planes, grey[y], costs, step, 0, changes, moved, beside))
+        # Straight paths count twice, as in `recon.stereo.kernels.paths`.
+        for x in range(width):
+            for k in range(count):
+                slanted = paths[0, x, k] + paths[2, x, k]
+                sums[y, x, k] = slanted + two * paths[1, x, k] + four * beside[x, k]
 
 
 @kernel(inline="always")

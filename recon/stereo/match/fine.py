@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.core.values.arrays import Bool, Float32, UInt8
+from recon.core.values.arrays import Bool, Float32, Int32, UInt8
 from recon.stereo.kernels import planes as kernels
 from recon.stereo.kernels.path_costs import (
     Views,
@@ -121,7 +121,7 @@ class FineMatcher:
             self._network = load_network()
         left, right = fine_grey(pair.left, pair.left_rgb), fine_grey(pair.right, pair.right_rgb)
         level = float(left.mean())
-        one, other = (Describer(self._network, image, level) for image in (left, right))
+        describers = [Describer(self._network, image, level) for image in (left, right)]
         at_once = rows_at_once(width)
 
         def prepare(rows: range) -> None:
@@ -136,14 +136,18 @@ class FineMatcher:
                 common.in_strips(pool, self._threads, work, height)
             for first in range(0, height, at_once):
                 end = min(first + at_once, height)
-                ours, others = one.describe(first, end), other.describe(first, end)
-                add = partial(_add_learned, ours, others, minimum, volume[first:end])
+                ours, others = (
+                    each.describe(first, end, pool, self._threads) for each in describers
+                )
+                add = partial(_add_learned, ours, others, width, minimum, volume[first:end])
                 common.in_strips(pool, self._threads, add, end - first)
         return volume
 
 
-def _add_learned(left: Float32, right: Float32, minimum: int, costs: UInt8, rows: range) -> None:
-    add_unlikeness(left, right, minimum, _BLEND, rows.start, rows.stop, costs)
+def _add_learned(
+    left: Int32, right: Int32, width: int, minimum: int, costs: UInt8, rows: range
+) -> None:
+    add_unlikeness(left, right, width, minimum, _BLEND, rows.start, rows.stop, costs)
 
 
 def _changes(minimum: int) -> kernels.Changes:

@@ -1,5 +1,6 @@
 """What the fine matcher promises: slants, plain areas, edges, reasons, pieces, memory."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from unittest.mock import patch
 
@@ -11,6 +12,7 @@ from recon.commands.evaluate_middlebury import run_middlebury
 from recon.core.errors import MatchingError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
+from recon.stereo.kernels.convolution import UNIT
 from recon.stereo.match import fine, segments, sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network
 from recon.stereo.match.fine import FineMatcher, FineSettings
@@ -174,13 +176,17 @@ def test_colour_and_threads_and_strips():
 def test_descriptions_are_of_unit_length_and_the_same_in_pieces():
     image = fine_grey(rendered(ground(), cloth()).left, None)
     described = Describer(load_network(), image, float(image.mean()))
-    whole = described.describe(0, 97)
-    assert whole.shape == (97, 48, WIDTH)
-    np.testing.assert_allclose(np.linalg.norm(whole, axis=1), 1, atol=1e-5)
-    parts = np.concatenate(
-        [described.describe(first, min(first + 32, 97)) for first in range(0, 97, 32)]
-    )
-    np.testing.assert_allclose(parts, whole, atol=1e-5)
+    with ThreadPoolExecutor(2) as pool:
+        whole = described.describe(0, 97, pool, 2)
+        parts = [
+            described.describe(first, min(first + 32, 97), pool, 1) for first in range(0, 97, 32)
+        ]
+    assert whole.shape[:2] == (97, 48 // 2)
+    assert whole.shape[2] >= WIDTH
+    features = np.ascontiguousarray(whole[:, :, :WIDTH]).view(np.int16).astype(float)
+    squares = (features**2).sum(axis=1).reshape(97, WIDTH, 2).sum(axis=2)
+    np.testing.assert_allclose(np.sqrt(squares) / UNIT, 1, atol=1e-3)
+    np.testing.assert_array_equal(np.concatenate(parts)[:, :, :WIDTH], whole[:, :, :WIDTH])
 
 
 @pytest.mark.slow

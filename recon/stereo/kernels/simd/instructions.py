@@ -13,20 +13,21 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import config, types
 from numba.core import cgutils, typing
+from numba.core.codegen import get_host_cpu_features
 from numba.extending import lower_builtin, models, register_model, type_callable
 
 from recon.stereo.kernels.simd import vectors
-from recon.stereo.kernels.simd.vectors import LANES
+from recon.stereo.kernels.simd.vectors import LANES, SUMS, WIDE
 
 
 class _Vector(types.Type):  # type: ignore[misc]
-    """Numba's type of a vector with elements of some integer type."""
+    """Numba's type of a vector with elements of some integer type, or of float32."""
 
-    def __init__(self, element: types.Integer) -> None:
+    def __init__(self, element: types.Number) -> None:
         self.element = element
-        super().__init__(name=f"Vector({element} x {LANES})")
+        super().__init__(name=f"Vector({element})")
 
 
 @register_model(_Vector)
@@ -34,11 +35,20 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
     """Represents a vector by LLVM's vector type."""
 
     def __init__(self, manager: Any, vector: _Vector) -> None:
-        super().__init__(manager, vector, _llvm_type(vector.element.bitwidth))
+        super().__init__(manager, vector, _llvm_type_of(vector))
 
 
 def _llvm_type(bits: int, lanes: int = LANES) -> ir.VectorType:
     return ir.VectorType(ir.IntType(bits), lanes)
+
+
+_WHOLE, _FLOATS = _llvm_type(32, WIDE), ir.VectorType(ir.FloatType(), WIDE)
+
+
+def _llvm_type_of(vector: _Vector) -> ir.VectorType:
+    if vector.element == types.float32:
+        return _FLOATS
+    return _WHOLE if vector.element.bitwidth == 32 else _llvm_type(vector.element.bitwidth)
 
 
 def _compiled_as(function: Callable[..., Any], typer: Callable[..., Any]) -> Callable[..., Any]:
@@ -72,6 +82,21 @@ def _intrinsic(name: str) -> Callable[..., Any]:
     return write
 
 
+def _either(of_integers: Callable[..., Any], of_floats: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what writes one or the other, by the type of the vectors."""
+    return lambda builder, a, b: (of_floats if a.type == _FLOATS else of_integers)(builder, a, b)
+
+
+def _write_smaller_float(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+
+
+def _write_float_difference(builder: Any, a: Any, b: Any) -> Any:
+    kind, name = ir.FunctionType(_FLOATS, [_FLOATS]), f"llvm.fabs.v{WIDE}f32"
+    size = cgutils.get_or_insert_function(builder.module, kind, name)
+    return builder.call(size, [builder.fsub(a, b)])
+
+
 def _write_difference(builder: Any, a: Any, b: Any) -> Any:
     # Saturating differences in either order: one of the two is zero.
     minus = _intrinsic("usub.sat")
@@ -91,19 +116,20 @@ def _write_differing(builder: Any, a: Any, b: Any) -> Any:
     return builder.call(count, [builder.xor(a, b)])
 
 
-_binary(operator.add, lambda builder, a, b: builder.add(a, b))
-_binary(operator.sub, lambda builder, a, b: builder.sub(a, b))
-_binary(operator.mul, lambda builder, a, b: builder.mul(a, b))
+_write_smaller = _either(_intrinsic("umin"), _write_smaller_float)
+_binary(operator.add, _either(ir.IRBuilder.add, ir.IRBuilder.fadd))
+_binary(operator.sub, _either(ir.IRBuilder.sub, ir.IRBuilder.fsub))
+_binary(operator.mul, _either(ir.IRBuilder.mul, ir.IRBuilder.fmul))
 _binary(operator.rshift, lambda builder, a, b: builder.lshr(a, b))
 _binary(vectors.mean, _write_mean)
 _binary(vectors.differing_bits, _write_differing)
-_binary(vectors.smaller, _intrinsic("umin"))
+_binary(vectors.smaller, _write_smaller)
 _binary(vectors.larger, _intrinsic("umax"))
-_binary(vectors.absolute_difference, _write_difference)
+_binary(vectors.absolute_difference, _either(_write_difference, _write_float_difference))
 
 
-def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
-    kind = _llvm_type(value.type.width, lanes)
+def _write_splat(builder: Any, value: Any, kind: ir.VectorType) -> Any:
+    lanes = kind.count
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
     return builder.shuffle_vector(one, one, ir.Constant(_llvm_type(32, lanes), [0] * lanes))
 
@@ -135,7 +161,7 @@ def _store_type(rows: Any, n: Any, at: Any, lanes: Any) -> Any:
 
 def _load_from(address: Callable[..., Any]) -> Callable[..., Any]:
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = _llvm_type(signature.return_type.element.bitwidth)
+        kind = _llvm_type_of(signature.return_type)
         return builder.load(address(context, builder, signature, arguments, kind), align=1)
 
     return emit
@@ -157,19 +183,26 @@ _compiled_as(vectors.load_row, _type_in_row)(_load_from(_address_in_row))
 _compiled_as(vectors.store_row, _store_type)(_store_at(_address_in_row))
 
 
-def _vector_of(value: types.Integer) -> _Vector:
+def _vector_of(value: types.Number) -> _Vector:
     # Not the class itself: numba reads the parameters of what it calls.
     return _Vector(value)
 
 
 @_compiled_as(vectors.splat, _vector_of)
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return _write_splat(builder, arguments[0], LANES)
+    return _write_splat(builder, arguments[0], _llvm_type_of(signature.return_type))
+
+
+@_compiled_as(vectors.splat_at, _type_in_row)
+def _splat_at(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    kind = _llvm_type_of(signature.return_type)
+    place = _address_in_row(context, builder, signature, arguments, kind.element)
+    return _write_splat(builder, builder.load(place), kind)
 
 
 @_compiled_as(vectors.ramp, lambda first: _Vector(types.uint16))
 def _ramp(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    start = _write_splat(builder, arguments[0], LANES)
+    start = _write_splat(builder, arguments[0], _llvm_type(16))
     return builder.add(start, ir.Constant(_llvm_type(16), list(range(LANES))))
 
 
@@ -198,17 +231,18 @@ def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 @_compiled_as(vectors.broadcast_smallest, lambda lanes: lanes)
 def _broadcast_smallest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     # A butterfly of exchanges between ever nearer lanes, which stays in registers.
-    found, turn = arguments[0], LANES // 2
+    found, lanes = arguments[0], arguments[0].type.count
+    turn = lanes // 2
     while turn:
-        order = [lane ^ turn for lane in range(LANES)]
-        found = _intrinsic("umin")(builder, found, _shuffle(builder, found, found, order))
+        order = [lane ^ turn for lane in range(lanes)]
+        found = _write_smaller(builder, found, _shuffle(builder, found, found, order))
         turn //= 2
     return found
 
 
 def _shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
     """Return lanes of two vectors in some order; ``LANES`` is the first lane of the second one."""
-    return builder.shuffle_vector(a, b, ir.Constant(_llvm_type(32), order))
+    return builder.shuffle_vector(a, b, ir.Constant(_llvm_type(32, len(order)), order))
 
 
 _binary(
@@ -269,3 +303,95 @@ def _write_dealt(builder: Any, part: list[Any], first: list[int], second: list[i
         pairs = zip(part[:half], part[half:], strict=True)
         part = [_shuffle(builder, a, b, order) for a, b in pairs for order in (first, second)]
     return part
+
+
+# What multiplies int16 in pairs: the feature of a processor that has it, and lanes.
+_PAIRS_ON_X86 = (
+    ("avx512bw", "llvm.x86.avx512.pmaddw.d.512", 32),
+    ("avx2", "llvm.x86.avx2.pmadd.wd", 16),
+)
+_FEATURES = config.CPU_FEATURES
+if _FEATURES is None:
+    _FEATURES = get_host_cpu_features()
+
+
+def _sums_type(sums: Any, pairs: Any, rows: Any, n: Any, at: Any) -> Any:
+    fits = _type_in_row(rows, n, at) == pairs == _Vector(types.int32)
+    return sums if fits else None
+
+
+def _write_products(builder: Any, a: Any, b: Any, total: Any) -> Any:
+    """Add products of 16 bits in pairs, for which x86 has an instruction that LLVM rarely finds."""
+    a, b = (builder.bitcast(pairs, _llvm_type(16)) for pairs in (a, b))
+    for feature, name, lanes in _PAIRS_ON_X86:
+        if f"+{feature}" in _FEATURES.split(","):
+            kind, wide = _llvm_type(16, lanes), _llvm_type(32, lanes // 2)
+            multiply = cgutils.get_or_insert_function(
+                builder.module, ir.FunctionType(wide, [kind, kind]), name
+            )
+            parts = [
+                builder.call(multiply, [_part(builder, one, n, lanes) for one in (a, b)])
+                for n in range(0, LANES, lanes)
+            ]
+            return builder.add(total, _joined(builder, parts))
+    for odd in (0, 1):
+        order = list(range(odd, LANES, 2))
+        one, other = (builder.sext(_shuffle(builder, each, each, order), _WHOLE) for each in (a, b))
+        total = builder.add(total, builder.mul(one, other))
+    return total
+
+
+def _part(builder: Any, vector: Any, first: int, lanes: int) -> Any:
+    return _shuffle(builder, vector, vector, list(range(first, first + lanes)))
+
+
+def _joined(builder: Any, parts: list[Any]) -> Any:
+    return parts[0] if len(parts) == 1 else _shuffle(builder, parts[0], parts[1], list(range(WIDE)))
+
+
+def _add_each(of: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what emits sums with the products of pairs; ``of`` gives those for sum ``i``."""
+
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        sums, pairs, rows, n, at = arguments
+        kinds = signature.args[2:]
+        start = _address_in_row(
+            context, builder, typing.signature(types.none, *kinds), (rows, n, at), _WHOLE.element
+        )
+        new = [
+            _write_products(builder, pairs, of(builder, start, i), total)
+            for i, total in enumerate(cgutils.unpack_tuple(builder, sums))
+        ]
+        return context.make_tuple(builder, signature.return_type, new)
+
+    return emit
+
+
+def _at_once(builder: Any, start: Any, i: int) -> Any:
+    return _write_splat(builder, builder.load(builder.gep(start, [ir.IntType(64)(i)])), _WHOLE)
+
+
+def _before(builder: Any, start: Any, i: int) -> Any:
+    moved = builder.gep(start, [ir.IntType(64)(-i)])
+    return builder.load(builder.bitcast(moved, _WHOLE.as_pointer()), align=1)
+
+
+_compiled_as(vectors.add_products, _sums_type)(_add_each(_at_once))
+_compiled_as(vectors.add_shifted, _sums_type)(_add_each(_before))
+
+
+@_compiled_as(vectors.no_sums, lambda: types.UniTuple(_Vector(types.int32), SUMS))
+def _no_sums(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    none = [ir.Constant(_WHOLE, [0] * WIDE)] * SUMS
+    return context.make_tuple(builder, signature.return_type, none)
+
+
+@_compiled_as(vectors.store_sums, lambda rows, n, at, sums: types.none)
+def _store_sums(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    (rows, n, at, sums), (kind, first_kind, *_) = arguments, signature.args
+    first = context.cast(builder, n, first_kind, types.intp)
+    types_of = typing.signature(types.none, kind, types.intp, signature.args[2])
+    for i, one in enumerate(cgutils.unpack_tuple(builder, sums)):
+        place = rows, builder.add(first, first.type(i)), at
+        builder.store(one, _address_in_row(context, builder, types_of, place, _WHOLE), align=1)
+    return context.get_dummy_value()

@@ -12,35 +12,46 @@ from numpy.typing import NDArray
 
 # Values of a vector. In 16 bits they fill 512 bits; of smaller registers the compiler uses several.
 LANES: Final = 32
+WIDE: Final = 16  # values of a vector of 32 bits each
+SUMS: Final = 8  # vectors that are added to at a time, so that all stay in registers
 
-Vector: TypeAlias = NDArray[Any]  # uint8 or uint16 (LANES,)
+Vector: TypeAlias = NDArray[Any]  # uint8 or uint16 (LANES,), int32 or float32 (WIDE,)
+Sums: TypeAlias = tuple[Vector, ...]  # `SUMS` vectors of int32
+
+
+def _lanes(values: NDArray[Any] | np.generic) -> int:
+    return WIDE if values.dtype.itemsize == np.dtype(np.int32).itemsize else LANES
 
 
 def load(array: NDArray[Any], at: int) -> Vector:
-    """Return values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,)."""
-    vector: Vector = array[at : at + LANES].copy()
+    """Return as many values of an array (n,) as a vector has, from ``at`` on."""
+    vector: Vector = array[at : at + _lanes(array)].copy()
     return vector
 
 
 def store(array: NDArray[Any], at: int, vector: Vector) -> None:
     """Write a vector from ``at`` on."""
-    array[at : at + LANES] = vector
+    array[at : at + vector.size] = vector
 
 
 def load_row(rows: NDArray[Any], n: int, at: int) -> Vector:
     """Return `load` from row ``n`` of a C-ordered array of rows."""
-    vector: Vector = rows[n, at : at + LANES].copy()
-    return vector
+    return load(rows[n], at)
 
 
 def store_row(rows: NDArray[Any], n: int, at: int, vector: Vector) -> None:
     """`store` to row ``n`` of a C-ordered array of rows."""
-    rows[n, at : at + LANES] = vector
+    store(rows[n], at, vector)
 
 
-def splat(value: np.uint8 | np.uint16) -> Vector:
+def splat(value: np.uint8 | np.uint16 | np.float32) -> Vector:
     """Return the same value in each lane."""
-    return np.full(LANES, value)
+    return np.full(_lanes(value), value)
+
+
+def splat_at(rows: NDArray[Any], n: int, at: int) -> Vector:
+    """Return value ``at`` of row ``n`` in each lane."""
+    return splat(rows[n, at])
 
 
 def ramp(first: np.uint16) -> Vector:
@@ -112,3 +123,30 @@ def broadcast_smallest(vector: Vector) -> Vector:
 def transpose(rows: NDArray[Any], n: int, at: int, out: NDArray[Any], m: int, to: int) -> None:
     """Write a block of `LANES` by `LANES` bytes at (n, at), transposed, to ``out`` at (m, to)."""
     out[m : m + LANES, to : to + LANES] = rows[n : n + LANES, at : at + LANES].T
+
+
+def no_sums() -> Sums:
+    """Return sums of nothing."""
+    return tuple(np.zeros((SUMS, WIDE), np.int32))
+
+
+def _products(a: Vector, b: Vector) -> Vector:
+    """Return what pairs of int16, each pair an int32, add up to when multiplied."""
+    products = a.view(np.int16).astype(np.int32) * b.view(np.int16)
+    return np.asarray(products.reshape(-1, 2).sum(axis=1, dtype=np.int32))
+
+
+def add_products(sums: Sums, pairs: Vector, rows: NDArray[np.int32], n: int, at: int) -> Sums:
+    """Add to sum ``i`` the products of pairs of int16 with the pair ``at + i`` of row ``n``."""
+    return tuple(one + _products(pairs, splat_at(rows, n, at + i)) for i, one in enumerate(sums))
+
+
+def add_shifted(sums: Sums, pairs: Vector, rows: NDArray[np.int32], n: int, at: int) -> Sums:
+    """Add to sum ``i`` the products of pairs with those of row ``n`` from ``at - i`` on."""
+    return tuple(one + _products(pairs, load_row(rows, n, at - i)) for i, one in enumerate(sums))
+
+
+def store_sums(rows: NDArray[np.int32], n: int, at: int, sums: Sums) -> None:
+    """Write each sum from ``at`` on, one to a row, from row ``n`` on."""
+    for i, one in enumerate(sums):
+        store_row(rows, n + i, at, one)
