@@ -81,6 +81,7 @@ def serve(options: argparse.Namespace) -> None:
     """Match the pair for each line of the input, and print figures of it as a line of JSON."""
     import recon  # noqa: PLC0415 - of the checkout, as are the others
     from recon.core.values import Reason, RectifiedPair  # noqa: PLC0415
+    from recon.io.images.disparity import read_pfm  # noqa: PLC0415
     from recon.io.middlebury import stand_in_camera  # noqa: PLC0415
     from recon.stereo.match.fine import FineMatcher, FineSettings  # noqa: PLC0415
 
@@ -90,7 +91,7 @@ def serve(options: argparse.Namespace) -> None:
     one, other = (cv2.cvtColor(view, cv2.COLOR_RGB2GRAY) for view in (left, right))
     camera = stand_in_camera(one.shape[1], one.shape[0], options.ndisp)
     pair = RectifiedPair(one, other, camera, left_rgb=left, right_rgb=right)
-    truth = cv2.imread(str(options.truth), cv2.IMREAD_UNCHANGED) if options.truth else None
+    truth = read_pfm(options.truth) if options.truth else None
     matcher = FineMatcher(FineSettings())
     for _ in sys.stdin:
         before, processor = time.perf_counter(), time.process_time()
