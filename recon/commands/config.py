@@ -108,7 +108,10 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 """The groups of settings that determine the result of each command."""
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
-    "matching": {"sad": {"fill": True}, "sgm": {"fill": True}, "fine": {"fill": True}},
+    "matching": {
+        "matcher": "fine",
+        **{name: {"fill": True} for name in ("sad", "sgm", "fine")},
+    },
     "cloud": {"min_range_m": 0.0, "max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
     "mesh": {"point_weight": 16.0},

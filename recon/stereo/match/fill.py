@@ -55,11 +55,14 @@ class FillingMatcher:
         return fill(pair, seen, self._threads)
 
 
-def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
+def fill(
+    pair: RectifiedPair, seen: Disparity, threads: int, others: Float32 | None = None
+) -> Disparity:
     """Return a disparity with planes of segments where there was none, or an unlikely one.
 
-    Such pixels are FILLED. Where no plane has enough evidence, or it is hidden in the right view,
-    all stays as it was.
+    Such pixels are FILLED. ``others``, float32 (3, H, W), are planes that are tried after those of
+    segments. Where no plane has enough evidence, or it is hidden in the right view, all stays as
+    it was.
     """
     sure = seen.measured & (seen.confidence >= _UNLIKELY)
     if not sure.any():
@@ -70,8 +73,11 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     with ThreadPoolExecutor(threads) as pool:
         shares = fit_segments(smooth_colours(pair), seen, planes, pool, threads)
         distances = _distances(sure, pool)
-        for plane, share in zip(planes, shares, strict=True):  # the smallest segments first
-            wanted = ~(sure | filled | beyond) & (share >= _LEAST_SHARE) & ~outside(plane[0])
+        enough = list(shares >= _LEAST_SHARE)
+        if others is not None:
+            planes, enough = [*planes, others], [*enough, np.any(enough, axis=0)]
+        for plane, supported in zip(planes, enough, strict=True):  # the smallest segments first
+            wanted = supported & ~(sure | filled | beyond | outside(plane[0]))
             support = np.empty((3, *sure.shape), np.uint8)
             weigh = partial(_weigh, seen.values, distances, plane, wanted, support)
             common.in_strips(pool, threads, weigh, len(sure))

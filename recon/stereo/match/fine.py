@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.core.values.arrays import Bool, Float32, Int32, UInt8
+from recon.core.values.arrays import Float32, Int32, UInt8
 from recon.stereo.kernels import planes as kernels
 from recon.stereo.kernels.path_costs import (
     Views,
@@ -35,7 +35,7 @@ from recon.stereo.kernels.similarity import Blend, add_unlikeness
 from recon.stereo.match import search as common
 from recon.stereo.match import sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network, rows_at_once
-from recon.stereo.match.fill import outside
+from recon.stereo.match.fill import fill, outside
 from recon.stereo.match.plane_search import search_planes
 from recon.stereo.match.segments import SAME_SURFACE_PX
 
@@ -107,10 +107,9 @@ class FineMatcher:
         seen = self._paths.run(pair, partial(_copy_costs, volume), 0, paths, rules)
         if not seen.valid.any():
             return seen
-        values = search_planes(pair, seen, volume, _changes(s.min_disparity_px), self._threads)
-        last = s.min_disparity_px + ndisp - 1
-        beyond = (values < s.min_disparity_px) | (values > last)
-        return _judged(pair, seen, values, beyond)
+        planes = search_planes(pair, seen, volume, _changes(s.min_disparity_px), self._threads)
+        found = _judged(pair, seen, planes[0], (s.min_disparity_px, s.min_disparity_px + ndisp - 1))
+        return fill(pair, found, self._threads, planes) if s.fill else found
 
     def _volume(self, pair: RectifiedPair, ndisp: int) -> UInt8:
         """Return the costs of all pixels, uint8 (H, P, at least W)."""
@@ -181,7 +180,9 @@ def _rows(pair: RectifiedPair, start: int, end: int) -> RectifiedPair:
     return replace(pair, camera=replace(pair.camera, height_px=end - start), **rows)
 
 
-def _judged(pair: RectifiedPair, seen: Disparity, values: Float32, beyond: Bool) -> Disparity:
+def _judged(
+    pair: RectifiedPair, seen: Disparity, values: Float32, ends: tuple[int, int]
+) -> Disparity:
     """Return the disparity with reasons, confidence and uncertainty.
 
     That a plane and what was seen agree makes both more probable than either. What planes alone
@@ -190,7 +191,7 @@ def _judged(pair: RectifiedPair, seen: Disparity, values: Float32, beyond: Bool)
     """
     with np.errstate(invalid="ignore"):
         agree = seen.valid & (np.abs(values - seen.values) <= SAME_SURFACE_PX)
-    agree &= ~(beyond | outside(values))
+    agree &= (values >= ends[0]) & (values <= ends[1]) & ~outside(values)
     if pair.valid is not None:
         agree &= pair.valid
     least, more = _AGREED_CONFIDENCE
