@@ -27,9 +27,11 @@ from recon.stereo.match.segments import SAME_SURFACE_PX, SEGMENTATIONS, fit_segm
 from recon.stereo.match.steps import beyond_range, settle_steps
 
 _UNLIKELY: Final = 0.5  # below this confidence a disparity is more likely wrong than right
+_TRUSTED: Final = 0.7  # from this confidence on it speaks for or against a plane
+_CLIPPED_PX: Final = 5  # edge of the square whose mean is black or white
+_CLIPPED_LEVELS: Final = 4  # grey levels that noise adds to black
 _WIDEST_GAP: Final = 3  # neighbouring directions without support: less than a half-plane
-_MOST_AGAINST: Final = 1  # directions with something behind the plane
-_LEAST_SHARE: Final = 0.3  # of a segment that lies on its plane
+_LEAST_SHARE: Final = 0.3  # of a segment that lies on its plane, unless it is supported all around
 # Of what such planes led to on MiddEval3, dmb4, the yard and rendered scenes, so much was right.
 _CONFIDENCE: Final = 0.88
 _AROUND_PX: Final = 30  # half the square whose disparities a filled one may be any of
@@ -68,20 +70,23 @@ def fill(
     if not sure.any():
         return seen
     planes = np.full((SEGMENTATIONS, 3, *sure.shape), np.nan, np.float32)
-    beyond = beyond_range(seen) | (seen.reason == np.uint8(Reason.BORDER))
+    trusted = seen.reject(~seen.measured | (seen.confidence < _TRUSTED), Reason.AMBIGUOUS)
+    unseen = beyond_range(seen) | _clipped(pair.left) | (seen.reason == np.uint8(Reason.BORDER))
     filled, values = np.zeros_like(sure), seen.values.copy()
     with ThreadPoolExecutor(threads) as pool:
-        shares = fit_segments(smooth_colours(pair), seen, planes, pool, threads)
-        distances = _distances(sure, pool)
+        shares = fit_segments(smooth_colours(pair), trusted, planes, pool, threads)
+        distances = _distances(trusted.measured, pool)
         enough = list(shares >= _LEAST_SHARE)
+        tried = list(planes)  # the smallest segments first
         if others is not None:
-            planes, enough = [*planes, others], [*enough, np.any(enough, axis=0)]
-        for plane, supported in zip(planes, enough, strict=True):  # the smallest segments first
-            wanted = supported & ~(sure | filled | beyond | outside(plane[0]))
+            tried, enough = [*tried, others], [*enough, np.any(enough, axis=0)]
+        for plane, shared in zip(tried, enough, strict=True):
+            wanted = ~(sure | filled | unseen | outside(plane[0]))
             support = np.empty((3, *sure.shape), np.uint8)
             weigh = partial(_weigh, seen.values, distances, plane, wanted, support)
             common.in_strips(pool, threads, weigh, len(sure))
-            taken = (support[2] <= _WIDEST_GAP) & (support[1] <= _MOST_AGAINST)
+            taken = shared & (support[2] <= _WIDEST_GAP) & (support[1] == 0)
+            taken |= support[0] == kernels.DIRECTIONS
             values[taken] = plane[0][taken]
             filled |= taken
     hidden = np.empty_like(filled)
@@ -94,6 +99,12 @@ def fill(
         sigma_px=np.where(filled, spread(seen.values), seen.sigma_px),
         reason=np.where(filled, np.uint8(Reason.FILLED), seen.reason),
     )
+
+
+def _clipped(grey: UInt8) -> Bool:
+    """Return where an image is black or white, but for noise: it shows nothing there."""
+    level = cv2.blur(grey, (_CLIPPED_PX, _CLIPPED_PX))
+    return np.asarray((level < _CLIPPED_LEVELS) | (level > 255 - _CLIPPED_LEVELS))
 
 
 def _distances(known: Bool, pool: Executor) -> UInt16:

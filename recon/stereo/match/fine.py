@@ -187,19 +187,21 @@ def _judged(
 
     That a plane and what was seen agree makes both more probable than either. What planes alone
     lead to is not measured: it keeps the reason why nothing was found, or is AMBIGUOUS where a
-    plane contradicts what was.
+    plane contradicts what was, BORDER or OUT_OF_RANGE where it leads there.
     """
     with np.errstate(invalid="ignore"):
         agree = seen.valid & (np.abs(values - seen.values) <= SAME_SURFACE_PX)
-    agree &= (values >= ends[0]) & (values <= ends[1]) & ~outside(values)
+    beyond, border = (values < ends[0]) | (values > ends[1]), outside(values)
     if pair.valid is not None:
-        agree &= pair.valid
+        border |= ~pair.valid
+    agree &= ~(beyond | border)
+    reason = np.where(seen.valid & ~agree, np.uint8(Reason.AMBIGUOUS), seen.reason)
+    reason[beyond], reason[border] = np.uint8(Reason.OUT_OF_RANGE), np.uint8(Reason.BORDER)
     least, more = _AGREED_CONFIDENCE
-    sure = np.float32(least) + np.float32(more) * seen.confidence**2
-    nan, contradicted = np.float32(np.nan), seen.valid & ~agree
+    sure, nan = np.float32(least) + np.float32(more) * seen.confidence**2, np.float32(np.nan)
     return Disparity(
         values=np.where(agree, values, nan),
         confidence=np.where(agree, sure, np.float32(0)),
         sigma_px=np.where(agree, seen.sigma_px, nan),
-        reason=np.where(contradicted, np.uint8(Reason.AMBIGUOUS), seen.reason),
+        reason=reason,
     )

@@ -34,7 +34,16 @@ def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executo
     rejected (`Reason.EDGE`); of what stays, the confidence falls with the share of the votes
     against it.
     """
-    values = np.where(beyond_range(seen), _BEYOND, seen.values)
+    own = _count_votes(pair, np.where(beyond_range(seen), _BEYOND, seen.values), reach, pool)
+    doubted = Disparity(seen.values, _doubted(seen.confidence, own), seen.sigma_px, seen.reason)
+    return doubted.reject(own < 0, Reason.EDGE)
+
+
+def _count_votes(pair: RectifiedPair, values: Float32, reach: int, pool: Executor) -> Float32:
+    """Return the share of the votes for each disparity within ``reach`` of a step, else 1.
+
+    float32 (H, W); negative where another surface has more.
+    """
     marked, across = np.zeros(values.shape, np.uint8), np.zeros(values.T.shape, np.uint8)
     kernels.mark_steps(values, reach, SAME_SURFACE_PX, marked)
     kernels.mark_steps(np.ascontiguousarray(values.T), reach, SAME_SURFACE_PX, across)
@@ -48,8 +57,7 @@ def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executo
         kernels.take_votes(values, grey, alike, marked, vote, rows.start, rows.stop, own)
 
     common.in_strips(pool, _STRIPS, take, len(values))
-    doubted = Disparity(seen.values, _doubted(seen.confidence, own), seen.sigma_px, seen.reason)
-    return doubted.reject(own < 0, Reason.EDGE)
+    return own
 
 
 def beyond_range(seen: Disparity) -> Bool:

@@ -46,7 +46,8 @@ def ground() -> np.ndarray:
 
 
 def match(pair: RectifiedPair, threads: int | None = None, **settings: int) -> Disparity:
-    return FineMatcher(FineSettings(**{"ndisp": 48, **settings}), threads).match(pair)
+    asked = FineSettings.parse({"ndisp": 48, "fill": True, **settings})
+    return FineMatcher(asked, threads).match(pair)
 
 
 def test_slanted_ground_is_complete_and_right_to_a_fraction():
@@ -65,27 +66,37 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     found = match(pair)
     plain = np.s_[45:75, 125:140]  # seen without texture in both views
     error = np.abs(found.values - truth)
-    assert (error[plain] < 1).mean() > 0.8
     filled = found.reason == Reason.FILLED
+    assert filled[plain].mean() > 0.1
+    assert (error[plain][filled[plain]] < 1).mean() > 0.95
     assert filled[45:75, 125:140].mean() > filled[85:, 60:].mean()
     only = sgm.SgmMatcher(sgm.SgmSettings(ndisp=48)).match(pair)
     assert (np.abs(only.values - truth)[plain] < 1).mean() < 0.3
-    # Of what only planes explain less is promised.
     seen = found.reason == Reason.VALID
     assert np.median(found.sigma_px[filled]) > 2 * np.median(found.sigma_px[seen])
-    assert np.median(found.confidence[filled]) < np.median(found.confidence[seen])
 
 
 def test_what_planes_lead_to_beyond_the_range_is_not_found():
-    pair, values = rendered(ground(), cloth()), ground().astype(np.float32)
-    values[:20, 100:] -= 30
-    values[100:, 100:] += 30
-    with patch.object(fine, "search_planes", lambda *_: values):
-        found = match(pair)
-    beyond = (values < 0) | (values > 47)
-    assert (found.reason[beyond] == Reason.OUT_OF_RANGE).mean() > 0.5
+    pair, planes = rendered(ground(), cloth()), np.zeros((3, HEIGHT, WIDTH), np.float32)
+    planes[0] = ground()
+    planes[0, :20, 100:] -= 30
+    planes[0, 100:, 100:] += 30
+    with patch.object(fine, "search_planes", lambda *_: planes):
+        found = match(pair, fill=False)
+    beyond = (planes[0] < 0) | (planes[0] > 47)
+    assert beyond.mean() > 0.05
     assert np.isnan(found.values[beyond]).all()
     assert np.isfinite(found.values[~beyond]).mean() > 0.5
+
+
+def test_without_filling_all_that_has_a_value_was_measured():
+    truth, texture = ground(), cloth()
+    texture[40:80, 120:180] = 120
+    pair = rendered(truth, texture, noise=1.5)
+    found, both = match(pair, fill=False), match(pair)
+    assert not found.inferred.any()
+    np.testing.assert_array_equal(found.measured, both.measured)
+    np.testing.assert_array_equal(found.values[found.valid], both.values[found.valid])
 
 
 def test_a_wide_plain_wall_is_the_plane_of_its_rim():
