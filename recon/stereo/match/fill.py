@@ -64,14 +64,17 @@ def fill(
 
     Such pixels are FILLED. ``others``, float32 (3, H, W), are planes that are tried after those of
     segments. Where no plane has enough evidence, or it is hidden in the right view, all stays as
-    it was.
+    it was. Where the image is black or white there is nothing to match: what was found there is
+    rejected (`Reason.LOW_TEXTURE`).
     """
+    clipped = _clipped(pair.left)
+    seen = seen.reject(clipped, Reason.LOW_TEXTURE)
     sure = seen.measured & (seen.confidence >= _UNLIKELY)
     if not sure.any():
         return seen
     planes = np.full((SEGMENTATIONS, 3, *sure.shape), np.nan, np.float32)
     trusted = seen.reject(~seen.measured | (seen.confidence < _TRUSTED), Reason.AMBIGUOUS)
-    unseen = beyond_range(seen) | _clipped(pair.left) | (seen.reason == np.uint8(Reason.BORDER))
+    unseen = beyond_range(seen) | clipped | (seen.reason == np.uint8(Reason.BORDER))
     filled, values = np.zeros_like(sure), seen.values.copy()
     with ThreadPoolExecutor(threads) as pool:
         shares = fit_segments(smooth_colours(pair), trusted, planes, pool, threads)

@@ -73,9 +73,34 @@ def test_planes_do_not_lead_to_what_was_seen_nowhere_around():
     assert np.isnan(found.values[:, 120:]).all()
 
 
+@pytest.mark.parametrize("level", [1, 254])
+def test_in_black_and_in_white_nothing_is_measured_nor_inferred(level):
+    image = np.full(WALL.shape, 120)
+    image[30:90, 80:160] = level
+    found = fill(pair_of(image), seen(WALL), 1)
+    assert (found.reason[35:85, 85:155] == Reason.LOW_TEXTURE).all()
+    assert found.measured[:25].all()
+
+
+@pytest.mark.parametrize("reason", [Reason.OUT_OF_RANGE, Reason.BORDER])
+def test_what_is_beyond_the_range_or_the_image_is_not_inferred(reason):
+    hole = np.zeros(WALL.shape, bool)
+    hole[30:90, 80:160] = True
+    given = seen(WALL).reject(hole, reason)
+    found = fill(pair_of(np.full(WALL.shape, 120)), given, 1)
+    assert (found.reason[35:85, 85:155] == reason).all()
+
+
+def test_a_plane_seen_along_one_edge_alone_is_not_continued():
+    values = WALL.copy()
+    values[20:] = np.nan
+    found = fill(pair_of(np.full(WALL.shape, 120)), seen(values), 1)
+    assert not found.inferred.any()
+
+
 def test_where_nothing_was_seen_nothing_is_filled():
     nothing = seen(np.full(WALL.shape, np.nan, np.float32))
-    assert fill(pair_of(np.full(WALL.shape, 120)), nothing, 1) is nothing
+    assert not fill(pair_of(np.full(WALL.shape, 120)), nothing, 1).valid.any()
 
 
 @pytest.mark.parametrize("matcher", ["sad", "sgm", "opencv-sgbm"])
