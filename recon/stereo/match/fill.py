@@ -57,15 +57,12 @@ class FillingMatcher:
         return fill(pair, seen, self._threads)
 
 
-def fill(
-    pair: RectifiedPair, seen: Disparity, threads: int, others: Float32 | None = None
-) -> Disparity:
+def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     """Return a disparity with planes of segments where there was none, or an unlikely one.
 
-    Such pixels are FILLED. ``others``, float32 (3, H, W), are planes that are tried after those of
-    segments. Where no plane has enough evidence, or it is hidden in the right view, all stays as
-    it was. Where the image is black or white there is nothing to match: what was found there is
-    rejected (`Reason.LOW_TEXTURE`).
+    Such pixels are FILLED. Where no plane has enough evidence, or it is hidden in the right view,
+    all stays as it was. Where the image is black or white there is nothing to match: what was found
+    there is rejected (`Reason.LOW_TEXTURE`).
     """
     clipped = _clipped(pair.left)
     seen = seen.reject(clipped, Reason.LOW_TEXTURE)
@@ -79,16 +76,12 @@ def fill(
     with ThreadPoolExecutor(threads) as pool:
         shares = fit_segments(smooth_colours(pair), trusted, planes, pool, threads)
         distances = _distances(trusted.measured, pool)
-        enough = list(shares >= _LEAST_SHARE)
-        tried = list(planes)  # the smallest segments first
-        if others is not None:
-            tried, enough = [*tried, others], [*enough, np.any(enough, axis=0)]
-        for plane, shared in zip(tried, enough, strict=True):
+        for plane, share in zip(planes, shares, strict=True):  # the smallest segments first
             wanted = ~(sure | filled | unseen | outside(plane[0]))
             support = np.empty((3, *sure.shape), np.uint8)
             weigh = partial(_weigh, seen.values, distances, plane, wanted, support)
             common.in_strips(pool, threads, weigh, len(sure))
-            taken = shared & (support[2] <= _WIDEST_GAP) & (support[1] == 0)
+            taken = (share >= _LEAST_SHARE) & (support[2] <= _WIDEST_GAP) & (support[1] == 0)
             taken |= support[0] == kernels.DIRECTIONS
             values[taken] = plane[0][taken]
             filled |= taken

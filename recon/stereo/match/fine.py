@@ -35,7 +35,7 @@ from recon.stereo.kernels.similarity import Blend, add_unlikeness
 from recon.stereo.match import search as common
 from recon.stereo.match import sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network, rows_at_once
-from recon.stereo.match.fill import fill, outside
+from recon.stereo.match.fill import outside
 from recon.stereo.match.plane_search import search_planes
 from recon.stereo.match.segments import SAME_SURFACE_PX
 
@@ -107,9 +107,8 @@ class FineMatcher:
         seen = self._paths.run(pair, partial(_copy_costs, volume), 0, paths, rules)
         if not seen.valid.any():
             return seen
-        planes = search_planes(pair, seen, volume, _changes(s.min_disparity_px), self._threads)
-        found = _judged(pair, seen, planes[0], (s.min_disparity_px, s.min_disparity_px + ndisp - 1))
-        return fill(pair, found, self._threads, planes) if s.fill else found
+        values = search_planes(pair, seen, volume, _changes(s.min_disparity_px), self._threads)
+        return _judged(pair, seen, values, (s.min_disparity_px, s.min_disparity_px + ndisp - 1))
 
     def _volume(self, pair: RectifiedPair, ndisp: int) -> UInt8:
         """Return the costs of all pixels, uint8 (H, P, at least W)."""

@@ -32,7 +32,7 @@ def search_planes(
     changes: kernels.Changes,
     threads: int,
 ) -> Float32:
-    """Return the plane that each pixel takes, float32 (3, H, W): its disparity there, its slopes.
+    """Return the disparity of the plane that each pixel takes, float32 (H, W), without NaN.
 
     ``volume`` is the cost of each candidate, uint8 (H, P, at least W); ``seen`` was found in it.
     """
@@ -68,8 +68,8 @@ def search_planes(
             radius = _LAST_FIT_PX if last else _NEAR_FIT_PX
             fits.fit(chosen[0], everywhere, radius, sources[FITTED])
     # Planes of neighbours on one surface differ by parts of a pixel.
-    chosen, fitted = sources[NOW], sources[FITTED]
-    near_by = np.abs(fitted[0] - chosen[0]) < SAME_SURFACE_PX / 2
+    chosen, fitted = sources[NOW, 0], sources[FITTED, 0]
+    near_by = np.abs(fitted - chosen) < SAME_SURFACE_PX / 2
     return np.asarray(np.where(near_by, fitted, chosen), dtype=np.float32)
 
 

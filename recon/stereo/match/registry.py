@@ -20,25 +20,12 @@ from recon.stereo.match.sad import AutoRangeMatcher, SadMatcher, SadSettings, es
 from recon.stereo.match.search import FillableSettings, SearchSettings
 from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 
-
-def _settled(
-    make: Callable[[Any, int | None], Matcher],
-) -> Callable[[FillableSettings, int | None], Matcher]:
-    """Return what makes a matcher that is filled where its settings say so."""
-
-    def made(own: FillableSettings, threads: int | None) -> Matcher:
-        matcher = make(own, threads)
-        return FillingMatcher(matcher, own.reach_px, threads) if own.fill else matcher
-
-    return made
-
-
 MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
-    "sad": _settled(SadMatcher),
-    "sgm": _settled(SgmMatcher),
+    "sad": SadMatcher,
+    "sgm": SgmMatcher,
     "fine": FineMatcher,
-    "opencv-bm": _settled(lambda own, _: OpencvMatcher(own, semi_global=False)),
-    "opencv-sgbm": _settled(lambda own, _: OpencvMatcher(own, semi_global=True)),
+    "opencv-bm": lambda settings, _: OpencvMatcher(settings, semi_global=False),
+    "opencv-sgbm": lambda settings, _: OpencvMatcher(settings, semi_global=True),
     "onnx": OnnxMatcher,
 }
 
@@ -79,6 +66,8 @@ def make_matcher(
         return AutoRangeMatcher(protocol.CheckedMatcher(given, name_of(matcher)))
     own = getattr(settings, field_of(matcher))
     made = MATCHERS[matcher](own, threads)
+    if isinstance(own, FillableSettings) and own.fill:
+        made = FillingMatcher(made, own.reach_px, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.
     if getattr(own, "ndisp", 0) is not None:
         return made

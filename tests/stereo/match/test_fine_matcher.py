@@ -15,7 +15,8 @@ from recon.io.middlebury import stand_in_camera
 from recon.stereo.kernels.convolution import UNIT
 from recon.stereo.match import fine, segments, sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network
-from recon.stereo.match.fine import FineMatcher, FineSettings
+from recon.stereo.match.fine import FineSettings
+from recon.stereo.match.registry import MatchingSettings, make_matcher
 
 HEIGHT, WIDTH = 120, 240
 SETTINGS = FineSettings(ndisp=48)
@@ -46,8 +47,8 @@ def ground() -> np.ndarray:
 
 
 def match(pair: RectifiedPair, threads: int | None = None, **settings: int) -> Disparity:
-    asked = FineSettings.parse({"ndisp": 48, "fill": True, **settings})
-    return FineMatcher(asked, threads).match(pair)
+    asked = MatchingSettings.parse({"fine": {"ndisp": 48, "fill": True, **settings}})
+    return make_matcher("fine", asked, threads).match(pair)
 
 
 def test_slanted_ground_is_complete_and_right_to_a_fraction():
@@ -77,13 +78,12 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
 
 
 def test_what_planes_lead_to_beyond_the_range_is_not_found():
-    pair, planes = rendered(ground(), cloth()), np.zeros((3, HEIGHT, WIDTH), np.float32)
-    planes[0] = ground()
-    planes[0, :20, 100:] -= 30
-    planes[0, 100:, 100:] += 30
-    with patch.object(fine, "search_planes", lambda *_: planes):
+    pair, values = rendered(ground(), cloth()), ground().astype(np.float32)
+    values[:20, 100:] -= 30
+    values[100:, 100:] += 30
+    with patch.object(fine, "search_planes", lambda *_: values):
         found = match(pair, fill=False)
-    beyond = (planes[0] < 0) | (planes[0] > 47)
+    beyond = (values < 0) | (values > 47)
     assert beyond.mean() > 0.05
     assert np.isnan(found.values[beyond]).all()
     assert np.isfinite(found.values[~beyond]).mean() > 0.5

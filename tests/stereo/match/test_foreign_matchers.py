@@ -13,7 +13,6 @@ from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
-from recon.stereo.match.sad import SadMatcher
 from tests.hostile.refusals import assert_refused, run
 
 
@@ -172,7 +171,7 @@ def plugin(tmp_path, monkeypatch):
 def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
     made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
-    assert type(made) is SadMatcher
+    assert type(made) is MATCHERS["sad"]
     with pytest.raises(SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad"):
         recon.match(image(), image(), matcher="cencus")
     install_plugin(tmp_path, "other-matcher", {}, {"flat": "other_matcher:Flat"})
