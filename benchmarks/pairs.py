@@ -6,8 +6,8 @@ SceneFlow. A disparity is measured, or inferred from planes around it; figures a
 in per cent. Of those whose truth is known: `measured` and `inferred`, whose errors are `off by 2`
 and `off by 3` (in pixels, of those given), and whose confidence is compared with the share within a
 pixel (`ece`). `in none` are the pixels of sky and of what is dark that have a disparity all the
-same. `other side`: of the pixels given within 5 px of a step of depth, those with the disparity of
-the other side. `off by 2` alone is of all that is given.
+same. `other side`: of all pixels within 5 px of a step of depth, those with the disparity of the
+other side. `off by 2` alone is of all that is given.
 
 Examples:
     python benchmarks/pairs.py --json
@@ -250,16 +250,21 @@ def ece(found: Disparity, truth: DisparityTruth) -> float | None:
 def at_steps(found: Disparity, scene: Scene) -> Figures:
     """Figures of the pixels near a step of depth; that of the sky is behind all."""
     truth = np.where(scene.sky, np.float32(0), scene.truth.values)
-    judged = near_steps(truth) & np.isfinite(truth) & found.valid
+    near = near_steps(truth) & np.isfinite(truth)
+    judged = near & found.valid
     own, given = truth[judged].astype(np.float64), found.values[judged].astype(np.float64)
     off = np.abs(given - own)
     other = np.zeros(len(own), np.bool_)
     for across in neighbours(truth, judged):
         other |= (np.abs(across - own) > STEP_PX) & (np.abs(across - given) < np.minimum(off, 1.0))
-    near = found.reject(~judged, Reason.AMBIGUOUS)
     there = DisparityTruth(truth, np.isfinite(truth))
-    ause = measure_sparsification(near, there, RIGHT_PX).ause if judged.any() else None
-    return {"other side": mean(100.0 * (other & (off > RIGHT_PX))), "ause at steps": ause}
+    left = found.reject(~judged, Reason.AMBIGUOUS)
+    if not judged.any():
+        return {"other side": None, "ause at steps": None}
+    return {
+        "other side": 100.0 * float(np.sum(other & (off > RIGHT_PX)) / near.sum()),
+        "ause at steps": measure_sparsification(left, there, RIGHT_PX).ause,
+    }
 
 
 def near_steps(truth: Float32) -> Bool:
