@@ -62,7 +62,9 @@ Set = Annotated[
 Matcher = Annotated[
     str | None,
     setting(
-        "matching.matcher", "sad, sgm, fine, opencv-bm, opencv-sgbm, onnx, plug-in.", default="sad"
+        "matching.matcher",
+        "sad, sgm, fine, opencv-bm, opencv-sgbm, onnx, plug-in.",
+        default="sad; fine for one pair",
     ),
 ]
 Json = Annotated[bool, option("Print the summary as JSON and nothing else.", "--json")]

@@ -37,7 +37,14 @@ from recon.sources.one_pair import PairInput
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 from recon.stereo.match.onnx import describe_network
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.registry import MATCHERS, MatchingSettings, check_matcher, field_of
+from recon.stereo.match.registry import (
+    MATCHERS,
+    MatchingSettings,
+    check_matcher,
+    field_of,
+    settings_of,
+)
+from recon.stereo.match.search import SearchSettings
 
 
 def run_pair(
@@ -135,6 +142,7 @@ def _compared(
 ) -> PairRun:
     """Return the results of a run, compared with the truth if it is known."""
     (pair, disparity), name = matched, given.pair.name
+    warnings = (*warnings, *_idle_settings(config.matching))
     metrics = None if given.truth is None else evaluate_disparity(disparity, given.truth)
     by_kind = {} if given.truth is None else evaluate_kinds(disparity, given.truth)
     summary = {
@@ -171,7 +179,7 @@ def match(
 
     It has what was measured, and what planes around a pixel say where nothing was found, or nothing
     sure: ``.measured`` and ``.inferred`` tell them apart, ``.only_measured()`` has the first alone,
-    as has ``fill=False`` of `sad` and `sgm`.
+    as has ``fill=False`` of `sad`, `sgm` and `fine`.
 
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
@@ -263,13 +271,38 @@ def _disparity_figures(disparity: Disparity) -> dict[str, Any]:
     }
 
 
+def _idle_settings(matching: MatchingSettings) -> tuple[str, ...]:
+    """Return warnings of changed settings of matchers that are not used; the range is for all."""
+    if not isinstance(settings_of(matching.matcher, matching), SearchSettings):
+        return ()  # the range of such a matcher is that of `sad`
+    used = field_of(name_of(matching.matcher))
+    others = dict.fromkeys(field_of(each) for each in MATCHERS if field_of(each) != used)
+
+    def changed(usual: Mapping[str, Any]) -> list[str]:
+        found = []
+        for name in others:
+            own: Any = getattr(matching, name)
+            same = {"ndisp": own.ndisp} if isinstance(own, SearchSettings) else {}
+            if own != type(own).parse({**usual.get(name, {}), **same}):
+                found.append(name)
+        return found
+
+    # In Python a configuration may begin with the defaults of drives.
+    named = min(changed(PAIR_DEFAULTS["matching"]), changed({}), key=len)
+    advice = f"the matcher is {used} (--matcher chooses another)"
+    return tuple(f"the settings of matching.{one} have no effect: {advice}" for one in named)
+
+
 def _network_figures(settings: MatchingSettings) -> dict[str, Any]:
     return {"network": describe_network(settings.onnx)} if settings.matcher == "onnx" else {}
 
 
 def _cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:
-    """Return the number of points, median depth and camera of a frame, ready for JSON."""
-    camera, z = frame.pair.camera, frame.cloud.xyz[:, 2]
+    """Return the number of points, median depth and camera of a frame, ready for JSON.
+
+    The median is of what was measured.
+    """
+    camera, z = frame.pair.camera, frame.cloud.only_measured().xyz[:, 2]
     inferred = frame.cloud.inferred
     return {
         "points": len(frame.cloud),

@@ -72,10 +72,11 @@ def _coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
 
 def write_disparity_files(
     disparity: Disparity, folder: Path, camera: RectifiedCamera | None = None
-) -> float:
+) -> float | None:
     """Write disparity, confidence, reasons; return grey levels per pixel in ``disparity.png``.
 
     What was inferred is in files of its own, if there is any. With a camera, depth is written, too.
+    A PNG holds no negative disparities: then there is none, and None is returned.
     """
     folder, measured = folder / "disparity", disparity.only_measured()
     kinds = [("disparity", "", measured)]
@@ -86,9 +87,11 @@ def write_disparity_files(
         write_pfm(folder / f"{prefix}confidence.pfm", kind.confidence)
         if camera is not None:
             write_pfm(folder / f"{prefix}depth.pfm", depth_from_disparity(kind.values, camera))
+    write_image(folder / "reason.png", disparity.reason)
+    if np.nanmin(measured.values, initial=0.0) < 0.0:
+        return None
     scale = fitting_scale(measured.values)
     write_disparity_png(folder / "disparity.png", measured.values, scale=scale)
-    write_image(folder / "reason.png", disparity.reason)
     return scale
 
 
@@ -128,6 +131,9 @@ def mesh_cloud(
 
     ``run`` is the folder of the pair, in which its left image may be.
     """
+    if camera is None and settings.pair_solid_m is not None:
+        what, hint = "only the surface of a pair is closed behind", "name the folder of its run"
+        raise MeshingError(what, got=f"mesh.pair_solid_m={settings.pair_solid_m:g}", hint=hint)
     if camera is None:
         mesh, covered = reconstruct_mesh(cloud, settings), {}
     else:

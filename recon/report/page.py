@@ -29,6 +29,7 @@ from recon.report.table import NOT_KNOWN
 from recon.run.directory import RunDirectory
 
 _WEBP_QUALITY: Final = 80
+_WEBP_MOST_PX: Final = 16_383  # a side of a picture, by its format
 _NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
 
 
@@ -152,6 +153,9 @@ def _embedded(png: bytes) -> dict[str, Any]:
 
 def _url(image: Image.Image) -> str:
     buffer = io.BytesIO()
+    if max(image.size) > _WEBP_MOST_PX:
+        image = image.copy()
+        image.thumbnail((_WEBP_MOST_PX, _WEBP_MOST_PX))
     image.save(buffer, "WEBP", quality=_WEBP_QUALITY)
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 

@@ -36,6 +36,24 @@ def test_settings_are_those_of_the_matcher_that_is_named(noise):
         recon.match(*noise, matcher="nonsense")
 
 
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        (["matching.sad.fill=false"], ["sad"]),
+        (["matching.sad.window_px=9", "matching.sgm.p2=60"], ["sad", "sgm"]),
+        (["matching.fine.fill=false"], []),
+        ([f"matching.{name}.ndisp=32" for name in ("sad", "sgm", "fine", "opencv")], []),
+        (["matching.matcher=sad", "matching.sad.window_px=9"], []),
+    ],
+)
+def test_settings_of_a_matcher_that_is_not_used_are_said_to_have_no_effect(noise, changes, named):
+    config = load_config(None, changes, PAIR_DEFAULTS)
+    given = PairInput(StereoPair(*noise), recon.RectifiedCamera(100.0, 60, 25, 60, 0.1, 120, 50))
+    found = recon.run_disparity(given, config)
+    said = [text for text in found.warnings if "have no effect" in text]
+    assert [text.split()[3] for text in said] == [f"matching.{name}" for name in named]
+
+
 CALIBRATIONS = {
     "kitti": "P0: 100 0 60 0 0 100 25 0 0 0 1 0\nP1: 100 0 60 -50 0 100 25 0 0 0 1 0\n",
     "middlebury": "cam0=[100 0 60; 0 100 25; 0 0 1]\ncam1=[100 0 60; 0 100 25; 0 0 1]\n"

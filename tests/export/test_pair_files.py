@@ -34,6 +34,16 @@ def frame(found: Disparity, **settings: bool) -> ReconstructedFrame:
     return ReconstructedFrame(PAIR, found, cloud)
 
 
+def test_negative_disparities_are_in_the_pfm_and_in_no_png(tmp_path):
+    found = disparity(WIDTH)
+    below = replace(found, values=np.where(found.valid, np.float32(-6), found.values))
+    assert write_disparity_files(below, tmp_path) is None
+    folder = tmp_path / "disparity"
+    np.testing.assert_array_equal(read_pfm(folder / "disparity.pfm"), below.values)
+    assert not (folder / "disparity.png").exists()
+    assert (folder / "reason.png").exists()
+
+
 @pytest.mark.parametrize("inferred_from", [0, 40, WIDTH])
 def test_each_file_has_one_kind_and_what_is_not_there_has_no_file(tmp_path, inferred_from):
     found = disparity(inferred_from)

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 
 import cv2
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -162,6 +163,7 @@ def described_reference(image: np.ndarray, level: float) -> np.ndarray:
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="minutes, interpreted")
 @pytest.mark.parametrize("contrast", [2.0, 60.0])
 def test_sixteen_bits_describe_as_single_precision_does(contrast):
     rng = np.random.default_rng(1)
