@@ -115,7 +115,9 @@ def test_tables_maps_and_images_are_written(matched):
 
 
 def test_figures_ignore_what_runs_beside(quarter, matched, tmp_path):
-    done = middlebury(quarter, "--out", tmp_path / "run", "--json", "--threads", "1")
+    done = middlebury(
+        quarter, "--matcher", "sad", "--out", tmp_path / "run", "--json", "--threads", "1"
+    )
     alone = printed(done)["matchers"]["sad"]["scenes"]["Vintage"]["nonocc"]
     beside = summary_of(matched)["matchers"]["sad"]["scenes"]
     assert alone == beside["MiddEval3/trainingQ/Vintage"]["nonocc"]

@@ -86,7 +86,7 @@ def test_a_keyframe_is_matched_again_where_its_images_are_at_hand(scenes, monkey
     views = scenes[-1].keyframes
     lines, image = views.look(0)
     assert image.shape == (3 * 96, 256, 3)
-    assert any(line.startswith("valid ") for line in lines)
+    assert any(line.startswith("measured ") for line in lines)
     views._opened.clear()
     monkeypatch.setattr("recon.view.follow.open_images", refuse)
     lines, image = views.look(0)

@@ -237,7 +237,7 @@ def test_a_bug_in_matching_is_reported_and_no_fault_of_the_file(pair, monkeypatc
 
     Path("tmp").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(Path(folder).absolute()))
-    monkeypatch.setitem(registry.MATCHERS, "sad", lambda *_: Broken())
+    monkeypatch.setitem(registry.MATCHERS, "fine", lambda *_: Broken())
     ended = run("disparity", *pair, "--quiet", "--out", "out")
     assert not Path("out").exists()
     if error in LACKING:

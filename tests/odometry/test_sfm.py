@@ -14,6 +14,7 @@ from recon.core.errors import MissingDependencyError, RegistrationError, Setting
 from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import invert
 from recon.core.progress import showing
+from recon.core.values import Disparity
 from recon.map.store.records import Store
 from recon.odometry.protocol import Odometry, OdometryFrame
 from recon.odometry.sfm.colmap import find_features
@@ -69,7 +70,7 @@ def test_pairs_in_no_order_get_metric_poses_and_black_ones_none(found, street):
 def test_poses_that_were_found_are_given_frame_by_frame_also_after_a_break(found, photos, tmp_path):
     odometry, resumed = FoundOdometry(found), FoundOdometry()
     assert isinstance(odometry, Odometry)
-    frame = OdometryFrame(None, None)
+    frame = OdometryFrame(None, Disparity.from_values(np.ones((2, 2))))
     first, second = odometry.register(frame), odometry.register(frame)
     assert (first.health.ok, first.health.skipped, second.health.ok) == (False, True, True)
     assert second.T_world_camera == pytest.approx(np.eye(4))
