@@ -270,7 +270,7 @@ def test_page_of_a_pair_tells_what_was_inferred_from_what_was_measured(view, bot
     figures, errors = key_figures(page), rows(blocks(page)["Disparity against truth"])
     assert (figures["Pixels measured"], figures["Pixels inferred"]) == ("25.0 %", "50.0 %")
     assert ("bad 2: off by more than 2 px", "10.00 %", "5.00 %", "81.00 %") in errors
-    assert "Measured and inferred pixels each alone" in page
+    assert "Measured and inferred: of such pixels alone" in page
     assert "50.0 % inferred from planes around them (hatched)" in page
     assert "Of measured pixels alone: --set cloud.inferred=true" in page
     view.summary["inferred_points"] = 1000
