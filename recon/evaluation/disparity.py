@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -79,12 +78,11 @@ def evaluate_disparity(
 
 
 def evaluate_kinds(estimate: Disparity, truth: DisparityTruth) -> dict[Kind, DisparityMetrics]:
-    """Compare each kind of pixel alone; a kind that cannot be compared is left out."""
-    found = {}
-    for kind in KINDS:
-        with suppress(EvaluationError):
-            found[kind] = evaluate_disparity(estimate, truth, kind=kind)
-    return found
+    """Compare each kind of pixel alone; a kind of which no pixel has a known truth is left out."""
+    counted = compared_pixels(estimate.values, truth, occluded=False)
+    masks = zip(KINDS, (estimate.measured, estimate.inferred), strict=True)
+    there = [kind for kind, mask in masks if (mask & counted).any()]
+    return {kind: evaluate_disparity(estimate, truth, kind=kind) for kind in there}
 
 
 def evaluate_depth(

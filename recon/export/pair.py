@@ -41,7 +41,7 @@ def mesh_frame(
     """
     try:
         mesh = _surface(frame.cloud, frame.pair.camera, settings, frame.pair.colours)
-        coverage = _coverage(mesh, frame.cloud)
+        coverage = _coverage(mesh, frame.cloud, settings)
     except MeshingError as error:
         return None, None, (f"no mesh: {error}",)
     return mesh, coverage, check_coverage(coverage)
@@ -64,9 +64,15 @@ def _surface(
     return replace(mesh, texture=Texture(image, inside, _PHOTO))
 
 
-def _coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
-    """Return the share of the measured points that lie on a mesh; of all, if none is measured."""
+def _coverage(mesh: TriangleMesh, cloud: PointCloud, settings: MeshSettings) -> float:
+    """Return the share of the measured points that lie on a mesh; of all, if none is measured.
+
+    Of a closed body, on its front, whose vertices come first.
+    """
     measured = cloud.only_measured()
+    if settings.pair_solid_m is not None:
+        front = (mesh.faces < len(mesh.vertices) // 2).all(axis=1)
+        mesh = replace(mesh, faces=mesh.faces[front])
     return mesh_coverage(mesh, measured if len(measured) else cloud)
 
 
@@ -138,7 +144,7 @@ def mesh_cloud(
         mesh, covered = reconstruct_mesh(cloud, settings), {}
     else:
         mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
-        covered = {"mesh_coverage": _coverage(mesh, cloud)}
+        covered = {"mesh_coverage": _coverage(mesh, cloud, settings)}
     sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     warnings = [line for share in covered.values() for line in check_coverage(share)]
     return mesh, {**sizes, **covered, "warnings": warnings}

@@ -175,7 +175,6 @@ REASON_COLOURS: Final[Mapping[Reason, Rgb]] = {
 REASON_LABELS: Final[Mapping[Reason, str]] = {
     **{reason: reason.name.lower().replace("_", " ") for reason in Reason},
     Reason.LEFT_RIGHT: "left-right check",
-    Reason.EDGE: "flying edge",
     Reason.VALID: "measured",
     Reason.FILLED: "inferred",
 }

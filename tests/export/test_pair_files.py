@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.core.errors import MeshingError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.export.mesh.poisson import MeshSettings
-from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
+from recon.export.pair import mesh_cloud, mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.images.disparity import read_disparity, read_pfm
 from recon.io.images.image import read_image
 from recon.io.models.ply import read_ply
@@ -85,6 +86,24 @@ def test_a_mesh_has_what_was_inferred_only_where_it_was_asked_for():
     # (39 - 31.5) and (63 - 31.5) pixels right of the centre, at 1 m.
     assert farthest[False] == pytest.approx(7.5 / 60, abs=0.01)
     assert farthest[True] == pytest.approx(31.5 / 60, abs=0.01)
+
+
+def test_closing_a_surface_behind_covers_no_more_points():
+    rng = np.random.default_rng(0)
+    rough = disparity(WIDTH)
+    values = np.where(rough.valid, 6 + rng.uniform(-2, 2, rough.values.shape), np.nan)
+    made = frame(replace(rough, values=values.astype(np.float32)))
+    settings = MeshSettings(min_component_faces=1)
+    _, alone, _ = mesh_frame(made, settings)
+    for thick_m in (0.01, 0.2):
+        _, closed, _ = mesh_frame(made, settings.model_copy(update={"pair_solid_m": thick_m}))
+        assert closed == pytest.approx(alone, abs=0.01)
+
+
+def test_a_cloud_that_is_not_that_of_a_pair_is_not_closed_behind(tmp_path):
+    cloud = frame(disparity(WIDTH)).cloud
+    with pytest.raises(MeshingError, match=r"only the surface of a pair.*pair_solid_m"):
+        mesh_cloud(cloud, None, MeshSettings(pair_solid_m=0.1), tmp_path)
 
 
 def test_coverage_is_of_what_was_measured():

@@ -277,6 +277,14 @@ def test_page_of_a_pair_tells_what_was_inferred_from_what_was_measured(view, bot
     assert "1,000 of the points are inferred" in pair_html(view)
 
 
+def test_a_picture_that_is_too_long_for_its_format_is_shown_smaller():
+    buffer = io.BytesIO()
+    Image.new("RGB", (40, 20_000)).save(buffer, "PNG")
+    ((_, url),) = page_environment().filters["embedded"](buffer.getvalue())["layers"]
+    with Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))) as image:
+        assert max(image.size) == 16_383
+
+
 def test_colour_images_of_a_pair_are_of_what_was_measured(view, both, tmp_path):
     view.disparity = both
     with RunDirectory(tmp_path / "pair") as directory:
