@@ -325,9 +325,7 @@ def _cost(window: TrackWindow, model: bundle.BundleModel, known: KnownPose | Non
 
 def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> TrackWindow:
     """A window after a step; poses step by translation and rotation in their own axes."""
-    poses = np.stack(
-        [T @ as_transform(step) for T, step in zip(window.T_world_camera, step_pose, strict=True)]
-    )
+    poses = window.T_world_camera @ as_transform(step_pose)
     return replace(window, T_world_camera=poses, xyz_world=window.xyz_world + step_point)
 
 

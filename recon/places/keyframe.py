@@ -87,12 +87,14 @@ def make_keyframe(frame: int, pair: Rectified, disparity: Disparity) -> Keyframe
     disparity = disparity.only_measured()
     sift = cv2.SIFT.create(contrastThreshold=_CONTRAST)
     image, zoom = _reduced(pair.left)
-    corners, sifts = sift.detectAndCompute(image, None)
+    corners = sift.detect(image)
     # OpenCV halves places in its doubled image as if pixels had their centres at a corner.
     uv = ((_places_of(corners) - _DOUBLED_PX + 0.5) / zoom - 0.5).astype(np.float32)
     chosen = _spread(corners, uv, pair.left.shape)
     uv = uv[chosen]
-    descriptors = _signs(np.zeros((0, 128), np.float32) if sifts is None else sifts[chosen])
+    # Half of the corners are left out; a descriptor takes longer than all that finds a corner.
+    sifts = sift.compute(image, [corners[n] for n in chosen])[1]
+    descriptors = _signs(np.zeros((0, 128), np.float32) if sifts is None else sifts)
     uvd = np.column_stack([uv, _disparity(disparity, uv, pair.camera)])
     return Keyframe(frame, uvd.astype(np.float32), descriptors, coarse_of(disparity))
 

@@ -33,6 +33,7 @@ from recon.core.values.arrays import Float32, UInt8, frozen_array
 from recon.core.work import Stopwatch
 from recon.stereo import open3d_clouds
 from recon.stereo.kernels import points
+from recon.stereo.kernels.finish import count_supporters
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, check_matcher
 from recon.stereo.observe import Effort, Inspected, Matching, MeasuredDepth, Observer
@@ -269,19 +270,10 @@ def remove_flying_edges(disparity: Disparity) -> Disparity:
 def _support(values: Float32) -> UInt8:
     """Return how many pixels of each window support its centre, with itself."""
     r = _RADIUS_PX
-    height, width = values.shape
     padded = cv2.copyMakeBorder(values, r, r, r, r, cv2.BORDER_REFLECT_101)
-    count = np.zeros(padded.shape, dtype=np.uint8)
-    # Support is mutual, so each pair of pixels is compared once, over half of the window.
-    window = range(-r, r + 1)
-    for dy, dx in ((dy, dx) for dy in window for dx in window if (dy, dx) > (0, 0)):
-        limit = _TOLERANCE_PX + _MAX_GRADIENT * float(np.hypot(dy, dx))
-        ahead = (slice(dy, None), slice(max(dx, 0), min(dx, 0) or None))
-        here = (slice(None, -dy or None), slice(max(-dx, 0), min(-dx, 0) or None))
-        near = cv2.compare(cv2.absdiff(padded[here], padded[ahead]), limit, cv2.CMP_LE) & 1
-        cv2.add(count[here], near, dst=count[here])
-        cv2.add(count[ahead], near, dst=count[ahead])
-    return np.asarray(count[r : r + height, r : r + width] + np.uint8(1))
+    away = np.arange(-r, r + 1)
+    limits = _TOLERANCE_PX + _MAX_GRADIENT * np.hypot(away[:, None], away)
+    return count_supporters(padded, limits.astype(np.float32))
 
 
 _STATISTICAL_SIGMAS: Final = 2.0  # of the mean distance: limit of the statistical filter

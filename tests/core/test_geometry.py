@@ -30,6 +30,13 @@ POINTS = np.random.default_rng(0).uniform(-10, 10, (20, 3))
 EXACT = {"rtol": 0, "atol": 1e-12}
 
 
+@given(steps=st.lists(st.tuples(*[st.floats(-3, 3)] * 6), max_size=4))
+def test_a_stack_of_steps_has_the_transform_of_each(steps):
+    steps = np.array(steps).reshape(-1, 6)
+    each = [se3.as_transform(step) for step in steps]
+    np.testing.assert_array_equal(se3.as_transform(steps), np.array(each).reshape(-1, 4, 4))
+
+
 @given(A=TRANSFORMS, B=TRANSFORMS)
 def test_inverses_undo_and_neighbouring_frames_cancel(A, B):
     np.testing.assert_allclose(A @ se3.invert(A), np.eye(4), **EXACT)

@@ -44,6 +44,24 @@ def test_features_are_spread_and_have_the_disparity_of_their_place(block):
     assert known.mean() > 0.3
 
 
+def test_descriptors_are_those_of_detecting_and_describing_at_once(block, monkeypatch):
+    kept, sift = block.keyframe(3), cv2.SIFT.create(contrastThreshold=0.015)
+
+    class AtOnce:
+        def detect(self, image):
+            self.corners, self.sifts = sift.detectAndCompute(image, None)
+            return self.corners
+
+        def compute(self, image, corners):
+            place = {id(corner): n for n, corner in enumerate(self.corners)}
+            return corners, self.sifts[[place[id(corner)] for corner in corners]]
+
+    monkeypatch.setattr(cv2.SIFT, "create", lambda **_: AtOnce())
+    again = make_keyframe(3, *block.frame(3))
+    np.testing.assert_array_equal(again.descriptors, kept.descriptors)
+    np.testing.assert_array_equal(again.uvd, kept.uvd)
+
+
 def test_an_image_without_texture_gives_a_keyframe_without_features():
     grey = np.full((120, 320), 90, np.uint8)
     unknown = Disparity.from_values(np.full(grey.shape, np.nan, np.float32))

@@ -74,13 +74,20 @@ def hat(w: NDArray[Any]) -> Float64:
 
 
 def exp_so3(w: NDArray[Any]) -> Float64:
-    """Return the rotation matrix of a rotation vector (3,), radians (Rodrigues)."""
-    angle = float(np.linalg.norm(w))
-    K = hat(np.asarray(w, dtype=np.float64))
+    """Return the rotation matrix of a rotation vector, radians (Rodrigues); stacks as `hat`."""
+    vectors = np.asarray(w, dtype=np.float64)
+    K = hat(vectors)
+    angles = np.sqrt(vectors[..., None, :] @ vectors[..., :, None])
+    factors = np.array([_rodrigues(angle) for angle in angles.ravel().tolist()])
+    a, b = factors.T.reshape(2, *angles.shape)
+    return np.asarray(np.eye(3) + a * K + b * K @ K)
+
+
+def _rodrigues(angle: float) -> tuple[float, float]:
+    """Return what the cross-product matrix counts, and its square."""
     if angle < 1e-8:
-        return np.eye(3) + K + 0.5 * K @ K
-    a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
-    return np.eye(3) + a * K + b * K @ K
+        return 1.0, 0.5
+    return math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
 
 
 def log_so3(R: NDArray[Any]) -> Float64:
@@ -103,8 +110,10 @@ def as_step(T: NDArray[Any]) -> Float64:
 
 
 def as_transform(step: NDArray[Any]) -> Float64:
-    """Return the rigid transform (4, 4) of a step (`as_step`)."""
-    return make_transform(exp_so3(step[3:]), step[:3])
+    """Return the rigid transform (…, 4, 4) of each step (…, 6) (`as_step`)."""
+    T = np.zeros((*step.shape[:-1], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = exp_so3(step[..., 3:]), step[..., :3], 1.0
+    return T
 
 
 def step_jacobian(xyz: NDArray[Any]) -> Float64:

@@ -20,12 +20,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import Float32, Float64, Int64, kernel
-from recon.core.kernels.voxels import find_or_add, make_table, pack_key, reserve
+from recon.core.kernels.voxels import (
+    KEY_BITS,
+    enter_keys,
+    find,
+    find_or_add,
+    make_table,
+    pack_key,
+    reserve,
+    unpack_key,
+)
 
 BLOCK_BITS: Final = 3
 BLOCK_EDGE: Final = 1 << BLOCK_BITS
 BLOCK_CELLS: Final = BLOCK_EDGE**3
 _LOW: Final = BLOCK_EDGE - 1
+_ALONG_X: Final = 1 << (2 * KEY_BITS)
+_ALONG_Y: Final = 1 << KEY_BITS
+_CORNER: Final = ~(_LOW * (_ALONG_X + _ALONG_Y + 1))
+"""The bits of a packed cell that say in which block it is."""
 MIN_DEPTH_M: Final = 1e-9
 _SQRT2: Final = math.sqrt(2.0)
 
@@ -161,21 +174,41 @@ def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
     while True:
         # Plain tuples: numba's cache on disk would remember the classes by name, and break when
         # one is renamed.
-        done = _cast_rays(tuple(evidence), tuple(rays), done, spread)
+        done = _cast_rays(tuple(evidence), tuple(rays), done, spread, False)
         if done == len(rays.ends):
             return evidence
         evidence = reserve(evidence, len(evidence.keys) + 1, make_blocks)
 
 
+def blocks_of(keys: Int64) -> Blocks:
+    """Blocks of packed indices (B,), each once and in this order, without evidence."""
+    blocks = make_blocks(len(keys))
+    blocks.keys[:], blocks.used[0] = keys, len(keys)
+    enter_keys(blocks.table, keys)
+    return blocks
+
+
+def cast_rays_into(blocks: Blocks, rays: Rays, spread: float) -> None:
+    """Collect the evidence of the rays of one frame in these blocks alone, as `cast_rays` does."""
+    _cast_rays(tuple(blocks), tuple(rays), 0, spread, True)
+
+
 @kernel
 def _cast_rays(
-    evidence: tuple[NDArray[Any], ...], rays: tuple[NDArray[Any], ...], start: int, spread: float
+    evidence: tuple[NDArray[Any], ...],
+    rays: tuple[NDArray[Any], ...],
+    start: int,
+    spread: float,
+    known: bool,
 ) -> int:
-    """Cast from ray ``start`` on; return the first that finds no memory left, to be cast again."""
+    """Cast from ray ``start`` on; return the first that finds no memory left, to be cast again.
+
+    ``known``: cells in other blocks than those that are there are passed.
+    """
     # Arrays are taken out of their tuples once: inside the loops numba would count references.
-    table, keys, values, used = evidence
+    table, keys, rows_of_cells, used = evidence
     origin, ends, frees, sigmas, hits, misses = rays
-    rows = used[0]
+    values, rows = rows_of_cells.reshape(-1), used[0]
     ox, oy, oz = origin[0], origin[1], origin[2]
     for n in range(start, len(ends)):
         dx, dy, dz = ends[n, 0] - ox, ends[n, 1] - oy, ends[n, 2] - oz
@@ -189,48 +222,64 @@ def _cast_rays(
         step_x, next_x, delta_x = _axis(ox, dx / length, i)
         step_y, next_y, delta_y = _axis(oy, dy / length, j)
         step_z, next_z, delta_z = _axis(oz, dz / length, k)
-        enter, below, block, row = 0.0, -1.0, -1, 0
+        # One number says where the ray is: a step adds to it, and three bits of each axis are the
+        # cell in its block.
+        place, block, first = pack_key(i, j, k), -1, 0
+        stride_x, stride_y, stride_z = step_x * _ALONG_X, step_y * _ALONG_Y, step_z
+        enter, below = 0.0, -1.0
         while True:
             leave = min(next_x, next_y, next_z)
             touched = leave > near
             if touched or leave <= free:
-                key = block_key(i, j, k)
-                if key != block:
-                    if rows == len(keys):
+                if place & _CORNER != block:
+                    block = place & _CORNER
+                    i, j, k = unpack_key(place)
+                    key = block_key(i, j, k)
+                    if known:
+                        row = find(table, key)
+                    elif rows == len(keys):
                         used[0] = rows
                         return n
-                    row = find_or_add(table, key, rows)
-                    if row == rows:
-                        keys[row] = key
-                        rows += 1
-                    block = key
-                cell = cell_in_block(i, j, k)
-                value = values[row, cell]
-                if not touched:
-                    if value <= 0 and miss < value:
-                        values[row, cell] = miss
+                    else:
+                        row = find_or_add(table, key, rows)
+                        if row == rows:
+                            keys[row] = key
+                            rows += 1
+                    first = row * BLOCK_CELLS
+                if first < 0:
+                    below = -1.0
                 else:
-                    if below < 0:
-                        below = _normal_cdf(enter, length, sigma)
-                    above = _normal_cdf(leave, length, sigma)
-                    gain = np.float32(hit * (above - below))
-                    below = above
-                    if gain > 0 and gain > value:
-                        values[row, cell] = gain
+                    cell = first + _cell_at(place)
+                    value = values[cell]
+                    if touched:
+                        if below < 0:
+                            below = _normal_cdf(enter, length, sigma)
+                        above = _normal_cdf(leave, length, sigma)
+                        gain = np.float32(hit * (above - below))
+                        below = above
+                        if gain > 0 and gain > value:
+                            values[cell] = gain
+                    elif value <= 0 and miss < value:
+                        values[cell] = miss
             if leave >= stop:
                 break
             enter = leave
-            if next_x <= next_y and next_x <= next_z:
-                i += step_x
-                next_x += delta_x
-            elif next_y <= next_z:
-                j += step_y
-                next_y += delta_y
-            else:
-                k += step_z
-                next_z += delta_z
+            # Without branches, which no processor can foretell.
+            along_x = (next_x <= next_y) & (next_x <= next_z)
+            along_y = (not along_x) & (next_y <= next_z)
+            next_x += delta_x if along_x else 0.0
+            next_y += delta_y if along_y else 0.0
+            next_z += 0.0 if along_x | along_y else delta_z
+            place += stride_x if along_x else (stride_y if along_y else stride_z)
     used[0] = rows
     return len(ends)
+
+
+@kernel
+def _cell_at(place: int) -> int:
+    """Column of a packed cell in the row of its block."""
+    high = (place >> (2 * (KEY_BITS - BLOCK_BITS))) & (_LOW << (2 * BLOCK_BITS))
+    return high | ((place >> (KEY_BITS - BLOCK_BITS)) & (_LOW << BLOCK_BITS)) | (place & _LOW)
 
 
 @kernel

@@ -25,14 +25,22 @@ from numpy.typing import NDArray
 from recon.core.geometry.se3 import apply, invert
 from recon.core.kernels.voxels import find_keys, pack_keys, unpack_keys
 from recon.core.values import PointCloud, RayCloud
-from recon.core.values.arrays import Bool, Float32, Float64, Int8, Int64
+from recon.core.values.arrays import Bool, Float64, Int8, Int64
 from recon.map.builders import (
     RAYS_PER_VOXEL,
     SPREAD_SIGMAS,
     OccupancySettings,
     frame_rays,
 )
-from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE, cast_rays, make_blocks
+from recon.map.kernels.looks import count_look, rays_towards
+from recon.map.kernels.raycast import (
+    BLOCK_BITS,
+    BLOCK_EDGE,
+    Blocks,
+    Rays,
+    blocks_of,
+    cast_rays_into,
+)
 from recon.map.occupancy.error import disagreement, frame_pairs
 
 _DISAGREEMENT: Final = 0.4
@@ -96,18 +104,11 @@ def pairs_of(keys: Int64) -> tuple[Int64, Bool]:
 
 
 def _count(cells: int, pairs: Int64, looks: Iterable[Int8]) -> _Seen:
-    hit, through, runs = (np.zeros(cells, np.int64) for _ in range(3))
-    both, differed = np.zeros((2, len(pairs)), np.int64)
-    before = np.zeros(cells, np.int8)
+    of_cells, before = np.zeros((3, cells), np.int64), np.zeros(cells, np.int8)
+    of_pairs = np.zeros((2, len(pairs)), np.int64)
     for look in looks:
-        hit += look > 0
-        through += look < 0
-        runs += (look > 0) & (before <= 0)
-        before = np.where(look != 0, look, before)
-        together = look[pairs[:, 0]] * look[pairs[:, 1]]
-        both += together != 0
-        differed += together < 0
-    return _Seen(hit, through, runs, both, differed)
+        count_look(look, before, of_cells, pairs, of_pairs)
+    return _Seen(*of_cells, *of_pairs)
 
 
 def _disagreement(seen: _Seen, pairs: Int64, upright: Bool, placed: Bool, piece: Int64) -> Float64:
@@ -161,10 +162,8 @@ def strides(steps: Int64) -> Int64:
     return pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64))
 
 
-_KEPT_FRAMES: Final = 64  # frames whose rays stay in memory: neighbouring tiles need the same ones
-_FIRST_BLOCKS: Final = 256
-_BINS: Final = 128  # directions on each axis, by which rays that may matter are chosen
-_WIDEST: Final = 1.5  # largest slope of a ray against the optical axis that has a bin of its own
+_KEPT_FRAMES: Final = 192
+"""Frames whose rays stay in memory, 60 MB at most: a tile needs those near it again and again."""
 
 
 class Looks:
@@ -196,14 +195,16 @@ class Looks:
         cells = unpack_keys(keys).astype(np.int64)
         centres = (cells + 0.5) * self.settings.resolution_m
         reach_m = self.settings.max_range_m + self.settings.resolution_m
+        wanted = _Wanted.of(cells)
         for frame in self._near(centres.min(axis=0), centres.max(axis=0), reach_m).tolist():
             T = self.T_map_camera[frame]
             ahead = apply(invert(T), centres)
             seen = (ahead[:, 2] > 0) & (np.linalg.norm(ahead, axis=1) < reach_m)
             if seen.any():
                 cloud = self._read(frame).cloud()
-                chosen = _towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
-                yield frame, self._cast(cloud.select(chosen), T, cells)
+                chosen = rays_towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
+                rays = frame_rays(cloud.select(chosen), T, self.settings)
+                yield frame, wanted.seen_by(rays)
 
     @cached_property
     def finest(self) -> Looks:
@@ -232,37 +233,22 @@ class Looks:
         places = self.T_map_camera[:, : len(low), 3]
         return np.flatnonzero(((places > low - reach_m) & (places < high + reach_m)).all(axis=1))
 
-    def _cast(self, cloud: PointCloud, T_map_camera: Float64, cells: Int64) -> Int8:
-        """Return what the rays of one frame did to cells (N, 3)."""
-        rays = frame_rays(cloud, T_map_camera, self.settings)
-        evidence = cast_rays(make_blocks(_FIRST_BLOCKS), rays, SPREAD_SIGMAS)
-        used = int(evidence.used[0])
-        order = np.argsort(evidence.keys[:used])
-        place, known = find_keys(pack_keys(cells >> BLOCK_BITS), evidence.keys[:used][order])
-        local = np.ravel_multi_index(tuple((cells[known] % BLOCK_EDGE).T), (BLOCK_EDGE,) * 3)
-        seen = np.zeros(len(cells), np.int8)
-        seen[known] = np.sign(evidence.values[order[place[known]], local])
-        return seen
 
+class _Wanted(NamedTuple):
+    """Cells (N,) that are looked at, as places in blocks; no others are kept of a frame."""
 
-def _towards(xyz: Float32, cells_m: Float64, edge_m: float) -> Bool:
-    """Return which points (N, 3) lie on rays that may cross cells (M, 3); camera axes."""
-    depth = np.maximum(cells_m[:, 2:], edge_m)
-    slopes = cells_m[:, :2] / depth
-    size = (1 + np.abs(slopes)) * edge_m * np.sqrt(3.0) / 2 / depth
-    first, last = (_bins(slopes + sign * size) for sign in (-1.0, 1.0))
-    # Rectangles of bins are counted at their corners, and summed up once.
-    count = np.zeros((_BINS + 1, _BINS + 1), np.int64)
-    for x, y, sign in ((first, first, 1), (last, last, 1), (first, last, -1), (last, first, -1)):
-        ends = [c[:, axis] + (c is last) for axis, c in enumerate((x, y))]
-        np.add.at(count, tuple(ends), sign)
-    wanted = count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
-    ahead = xyz[:, 2] > 0
-    chosen: Bool = wanted[tuple(_bins(xyz[:, :2] / np.where(ahead, xyz[:, 2], 1.0)[:, None]).T)]
-    return ahead & chosen
+    blocks: Blocks
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
 
+    @classmethod
+    def of(cls, cells: Int64) -> _Wanted:
+        keys, row = np.unique(pack_keys(cells >> BLOCK_BITS), return_inverse=True)
+        column = np.ravel_multi_index(tuple((cells % BLOCK_EDGE).T), (BLOCK_EDGE,) * 3)
+        return cls(blocks_of(keys), row, column)
 
-def _bins(slopes: NDArray[np.floating]) -> Int64:
-    """Return the bins of slopes (N, 2); what is steeper shares the outermost."""
-    places = np.floor((slopes + _WIDEST) * (_BINS / (2 * _WIDEST)))
-    return np.asarray(np.clip(places, 0, _BINS - 1), np.int64)
+    def seen_by(self, rays: Rays) -> Int8:
+        """Return what the rays of one frame did to the cells."""
+        self.blocks.values[:] = 0
+        cast_rays_into(self.blocks, rays, SPREAD_SIGMAS)
+        return np.sign(self.blocks.values[self.row, self.column]).astype(np.int8)

@@ -1,4 +1,4 @@
-"""What is done with disparities once they are found: speckles are marked, neighbours averaged."""
+"""What follows when disparities are found: what stands alone is marked, others averaged."""
 
 from __future__ import annotations
 
@@ -172,3 +172,30 @@ def _add_pair(
         near = (abs(a - centre) <= step) & (abs(b - centre) <= step)
         total[x] += a + b if near else zero
         count[x] += two if near else zero
+
+
+@kernel
+def count_supporters(padded: Float32, limits: Float32) -> UInt8:
+    """Count the neighbours of each pixel whose values differ by no more than a limit.
+
+    Args:
+        padded: float32 (H + 2r, W + 2r), an image in a frame of r pixels; NaN is near nothing.
+        limits: float32 (2r + 1, 2r + 1), the largest difference of each neighbour in the window.
+
+    Returns:
+        uint8 (H, W); a pixel itself counts, whatever it is.
+    """
+    side = len(limits)
+    radius = side // 2
+    height, width = padded.shape[0] - 2 * radius, padded.shape[1] - 2 * radius
+    count = np.ones((height, width), np.uint8)
+    for v in range(height):
+        here = padded[v + radius, radius : radius + width]
+        for dy in range(side):
+            for dx in range(side):
+                if dy == radius and dx == radius:
+                    continue
+                there, limit = padded[v + dy, dx : dx + width], limits[dy, dx]
+                for u in range(width):
+                    count[v, u] += np.uint8(abs(here[u] - there[u]) <= limit)
+    return count

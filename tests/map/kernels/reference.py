@@ -264,3 +264,32 @@ def _next_on_face(edge, face, distance):
 def _crossing(edge, distance):
     begin, end = (distance[corner] for corner in edge)
     return np.add(edge[0], begin / (begin - end) * np.subtract(edge[1], edge[0]))
+
+
+def rays_towards_reference(xyz, cells, edge):
+    """Which points lie on rays that may cross cells, as `recon.map.kernels.looks` says."""
+
+    def bins(slopes):
+        return np.clip(np.floor((slopes + 1.5) * 128 / 3), 0, 127).astype(int)
+
+    depth = np.maximum(cells[:, 2:], edge)
+    slopes = cells[:, :2] / depth
+    size = (1 + np.abs(slopes)) * edge * math.sqrt(3) / 2 / depth
+    wanted = np.zeros((128, 128), bool)
+    for (left, top), (right, bottom) in zip(bins(slopes - size), bins(slopes + size), strict=True):
+        wanted[left : right + 1, top : bottom + 1] = True
+    ahead = xyz[:, 2] > 0
+    column, row = bins(xyz[:, :2] / np.where(ahead, xyz[:, 2], 1)[:, None]).T
+    return ahead & wanted[column, row]
+
+
+def counts_reference(looks, pairs):
+    """Counts of frames over looks (F, N): of each cell, and of each pair."""
+    cells, of_pairs = np.zeros((3, looks.shape[1]), int), np.zeros((2, len(pairs)), int)
+    for n, seen in enumerate(looks.T):
+        told = seen[seen != 0]
+        begun = np.diff(told, prepend=-1) > 0
+        cells[:, n] = (seen > 0).sum(), (seen < 0).sum(), begun.sum()
+    for p, (one, other) in enumerate(looks[:, pairs].transpose(1, 2, 0)):
+        of_pairs[:, p] = (one * other != 0).sum(), (one * other < 0).sum()
+    return cells, of_pairs

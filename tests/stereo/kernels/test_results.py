@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon.core.kernels.compiled import Bool, Float32, Float64, UInt8, UInt16
 from recon.core.values import Reason
 from recon.stereo.kernels import refine
-from recon.stereo.kernels.finish import average_opposite, find_speckles
+from recon.stereo.kernels.finish import average_opposite, count_supporters, find_speckles
 from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.points import MIN_SPREAD, Maps, PointRules, Points, make_points
 from recon.stereo.kernels.refine import Refined, Rules, refine_minima, refined_in
@@ -234,6 +234,20 @@ def speckles_reference(values: Float32, largest_step: float, smallest_size: int)
 def test_speckles_equal_those_of_the_reference(values, step, size):
     found = find_speckles(values, step, size)
     np.testing.assert_array_equal(found, speckles_reference(values, step, size))
+
+
+@given(steps, st.integers(1, 2), st.integers(0, 2**16))
+def test_supporters_equal_those_of_the_reference(values, radius, seed):
+    height, width = values.shape
+    side = 2 * radius + 1
+    limits = np.random.default_rng(seed).integers(0, 4, (side, side)).astype(np.float32) / 2
+    padded = np.pad(values, radius, constant_values=np.nan)
+    expected = np.ones(values.shape, np.uint8)
+    for v, u, dy, dx in np.ndindex(height, width, side, side):
+        if (dy, dx) != (radius, radius):
+            away = abs(values[v, u] - padded[v + dy, u + dx])
+            expected[v, u] += away <= limits[dy, dx]
+    np.testing.assert_array_equal(count_supporters(padded, limits), expected)
 
 
 POINT_RULES = PointRules(100.0, 12.3, 7.7, 20.0, 2.0, 0.1, 8.0, 0.2, stride=1, radius=3)
