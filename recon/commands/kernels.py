@@ -71,11 +71,12 @@ def recorded_calls() -> list[Call]:
 
 
 def _is_kept(call: Call) -> bool:
-    kernel = _kernel(call)
+    kernel = kernel_of(call)
     return bool(kernel._cache.holds(signature(call), kernel.targetctx))
 
 
-def _kernel(call: Call) -> Any:
+def kernel_of(call: Call) -> Any:
+    """Return the kernel of a call."""
     return getattr(importlib.import_module(f"recon.{call.module}"), call.name)
 
 
@@ -160,7 +161,7 @@ def _feed(worker: subprocess.Popen[str], files: deque[deque[Call]], done: Simple
 def _compile_what_is_read() -> None:
     for line in sys.stdin:
         call = Call(*json.loads(line))
-        _kernel(call).compile(signature(call))
+        kernel_of(call).compile(signature(call))
         sys.stdout.write(f"{call.name}\n")
         sys.stdout.flush()
 

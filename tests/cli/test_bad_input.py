@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from recon.cli.errors import one_line_errors
-from recon.core.kernels.cache import note_compiling, announce
+from recon.core.kernels.cache import announce, note_compiling
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.hostile.refusals import Ended, assert_refused, run, run_apart
