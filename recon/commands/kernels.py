@@ -8,6 +8,7 @@ the calls of each line that it reads, and writes a line for each one.
 from __future__ import annotations
 
 import fcntl
+import gc
 import importlib
 import json
 import os
@@ -159,6 +160,7 @@ def _feed(worker: subprocess.Popen[str], files: deque[deque[Call]], done: Simple
 
 
 def _compile_what_is_read() -> None:
+    gc.disable()  # it is a seventh of the time, and this process ends soon
     for line in sys.stdin:
         call = Call(*json.loads(line))
         kernel_of(call).compile(signature(call))
