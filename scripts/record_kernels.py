@@ -26,6 +26,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.kernels.cache import PACKAGE, with_imports
 from recon.core.values import StereoPair
 from recon.io.models.octomap import read_octomap
 from recon.map.drive.sequence import map_sequence
@@ -132,6 +133,12 @@ def recorded(command: str) -> list[tuple[str, str, str]]:
     return list(Calls.seen)
 
 
+def effort(call: tuple[tuple[str, str, str], list[str]]) -> tuple[int, tuple[str, str, str]]:
+    """The more source the file of a call has, with what it imports, the longer it takes."""
+    source = PACKAGE.joinpath(*call[0][0].split(".")).with_suffix(".py")
+    return -sum(path.stat().st_size for path in with_imports(source, PACKAGE)), call[0]
+
+
 def main() -> None:
     needed_by: dict[tuple[str, str, str], list[str]] = {}
     for command in COMMANDS:
@@ -142,7 +149,7 @@ def main() -> None:
             needed_by.setdefault(tuple(call), []).append(command)
     lines = [
         json.dumps([module, name, json.loads(kinds), commands])
-        for (module, name, kinds), commands in sorted(needed_by.items())
+        for (module, name, kinds), commands in sorted(needed_by.items(), key=effort)
     ]
     RECORDED.write_text("[\n" + ",\n".join(lines) + "\n]\n")
 

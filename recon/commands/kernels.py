@@ -24,7 +24,7 @@ from typing import Any, Final, NamedTuple
 
 from numba import config, types
 
-from recon.core.kernels.cache import PACKAGE, announce, cache_parent, note_compiling, with_imports
+from recon.core.kernels.cache import PACKAGE, announce, cache_parent, note_compiling
 from recon.core.machine import available_cores
 from recon.core.progress import tracked
 
@@ -38,9 +38,6 @@ class Call(NamedTuple):
     name: str
     types: list[Any]
     needed_by: list[str]  # names of what makes it, such as a matcher
-
-    def is_needed(self, names: Sequence[object]) -> bool:
-        return any(name in self.needed_by for name in names)
 
 
 def compile_kernels(*needed_by: object) -> int:
@@ -62,18 +59,18 @@ def compile_kernels(*needed_by: object) -> int:
 
 def missing_calls(*needed_by: object) -> list[Call]:
     """Return the calls, of the names given if any, whose code is not in the cache."""
-    chosen = [one for one in recorded_calls() if not needed_by or one.is_needed(needed_by)]
-    return [] if config.DISABLE_JIT else [call for call in chosen if not _is_kept(call)]
+    found = []
+    for call in [] if config.DISABLE_JIT else recorded_calls():
+        if not needed_by or any(name in call.needed_by for name in needed_by):
+            kernel = kernel_of(call)
+            if not kernel._cache.holds(signature(call), kernel.targetctx):
+                found.append(call)
+    return found
 
 
 def recorded_calls() -> list[Call]:
-    """Return the calls that commands make, as they were recorded."""
+    """Return the calls that commands make, those first that take long to compile."""
     return [Call(*call) for call in json.loads(RECORDED.read_bytes())]
-
-
-def _is_kept(call: Call) -> bool:
-    kernel = kernel_of(call)
-    return bool(kernel._cache.holds(signature(call), kernel.targetctx))
 
 
 def kernel_of(call: Call) -> Any:
@@ -110,7 +107,7 @@ def _compiled(calls: Sequence[Call]) -> Iterator[str]:
     files = defaultdict[str, deque[Call]](deque)
     for call in calls:
         files[call.module].append(call)
-    waiting = deque(files[module] for module in sorted(files, key=_size, reverse=True))
+    waiting = deque(files.values())
     done = SimpleQueue[str]()
     workers = [_worker() for _ in range(min(available_cores(), len(files)))]
     try:
@@ -122,12 +119,6 @@ def _compiled(calls: Sequence[Call]) -> Iterator[str]:
         for worker in workers:
             worker.kill()
             worker.wait()
-
-
-def _size(module: str) -> int:
-    """Return how much source a file of kernels has, with what it imports: the more, the longer."""
-    source = PACKAGE.joinpath(*module.split(".")).with_suffix(".py")
-    return sum(path.stat().st_size for path in with_imports(source, PACKAGE))
 
 
 def _worker() -> subprocess.Popen[str]:

@@ -14,6 +14,7 @@ from recon.commands import kernels
 from recon.commands.config import ReconConfig
 from recon.commands.kernels import Call, compile_kernels, missing_calls, recorded_calls, signature
 from recon.core.kernels.cache import cache_parent, when_compiling
+from recon.core.kernels.compiled import _KernelCache
 from recon.core.progress import Progress, showing
 
 compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
@@ -28,16 +29,21 @@ def test_recorded_calls_are_of_kernels_that_are_there_with_types_that_numba_know
         assert kernel.__code__.co_argcount == len(signature(call))
 
 
-def test_a_matcher_needs_some_kernels_a_drive_others_and_one_of_somebody_else_none():
+def test_a_matcher_needs_some_kernels_a_drive_others():
     every = recorded_calls()
     needed = {
-        name: {json.dumps(call) for call in every if call.is_needed([name])}
+        name: {json.dumps(call) for call in every if name in call.needed_by}
         for name in ("sad", "fine", "map", "demo")
     }
     assert all(needed.values())
     assert needed["map"] < needed["demo"]
     assert needed["fine"] - needed["demo"]
-    assert not any(call.is_needed([None, ReconConfig(), "yours"]) for call in every)
+
+
+@compiled
+def test_a_matcher_of_somebody_else_needs_none(monkeypatch):
+    monkeypatch.setattr(kernels, "kernel_of", None)
+    assert missing_calls(None, ReconConfig(), "yours") == []
 
 
 def test_types_are_read_as_numba_has_them():
@@ -85,7 +91,7 @@ def test_nothing_starts_where_nothing_lacks(monkeypatch):
 
 @compiled
 def test_where_kernels_are_not_compiled_none_lacks(monkeypatch):
-    monkeypatch.setattr(kernels, "_is_kept", lambda _: False)
+    monkeypatch.setattr(_KernelCache, "holds", lambda *_: False)
     assert len(missing_calls()) == len(recorded_calls())
     monkeypatch.setattr(kernels.config, "DISABLE_JIT", 1)
     assert missing_calls() == []
