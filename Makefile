@@ -41,7 +41,7 @@ test: $(READY) ## fast tests, with style, types and import contracts; real data 
 	@$(MAKE) --no-print-directory -j2 $(COMPILED) interpreted
 	$(PYTEST) -m "not slow"
 
-# While the kernels are compiled, which keeps one core busy, their tests run them interpreted.
+# While the kernels are compiled, their tests run them interpreted.
 interpreted: $(READY)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q tests/*/kernels
 

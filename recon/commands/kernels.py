@@ -24,7 +24,8 @@ from typing import Any, Final, NamedTuple
 
 from numba import config, types
 
-from recon.core.kernels.cache import PACKAGE, announce, cache_parent, note_compiling
+from recon.core.kernels.cache import PACKAGE, announce, note_compiling
+from recon.core.kernels.compiled import CACHE
 from recon.core.machine import available_cores
 from recon.core.progress import tracked
 
@@ -48,7 +49,7 @@ def compile_kernels(*needed_by: object) -> int:
     """
     if not missing_calls(*needed_by):
         return 0
-    with (cache_parent() / "compiling").open("w") as lock:
+    with (CACHE / "compiling").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         calls = missing_calls(*needed_by)
         note_compiling()
@@ -118,13 +119,16 @@ def _compiled(calls: Sequence[Call]) -> Iterator[str]:
     finally:
         for worker in workers:
             worker.kill()
+        for worker in workers:
             worker.wait()
 
 
 def _worker() -> subprocess.Popen[str]:
     """Start a process that compiles the calls that it reads."""
-    # It must be able to import this package however its parent found it, and not another.
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    # It must be able to import this package however its parent found it, and keep code where that
+    # looks for it, also where each process would have a folder of its own.
+    paths = os.pathsep.join(filter(None, sys.path))
+    environment = {**os.environ, "PYTHONPATH": paths, "NUMBA_CACHE_DIR": str(CACHE)}
     return subprocess.Popen(
         [sys.executable, "-m", __name__],
         stdin=subprocess.PIPE,

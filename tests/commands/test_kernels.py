@@ -13,8 +13,8 @@ import pytest
 from recon.commands import kernels
 from recon.commands.config import ReconConfig
 from recon.commands.kernels import Call, compile_kernels, missing_calls, recorded_calls, signature
-from recon.core.kernels.cache import cache_parent, when_compiling
-from recon.core.kernels.compiled import _KernelCache
+from recon.core.kernels.cache import when_compiling
+from recon.core.kernels.compiled import CACHE, _KernelCache
 from recon.core.progress import Progress, showing
 
 compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
@@ -136,7 +136,7 @@ def test_an_interruption_leaves_no_process(monkeypatch, lacking):
 def test_a_second_command_waits_for_the_first_and_then_has_nothing_to_compile(monkeypatch):
     answers = iter([CALLS, []])  # before and after it had waited
     monkeypatch.setattr(kernels, "missing_calls", lambda *_: next(answers))
-    with (cache_parent() / "compiling").open("w") as first:
+    with (CACHE / "compiling").open("w") as first:
         fcntl.flock(first, fcntl.LOCK_EX)
         second: list[int] = []
         waits = threading.Thread(target=lambda: second.append(compile_kernels()))

@@ -42,7 +42,7 @@ def _usable_cache() -> Path:
     return parent
 
 
-_CACHE: Final = _usable_cache()
+CACHE: Final = _usable_cache()
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
@@ -100,7 +100,7 @@ def _folder(file: str) -> Path:
     """Return the folder for a file of kernels; those of others, as in tests, have one for all."""
     source = Path(file)
     inside = source.is_relative_to(PACKAGE)
-    return cache_folder(_CACHE, source if inside else Path(__file__))
+    return cache_folder(CACHE, source if inside else Path(__file__))
 
 
 def _keep(compiled: Any, function: Callable[..., Any]) -> None:
