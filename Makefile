@@ -6,6 +6,7 @@ SHELL := /bin/bash
 unexport PYTHONDONTWRITEBYTECODE
 
 BIN := .venv/bin
+CORE := .venv/.core
 READY := .venv/.ready
 COMPILED := .venv/.compiled
 WORKERS ?= 2
@@ -13,30 +14,34 @@ WORKERS ?= 2
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope --no-loadscope-reorder
 
-.PHONY: help setup demo test interpreted test-all fuzz check lint bench results format clean
+.PHONY: help setup demo test interpreted test-all fuzz check lint bench results lock format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: $(COMPILED) ## system libraries, .venv, the package with its tested versions, compiled kernels
+setup: $(COMPILED) ## system libraries, .venv, all that tests need in its tested versions, compiled kernels
 
-$(READY): pyproject.toml constraints.txt scripts/setup.sh
+# What commands run, and what tests run beside; the stamp is written once all of it is there.
+$(CORE): pyproject.toml constraints.lock scripts/setup.sh
 	@scripts/setup.sh
 	@touch $@
 
+$(READY): pyproject.toml constraints.lock scripts/setup.sh
+	@scripts/setup.sh dev
+	@touch $(CORE) $@
+
 $(COMPILED): $(READY) $(wildcard recon/*/kernels/*.py recon/*/kernels/*/*.py)
-	@echo "setup: compiling the kernels, once: about two minutes"
 	@printf 'setup: %s\n' "$$($(BIN)/recon doctor --compile)"
 	@touch $@
 
-demo: $(COMPILED) ## map a synthetic street drive into outputs/demo/
+demo: $(CORE) ## map a synthetic street drive into outputs/demo/
 	$(BIN)/recon demo
 
 test: $(READY) ## fast tests, with style, types and import contracts; real data where RECON_DATA is set
 	@$(MAKE) --no-print-directory -j2 $(COMPILED) interpreted
 	$(PYTEST) -m "not slow"
 
-# While the kernels are compiled, which keeps one core busy, their tests run them interpreted.
+# While the kernels are compiled, their tests run them interpreted.
 interpreted: $(READY)
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q tests/*/kernels
 
@@ -59,6 +64,9 @@ bench: $(COMPILED) ## speed of the matchers beside OpenCV's, as JSON
 
 results: $(COMPILED) ## measure the tables of the pages, or some: ONLY="movers kitti"; hours in all
 	@$(BIN)/python benchmarks/results.py $(if $(ONLY),--only $(ONLY))
+
+lock: $(READY) ## write the hashes of the versions of constraints.txt into constraints.lock
+	@scripts/lock.sh
 
 format: $(READY) ## put the code into the project's style
 	$(BIN)/ruff check --fix

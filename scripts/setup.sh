@@ -1,6 +1,10 @@
 #!/usr/bin/env bash
 # Prepare this folder: system packages, .venv, the package with the versions of constraints.txt.
 #
+#   scripts/setup.sh        what commands run
+#   scripts/setup.sh dev    what tests run, too
+#
+# uv installs, where it is there or pip gets it, and checks the hashes of constraints.lock; else pip.
 # Safe to repeat: what is there already is left alone, and apt is called only for what is missing.
 # PYTHON=/path/to/python3 chooses the interpreter.
 set -euo pipefail
@@ -14,7 +18,7 @@ readonly LIBRARIES=(
     libusb-1.0.so.0:libusb-1.0-0 # open3d
     libOpenGL.so.0:libopengl0   # pymeshlab's reader and writer of PLY
 )
-readonly HEAVY="cv2, kiss_icp, numba, open3d, pymeshlab, pyoctomap"
+readonly HEAVY="cv2, kiss_icp, numba, open3d, pymeshlab${1:+, pyoctomap}"
 
 say() { printf 'setup: %s\n' "$*"; }
 fail() { printf 'setup: %s\n' "$*" >&2; exit 1; }
@@ -80,16 +84,36 @@ ensure_venv() {
     "$(find_python)" -m venv --clear .venv
 }
 
+# The uv of the machine, else that of the lock, in .venv; nothing where it cannot be had.
+find_uv() {
+    command -v uv && return
+    if [[ ! -x .venv/bin/uv ]]; then
+        sed -n '/^uv==/,/[^\\]$/p' constraints.lock >.venv/uv.txt
+        pip install --require-hashes -r .venv/uv.txt >&2 || return 0
+    fi
+    echo "$PWD/.venv/bin/uv"
+}
+
+pip() { .venv/bin/python -m pip --quiet --disable-pip-version-check "$@"; }
+
+# Install recon with the extras given, and tell every few seconds that it goes on.
 ensure_package() {
-    say "installing recon and its libraries into .venv (about 2 GB, some minutes the first time)"
+    local uv begun=$SECONDS package=".${1:+[$1]}"
     # An earlier checkout installed itself by a name that is another project's.
-    .venv/bin/python -m pip uninstall --quiet --yes recon 2>/dev/null || true
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check \
-        -c constraints.txt -e '.[dev]'
+    pip uninstall --yes recon 2>/dev/null || true
+    uv=$(find_uv)
+    if [[ -n $uv ]]; then
+        say "installing recon and its libraries into .venv with uv (${1:+with all that tests need, }about 2 GB)"
+        "$uv" pip install --python .venv/bin/python -c constraints.lock -e "$package"
+    else
+        say "uv cannot be had: pip takes some minutes, and does not check the hashes of constraints.lock"
+        pip install -c constraints.txt -e "$package"
+    fi || fail "the libraries could not be installed, as said above; what is there stays: run it again"
+    say "installed in $((SECONDS - begun)) s"
     .venv/bin/python -W ignore -c "import $HEAVY" ||
         fail "the libraries are installed but one cannot be loaded; the line above names it"
 }
 
 ensure_system
 ensure_venv
-ensure_package
+ensure_package "$@"

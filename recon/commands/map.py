@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
+from recon.commands.kernels import compile_kernels
 from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import begun_in_pieces, map_pieces, pieces_of
 from recon.core.errors import (
@@ -120,6 +121,7 @@ def run_map(
     check_odometry(config.odometry.method)
     if config.odometry.method == "sfm" and options.known_poses is None:
         refuse_with_sfm(source, options)
+    compile_kernels("map", config.matching.matcher, config.matching.keyframe_matcher)
     with _begun(source, config, options) as (run, map_, seen, scene, config):
         found, findings, source = seen.rig, seen.findings, seen.drive
         if config.rig.refine:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
+from recon.commands.kernels import compile_kernels
 from recon.core.errors import SettingsError
 from recon.core.plugins import name_of
 from recon.core.progress import stage
@@ -159,6 +160,7 @@ def _compared(
 
 def _reconstructor(given: PairInput, config: ReconConfig, run: Run) -> FrameReconstructor:
     rig, watch = given.calibration, run.watch
+    compile_kernels(config.matching.matcher)
     with naming(given.files[2]) if len(given.files) > 2 else nullcontext():  # the calibration
         return FrameReconstructor(rig, config, threads=run.threads, stopwatch=watch)
 

@@ -12,7 +12,6 @@ import pytest
 
 import recon
 from recon.commands.doctor import PACKAGES, SYSTEM_LIBRARIES
-from recon.commands.kernel_samples import SAMPLES
 from recon.core.errors import DISTRIBUTION
 
 # What numba takes from scipy: it is compiled without, and fails when it is called.
@@ -51,6 +50,22 @@ def test_what_is_imported_is_declared_and_pinned_and_nothing_else(imported, pypr
     assert (
         declared | set(map(_normal, pyproject["project"]["optional-dependencies"]["dev"])) <= pinned
     )
+
+
+def test_the_lock_has_the_versions_of_the_constraints_with_hashes_and_names_no_place(root):
+    lock = (root / "constraints.lock").read_text()
+    locked = {
+        (_normal(name), version): entry.count("--hash=sha256:")
+        for entry in re.split(r"^(?=\S)", lock, flags=re.MULTILINE)
+        for name, version in re.findall(r"^([\w.-]+)==(\S+)", entry)
+    }
+    assert min(locked.values()) >= 1
+    lines = (root / "constraints.txt").read_text().splitlines()
+    pinned = {(_normal(line), line.split("==")[1].split()[0]) for line in lines if "==" in line}
+    assert pinned <= set(locked)
+    other = {"appnope", "cffi", "pycparser", "pyreadline3"}  # of other systems, and of PyPy
+    assert {name for name, _ in set(locked) - pinned} == other
+    assert not re.search(r"://|index-url|find-links", lock)
 
 
 def test_every_optional_library_is_declared_by_the_extra_that_its_error_names(trees, pyproject):
@@ -110,16 +125,13 @@ def test_what_messages_and_pages_tell_to_install_is_this_package(root, pyproject
     assert [path.name for path in files if wrong.search(path.read_text())] == []
 
 
-def test_doctor_looks_for_what_is_installed_and_runs_kernels_of_each_room_that_has_some(
-    root, pyproject
-):
+def test_doctor_looks_for_what_is_installed(root, pyproject):
     entry = re.compile(r"^ +(lib\S+\.so\S*?):(\S+)", re.MULTILINE)
     installed = dict(entry.findall((root / "scripts" / "setup.sh").read_text()))
     assert dict(SYSTEM_LIBRARIES) == installed
     declared = {re.split("[>= ]", entry)[0] for entry in pyproject["project"]["dependencies"]}
     unneeded = {"tomli"} if sys.version_info >= (3, 11) else set()
     assert set(PACKAGES) == declared - unneeded
-    assert set(SAMPLES) == {folder.parent.name for folder in (root / "recon").glob("*/kernels")}
 
 
 def test_public_names_are_exactly_the_documented_ones_and_explain_themselves(root):

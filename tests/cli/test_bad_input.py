@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from recon.cli.errors import one_line_errors
-from recon.core.kernels.cache import _log_compiling, announce
+from recon.core.kernels.cache import announce, note_compiling
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.hostile.refusals import Ended, assert_refused, run, run_apart
@@ -167,7 +167,7 @@ class Terminal(io.StringIO):
 def shown(monkeypatch: pytest.MonkeyPatch, stream: io.StringIO, *, quiet: bool) -> list[str]:
     """What is said of kernels while a command meets two that are not compiled."""
     monkeypatch.setattr("sys.stderr", stream)
-    _log_compiling.cache_clear()
+    note_compiling.cache_clear()
     with one_line_errors(quiet=quiet):
         announce("first")
         announce("second")

@@ -18,13 +18,14 @@ import recon
 from recon.cli.tables import print_checks
 from recon.commands import doctor
 from recon.commands.doctor import Check, check_kernels, examine
+from recon.commands.kernels import recorded_calls
 
 
 def test_this_machine_is_examined_and_ready(tmp_path):
     checks = examine(tmp_path / "outputs")
     assert [check for check in checks if check.needed and not check.ok] == []
     names = {check.name for check in checks}
-    assert {"Python", "numpy", "open3d", "kernels of map", "memory", "cores"} <= names
+    assert {"Python", "numpy", "open3d", "kernels", "memory", "cores"} <= names
     assert not (tmp_path / "outputs").exists()
 
 
@@ -36,15 +37,29 @@ def test_another_project_of_our_import_name_is_reported(monkeypatch):
     assert "pip uninstall recon" in found.hint
 
 
-def test_what_kernels_lack_is_named(tmp_path, monkeypatch):
-    (tmp_path / "llvmlite.py").write_text("raise ImportError('half of it is gone')")
+@pytest.fixture
+def with_modules(tmp_path, monkeypatch):
+    """Adds modules to what processes find before all others."""
     paths = os.pathsep.join([str(tmp_path), str(Path(recon.__file__).parents[1])])
     monkeypatch.setenv("PYTHONPATH", paths)
-    checks = [check for check in check_kernels() if check.needed]
-    assert {"kernels of map", "kernels of stereo"} <= {check.name for check in checks}
-    for check in checks:
-        assert not check.ok
-        assert check.found == "ImportError: half of it is gone"
+    return tmp_path
+
+
+def test_what_kernels_lack_is_named(with_modules):
+    (with_modules / "llvmlite.py").write_text("raise ImportError('half of it is gone')")
+    (check,) = (check for check in check_kernels() if check.needed)
+    assert (check.name, check.ok) == ("kernels", False)
+    assert check.found == "ImportError: half of it is gone"
+    assert "constraints.txt" in check.hint
+
+
+def test_kernels_are_counted_and_none_is_compiled(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
+    (check,) = (check for check in check_kernels() if check.needed)
+    assert check.ok
+    assert check.found.startswith(f"0 of {len(recorded_calls())} compiled")
+    assert list(tmp_path.rglob("*.nbi")) == []
 
 
 def test_what_is_missing_says_what_to_do(monkeypatch):

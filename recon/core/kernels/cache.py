@@ -1,13 +1,15 @@
-"""Where the machine code of kernels is kept: a folder for each state of their sources.
+"""Where the machine code of kernels is kept: for each of their files a folder for its state.
 
 numba alone keeps it beside the source and checks only the file of the outermost function: after
-an update a kernel would go on running old code that it calls in another file.
+an update a kernel would go on running old code that it calls in another file. So the state of a
+file is that of all that it imports, too; an update compiles what it changed, and no more.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -19,14 +21,16 @@ from typing import Final
 
 from recon.core.progress import LOGGER
 
-_PACKAGE: Final = Path(__file__).parents[2]
+PACKAGE: Final = Path(__file__).parents[2]
 _PREFIX: Final = "kernels-"
+# Modules of the package are imported by their whole names.
+_IMPORT: Final = re.compile(rb"^ *from (recon[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 _LISTENERS: Final[list[Callable[[str], None]]] = []
 
 
 @contextmanager
 def when_compiling(notify: Callable[[str], None]) -> Iterator[None]:
-    """Call ``notify`` with the name of each kernel that is about to be compiled, in any thread."""
+    """Call ``notify`` with the name of each kernel that is compiled, in any thread."""
     _LISTENERS.append(notify)
     try:
         yield
@@ -35,15 +39,16 @@ def when_compiling(notify: Callable[[str], None]) -> Iterator[None]:
 
 
 def announce(kernel: str) -> None:
-    """Notify all listeners that a kernel is about to be compiled; the first time, log it."""
-    _log_compiling()
+    """Notify all listeners that a kernel is compiled; the first time, log it."""
+    note_compiling()
     for notify in tuple(_LISTENERS):
         notify(kernel)
 
 
 @cache
-def _log_compiling() -> None:
-    LOGGER.warning("compiling kernels, once after an installation: about two minutes …")
+def note_compiling() -> None:
+    """Log, once, that kernels are compiled: whoever waits is to know why."""
+    LOGGER.warning("compiling kernels, once after an installation …")
 
 
 def cache_parent() -> Path:
@@ -82,14 +87,44 @@ def _temporary() -> Path:
     return Path(tempfile.mkdtemp(prefix="recon-"))
 
 
-def cache_folder(parent: Path, package: Path = _PACKAGE) -> Path:
-    """Return the folder for the sources in folders ``kernels`` as they are; others are removed."""
+def cache_folder(parent: Path, source: Path, package: Path = PACKAGE) -> Path:
+    """Return the folder for a file of kernels as it and its imports are; earlier ones are removed.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
     digest = hashlib.sha256()
-    for path in sorted(path for path in package.rglob("*.py") if "kernels" in path.parts):
-        digest.update(path.read_bytes())
-    folder = parent / f"{_PREFIX}{digest.hexdigest()[:16]}"
+    for path in with_imports(source, package):
+        digest.update(_read(path))
+    name = ".".join(source.relative_to(package).with_suffix("").parts)
+    folder = parent / f"{_PREFIX}{name}-{digest.hexdigest()[:16]}"
     if not folder.is_dir():
         # Another process may make the folder at this moment.
-        for earlier in set(parent.glob(f"{_PREFIX}*")) - {folder}:
+        for earlier in set(parent.glob(f"{_PREFIX}{name}-*")) - {folder}:
             shutil.rmtree(earlier, ignore_errors=True)
     return folder
+
+
+def with_imports(source: Path, package: Path) -> list[Path]:
+    """Return a file and those of the package that it imports, and they in turn, in order."""
+    found, waiting = set[Path](), [source]
+    while waiting:
+        if (path := waiting.pop()) not in found:
+            found.add(path)
+            waiting += _imported(path, package)
+    return sorted(found)
+
+
+_read: Final = cache(Path.read_bytes)
+
+
+@cache
+def _imported(path: Path, package: Path) -> list[Path]:
+    """Return the files of the package that one imports: modules, or the names of one."""
+    found = list[Path]()
+    for module, names in _IMPORT.findall(_read(path)):
+        place = package.parent.joinpath(*module.decode().split("."))
+        beside = (place / f"{name.decode()}.py" for name in re.findall(rb"\w+", names))
+        files = (place.with_suffix(".py"), place / "__init__.py", *beside)
+        found += filter(Path.is_file, files)
+    return found

@@ -5,6 +5,8 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, Final, Literal, TypeVar, overload
 
@@ -13,7 +15,7 @@ from numba import __version__, config, njit
 from numba.core.caching import FunctionCache
 from numpy.typing import NDArray
 
-from recon.core.kernels.cache import announce, cache_folder, cache_parent
+from recon.core.kernels.cache import PACKAGE, announce, cache_folder, cache_parent
 
 KernelT = TypeVar("KernelT", bound=Callable[..., Any])
 
@@ -27,7 +29,7 @@ Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 
-def _usable_cache() -> str:
+def _usable_cache() -> Path:
     """Return the folder of our cache; where it cannot be written, numba would take another one."""
     try:
         parent = cache_parent()
@@ -37,14 +39,18 @@ def _usable_cache() -> str:
         what = f"compiled kernels cannot be kept ({error.strerror or error})"
         hint = "set NUMBA_CACHE_DIR to a folder that can be written"
         raise OSError(error.errno, f"{what}; {hint}", error.filename) from error
-    return str(cache_folder(parent))
+    return parent
 
 
-_CACHE: Final = _usable_cache()
+CACHE: Final = _usable_cache()
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
     """numba's cache of one kernel, which one process at a time writes: two would mix up code."""
+
+    def holds(self, sig: Any, target_context: Any) -> bool:
+        """Return whether the code for these types is kept, and of this numba and processor."""
+        return self._index_key(sig, target_context.codegen()) in self._cache_file._load_index()
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         found = super().load_overload(sig, target_context)
@@ -78,9 +84,10 @@ def kernel(function: Any = None, **options: str) -> Any:
         return lambda function: kernel(function, **options)
     kept = config.CACHE_DIR
     # numba takes the folder while it decorates; functions of other packages keep theirs.
-    config.CACHE_DIR = _CACHE
+    config.CACHE_DIR = str(_folder(function.__code__.co_filename))
     try:
-        compiled = njit(nogil=True, **options)(function)
+        # Nothing calls kernels from C, so nothing is compiled that C could call.
+        compiled = njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
         if compiled is not function:  # it is where NUMBA_DISABLE_JIT is set
             _keep(compiled, function)
         return compiled
@@ -88,11 +95,19 @@ def kernel(function: Any = None, **options: str) -> Any:
         config.CACHE_DIR = kept
 
 
+@cache
+def _folder(file: str) -> Path:
+    """Return the folder for a file of kernels; those of others, as in tests, have one for all."""
+    source = Path(file)
+    inside = source.is_relative_to(PACKAGE)
+    return cache_folder(CACHE, source if inside else Path(__file__))
+
+
 def _keep(compiled: Any, function: Callable[..., Any]) -> None:
     """Give a compiled function our cache, as `enable_caching` does its own."""
     before, own = getattr(compiled, "_cache", None), _KernelCache(function)
     used = all(hasattr(before, name) for name in ("load_overload", "save_overload"))
-    if not (used and own.cache_path.startswith(_CACHE)):
+    if not (used and own.cache_path.startswith(config.CACHE_DIR)):
         # Code of earlier sources would run, or two processes would mix up what they write.
         raise ImportError(f"numba {__version__} keeps machine code in another way", name="numba")
     compiled._cache = own

@@ -1,7 +1,9 @@
 """Machine code is never older than its sources; the voxel hash agrees with a dictionary."""
 
+import ast
 import fcntl
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numba.core.caching import FunctionCache
 
-from recon.core.kernels import voxels
+from recon.core.kernels import cache, voxels
 from recon.core.kernels.cache import cache_folder, cache_parent, when_compiling
 from recon.core.kernels.compiled import kernel
 from recon.core.kernels.voxels import are_among, distinct_keys, find_keys
@@ -24,34 +26,67 @@ compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels ar
 
 @pytest.fixture
 def sources(tmp_path):
-    folder = tmp_path / "sources" / "room" / "kernels"
+    """A package in which outer.py calls inner.py, which calls deep.py; other.py calls nobody."""
+    folder = tmp_path / "recon" / "room" / "kernels"
     (folder / "simd").mkdir(parents=True)
-    for name in ("outer.py", "inner.py", "simd/vectors.py"):
-        (folder / name).write_text("LANES = 32\n")
+    for name, text in {
+        "outer": "from recon.room.kernels import (\n    inner,\n)\n",
+        "inner": "def f():\n    from recon.room.kernels.simd.deep import LANES, g\n",
+        "simd/deep": "from recon.room.kernels import inner as around\nLANES = 32\n",
+        "other": "LANES = 32\nfrom recon.nowhere import gone\nfrom recon import room\n",
+    }.items():
+        (folder / f"{name}.py").write_text(text)
     return folder
 
 
-@pytest.mark.parametrize("name", ["inner.py", "simd/vectors.py"])
-def test_a_change_in_a_source_gives_another_folder(tmp_path, sources, name):
-    before = cache_folder(tmp_path, sources.parents[1])
-    assert cache_folder(tmp_path, sources.parents[1]) == before
-    (sources / name).write_text("LANES = 16\n")
-    assert cache_folder(tmp_path, sources.parents[1]) != before
+def folder_of(sources: Path, name: str) -> Path:
+    """The folder, as a process finds it that starts now."""
+    cache._read.cache_clear()
+    cache._imported.cache_clear()
+    return cache_folder(sources.parents[2], sources / f"{name}.py", sources.parents[1])
 
 
-def test_folders_of_earlier_sources_are_removed(tmp_path, sources):
-    current = cache_folder(tmp_path, sources.parents[1])
-    current.mkdir()
-    earlier, other = tmp_path / "kernels-0123", tmp_path / "notes"
-    for folder in (earlier, other):
+@pytest.mark.parametrize("changed", ["outer", "inner", "simd/deep"])
+def test_a_change_gives_other_folders_to_the_file_and_whoever_imports_it_alone(sources, changed):
+    before = {name: folder_of(sources, name) for name in ("outer", "inner", "other")}
+    assert before == {name: folder_of(sources, name) for name in before}
+    path = sources / f"{changed}.py"
+    path.write_text(path.read_text() + "LANES = 16\n")
+    after = {name: folder_of(sources, name) for name in before}
+    assert after["outer"] != before["outer"]
+    assert (after["inner"] == before["inner"]) is (changed == "outer")
+    assert after["other"] == before["other"]
+
+
+def test_folders_of_earlier_states_of_a_file_are_removed(sources):
+    current, other = folder_of(sources, "outer"), folder_of(sources, "other")
+    earlier = current.with_name(f"{current.name[:-4]}0123")
+    notes = current.with_name("notes")
+    for folder in (current, earlier, other, notes):
         folder.mkdir()
         (folder / "file").write_text("")
-    cache_folder(tmp_path, sources.parents[1])
+    folder_of(sources, "outer")
     assert earlier.is_dir()  # nothing is tidied while the current one is in use
-    current.rmdir()
-    cache_folder(tmp_path, sources.parents[1])
+    shutil.rmtree(current)
+    folder_of(sources, "outer")
     assert not earlier.exists()
     assert other.is_dir()
+    assert notes.is_dir()
+
+
+def test_imports_of_kernels_are_found_as_python_reads_them():
+    """Without reading all of the language, which each command would wait for."""
+    root = cache.PACKAGE.parent
+    files = [path for path in (root / "recon").rglob("*.py") if "kernels" in path.parts]
+    for path in files:
+        expected = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("recon"):
+                place = root.joinpath(*node.module.split("."))
+                names = (place / f"{alias.name}.py" for alias in node.names)
+                ways = (place.with_suffix(".py"), place / "__init__.py", *names)
+                expected |= {way for way in ways if way.is_file()}
+        assert set(cache._imported(path, root / "recon")) == expected
 
 
 @pytest.fixture
@@ -129,7 +164,9 @@ def test_a_numba_that_keeps_code_in_another_way_is_refused(monkeypatch, change):
 
 @compiled
 def test_what_is_compiled_is_announced_unless_it_is_cached(monkeypatch):
-    assert Path(voxels.pack_key.stats.cache_path).parent == cache_folder(cache_parent())
+    assert Path(voxels.pack_key.stats.cache_path).parent == cache_folder(
+        cache_parent(), Path(voxels.__file__)
+    )
     # Other users of numba keep their cache.
     monkeypatch.setattr(numba.config, "CACHE_DIR", "elsewhere")
 
