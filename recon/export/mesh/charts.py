@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Float64, Int32, Int64
+from recon.export.mesh.cut import components, neighbours
 
 _RIGHT: Final = np.array([[0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, -1, 0], [1, 0, 0], [1, 0, 0]])
 _DOWN: Final = np.array([[0, 0, -1], [0, 0, -1], [0, -1, 0], [0, 0, -1], [0, 0, -1], [0, 1, 0]])
@@ -93,7 +92,7 @@ def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     cosines = normals @ _FACING.T
-    facing, pairs, rows = cosines.argmax(axis=1), _neighbours(mesh.faces), np.arange(len(a))
+    facing, pairs, rows = cosines.argmax(axis=1), neighbours(mesh.faces), np.arange(len(a))
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     for _ in range(_SMOOTHINGS):
         votes = np.bincount(6 * ends[:, 0] + facing[ends[:, 1]], minlength=6 * len(a))
@@ -103,23 +102,14 @@ def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
     return facing, pairs
 
 
-def _neighbours(faces: Int32) -> Int64:
-    """Return int64 (P, 2), the faces on both sides of each inner edge."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
-    packed = (edges[:, 0] << 32) | edges[:, 1]
-    order = np.argsort(packed, kind="stable")
-    same = np.flatnonzero(packed[order][1:] == packed[order][:-1])
-    return np.stack([order[same], order[same + 1]], axis=1) // 3
-
-
 def _laid_out(mesh: TriangleMesh, facing: Int64, pairs: Int64, texel_m: float) -> Atlas:
     """Return the atlas with texels of a size."""
     middles = mesh.vertices[mesh.faces].mean(axis=1)
     block = np.floor(middles / (_BLOCK_PX * texel_m)).astype(np.int64)
     one, other = pairs.T
     joined = (facing[one] == facing[other]) & (block[one] == block[other]).all(axis=1)
-    links = coo_matrix((np.ones(joined.sum()), pairs[joined].T), shape=(len(facing),) * 2)
-    charts, chart_of_face = connected_components(links, directed=False)
+    chart_of_face = components(pairs[joined], len(facing))
+    charts = int(chart_of_face.max()) + 1
     packed = (chart_of_face.astype(np.int64)[:, None] << 32) | mesh.faces
     keys, faces = np.unique(packed, return_inverse=True)
     chart, vertex = keys >> 32, keys & 0xFFFFFFFF
