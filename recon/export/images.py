@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from recon.sources.source import StereoSource, mark_of
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.rectify.rectifier import Rectifier, turns_of
 from recon.street.settings import StreetSettings
+
+_KEPT_BYTES: Final = 1 << 28  # of a drive's rectified images that stay in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +55,29 @@ class DriveImages:
     def file(self, side: str, frame: int) -> str:
         return f"{self.prefix}{side}_{frame:06d}.png"
 
-    def pairs(self) -> Iterator[tuple[int, Recorded]]:
+    @cached_property
+    def _kept(self) -> dict[int, tuple[UInt8, ...]]:
+        return {}
+
+    def views(self) -> Iterator[tuple[int, tuple[UInt8, ...]]]:
+        """Yield number and rectified images of the frames that have a place, the left one first.
+
+        Those of the first frames stay in memory, as many as fit: whoever comes next need not read
+        and rectify them again.
+        """
+        kept = self._kept
+        yield from [*kept.items()]
+        room = _KEPT_BYTES - sum(image.nbytes for images in kept.values() for image in images)
+        for frame, pair in self.pairs(max(kept, default=-1) + 1):
+            images = self.rectified(pair)
+            room -= sum(image.nbytes for image in images)
+            if room >= 0:
+                kept[frame] = images
+            yield frame, images
+
+    def pairs(self, start: int = 0) -> Iterator[tuple[int, Recorded]]:
         """Yield number and pair of the frames that have a place, one in memory at a time."""
-        first = int(np.argmax(self.placed))
+        first = max(start, int(np.argmax(self.placed)))
         frames = range(first, len(self.placed))
         pairs = zip(frames, self.source.frames(first), strict=False)
         for frame, pair in tracked(pairs, "images", total=len(frames)):

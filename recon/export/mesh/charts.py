@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -35,6 +36,15 @@ class Atlas:
     width_px: int
     height_px: int
     texel_m: float  # edge of a texel
+
+    @cached_property
+    def sides(self) -> Float64:
+        """float64 (7, F): first corner of each face, the ways to both others, and their product."""
+        a, b, c = self.places[self.mesh.faces].transpose(1, 2, 0)
+        (ux, uy), (vx, vy) = b - a, c - a
+        area = ux * vy - uy * vx
+        area = np.where(np.abs(area) < 1e-12, 1.0, area)  # on edge, as a ray may just hit one
+        return np.stack([*a, ux, uy, vx, vy, area])
 
 
 def make_atlas(mesh: TriangleMesh, texel_m: float, most_px: int) -> Atlas:
@@ -76,11 +86,8 @@ def texels_of(atlas: Atlas) -> tuple[Int32, Int32]:
 
 def shares_of(atlas: Atlas, numbers: Int32, faces: Int32) -> Float32:
     """Return float32 (N, 3), how much each corner of its face counts at the centre of a texel."""
-    at = np.stack([numbers % atlas.width_px, numbers // atlas.width_px], axis=1) + 0.5
-    a, b, c = atlas.places[atlas.mesh.faces[faces]].transpose(1, 0, 2)
-    (ux, uy), (vx, vy), (wx, wy) = (b - a).T, (c - a).T, (at - a).T
-    area = ux * vy - uy * vx
-    area = np.where(np.abs(area) < 1e-12, 1.0, area)  # a face on edge, as a ray may just hit one
+    x, y, ux, uy, vx, vy, area = atlas.sides.take(faces, axis=1)
+    wx, wy = numbers % atlas.width_px + 0.5 - x, numbers // atlas.width_px + 0.5 - y
     second, third = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
     shares = np.stack([1 - second - third, second, third], axis=1)
     return np.asarray(np.clip(shares, 0, 1), np.float32)
