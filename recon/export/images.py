@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -37,6 +37,7 @@ class DriveImages:
     prefix: str  # of names, which tells drives apart where there are several
     source: StereoSource
     rig: Rig  # with which it was mapped
+    kept: dict[int, tuple[UInt8, ...]] = field(default_factory=dict, init=False)  # see `views`
 
     @cached_property
     def T_map_camera(self) -> Float64:
@@ -55,24 +56,19 @@ class DriveImages:
     def file(self, side: str, frame: int) -> str:
         return f"{self.prefix}{side}_{frame:06d}.png"
 
-    @cached_property
-    def _kept(self) -> dict[int, tuple[UInt8, ...]]:
-        return {}
-
     def views(self) -> Iterator[tuple[int, tuple[UInt8, ...]]]:
         """Yield number and rectified images of the frames that have a place, the left one first.
 
         Those of the first frames stay in memory, as many as fit: whoever comes next need not read
         and rectify them again.
         """
-        kept = self._kept
-        yield from [*kept.items()]
-        room = _KEPT_BYTES - sum(image.nbytes for images in kept.values() for image in images)
-        for frame, pair in self.pairs(max(kept, default=-1) + 1):
+        yield from [*self.kept.items()]
+        room = _KEPT_BYTES - sum(one.nbytes for images in self.kept.values() for one in images)
+        for frame, pair in self.pairs(max(self.kept, default=-1) + 1):
             images = self.rectified(pair)
-            room -= sum(image.nbytes for image in images)
+            room -= sum(one.nbytes for one in images)
             if room >= 0:
-                kept[frame] = images
+                self.kept[frame] = images
             yield frame, images
 
     def pairs(self, start: int = 0) -> Iterator[tuple[int, Recorded]]:

@@ -13,7 +13,7 @@ from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Float64, Int32, Int64
-from recon.export.mesh.cut import components, neighbours
+from recon.export.mesh.cut import components, meeting_sides
 
 _RIGHT: Final = np.array([[0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, -1, 0], [1, 0, 0], [1, 0, 0]])
 _DOWN: Final = np.array([[0, 0, -1], [0, 0, -1], [0, -1, 0], [0, 0, -1], [0, 0, -1], [0, 1, 0]])
@@ -99,7 +99,7 @@ def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     cosines = normals @ _FACING.T
-    facing, pairs, rows = cosines.argmax(axis=1), neighbours(mesh.faces), np.arange(len(a))
+    facing, pairs, rows = cosines.argmax(axis=1), meeting_sides(mesh.faces) // 3, np.arange(len(a))
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     for _ in range(_SMOOTHINGS):
         votes = np.bincount(6 * ends[:, 0] + facing[ends[:, 1]], minlength=6 * len(a))

@@ -225,7 +225,7 @@ def component_labels(faces: Int32) -> tuple[Int32, Int32]:
 
     They are numbered by their first faces.
     """
-    labels = components(neighbours(faces), len(faces))
+    labels = components(meeting_sides(faces) // 3, len(faces))
     return labels, np.bincount(labels).astype(np.int32)
 
 
@@ -235,13 +235,13 @@ def components(pairs: Int64, count: int) -> Int32:
     return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 
 
-def neighbours(faces: Int32) -> Int64:
-    """Return int64 (P, 2), the faces on both sides of each inner edge."""
+def meeting_sides(faces: NDArray[np.signedinteger]) -> Int64:
+    """Return int64 (P, 2), sides that are one edge; 3f + k begins at corner k of face f."""
     begin, end = faces.astype(np.int64), np.roll(faces, -1, axis=1)
     packed = ((np.minimum(begin, end) << 32) | np.maximum(begin, end)).ravel()
     order = np.argsort(packed, kind="stable")
     same = np.flatnonzero(packed[order][1:] == packed[order][:-1])
-    return np.stack([order[same], order[same + 1]], axis=1) // 3
+    return np.stack([order[same], order[same + 1]], axis=1)
 
 
 def vertex_normals(vertices: Float32, faces: Int32) -> Float32:

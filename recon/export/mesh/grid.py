@@ -17,7 +17,7 @@ import numpy as np
 from recon.core.errors import MeshingError
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Bool, Float64, Int32, Int64
-from recon.export.mesh.cut import components, renumbered, vertex_normals
+from recon.export.mesh.cut import components, meeting_sides, renumbered, vertex_normals
 from recon.export.mesh.poisson import MeshSettings, simplified, usable
 from recon.export.mesh.solid import closed_behind
 
@@ -345,14 +345,10 @@ def _manifold(faces: Int64, least: int, width: int) -> tuple[Int64, Int32]:
     than ``least`` half pixels are left out.
     """
     count = len(faces)
-    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    key = np.minimum(begin, end) * (begin.max(initial=0) + 1) + np.maximum(begin, end)
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(np.diff(key[order]) == 0)
-    one, other = order[same], order[same + 1]
+    pairs = meeting_sides(faces)
+    one, other = pairs.T
     following = np.arange(3 * count).reshape(-1, 3)[:, [1, 2, 0]].ravel()
     # Two triangles run along a side in opposite directions.
-    pairs = np.stack([one, other], axis=1)
     links = np.stack([np.append(one, following[one]), np.append(following[other], other)], axis=1)
     surface = components(pairs // 3, count)
     row, column = np.divmod(faces, width)

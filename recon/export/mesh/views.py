@@ -183,11 +183,8 @@ class _Texels(NamedTuple):
 
     def mean_of(self, values: Float32) -> Float32:
         """Return the values (V, C) of vertices, interpolated: float32 (N, C)."""
-        parts = (
-            share[:, None] * values.take(corner, axis=0)
-            for share, corner in zip(self.shares.T, self.corners.T, strict=True)
-        )
-        return reduce(np.add, parts)  # twice as fast as einsum
+        each = zip(self.shares.T, self.corners.T, strict=True)  # twice as fast as einsum
+        return reduce(np.add, (share[:, None] * values.take(corner, 0) for share, corner in each))
 
 
 class _Canvas:
